@@ -78,7 +78,7 @@ def state_fields() -> str:
         for field in topic.state:
             numbers = ", ".join(f"`{each}`" for each in field.members or field.entries)
             rows.append(
-                (f"`{topic.name}`", f"`{field.path}`", numbers or f"one for each of the {topic.of}")
+                (f"`{topic.name}`", f"`{field.path}`", numbers or f"one for each of the {topic.entries_of}")
             )
     return table(("topic", "field", "numbers"), rows)
 

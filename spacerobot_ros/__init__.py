@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from spacerobot_ros.version import __version__
@@ -16,7 +17,15 @@ if TYPE_CHECKING:
 __all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag"]
 
 
-_LEAST_SHARED_MEMORY = 16 * 2**10
+_MODULES = {
+    "fly": "spacerobot_ros.flight.api",
+    "load_scenario": "spacerobot_ros.scenario",
+    "plan": "spacerobot_ros.flight.api",
+    "read_bag": "spacerobot_ros.bag",
+}
+"""Modules of the names that are imported when first asked for: the package itself is light."""
+
+_MIN_SHARED_MEMORY = 16 * 2**10
 """Bytes of shared memory without which libraries of ROS end the process that loads them."""
 
 
@@ -26,7 +35,7 @@ def _warn_of_full_shared_memory() -> None:
         facts = os.statvfs("/dev/shm")
     except OSError:
         return
-    if facts.f_blocks and facts.f_bavail * facts.f_frsize < _LEAST_SHARED_MEMORY:
+    if facts.f_blocks and facts.f_bavail * facts.f_frsize < _MIN_SHARED_MEMORY:
         logging.getLogger(__name__).warning(
             "/dev/shm is full: ROS may end here with SIGBUS (bus error). Free it; what killed "
             "processes have left, fastrtps_*, may be deleted while nothing runs."
@@ -37,17 +46,6 @@ _warn_of_full_shared_memory()
 
 
 def __getattr__(name: str) -> Any:
-    # Imported when first asked for: the package itself is light.
-    if name in ("fly", "plan"):
-        from spacerobot_ros.flight import api
-
-        return getattr(api, name)
-    if name == "load_scenario":
-        from spacerobot_ros.scenario import load_scenario
-
-        return load_scenario
-    if name == "read_bag":
-        from spacerobot_ros.bag import read_bag
-
-        return read_bag
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

@@ -28,19 +28,19 @@ _OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _CACHE_MAGIC = b"spacerobot_ros cache 2"
 """Begins the last line of a file of the cache; the number is that of the format."""
 
-_LARGEST_PRIVATE_FILE = 256 * 2**20
+_MAX_PRIVATE_FILE_SIZE = 256 * 2**20
 """Largest file that :func:`read_private` reads, bytes."""
 
 _MCAP_MAGIC = b"\x89MCAP"
 """First bytes of a bag."""
 
-_MOST_YAML_CHARACTERS = 1_000_000
+_MAX_YAML_CHARACTERS = 1_000_000
 """Largest number of characters of a YAML text."""
 
-_MOST_YAML_VALUES = 100_000
+_MAX_YAML_VALUES = 100_000
 """Largest number of values of a YAML text, with those that aliases repeat."""
 
-_MOST_YAML_DEPTH = 50
+_MAX_YAML_DEPTH = 50
 """Largest number of levels of a YAML text."""
 
 _logged_warnings: set[str] = set()
@@ -78,17 +78,17 @@ def write_whole(path: Path, content: bytes, *, durable: bool = True, mode: int =
     OSError
         It cannot be written; an older file stays.
     """
-    made = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.new")
+    new_file = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.new")
     try:
-        with os.fdopen(os.open(made, os.O_CREAT | os.O_WRONLY | os.O_EXCL, mode), "wb") as file:
+        with os.fdopen(os.open(new_file, os.O_CREAT | os.O_WRONLY | os.O_EXCL, mode), "wb") as file:
             file.write(content)
             file.flush()
             if durable:
                 os.fsync(file.fileno())
-        os.replace(made, path)
+        os.replace(new_file, path)
     except BaseException:
         with suppress(OSError):
-            os.unlink(made)
+            os.unlink(new_file)
         raise
     if durable:
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
@@ -123,20 +123,19 @@ def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
 
 def _write_output(path: Path, data: bytes, mode: int) -> None:
     before = path.stat() if path.exists() else None
-    in_place = before is not None and not stat.S_ISREG(before.st_mode)
-    if before is not None and not in_place and _is_bag(path):
-        raise SpaceRobotError(f"The file {path} is a bag, which is not replaced: name another.")
-    if in_place or not os.access(path.parent, os.W_OK):
+    is_device = before is not None and not stat.S_ISREG(before.st_mode)
+    if before is not None and not is_device:
+        with path.open("rb") as file:
+            if file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC:
+                raise SpaceRobotError(
+                    f"The file {path} is a bag, which is not replaced: name another."
+                )
+    if is_device or not os.access(path.parent, os.W_OK):
         path.write_bytes(data)
         return
     if before is not None:
         mode = stat.S_IMODE(before.st_mode)
     write_whole(path, data, durable=False, mode=mode)
-
-
-def _is_bag(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
 
 
 # -- YAML -------------------------------------------------------------------------------------
@@ -160,8 +159,8 @@ def load_yaml(text: str, loader: Any = None) -> Any:
     """
     import yaml
 
-    if len(text) > _MOST_YAML_CHARACTERS:
-        raise ValueError(f"it has more than {_MOST_YAML_CHARACTERS} characters")
+    if len(text) > _MAX_YAML_CHARACTERS:
+        raise ValueError(f"it has more than {_MAX_YAML_CHARACTERS} characters")
     try:
         reader = (loader or yaml.SafeLoader)(text)
         try:
@@ -178,25 +177,25 @@ def load_yaml(text: str, loader: Any = None) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
-def _count_values(node: Any, known: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
+def _count_values(node: Any, sizes: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
     """Return the number of values that a node stands for, and its depth.
 
-    ``known`` has those of nodes by their id, and None for the nodes around this one.
+    ``sizes`` has those of nodes by their id, and None for the nodes around this one.
     """
-    if id(node) not in known:
-        known[id(node)] = None
-        parts = () if isinstance(node.value, str) else node.value
+    if id(node) not in sizes:
+        sizes[id(node)] = None
+        children = () if isinstance(node.value, str) else node.value
         count, depth = 1, 0
-        for part in parts:
-            for each in part if isinstance(part, tuple) else (part,):
-                more, below = _count_values(each, known)
-                count, depth = count + more, max(depth, below)
-            if count > _MOST_YAML_VALUES:
-                raise ValueError(f"its aliases stand for more than {_MOST_YAML_VALUES} values")
-        if depth >= _MOST_YAML_DEPTH:
+        for child in children:
+            for each in child if isinstance(child, tuple) else (child,):
+                child_count, child_depth = _count_values(each, sizes)
+                count, depth = count + child_count, max(depth, child_depth)
+            if count > _MAX_YAML_VALUES:
+                raise ValueError(f"its aliases stand for more than {_MAX_YAML_VALUES} values")
+        if depth >= _MAX_YAML_DEPTH:
             raise ValueError("it is nested too deeply")
-        known[id(node)] = count, depth + 1
-    size = known[id(node)]
+        sizes[id(node)] = count, depth + 1
+    size = sizes[id(node)]
     if size is None:
         raise ValueError("it refers to itself")
     return size
@@ -222,7 +221,7 @@ def read_private(path: Path) -> bytes:
         if not stat.S_ISREG(facts.st_mode):
             raise UntrustedFileError(f"'{path}' is not a regular file; remove it.")
         _require_own_path(path, facts)
-        if facts.st_size > _LARGEST_PRIVATE_FILE:
+        if facts.st_size > _MAX_PRIVATE_FILE_SIZE:
             raise UntrustedFileError(f"'{path}' has {facts.st_size} bytes; remove it.")
         return file.read(facts.st_size)
 
@@ -323,10 +322,10 @@ class Cache:
             return None
         return path
 
-    def discard(self, name: str, why: str) -> None:
+    def discard(self, name: str, reason: str) -> None:
         """Delete a file, and warn with the reason."""
         path = self.folder / name
-        warn_once(f"'{path}' is thrown away and made anew: {why.rstrip('.')}.")
+        warn_once(f"'{path}' is thrown away and made anew: {reason.rstrip('.')}.")
         with suppress(OSError):
             path.unlink()
 
@@ -355,13 +354,7 @@ def _trailer(content: bytes, key: str) -> bytes:
 
 
 def _content_of_entry(whole: bytes, key: str) -> bytes:
-    """Return the content of a file without its last line.
-
-    Raises
-    ------
-    ValueError
-        The line is not that of this content and key.
-    """
+    """Return the content of a file without its last line; ValueError if that is of another."""
     content = whole[: whole.rfind(b"\n" + _CACHE_MAGIC + b" ")]
     if not whole.endswith(_trailer(content, key)):
         raise ValueError("it is damaged, or of something else")

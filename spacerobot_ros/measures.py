@@ -145,12 +145,14 @@ def flown_time(
     float | None
         None where neither is reported.
     """
-    given = list(statuses)
-    planned = [(time, each) for time, each in given if isinstance(each, PlannerStatus)]
-    if planned:
-        end = max(end, planned[-1][0])
-    tracked = ((time, each.state) for time, each in given if isinstance(each, ControllerStatus))
-    return manoeuvre_time(planned, end) or tracking_time(tracked)
+    all_statuses = list(statuses)
+    planner = [(time, each) for time, each in all_statuses if isinstance(each, PlannerStatus)]
+    if planner:
+        end = max(end, planner[-1][0])
+    controller = (
+        (time, each.state) for time, each in all_statuses if isinstance(each, ControllerStatus)
+    )
+    return manoeuvre_time(planner, end) or tracking_time(controller)
 
 
 # -- the measures by name ---------------------------------------------------------------------
@@ -164,24 +166,25 @@ class Metric:
     ----------
     unit, description
         For people.
-    of
+    evaluate
         Function of the measures and the robot: a number, NaN where a flight has none; or a number
         for each joint.
     by_joint
         Whether ``<name>.<joint>`` is the number of a joint, and the name itself the worst of all.
-    least
+    smallest_is_worst
         Whether the smallest number is the worst.
     """
 
     unit: str
     description: str
-    of: Callable[[Measures, RobotDescription], float | Array]
+    evaluate: Callable[[Measures, RobotDescription], float | Array]
     by_joint: bool = False
-    least: bool = False
+    smallest_is_worst: bool = False
 
 
-def _error_part(error: PoseError | None, part: str) -> float:
-    return math.nan if error is None else float(getattr(error, part))
+def _error_metric(error: str, part: str, unit: str, description: str) -> Metric:
+    """Return the metric of a part (``distance`` or ``angle``) of an error of the measures."""
+    return Metric(unit, description, lambda m, _: float(getattr(getattr(m, error), part, math.nan)))
 
 
 def _joint_margin(measures: Measures, robot: RobotDescription) -> Array:
@@ -189,36 +192,28 @@ def _joint_margin(measures: Measures, robot: RobotDescription) -> Array:
     return np.minimum(measures.lowest - lower, upper - measures.highest)
 
 
-def _margin_metric(limited: str, limit: str, values: Callable[[Measures], Array]) -> Metric:
+def _margin_metric(quantity: str, limit: str, peak_of: Callable[[Measures], Array]) -> Metric:
     return Metric(
         "",
-        f"unused share of the {limited} limit of a joint",
-        lambda measures, robot: 1.0 - values(measures) / robot.limits(limit),
+        f"unused share of the {quantity} limit of a joint",
+        lambda measures, robot: 1.0 - peak_of(measures) / robot.limits(limit),
         by_joint=True,
-        least=True,
+        smallest_is_worst=True,
     )
 
 
 METRICS: dict[str, Metric] = {
-    "position_error_m": Metric(
-        "m",
-        "distance of the last true position of the base from the goal",
-        lambda m, _: _error_part(m.error, "distance"),
+    "position_error_m": _error_metric(
+        "error", "distance", "m", "distance of the last true position of the base from the goal"
     ),
-    "attitude_error_rad": Metric(
-        "rad",
-        "angle between the last true attitude of the base and the goal",
-        lambda m, _: _error_part(m.error, "angle"),
+    "attitude_error_rad": _error_metric(
+        "error", "angle", "rad", "angle between the last true attitude of the base and the goal"
     ),
-    "end_effector_position_error_m": Metric(
-        "m",
-        "likewise, of the end-effector",
-        lambda m, _: _error_part(m.end_effector_error, "distance"),
+    "end_effector_position_error_m": _error_metric(
+        "end_effector_error", "distance", "m", "likewise, of the end-effector"
     ),
-    "end_effector_attitude_error_rad": Metric(
-        "rad",
-        "likewise, of the end-effector",
-        lambda m, _: _error_part(m.end_effector_error, "angle"),
+    "end_effector_attitude_error_rad": _error_metric(
+        "end_effector_error", "angle", "rad", "likewise, of the end-effector"
     ),
     "duration_s": Metric("s", "simulated time of the flight", lambda m, _: m.duration),
     "manoeuvre_time_s": Metric("s", "duration of all schedules", lambda m, _: m.manoeuvre_time),
@@ -241,7 +236,7 @@ METRICS: dict[str, Metric] = {
         "least distance of a joint from its ends",
         _joint_margin,
         by_joint=True,
-        least=True,
+        smallest_is_worst=True,
     ),
     "rate_margin": _margin_metric("rate", "velocity", lambda m: m.peak_rate),
     "effort_margin": _margin_metric("effort", "effort", lambda m: m.peak_effort),
@@ -256,19 +251,19 @@ METRICS: dict[str, Metric] = {
 
 def metrics_of(measures: Measures, robot: RobotDescription) -> dict[str, float]:
     """Return every metric of a flight by name, those of joints too; NaN where it has none."""
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
         for name, metric in METRICS.items():
-            value = metric.of(measures, robot)
+            value = metric.evaluate(measures, robot)
             if not metric.by_joint:
-                found[name] = float(value)
+                metrics[name] = float(value)
                 continue
-            each = np.asarray(value, dtype=float)
-            worst = each.min if metric.least else each.max
-            found[name] = float(worst()) if each.size else math.nan
-            for joint, number in zip(robot.joint_names, each.tolist(), strict=True):
-                found[f"{name}.{joint}"] = number
-    return found
+            by_joint = np.asarray(value, dtype=float)
+            worst = by_joint.min if metric.smallest_is_worst else by_joint.max
+            metrics[name] = float(worst()) if by_joint.size else math.nan
+            for joint, number in zip(robot.joint_names, by_joint.tolist(), strict=True):
+                metrics[f"{name}.{joint}"] = number
+    return metrics
 
 
 def metric_names(joints: Sequence[str]) -> list[str]:

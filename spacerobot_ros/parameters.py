@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any, TypeVar
 
@@ -74,14 +74,14 @@ class Parameter:
         ParameterError
             It has another type, is out of range, or is not one of the choices.
         """
-        wanted = self.default
-        if isinstance(wanted, bool):
+        default = self.default
+        if isinstance(default, bool):
             if not isinstance(value, bool):
                 raise self._refusal(value, "true or false")
             return value
-        if isinstance(wanted, (int, float)):
-            return self._check_number(value, isinstance(wanted, int))
-        if isinstance(wanted, str):
+        if isinstance(default, (int, float)):
+            return self._check_number(value, isinstance(default, int))
+        if isinstance(default, str):
             if not isinstance(value, str):
                 raise self._refusal(value, "a text")
             if self.choices and value not in self.choices:
@@ -125,30 +125,15 @@ class Parameter:
             return "" if math.isinf(self.minimum) else f" of at least {self.minimum:g}"
         return f" from {self.minimum:g} to {self.maximum:g}"
 
-    def _refusal(self, value: Any, wanted: str) -> ParameterError:
+    def _refusal(self, value: Any, expected: str) -> ParameterError:
         unit = f" ({self.unit})" if self.unit else ""
         shown = value if not isinstance(value, str) else f"'{value[:60]}'"
-        return ParameterError(f"Parameter '{self.name}' is {shown}; it must be {wanted}{unit}.")
+        return ParameterError(f"Parameter '{self.name}' is {shown}; it must be {expected}{unit}.")
 
 
-def parameter(
-    default: Value,
-    description: str,
-    *,
-    unit: str = "",
-    minimum: float = -math.inf,
-    maximum: float = math.inf,
-    choices: Sequence[str] = (),
-    length: int | None = None,
-    read_only: bool = True,
-    texts: bool = False,
-    of_joints: bool = False,
-) -> Any:
-    """Return a field of a configuration; see :class:`Parameter` for the arguments."""
-    declaration = Parameter(
-        "", default, unit, description, minimum, maximum, tuple(choices), length, read_only, texts,
-        of_joints,
-    )  # fmt: skip
+def parameter(default: Value, description: str, **attributes: Any) -> Any:
+    """Return a field of a configuration; ``attributes`` are further ones of :class:`Parameter`."""
+    declaration = Parameter("", default, description=description, **attributes)
     return field(default=default, metadata={_PARAMETER: declaration})
 
 
@@ -171,18 +156,20 @@ def registered(registry: Mapping[str, Any]) -> Any:
     )
 
 
-def declared(config: type[Any] | Any, prefix: str = "") -> tuple[Parameter, ...]:
+def declared(config: type[Any] | Any) -> tuple[Parameter, ...]:
     """Return the parameters of a configuration, in the order of their declaration.
 
-    ``config`` is the class, or an instance whose values are the defaults; ``prefix`` comes before
-    every name.
+    ``config`` is the class, or an instance whose values are the defaults.
     """
     if isinstance(config, type):
-        return _declared(config, prefix, _registered(config()))
-    return tuple(parameter for parameter, _ in _parameters_with_values(config, prefix))
+        return _declared_in_class(config, _registered_options(config()))
+    return tuple(
+        replace(declaration, name=name, default=value)
+        for name, declaration, value in _parameters_with_values(config)
+    )
 
 
-def _registered(config: Any) -> tuple[tuple[str, type[Any]], ...]:
+def _registered_options(config: Any) -> tuple[tuple[str, type[Any]], ...]:
     """Return names and option classes of the present registries, to which users add their own."""
     return tuple(
         (entry, type(options))
@@ -193,14 +180,14 @@ def _registered(config: Any) -> tuple[tuple[str, type[Any]], ...]:
 
 
 @cache
-def _declared(
-    config: type[Any], prefix: str, registered: tuple[tuple[str, type[Any]], ...]
+def _declared_in_class(
+    config: type[Any], registered_options: tuple[tuple[str, type[Any]], ...]
 ) -> tuple[Parameter, ...]:
     """Return the parameters of a class; the registries are part of the cache's key."""
-    return tuple(parameter for parameter, _ in _parameters_with_values(config, prefix))
+    return declared(config())
 
 
-def configured(kind: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
+def configured(kind: type[C], values: Mapping[str, Any]) -> C:
     """Return a configuration with ``values`` by full name; those left out have their defaults.
 
     Values of other names are left alone; see :func:`require_known`.
@@ -210,7 +197,7 @@ def configured(kind: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
     ParameterError
         A value is refused; the message names the parameter.
     """
-    return _reconfigured(kind(), kind(), values, prefix)
+    return _reconfigured(kind(), kind(), values, "")
 
 
 def reconfigured(config: C, values: Mapping[str, Any]) -> C:
@@ -226,9 +213,9 @@ def reconfigured(config: C, values: Mapping[str, Any]) -> C:
     return _reconfigured(config, type(config)(), values, "")
 
 
-def values_of(config: Any, prefix: str = "") -> dict[str, Value]:
+def values_of(config: Any) -> dict[str, Value]:
     """Return the value of every parameter of a configuration by full name."""
-    return {f"{prefix}{name}": value for name, _, value in _fields_of(config)}
+    return {name: value for name, _, value in _parameters_with_values(config)}
 
 
 def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
@@ -250,7 +237,7 @@ def _reconfigured(config: C, defaults: Any, values: Mapping[str, Any], prefix: s
         name, default = f"{prefix}{each.name}", getattr(defaults, each.name)
         if _PARAMETER in each.metadata:
             if name in values:
-                declaration = _with_name_and_default(each.metadata[_PARAMETER], name, default)
+                declaration = replace(each.metadata[_PARAMETER], name=name, default=default)
                 chosen[each.name] = declaration.checked(values[name])
         elif _GROUP in each.metadata:
             if _has_parameter_below(f"{name}.", values):
@@ -274,30 +261,14 @@ def _has_parameter_below(prefix: str, names: Iterable[str]) -> bool:
     return any(name.startswith(prefix) for name in names)
 
 
-def _parameters_with_values(
-    config: type[Any] | Any, prefix: str
-) -> Iterator[tuple[Parameter, Value]]:
-    """Yield every parameter with its value in a configuration."""
-    for name, declaration, value in _fields_of(config):
-        yield _with_name_and_default(declaration, f"{prefix}{name}", value), value
-
-
-def _fields_of(config: type[Any] | Any) -> Iterator[tuple[str, Parameter, Value]]:
-    """Yield name, declaration and value of every parameter of a configuration."""
-    assert is_dataclass(config)
-    instance = config() if isinstance(config, type) else config
-    for each in fields(instance):
-        value = getattr(instance, each.name)
+def _parameters_with_values(config: Any) -> Iterator[tuple[str, Parameter, Value]]:
+    """Yield full name, declaration and value of every parameter of a configuration."""
+    for each in fields(config):
+        value = getattr(config, each.name)
         if _PARAMETER in each.metadata:
             yield each.name, each.metadata[_PARAMETER], value
-        elif _GROUP in each.metadata:
-            for name, declaration, inner in _fields_of(value):
-                yield f"{each.name}.{name}", declaration, inner
-        elif _REGISTERED in each.metadata:
-            for entry, options in value.items():
-                for name, declaration, inner in _fields_of(options):
-                    yield f"{entry}.{name}", declaration, inner
-
-
-def _with_name_and_default(declaration: Parameter, name: str, default: Value) -> Parameter:
-    return replace(declaration, name=name, default=default)
+            continue
+        groups = {each.name: value} if _GROUP in each.metadata else {}
+        for prefix, part in (value if _REGISTERED in each.metadata else groups).items():
+            for name, declaration, inner in _parameters_with_values(part):
+                yield f"{prefix}.{name}", declaration, inner

@@ -62,9 +62,6 @@ _SCENARIO_KEYS = (
     *(f"{goal}_{part}" for goal in _GOAL_NAMES for part in ("position", "orientation", "rotvec")),
 )
 
-_LOCKSTEP_OVERRIDES: Mapping[str, Mapping[str, Any]] = {"plant": {"time_mode": "lockstep"}}
-"""The overrides of every scenario that is loaded."""
-
 _LONGEST_TF_PERIOD = 0.1
 """Longest wall time between transforms of a flight in real time, s."""
 
@@ -119,13 +116,15 @@ class Scenario:
     path: Path
     description: str
     goal: Goal
-    end_effector_goal: Goal | None
-    commanders: tuple[str, ...]
-    published: tuple[Published, ...]
-    published_method: str
-    kills: tuple[Kill, ...]
     in_file: Mapping[str, Mapping[str, Any]]
-    overrides: Mapping[str, Mapping[str, Any]]
+    end_effector_goal: Goal | None = None
+    commanders: tuple[str, ...] = ("planner",)
+    published: tuple[Published, ...] = ()
+    published_method: str = ""
+    kills: tuple[Kill, ...] = ()
+    overrides: Mapping[str, Mapping[str, Any]] = field(
+        default_factory=lambda: {"plant": {"time_mode": "lockstep"}}
+    )
     has_goal: bool = True
     _configs: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     """Results of :meth:`config`, by node."""
@@ -143,10 +142,10 @@ class Scenario:
             The node has no such parameter, or a value is refused; the message names both.
         """
         if node not in self._configs:
-            self._configs[node] = self._configured(node)
+            self._configs[node] = self._make_config(node)
         return self._configs[node]
 
-    def _configured(self, node: str) -> Any:
+    def _make_config(self, node: str) -> Any:
         known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
         before, values = self._changes.get(node, (None, self._parameters_as_written(node)))
         for name, value in values.items():
@@ -200,12 +199,12 @@ class Scenario:
             A parameter of the node is refused.
         """
         values = values_of(self.config(node))
-        given = self._parameters_as_written(node)
+        written = self._parameters_as_written(node)
         # An empty list is every list's default, and has no type that ROS could know it by.
-        found = {name: values[name] for name in given if name in values and values[name] != ()}
-        if "use_sim_time" in given:
-            found["use_sim_time"] = bool(given["use_sim_time"])
-        return found
+        typed = {name: values[name] for name in written if values.get(name, ()) != ()}
+        if "use_sim_time" in written:
+            typed["use_sim_time"] = bool(written["use_sim_time"])
+        return typed
 
     def records(self, nodes: Sequence[str]) -> dict[str, dict[str, str]]:
         """Return the metadata records of a bag of the flight, by name.
@@ -213,12 +212,8 @@ class Scenario:
         ``scenario`` has name, description, goals and published figures, ``parameters/<node>`` every
         parameter of a node as a JSON text.
         """
-        goals = {"goal": self.goal, "end_effector_goal": self.end_effector_goal}
         scenario = {"name": self.name, "description": self.description}
-        for name, goal in goals.items():
-            if goal is not None:
-                scenario[f"{name}_position"] = " ".join(map(repr, goal.position.tolist()))
-                scenario[f"{name}_orientation"] = " ".join(map(repr, goal.quaternion.tolist()))
+        scenario |= {key: " ".join(map(repr, pose)) for key, pose in self._goal_poses().items()}
         scenario["published"] = json.dumps([asdict(row) for row in self.comparable])
         parameters = {
             f"parameters/{node}": {
@@ -227,6 +222,16 @@ class Scenario:
             for node in nodes
         }
         return {"scenario": scenario, **parameters}
+
+    def _goal_poses(self) -> dict[str, list[float]]:
+        """Return positions (3,) and quaternions (4,) of the goals by their keys in a file."""
+        goals = zip(_GOAL_NAMES, (self.goal, self.end_effector_goal), strict=True)
+        poses = {name: goal for name, goal in goals if goal is not None}
+        return {
+            f"{name}_{part}": values.tolist()
+            for name, goal in poses.items()
+            for part, values in (("position", goal.position), ("orientation", goal.quaternion))
+        }
 
     def problem(self) -> Problem:
         """Return the planning problem of the goal of the base.
@@ -381,12 +386,7 @@ def scenario_text(scenario: Scenario) -> str:
 
     Published figures and kills of nodes are not in it.
     """
-    about: dict[str, Any] = {"description": scenario.description}
-    goals = {"goal": scenario.goal, "end_effector_goal": scenario.end_effector_goal}
-    for name, goal in goals.items():
-        if goal is not None:
-            about[f"{name}_position"] = goal.position.tolist()
-            about[f"{name}_orientation"] = goal.quaternion.tolist()
+    about: dict[str, Any] = {"description": scenario.description, **scenario._goal_poses()}
     if scenario.goal.joint_positions is not None:
         about["goal_joint_positions"] = scenario.goal.joint_positions.tolist()
     content = {"scenario": {"ros__parameters": about}}
@@ -417,14 +417,14 @@ def load_scenario(name: str) -> Scenario:
             f"There is no scenario '{name}'; there are: {', '.join(known)}, or any YAML file."
             f"{suggestion(name, [*known, *robots])}"
         )
-    content = read_content(path)
+    content = _read_content(path)
     section = content.get("scenario")
     values = section.get("ros__parameters") if isinstance(section, dict) else None
     if not isinstance(values, dict):
         raise ParameterError(
             f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
         )
-    in_file = sections_of(content, path)
+    in_file = _parameters_by_node(content, path)
     unknown = sorted(set(map(str, values)) - set(_SCENARIO_KEYS))
     if unknown:
         raise ParameterError(
@@ -446,7 +446,6 @@ def load_scenario(name: str) -> Scenario:
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file={node: _with_robot_beside(path, values) for node, values in in_file.items()},
-        overrides=_LOCKSTEP_OVERRIDES,
     )
 
 
@@ -493,13 +492,7 @@ def _scenario_without_goal(name: str, path: Path, robot: dict[str, str]) -> Scen
         path=path,
         description="",
         goal=Goal.checked([0, 0, 0], [0, 0, 0, 1]),
-        end_effector_goal=None,
-        commanders=("planner",),
-        published=(),
-        published_method="",
-        kills=(),
         in_file={"plant": robot, "planner": robot},
-        overrides=_LOCKSTEP_OVERRIDES,
         has_goal=False,
     )
 
@@ -587,17 +580,11 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     ParameterError
         The file cannot be read, or a section has no ``ros__parameters`` with parameters under it.
     """
-    return sections_of(read_content(path), path)
+    return _parameters_by_node(_read_content(path), path)
 
 
-def read_content(path: Path) -> dict[Any, Any]:
-    """Return the content of a parameter file; empty where the file is no mapping.
-
-    Raises
-    ------
-    ParameterError
-        The file cannot be read.
-    """
+def _read_content(path: Path) -> dict[Any, Any]:
+    """Return the content of a parameter file; empty where the file is no mapping."""
     try:
         content = load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -605,33 +592,28 @@ def read_content(path: Path) -> dict[Any, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def sections_of(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
-    """Return the parameters by node and full name in the content of a parameter file.
-
-    Raises
-    ------
-    ParameterError
-        A section has no ``ros__parameters`` with parameters under it.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    of_all: dict[str, Any] = {}
-    for key, given in content.items():
+def _parameters_by_node(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
+    """Return the parameters by node and full name in the content of a parameter file."""
+    by_node: dict[str, dict[str, Any]] = {}
+    of_all_nodes: dict[str, Any] = {}
+    for key, section in content.items():
         node = str(key).rpartition("/")[2]
         if node not in (*NODES, "**"):
             continue
-        given = {} if given is None else given
-        values = given.get("ros__parameters", {}) if isinstance(given, dict) else None
+        section = {} if section is None else section
+        values = section.get("ros__parameters", {}) if isinstance(section, dict) else None
         if not isinstance(values, dict):
             raise ParameterError(
                 f"The section '{key}' of the scenario file {path} is not 'ros__parameters:' with "
                 "the parameters under it."
             )
-        (of_all if node == "**" else found.setdefault(node, {})).update(_flatten_section(values))
-    for node, values in found.items():
+        chosen = of_all_nodes if node == "**" else by_node.setdefault(node, {})
+        chosen.update(_flatten_section(values))
+    for node, values in by_node.items():
         known = {parameter.name for parameter in declared(CONFIGS[node])}
-        shared = {name: value for name, value in of_all.items() if name in known}
-        found[node] = {**shared, **values}
-    return found
+        shared = {name: value for name, value in of_all_nodes.items() if name in known}
+        by_node[node] = {**shared, **values}
+    return by_node
 
 
 def parse_setting(text: str) -> tuple[str, str, Any]:

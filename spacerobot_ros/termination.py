@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 if TYPE_CHECKING:
     import subprocess
@@ -78,11 +78,11 @@ class Terminated(KeyboardInterrupt):
         return 128 + self.number
 
 
-class _Request:
+class _Request(NamedTuple):
     """Functions to call on a signal: in the main thread, and at once in the guard's thread."""
 
-    def __init__(self, main: Callable[[], None], at_once: Callable[[], None]) -> None:
-        self.main, self.at_once = main, at_once
+    main: Callable[[], None]
+    at_once: Callable[[], None]
 
 
 class _Guard:
@@ -166,11 +166,10 @@ class _Guard:
         poll.register(self._reader, select.POLLIN)
         if self._lifeline is not None:
             poll.register(self._lifeline, select.POLLIN | select.POLLHUP)
-        told = False
+        handled = False
         while True:
-            deadlines = [by for by in (self._notice_by, self._end_by) if by is not None]
-            left = min(deadlines, default=None)
-            wait = None if left is None else max(0.0, 1e3 * (left - time.monotonic()))
+            deadline = self._deadline()
+            wait = None if deadline is None else max(0.0, 1e3 * (deadline - time.monotonic()))
             for file, _ in poll.poll(wait):
                 if file == self._lifeline:
                     poll.unregister(file)
@@ -183,16 +182,21 @@ class _Guard:
                         self._on_parent_end()
                     elif number in _MESSAGE_BY_SIGNAL:
                         self._note_signal(number)
-                        if told and time.monotonic() - self._since > _SAME_SIGNAL_TIME:
+                        if handled and time.monotonic() - self._since > _SAME_SIGNAL_TIME:
                             self._end_process()
-            if self.number is not None and not told:
-                told = True
+            if self.number is not None and not handled:
+                handled = True
                 self._kill_tools()
                 if self.request is not None:
                     self.request.at_once()
-            now = time.monotonic()
-            if any(by is not None and now >= by for by in (self._notice_by, self._end_by)):
+            deadline = self._deadline()
+            if deadline is not None and time.monotonic() >= deadline:
                 self._end_process()
+
+    def _deadline(self) -> float | None:
+        """Return the time (monotonic, s) at which this process is ended, None without one."""
+        deadlines = [by for by in (self._notice_by, self._end_by) if by is not None]
+        return min(deadlines, default=None)
 
     def _on_parent_end(self) -> None:
         """End this process soon, as by SIGTERM."""

@@ -81,7 +81,7 @@ class Topic:
         The numbers of a state of the plant; empty for other topics.
     frame
         The frame of the header of a state topic: ``world`` or ``base``.
-    of
+    entries_of
         Objects that the entries of its arrays belong to: ``joints`` or ``thrusters``.
     every_tick
         Whether a state topic is published in every tick, or every ``base_pose_period``.
@@ -95,7 +95,7 @@ class Topic:
     latched: bool = False
     state: tuple[StateField, ...] = ()
     frame: str = "world"
-    of: str = "joints"
+    entries_of: str = "joints"
     every_tick: bool = True
 
     @property
@@ -220,7 +220,7 @@ _TOPIC_TABLE = (
             StateField("effort", "thruster_force"),
         ),
         frame="base",
-        of="thrusters",
+        entries_of="thrusters",
     ),
     Topic(
         "/tf",
@@ -252,12 +252,7 @@ _TOPIC_TABLE = (
         "refused commands, limits, momentum, faults, deadlines; ignored states; silent nodes; what "
         "was recorded and lost",
     ),
-    Topic(
-        "fault_injection",
-        _STRING,
-        _USER,
-        "faults for the plant, one a line, or `clear`",
-    ),
+    Topic("fault_injection", _STRING, _USER, "faults for the plant, one a line, or `clear`"),
     Topic(
         "joint_commands",
         _JOINTS,

@@ -88,10 +88,7 @@ def dynamics_benchmark() -> dict[str, float | str]:
         runs["step_us"] = _plant_steps(robot), _STEPS
     with _virtual_machine():
         # Built anew, because functions are compiled where a model is built.
-        runs["step_without_compiler_us"] = (
-            _plant_steps(SpaceRobot(robot.description)),
-            _STEPS,
-        )
+        runs["step_without_compiler_us"] = (_plant_steps(SpaceRobot(robot.description)), _STEPS)
     try:
         import mujoco
     except ImportError:

@@ -177,10 +177,7 @@ CASES = {
     "planar_chain": Case((0.0, 0.0), {}, angle=3.0, planar=True),
     "sliding_masses": Case(
         (0.0, 0.0, 0.0),
-        {
-            "max_velocity": (0.0647, 0.1871, 0.6550),
-            "max_acceleration": (0.228, 0.643, 3.564),
-        },
+        {"max_velocity": (0.0647, 0.1871, 0.6550), "max_acceleration": (0.228, 0.643, 3.564)},
         sliding=True,
     ),
     "three_joint_arm": Case((0.0, -math.pi / 4, math.pi / 2), {}),
@@ -274,11 +271,7 @@ def first_plan(urdf: str) -> dict[str, float]:
     total = sum(each.ru_utime + each.ru_stime for each in used)
     began = time.process_time()
     method.plan(request)
-    return {
-        "joints": robot.n,
-        "cpu_s": total,
-        "plan_cpu_s": time.process_time() - began,
-    }
+    return {"joints": robot.n, "cpu_s": total, "plan_cpu_s": time.process_time() - began}
 
 
 MEASUREMENTS = {"tick_times": tick_times, "plans": plans, "first_plan": first_plan}

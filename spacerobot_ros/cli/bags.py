@@ -71,8 +71,7 @@ def _millimetres(context: click.Context, option: click.Parameter, text: str) -> 
     "--only", metavar="NAME,NAME", default="", help="Draw only these figures, such as pose,joints."
 )
 @format_option(
-    ("pdf", "svg", "png"),
-    "Format of the files; text in PDF and SVG can be searched and edited.",
+    ("pdf", "svg", "png"), "Format of the files; text in PDF and SVG can be searched and edited."
 )
 @click.option(
     "--width",

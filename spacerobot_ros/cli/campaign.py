@@ -137,12 +137,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
 
 
 def _flown(
-    file: Path,
-    flights: int | None,
-    engine: str,
-    cluster: Cluster,
-    out: Path | None,
-    name: str = "",
+    file: Path, flights: int | None, engine: str, cluster: Cluster, out: Path | None, name: str = ""
 ) -> Path:
     """Fly a campaign, say how far it has come, and return its folder; ``name`` replaces its own."""
     from spacerobot_ros.campaign.config import load_campaign

@@ -127,11 +127,7 @@ def _shortest(found: Mapping[str, PlanEvaluation | SpaceRobotError]) -> str:
     return min(reached, default=(0.0, ""))[1]
 
 
-def problem_of(
-    name: str,
-    goal: GoalOptions = _NO_GOAL,
-    settings: Sequence[str] = (),
-) -> Problem:
+def problem_of(name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] = ()) -> Problem:
     """Return the planning problem of a scenario, or of a robot (a name or a URDF file) at rest.
 
     ``goal`` replaces the scenario's, ``settings`` are ``planner.parameter=value`` and

@@ -92,7 +92,7 @@ def _states(flight: Flight) -> Iterator[_Stream]:
     for topic in state_topics():
         if not all(field.quantity in quantities for field in topic.state):
             continue
-        names = thrusters if topic.of == "thrusters" else flight.joint_names
+        names = thrusters if topic.entries_of == "thrusters" else flight.joint_names
         base = config.frame_prefix + robot.base_link
         message = state_message(topic, names, config.world_frame, base)
         columns = {

@@ -308,7 +308,7 @@ class _Published:
         """Leave out the messages until a tick, from which on-times of thrusters count."""
         kept = self.ticks > tick
         values = self.values[kept]
-        if self.topic.of == "thrusters" and not kept.all():
+        if self.topic.entries_of == "thrusters" and not kept.all():
             count = self.values.shape[1] // len(self.topic.state)
             values[:, :count] -= self.values[~kept][-1, :count]
         return replace(self, ticks=self.ticks[kept], values=values)
@@ -355,7 +355,7 @@ def _published(flight: _RecordedPlant) -> list[_Published]:
                 f"A message on {series.topic} of the bag {flight.path} is stamped "
                 f"{stamps[between[0]] / SECOND:.9g} s, between the ticks of the plant in it."
             )
-        named = recorded.names(topic.name) if topic.of == "thrusters" else names
+        named = recorded.names(topic.name) if topic.entries_of == "thrusters" else names
         labels = [each.labels(named) for each in topic.state]
         table = np.hstack(
             [

@@ -191,7 +191,7 @@ class ReportedState:
 
     def names(self, topic: Topic) -> tuple[str, ...]:
         """Return the names of the entries of a topic's arrays: joints or thrusters."""
-        if topic.of == "thrusters" and self._thrusters is not None:
+        if topic.entries_of == "thrusters" and self._thrusters is not None:
             return tuple(self._thrusters.table.names)
         return tuple(self._plant.robot.joint_names)
 
