@@ -77,9 +77,8 @@ def state_fields() -> str:
     for topic in state_topics():
         for field in topic.state:
             numbers = ", ".join(f"`{each}`" for each in field.members or field.entries)
-            rows.append(
-                (f"`{topic.name}`", f"`{field.path}`", numbers or f"one for each of the {topic.entries_of}")
-            )
+            numbers = numbers or f"one for each of the {topic.entries_of}"
+            rows.append((f"`{topic.name}`", f"`{field.path}`", numbers))
     return table(("topic", "field", "numbers"), rows)
 
 
