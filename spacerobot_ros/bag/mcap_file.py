@@ -69,7 +69,7 @@ _POLICY_NUMBERS = {
     "durability": {0: "system_default", 1: "transient_local", 2: "volatile"},
     "liveliness": {0: "system_default", 1: "automatic", 3: "manual_by_topic"},
 }
-_DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
+_DURATION_POLICIES = ("deadline", "lifespan", "liveliness_lease_duration")
 
 
 @dataclass(frozen=True)
@@ -141,9 +141,9 @@ class QosProfile:
             The text is not such a list.
         """
         try:
-            _require_plain(text)
+            _require_flat_yaml(text)
             entries = yaml.safe_load(text) or []
-            return [cls(**_arguments(entry)) for entry in entries]
+            return [cls(**_profile_arguments(entry)) for entry in entries]
         except (
             *(yaml.YAMLError, TypeError, ValueError, AttributeError),
             *(KeyError, OverflowError, RecursionError),
@@ -159,10 +159,10 @@ class QosProfile:
                 f"  depth: {self.depth}",
                 f"  reliability: {self.reliability}",
                 f"  durability: {self.durability}",
-                *_duration("deadline", self.deadline_ns),
-                *_duration("lifespan", self.lifespan_ns),
+                *_duration_lines("deadline", self.deadline_ns),
+                *_duration_lines("lifespan", self.lifespan_ns),
                 f"  liveliness: {self.liveliness}",
-                *_duration("liveliness_lease_duration", self.liveliness_lease_duration_ns),
+                *_duration_lines("liveliness_lease_duration", self.liveliness_lease_duration_ns),
                 "  avoid_ros_namespace_conventions: "
                 + ("true" if self.avoid_ros_namespace_conventions else "false"),
             )
@@ -173,17 +173,17 @@ LATCHED = QosProfile(depth=1, durability="transient_local")
 """Reliable, transient local, depth 1: a late subscriber gets the last message."""
 
 
-def _duration(name: str, nanoseconds: int) -> tuple[str, str, str]:
+def _duration_lines(name: str, nanoseconds: int) -> tuple[str, str, str]:
     seconds, rest = divmod(nanoseconds, SECOND)
     return f"  {name}:", f"    sec: {seconds}", f"    nsec: {rest}"
 
 
-_LONGEST_TEXT = 65_536
-_DEEPEST = 8
+_MAX_YAML_CHARACTERS = 65_536
+_MAX_YAML_DEPTH = 8
 """Levels of lists and mappings: a list of profiles, each with durations, has three."""
 
 
-def _require_plain(text: str) -> None:
+def _require_flat_yaml(text: str) -> None:
     """Refuse YAML that is nested, or multiplies itself by references.
 
     Raises
@@ -191,8 +191,8 @@ def _require_plain(text: str) -> None:
     ValueError
         It does.
     """
-    if len(text) > _LONGEST_TEXT:
-        raise ValueError(f"it is longer than {_LONGEST_TEXT} characters")
+    if len(text) > _MAX_YAML_CHARACTERS:
+        raise ValueError(f"it is longer than {_MAX_YAML_CHARACTERS} characters")
     depth = 0
     # Events are read without recursion.
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
@@ -202,15 +202,15 @@ def _require_plain(text: str) -> None:
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
-        if depth > _DEEPEST:
-            raise ValueError(f"it is nested more than {_DEEPEST} deep")
+        if depth > _MAX_YAML_DEPTH:
+            raise ValueError(f"it is nested more than {_MAX_YAML_DEPTH} deep")
 
 
-def _arguments(entry: dict[str, Any]) -> dict[str, Any]:
+def _profile_arguments(entry: dict[str, Any]) -> dict[str, Any]:
     """Turn one entry of the YAML into the arguments of a profile."""
     arguments: dict[str, Any] = {}
     for name, value in entry.items():
-        if name in _DURATIONS:
+        if name in _DURATION_POLICIES:
             nanoseconds = int(value["sec"]) * SECOND + int(value["nsec"])
             arguments[f"{name}_ns"] = min(nanoseconds, INFINITE_NS)
         elif name in _POLICIES:
@@ -230,11 +230,11 @@ _METADATA_KEY = "serialized_metadata"
 """Its only key."""
 
 # The first one whose QoS policies are words; a reader that finds no version takes them for numbers.
-_VERSION = 9
+_METADATA_VERSION = 9
 
 # What every YAML reader takes for a string without quotes: such words, but for these.
-_PLAIN = re.compile(r"[A-Za-z/][\w./-]*", re.ASCII)
-_NOT_STRINGS = {"false", "n", "no", "null", "off", "on", "true", "y", "yes"}
+_UNQUOTED_STRING = re.compile(r"[A-Za-z/][\w./-]*", re.ASCII)
+_YAML_KEYWORDS = {"false", "n", "no", "null", "off", "on", "true", "y", "yes"}
 
 
 @dataclass(frozen=True)
@@ -260,10 +260,10 @@ def metadata_record(
     if start_ns is not None and end_ns is not None:
         start, duration = start_ns, end_ns - start_ns
     count = sum(topic.message_count for topic in topics)
-    path = _scalar(file_name)
-    listed = "\n" + "\n".join(map(_topic, topics)) if topics else "\n  []"
+    path = _yaml_string(file_name)
+    listed = "\n" + "\n".join(map(_topic_entry, topics)) if topics else "\n  []"
     text = (
-        f"version: {_VERSION}\n"
+        f"version: {_METADATA_VERSION}\n"
         "storage_identifier: mcap\n"
         f"duration:\n  nanoseconds: {duration}\n"
         f"starting_time:\n  nanoseconds_since_epoch: {start}\n"
@@ -278,26 +278,26 @@ def metadata_record(
         f"    duration:\n      nanoseconds: {duration}\n"
         f"    message_count: {count}\n"
         "custom_data: ~\n"
-        f"ros_distro: {_scalar(os.environ.get('ROS_DISTRO', 'jazzy'))}"
+        f"ros_distro: {_yaml_string(os.environ.get('ROS_DISTRO', 'jazzy'))}"
     )
     return Metadata(name=METADATA_NAME, metadata={_METADATA_KEY: text})
 
 
-def _topic(topic: RecordedTopic) -> str:
+def _topic_entry(topic: RecordedTopic) -> str:
     return (
         "  - topic_metadata:\n"
-        f"      name: {_scalar(topic.name)}\n"
-        f"      type: {_scalar(topic.type_name)}\n"
+        f"      name: {_yaml_string(topic.name)}\n"
+        f"      type: {_yaml_string(topic.type_name)}\n"
         "      serialization_format: cdr\n"
         f"      offered_qos_profiles:\n{indent(topic.qos.to_yaml(), ' ' * 8)}\n"
-        f"      type_description_hash: {_scalar(topic.type_hash)}\n"
+        f"      type_description_hash: {_yaml_string(topic.type_hash)}\n"
         f"    message_count: {topic.message_count}"
     )
 
 
-def _scalar(text: str) -> str:
+def _yaml_string(text: str) -> str:
     # Every JSON string is a YAML string.
-    plain = _PLAIN.fullmatch(text) and text.lower() not in _NOT_STRINGS
+    plain = _UNQUOTED_STRING.fullmatch(text) and text.lower() not in _YAML_KEYWORDS
     return text if plain else json.dumps(text)
 
 
@@ -307,7 +307,7 @@ _COMPRESSIONS = {"zstd": "zstd", "lz4": "lz4", "none": ""}
 _MESSAGE_INDEX_HEADER = struct.Struct("<BQHI")
 
 
-def _compressor(compression: str) -> Callable[[bytes | bytearray], bytes]:
+def _compression_function(compression: str) -> Callable[[bytes | bytearray], bytes]:
     if compression == "zstd":
         # One for each file, because two threads must not share one. Level -1 makes
         # telemetry 1 to 4 % larger than level 1 and 3 to 8 % larger than level 3, in half the
@@ -320,7 +320,7 @@ class BagExistsError(RecordingError):
     """A bag that exists and is not to be overwritten."""
 
 
-def _created(path: Path, overwrite: bool) -> io.FileIO:
+def _create_locked_file(path: Path, overwrite: bool) -> io.FileIO:
     """Open a file of our own for writing: regular, empty and locked.
 
     Raises
@@ -396,14 +396,14 @@ class McapFile:
         self.start_ns: int | None = None
         self.end_ns: int | None = None
         self._compression = _COMPRESSIONS[compression]
-        self._compress = _compressor(compression)
+        self._compress = _compression_function(compression)
         self._chunk_indexes: list[bytes] = []  # Encoded: a long flight has many.
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._size = 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._raw = _created(path, overwrite)
+            self._raw = _create_locked_file(path, overwrite)
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise RecordingError(f"Cannot make the bag {path}: {reason}.") from error

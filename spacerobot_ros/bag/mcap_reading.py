@@ -45,22 +45,22 @@ T = TypeVar("T")
 LIMIT_VARIABLE = "SPACEROBOT_BAG_LIMIT"
 """Environment variable: how many MB a bag may inflate to, however small its file is."""
 
-_LIMIT = 32.0
+_DEFAULT_LIMIT_MB = 32.0
 """Its default, MB."""
 
-_LARGEST_RATIO = 200
+_MAX_INFLATION_RATIO = 200
 """Largest ratio of the inflated size of a bag to its file, beyond the limit above. Telemetry has
 3 to 40, bags made to fill the memory 1000 and more."""
 
 RECORD_HEADER = struct.Struct("<BQ")
 """Opcode, and the length of the body."""
 
-_LENGTH = struct.Struct("<Q")
+_UINT64 = struct.Struct("<Q")
 
-_CHUNK = struct.Struct("<QQQI")
+_CHUNK_HEAD = struct.Struct("<QQQI")
 """The head of a chunk: times, size and checksum of its content."""
 
-DAMAGE = (
+DAMAGE_ERRORS = (
     McapError,
     ValueError,
     OverflowError,
@@ -74,7 +74,7 @@ DAMAGE = (
 
 # -- files ------------------------------------------------------------------------------------
 
-_KINDS = (
+_FILE_KINDS = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),
     (stat.S_ISSOCK, "a socket"),
@@ -92,7 +92,7 @@ def require_regular(mode: int, path: Path, act: str = "read") -> None:
         ``mode``, of the inode at ``path``, is not that of a regular file.
     """
     if not stat.S_ISREG(mode):
-        kind = next((words for test, words in _KINDS if test(mode)), "no file")
+        kind = next((words for test, words in _FILE_KINDS if test(mode)), "no file")
         raise RecordingError(f"Cannot {act} the bag {path}: it is {kind}.")
 
 
@@ -136,7 +136,7 @@ def open_bag(path: Path) -> Iterator[BinaryIO]:
             raise RecordingError(
                 f"The bag {path} is damaged: a record claims to be larger than the memory."
             ) from error
-        except DAMAGE as error:
+        except DAMAGE_ERRORS as error:
             reason = str(error) or type(error).__name__
             raise RecordingError(f"The bag {path} is damaged: {reason}.") from error
 
@@ -179,12 +179,12 @@ def records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, by
     """
     while start < end:
         file.seek(start)
-        opcode, length = _header(file, start, end)
+        opcode, length = _read_record_header(file, start, end)
         yield start, opcode, file.read(length)
         start += RECORD_HEADER.size + length
 
 
-def records_in(data: bytes, place: int) -> Iterator[tuple[int, int, int]]:
+def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int, int]]:
     """Iterate over the records of the unpacked chunk at ``place``: opcode, first and last place.
 
     Raises
@@ -208,7 +208,7 @@ def records_in(data: bytes, place: int) -> Iterator[tuple[int, int, int]]:
         position = end
 
 
-def record_at(file: BinaryIO, place: int, wanted: Opcode) -> bytes:
+def read_record(file: BinaryIO, place: int, wanted: Opcode) -> bytes:
     """Return the body of the record that begins somewhere in a file.
 
     Raises
@@ -220,13 +220,13 @@ def record_at(file: BinaryIO, place: int, wanted: Opcode) -> bytes:
     if place + RECORD_HEADER.size > end:
         raise ValueError(f"its index names byte {place}, and it has {end} bytes")
     file.seek(place)
-    opcode, length = _header(file, place, end)
+    opcode, length = _read_record_header(file, place, end)
     if opcode != wanted:
         raise ValueError(f"there is no {wanted.name.lower()} at byte {place}")
     return file.read(length)
 
 
-def _header(file: BinaryIO, place: int, end: int) -> tuple[int, int]:
+def _read_record_header(file: BinaryIO, place: int, end: int) -> tuple[int, int]:
     head = file.read(RECORD_HEADER.size)
     if len(head) < RECORD_HEADER.size:
         raise ValueError(f"it ends inside of the record at byte {place}")
@@ -239,7 +239,7 @@ def _header(file: BinaryIO, place: int, end: int) -> tuple[int, int]:
     return opcode, length
 
 
-def parsed(read: Callable[[ReadDataStream], T], body: bytes, place: int) -> T:
+def parse_record(read: Callable[[ReadDataStream], T], body: bytes, place: int) -> T:
     """Return the object that a class of ``mcap.records`` reads from the record at ``place``.
 
     Raises
@@ -249,7 +249,7 @@ def parsed(read: Callable[[ReadDataStream], T], body: bytes, place: int) -> T:
     """
     try:
         return read(ReadDataStream(BytesIO(body)))
-    except DAMAGE as error:
+    except DAMAGE_ERRORS as error:
         reason = str(error) or type(error).__name__
         raise ValueError(f"the record at byte {place} cannot be read ({reason})") from error
 
@@ -257,7 +257,7 @@ def parsed(read: Callable[[ReadDataStream], T], body: bytes, place: int) -> T:
 # -- chunks -----------------------------------------------------------------------------------
 
 
-class Allowance:
+class InflationLimit:
     """Limit of the inflated size of all chunks of a file.
 
     Parameters
@@ -267,9 +267,9 @@ class Allowance:
     """
 
     def __init__(self, compressed: int) -> None:
-        self.most = max(round(1e6 * _limit()), _LARGEST_RATIO * compressed)
+        self.most = max(round(1e6 * _limit_mb()), _MAX_INFLATION_RATIO * compressed)
         """In bytes."""
-        self._taken = 0
+        self._inflated_size = 0
 
     def take(self, size: int, place: int) -> None:
         """Count the inflated size of the chunk at ``place``.
@@ -279,21 +279,21 @@ class Allowance:
         ValueError
             The sum exceeds the allowance.
         """
-        if self._taken + size > self.most:
+        if self._inflated_size + size > self.most:
             raise ValueError(
-                f"with the chunk at byte {place} it inflates to {self._taken + size} bytes, more "
-                f"than the {self.most} that its size allows (set {LIMIT_VARIABLE} to more MB if "
-                "you trust it)"
+                f"with the chunk at byte {place} it inflates to {self._inflated_size + size} "
+                f"bytes, more than the {self.most} that its size allows (set {LIMIT_VARIABLE} to "
+                "more MB if you trust it)"
             )
-        self._taken += size
+        self._inflated_size += size
 
 
-def _limit() -> float:
+def _limit_mb() -> float:
     try:
-        limit = float(os.environ.get(LIMIT_VARIABLE, _LIMIT))
+        limit = float(os.environ.get(LIMIT_VARIABLE, _DEFAULT_LIMIT_MB))
     except ValueError:
-        return _LIMIT
-    return limit if 0.0 < limit < 1e12 else _LIMIT
+        return _DEFAULT_LIMIT_MB
+    return limit if 0.0 < limit < 1e12 else _DEFAULT_LIMIT_MB
 
 
 def chunk_size(body: bytes) -> int:
@@ -304,10 +304,10 @@ def chunk_size(body: bytes) -> int:
     struct.error
         The body is too short for a chunk.
     """
-    return int(_CHUNK.unpack_from(body)[2])
+    return int(_CHUNK_HEAD.unpack_from(body)[2])
 
 
-def unpacked(body: bytes, place: int) -> bytes:
+def unpack_chunk(body: bytes, place: int) -> bytes:
     """Return the records of a chunk, whose size was allowed.
 
     Raises
@@ -316,12 +316,12 @@ def unpacked(body: bytes, place: int) -> bytes:
         It is damaged: its compression, its checksum, or it holds another number of bytes than it
         claims to.
     """
-    chunk = parsed(Chunk.read, body, place)
+    chunk = parse_record(Chunk.read, body, place)
     if chunk.compression not in _DECOMPRESSORS:
         raise ValueError(
             f"the compression {chunk.compression!r} of the chunk at byte {place} is unknown"
         )
-    claimed = _LENGTH.unpack_from(body, _CHUNK.size + 4 + len(chunk.compression.encode()))[0]
+    claimed = _UINT64.unpack_from(body, _CHUNK_HEAD.size + 4 + len(chunk.compression.encode()))[0]
     if claimed != len(chunk.data):
         raise ValueError(
             f"the chunk at byte {place} holds {len(chunk.data)} packed bytes, not the {claimed} "
@@ -330,7 +330,7 @@ def unpacked(body: bytes, place: int) -> bytes:
     size = chunk.uncompressed_size
     try:
         data = _DECOMPRESSORS[chunk.compression](chunk.data, size)
-    except DAMAGE as error:
+    except DAMAGE_ERRORS as error:
         reason = str(error) or type(error).__name__
         raise ValueError(f"the chunk at byte {place} cannot be unpacked ({reason})") from error
     if len(data) != size:
@@ -366,15 +366,15 @@ _DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
 """Each takes the compressed data and how large they were, and returns at most one byte more."""
 
 
-_MESSAGE = struct.Struct("<BQHIQQ")
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 """Opcode, length of the rest, channel, sequence, log time, publish time."""
 
 _MESSAGE_BODY = struct.Struct("<HIQQ")
-_MESSAGE_INDEX = struct.Struct("<HI")
+_MESSAGE_INDEX_HEAD = struct.Struct("<HI")
 _FOOTER_SIZE = RECORD_HEADER.size + struct.calcsize("<QQI")
-_END_OF_TIME = 2**63 - 1
+_LATEST_TIME_NS = 2**63 - 1
 
-_SUMMARY: dict[int, Callable[[ReadDataStream], Any]] = {
+_SUMMARY_PARSERS: dict[int, Callable[[ReadDataStream], Any]] = {
     Opcode.STATISTICS: Statistics.read,
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,
@@ -402,15 +402,15 @@ def read_summary(path: Path, file: BinaryIO) -> Summary:
         It is damaged, or contradicts the file.
     """
     end = file_size(file) - len(MCAP0_MAGIC) - _FOOTER_SIZE
-    footer = parsed(Footer.read, record_at(file, max(end, 0), Opcode.FOOTER), max(end, 0))
+    footer = parse_record(Footer.read, read_record(file, max(end, 0), Opcode.FOOTER), max(end, 0))
     if footer.summary_start > end:
         raise ValueError(f"its summary begins at byte {footer.summary_start}, behind its end")
     summary = Summary()
     found = records(file, footer.summary_start, end) if footer.summary_start else ()
     for place, opcode, body in found:
-        if opcode not in _SUMMARY:
+        if opcode not in _SUMMARY_PARSERS:
             continue
-        match parsed(_SUMMARY[opcode], body, place):
+        match parse_record(_SUMMARY_PARSERS[opcode], body, place):
             case Statistics() as statistics:
                 summary.statistics = statistics
             case Schema() as schema:
@@ -440,7 +440,7 @@ def _check_chunks(summary: Summary, end: int) -> None:
     ValueError
         Two chunks overlap, or all together are too large.
     """
-    allowance = Allowance(end)
+    allowance = InflationLimit(end)
     free = 0
     for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
         place = index.chunk_start_offset
@@ -461,7 +461,7 @@ def indexed_records(
         One is not there.
     """
     for place in dict.fromkeys(index.offset for index in indexes):
-        yield place, record_at(file, place, wanted)
+        yield place, read_record(file, place, wanted)
 
 
 # -- messages ---------------------------------------------------------------------------------
@@ -476,11 +476,11 @@ def messages_in_file_order(file: BinaryIO) -> Iterator[RawMessage]:
         A record is damaged.
     """
     size = file_size(file)
-    allowance = Allowance(size)
+    allowance = InflationLimit(size)
     for place, opcode, body in records(file, len(MCAP0_MAGIC), size):
         if opcode == Opcode.CHUNK:
             allowance.take(chunk_size(body), place)
-            yield from _messages_in_chunk(unpacked(body, place), place)
+            yield from _messages_in_records(unpack_chunk(body, place), place)
         elif opcode == Opcode.MESSAGE:
             channel, _, log_ns, publish_ns = _MESSAGE_BODY.unpack_from(body)
             yield channel, log_ns, publish_ns, body[_MESSAGE_BODY.size :]
@@ -488,18 +488,18 @@ def messages_in_file_order(file: BinaryIO) -> Iterator[RawMessage]:
             return
 
 
-def _messages_in_chunk(data: bytes, place: int) -> Iterator[RawMessage]:
-    for opcode, position, end in records_in(data, place):
+def _messages_in_records(data: bytes, place: int) -> Iterator[RawMessage]:
+    for opcode, position, end in records_in_chunk(data, place):
         if opcode == Opcode.MESSAGE:
-            _, _, channel, _, log_ns, publish_ns = _MESSAGE.unpack_from(data, position)
-            yield channel, log_ns, publish_ns, data[position + _MESSAGE.size : end]
+            _, _, channel, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(data, position)
+            yield channel, log_ns, publish_ns, data[position + _MESSAGE_HEAD.size : end]
 
 
 def messages_in_time_order(
     path: str | os.PathLike[str],
     channel_ids: set[int],
     start_ns: int = 0,
-    end_ns: int = _END_OF_TIME,
+    end_ns: int = _LATEST_TIME_NS,
     summary: Summary | None = None,
 ) -> Iterator[RawMessage]:
     """Iterate over messages of a bag by log time, those of one time in the order they were written.
@@ -525,7 +525,7 @@ def messages_in_time_order(
         There is no such bag, it is not MCAP, was cut short or is damaged.
     """
     # The largest time that the columns of this package hold: the year 2262.
-    start_ns, end_ns = min(start_ns, _END_OF_TIME), min(end_ns, _END_OF_TIME)
+    start_ns, end_ns = min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS)
     with open_bag(Path(path)) as file:
         summary = summary or read_summary(Path(path), file)
         indexes = summary.chunk_indexes
@@ -538,11 +538,11 @@ def messages_in_time_order(
             ]
             yield from sorted(wanted, key=lambda message: message[1])
             return
-        for cluster in _clusters(summary, channel_ids, start_ns, end_ns):
-            yield from _messages_of(file, cluster, channel_ids, start_ns, end_ns)
+        for cluster in _overlapping_chunks(summary, channel_ids, start_ns, end_ns):
+            yield from _messages_in_chunks(file, cluster, channel_ids, start_ns, end_ns)
 
 
-def _clusters(
+def _overlapping_chunks(
     summary: Summary, channel_ids: set[int], start_ns: int, end_ns: int
 ) -> Iterator[list[ChunkIndex]]:
     """Group the chunks with something wanted in them: those of a group overlap in time."""
@@ -568,7 +568,7 @@ def _clusters(
         yield cluster
 
 
-def _messages_of(
+def _messages_in_chunks(
     file: BinaryIO,
     cluster: Sequence[ChunkIndex],
     channel_ids: set[int],
@@ -585,9 +585,9 @@ def _messages_of(
     order = np.lexsort((table[:, 1], table[:, 2], table[:, 0]))
     for _, position, number in table[order].tolist():
         chunk = chunks[number]
-        _, length, channel, _, log_ns, publish_ns = _MESSAGE.unpack_from(chunk, position)
+        _, length, channel, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(chunk, position)
         end = position + RECORD_HEADER.size + length
-        data = chunk[position + _MESSAGE.size : end]
+        data = chunk[position + _MESSAGE_HEAD.size : end]
         yield channel, log_ns, publish_ns, data
 
 
@@ -602,19 +602,19 @@ def _chunk_and_entries(
         The chunk is damaged, or its indexes name other records, or a message twice.
     """
     place = index.chunk_start_offset
-    body = record_at(file, place, Opcode.CHUNK)
+    body = read_record(file, place, Opcode.CHUNK)
     if chunk_size(body) != index.uncompressed_size:
         raise ValueError(f"the chunk at byte {place} and its index claim different sizes")
-    chunk = unpacked(body, place)
+    chunk = unpack_chunk(body, place)
     entries = [np.empty((0, 2), np.uint64)]
     for channel, offset in index.message_index_offsets.items():
         if channel not in channel_ids:
             continue
-        listed = record_at(file, offset, Opcode.MESSAGE_INDEX)
-        named, size = _MESSAGE_INDEX.unpack_from(listed)
-        if named != channel or size % 16 or _MESSAGE_INDEX.size + size > len(listed):
+        listed = read_record(file, offset, Opcode.MESSAGE_INDEX)
+        named, size = _MESSAGE_INDEX_HEAD.unpack_from(listed)
+        if named != channel or size % 16 or _MESSAGE_INDEX_HEAD.size + size > len(listed):
             raise ValueError(f"the message index at byte {offset} is damaged")
-        pairs = np.frombuffer(listed, "<u8", size // 8, _MESSAGE_INDEX.size)
+        pairs = np.frombuffer(listed, "<u8", size // 8, _MESSAGE_INDEX_HEAD.size)
         entries.append(pairs.reshape(-1, 2))
     pairs = np.concatenate(entries)
     _check_entries(chunk, pairs[:, 1], place)
@@ -632,7 +632,7 @@ def _check_entries(chunk: bytes, positions: NDArray[np.uint64], place: int) -> N
     if not len(positions):
         return
     wrong = f"the message indexes of the chunk at byte {place} do not fit it"
-    if int(positions.max()) > len(chunk) - _MESSAGE.size:
+    if int(positions.max()) > len(chunk) - _MESSAGE_HEAD.size:
         raise ValueError(wrong)
     starts = positions.astype(np.int64)
     content = np.frombuffer(chunk, np.uint8)
@@ -642,5 +642,5 @@ def _check_entries(chunk: bytes, positions: NDArray[np.uint64], place: int) -> N
     ends = starts + RECORD_HEADER.size + lengths.astype(np.int64)
     order = np.argsort(starts)
     apart = bool((starts[order][1:] >= ends[order][:-1]).all())
-    if not apart or int(ends.max()) > len(chunk) or (ends - starts < _MESSAGE.size).any():
+    if not apart or int(ends.max()) > len(chunk) or (ends - starts < _MESSAGE_HEAD.size).any():
         raise ValueError(wrong)

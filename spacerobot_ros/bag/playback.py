@@ -11,11 +11,11 @@ from spacerobot_ros.bag.reader import Bag
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.times import SECOND
 
-_END_OF_TIME = 2**63 - 1
-_RECENT_NS = SECOND
+_LATEST_TIME_NS = 2**63 - 1
+_SHOWN_AFTER_JUMP_NS = SECOND
 """How old a message may be that is shown again after a jump."""
 
-_MOST_TOPICS = 1000
+_MAX_REPLAYED_TOPICS = 1000
 """Against bags made to harm: each topic takes a publisher, memory and discovery."""
 
 
@@ -164,7 +164,7 @@ class ReaderWait:
         return settled or self._waited >= self._longest
 
 
-def renamed(remap: str, topics: Collection[str]) -> dict[str, str]:
+def renamed_topics(remap: str, topics: Collection[str]) -> dict[str, str]:
     """Return the new name of each topic that ``remap`` (``old:=new``, by spaces) renames.
 
     Raises
@@ -228,25 +228,25 @@ class Playback:
     ) -> None:
         if not bag.message_count():
             raise RecordingError(f"The bag {bag.path} has no messages to replay.")
-        if len(topics or bag.topics) > _MOST_TOPICS:
+        if len(topics or bag.topics) > _MAX_REPLAYED_TOPICS:
             raise RecordingError(
-                f"The bag {bag.path} has {len(bag.topics)} topics, and {_MOST_TOPICS} can be "
-                "replayed at once: name those that are wanted."
+                f"The bag {bag.path} has {len(bag.topics)} topics, and {_MAX_REPLAYED_TOPICS} can "
+                "be replayed at once: name those that are wanted."
             )
         self._bag = bag
         self._loop = loop
-        self._start_ns = min(bag.start_time_ns + round(start * SECOND), _END_OF_TIME)
-        end_ns = self._start_ns + round(duration * SECOND) if duration else _END_OF_TIME
-        self._end_ns = min(end_ns, _END_OF_TIME)
+        self._start_ns = min(bag.start_time_ns + round(start * SECOND), _LATEST_TIME_NS)
+        end_ns = self._start_ns + round(duration * SECOND) if duration else _LATEST_TIME_NS
+        self._end_ns = min(end_ns, _LATEST_TIME_NS)
         self._last_ns = max(min(bag.end_time_ns, self._end_ns), self._start_ns)
-        self.topics = [_topic(bag, name) for name in topics or bag.topics]
-        self._names = {
+        self.topics = [_replay_topic(bag, name) for name in topics or bag.topics]
+        self._topic_by_channel = {
             number: topic.name for topic in self.topics for number in bag.channel_ids(topic.name)
         }
         self._timeline = Timeline(rate, self._start_ns)
-        self._turn = self._messages(self._start_ns)
-        self._next = next(self._turn, None)
-        if self._next is None:
+        self._remaining_messages = self._messages(self._start_ns)
+        self._next_message = next(self._remaining_messages, None)
+        if self._next_message is None:
             raise RecordingError(
                 f"The bag {bag.path} has no message to replay from {start:g} s on"
                 + (f" for {duration:g} s" if duration else "")
@@ -256,7 +256,7 @@ class Playback:
     @property
     def ended(self) -> bool:
         """Whether no message is left."""
-        return self._next is None
+        return self._next_message is None
 
     @property
     def running(self) -> bool:
@@ -266,8 +266,10 @@ class Playback:
     def bag_time(self, clock_ns: int) -> int:
         """Return the time in the bag, in nanoseconds, when the clock is at ``clock_ns``."""
         now = self._timeline.bag_time(clock_ns)
+        if self._next_message is None:
+            return now
         # Messages still to come are late, not skipped.
-        return now if self._next is None else min(now, max(self._next.log_time_ns, self._start_ns))
+        return min(now, max(self._next_message.log_time_ns, self._start_ns))
 
     def run(self, clock_ns: int) -> None:
         """Let time advance; ``clock_ns`` is the present time of the clock."""
@@ -277,8 +279,8 @@ class Playback:
         """Stop time."""
         self._timeline.stop(clock_ns)
 
-    def due(self, clock_ns: int, most: int) -> list[ReplayMessage]:
-        """Return the messages that are due, at most so many.
+    def take_due(self, clock_ns: int, max_count: int) -> list[ReplayMessage]:
+        """Return the messages that are due, at most ``max_count``.
 
         Raises
         ------
@@ -286,24 +288,24 @@ class Playback:
             The bag turns out damaged.
         """
         taken: list[ReplayMessage] = []
-        while self._next is not None and self._timeline.running and len(taken) < most:
-            if self._next.log_time_ns > self._timeline.bag_time(clock_ns):
+        while self._next_message is not None and self._timeline.running and len(taken) < max_count:
+            if self._next_message.log_time_ns > self._timeline.bag_time(clock_ns):
                 break
-            taken.append(self._take())
+            taken.append(self._take_next_message())
         return taken
 
-    def next_due(self) -> int | None:
+    def next_due_time(self) -> int | None:
         """Return the clock's time of the next message; None when there is none, or time stands."""
-        if self._next is None or not self._timeline.running:
+        if self._next_message is None or not self._timeline.running:
             return None
-        return self._timeline.clock_time(self._next.log_time_ns)
+        return self._timeline.clock_time(self._next_message.log_time_ns)
 
     def step(self, clock_ns: int) -> ReplayMessage | None:
         """Take the next message now, whenever it is due; None at the end."""
-        if self._next is None:
+        if self._next_message is None:
             return None
-        self._timeline.seek(max(self._next.log_time_ns, self._start_ns), clock_ns)
-        return self._take()
+        self._timeline.seek(max(self._next_message.log_time_ns, self._start_ns), clock_ns)
+        return self._take_next_message()
 
     def seek(self, bag_ns: int, clock_ns: int) -> list[ReplayMessage]:
         """Jump to ``bag_ns`` in the bag, or to its nearer end; a pause lasts.
@@ -318,15 +320,19 @@ class Playback:
             The bag turns out damaged.
         """
         at = min(max(bag_ns, self._start_ns), self._last_ns)
-        recent = max(at - _RECENT_NS, self._start_ns)
+        recent = max(at - _SHOWN_AFTER_JUMP_NS, self._start_ns)
         last = {message.topic: message for message in self._latched_before(at)}
         begins = at == self._start_ns and not self._timeline.running
-        for message in self._between(set(self._names), recent, at if begins else at - 1):
+        for message in self._messages_between(
+            set(self._topic_by_channel), recent, at if begins else at - 1
+        ):
             last[message.topic] = message
-        self._turn.close()
-        self._turn = self._between(set(self._names), at, self._end_ns)
+        self._remaining_messages.close()
+        self._remaining_messages = self._messages_between(
+            set(self._topic_by_channel), at, self._end_ns
+        )
         self._timeline.seek(at, clock_ns)
-        self._next = next(self._turn, None)
+        self._next_message = next(self._remaining_messages, None)
         # In the order in which they were published, and no later than what comes next.
         ordered = sorted(last.values(), key=lambda message: message.log_time_ns)
         return [replace(message, log_time_ns=at) for message in ordered]
@@ -343,26 +349,26 @@ class Playback:
 
     def close(self) -> None:
         """Close the bag; nothing is left to play."""
-        self._turn.close()
-        self._next = None
+        self._remaining_messages.close()
+        self._next_message = None
 
-    def _take(self) -> ReplayMessage:
-        message = self._next
+    def _take_next_message(self) -> ReplayMessage:
+        message = self._next_message
         assert message is not None
-        self._next = next(self._turn, None)
-        if self._next is None and self._loop:
+        self._next_message = next(self._remaining_messages, None)
+        if self._next_message is None and self._loop:
             # The next turn begins at the very time of the last message.
             last = max(message.log_time_ns, self._start_ns)
             self._timeline.seek(self._start_ns, self._timeline.clock_time(last))
-            self._turn = self._messages(self._start_ns)
-            self._next = next(self._turn, None)
+            self._remaining_messages = self._messages(self._start_ns)
+            self._next_message = next(self._remaining_messages, None)
         return message
 
     def _messages(self, start_ns: int) -> Generator[ReplayMessage, None, None]:
         earlier: dict[str, ReplayMessage] = {}
         for message in self._latched_before(start_ns):
             earlier[message.topic] = message
-        in_time = self._between(set(self._names), start_ns, self._end_ns)
+        in_time = self._messages_between(set(self._topic_by_channel), start_ns, self._end_ns)
         first = next(in_time, None)
         if first is None:
             return
@@ -374,16 +380,16 @@ class Playback:
         """Yield the messages of latched topics before a time; the last of each counts."""
         latched = {n for t in self.topics if t.latched for n in self._bag.channel_ids(t.name)}
         if latched and time_ns > self._bag.start_time_ns:
-            yield from self._between(latched, 0, time_ns - 1)
+            yield from self._messages_between(latched, 0, time_ns - 1)
 
-    def _between(
+    def _messages_between(
         self, channel_ids: set[int], start_ns: int, end_ns: int
     ) -> Generator[ReplayMessage, None, None]:
         found = self._bag.raw_messages(channel_ids, start_ns, end_ns)
         for channel_id, log_time_ns, _, data in found:
-            yield ReplayMessage(self._names[channel_id], log_time_ns, data)
+            yield ReplayMessage(self._topic_by_channel[channel_id], log_time_ns, data)
 
 
-def _topic(bag: Bag, name: str) -> ReplayTopic:
+def _replay_topic(bag: Bag, name: str) -> ReplayTopic:
     profiles = bag.qos(name)
     return ReplayTopic(name, bag.topics[name], profiles[0] if profiles else QosProfile())

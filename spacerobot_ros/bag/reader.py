@@ -23,7 +23,7 @@ from spacerobot_ros.bag.mcap_reading import (
     messages_in_file_order,
     messages_in_time_order,
     open_bag,
-    parsed,
+    parse_record,
     read_summary,
 )
 from spacerobot_ros.bag.series import TopicSeries
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     import xarray
 
 Array = NDArray[np.float64]
-_Default = TypeVar("_Default")
+_DefaultT = TypeVar("_DefaultT")
 
-_TEXT = "std_msgs/msg/String"
+_STRING_TYPE = "std_msgs/msg/String"
 
-_DECODABLE, _DECODABLE_TIMES = 16_000_000, 50
+_DECODABLE_BYTES, _DECODABLE_RATIO = 16_000_000, 50
 """Bytes of a topic that may become objects, which take ten times as much: so many, or so many times
 the size of the file."""
 
@@ -99,10 +99,10 @@ class Bag:
         self.path = path
         with open_bag(path) as file:
             self._summary = read_summary(path, file)
-            self._decodable = max(_DECODABLE, _DECODABLE_TIMES * file_size(file))
-        self._types = MessageTypes()
-        self._series: dict[str, TopicSeries] = {}
-        self._kinds: dict[str, dict[str, bool]] = {}
+            self._max_decoded_bytes = max(_DECODABLE_BYTES, _DECODABLE_RATIO * file_size(file))
+        self._message_types = MessageTypes()
+        self._series_by_topic: dict[str, TopicSeries] = {}
+        self._prismatic_by_namespace: dict[str, dict[str, bool]] = {}
 
     @cached_property
     def _channels_by_topic(self) -> dict[str, list[Channel]]:
@@ -150,7 +150,7 @@ class Bag:
     @overload
     def get(self, topic: str) -> TopicSeries | None: ...
     @overload
-    def get(self, topic: str, default: _Default) -> TopicSeries | _Default: ...
+    def get(self, topic: str, default: _DefaultT) -> TopicSeries | _DefaultT: ...
     def get(self, topic: str, default: Any = None) -> Any:
         """Return the messages of a topic, or ``default`` where there is no such topic."""
         if topic not in self:
@@ -158,7 +158,7 @@ class Bag:
         return self[topic]
 
     def __repr__(self) -> str:
-        rows = self._overview()
+        rows = self._topic_rows()
         wide = max((len(row[0]) for row in rows), default=0)
         lines = [f"  {name:<{wide}}  {count:>7}  {kind}" for name, count, kind in rows]
         return "\n".join([f"{self._headline()}{':' if lines else ''}", *lines])
@@ -166,7 +166,7 @@ class Bag:
     def _repr_html_(self) -> str:
         rows = "".join(
             f"<tr><td>{escape(name)}</td><td>{count}</td><td>{escape(kind)}</td></tr>"
-            for name, count, kind in self._overview()
+            for name, count, kind in self._topic_rows()
         )
         head = "<tr><th>topic</th><th>messages</th><th>type</th></tr>"
         return f"<p>{escape(self._headline())}</p><table>{head}{rows}</table>"
@@ -175,7 +175,7 @@ class Bag:
         span = f", {self.end_time - self.start_time:.6g} s" if self.message_count() else ""
         return f"Bag {self.path}: {self.message_count()} messages on {len(self)} topics{span}"
 
-    def _overview(self) -> list[tuple[str, int, str]]:
+    def _topic_rows(self) -> list[tuple[str, int, str]]:
         """Name, number of messages and type of every topic, by name."""
         counts = self._statistics.channel_message_counts
         return [
@@ -199,7 +199,7 @@ class Bag:
         """Keys and values of every metadata record by its name; the last of several of one name."""
         with open_bag(self.path) as file:
             found = indexed_records(file, self._summary.metadata_indexes, Opcode.METADATA)
-            read = (parsed(Metadata.read, body, place) for place, body in found)
+            read = (parse_record(Metadata.read, body, place) for place, body in found)
             return {metadata.name: metadata.metadata for metadata in read}
 
     @cached_property
@@ -207,7 +207,7 @@ class Bag:
         """Content of every attachment by its name; the last of several of one name."""
         with open_bag(self.path) as file:
             found = indexed_records(file, self._summary.attachment_indexes, Opcode.ATTACHMENT)
-            read = (parsed(Attachment.read, body, place) for place, body in found)
+            read = (parse_record(Attachment.read, body, place) for place, body in found)
             return {attachment.name: attachment.data for attachment in read}
 
     @property
@@ -351,7 +351,7 @@ class Bag:
             There is no such topic, or the bag is damaged.
         """
         series = self[topic]
-        return table_of(series, self._sliding(series.topic.rpartition("/")[0]))
+        return table_of(series, self._prismatic_joints(series.topic.rpartition("/")[0]))
 
     def robot_descriptions(self, namespace: str = "") -> list[bytes]:
         """Return what may be the URDF of the robot in a namespace, the likeliest first.
@@ -367,35 +367,41 @@ class Bag:
         attached = {n: text for n, text in self.attachments.items() if n.endswith(".urdf")}
         own = attached.pop(f"{topic.strip('/').replace('/', '.')}.urdf", None)
         found = [] if own is None else [own]
-        if self.topics.get(topic) == _TEXT:
+        if self.topics.get(topic) == _STRING_TYPE:
             found += [text.encode() for text in self[topic].field("data")[-1:]]
         return [*found, *attached.values()]
 
-    def _sliding(self, namespace: str) -> dict[str, bool]:
+    def _prismatic_joints(self, namespace: str) -> dict[str, bool]:
         """Whether each joint of the robot in a namespace is prismatic."""
-        if namespace not in self._kinds:
+        if namespace not in self._prismatic_by_namespace:
             # The model takes as long to import as everything else here.
             from spacerobot_ros.model.description import JointKind
             from spacerobot_ros.model.urdf import parse_robot
 
-            kinds = self._kinds.setdefault(namespace, {})
+            kinds = self._prismatic_by_namespace.setdefault(namespace, {})
             with suppress(RecordingError):
                 for text in self.robot_descriptions(namespace):
                     with suppress(RobotDescriptionError, UnicodeDecodeError):
                         for joint in parse_robot(text.decode()).movable_joints:
                             kinds.setdefault(joint.name, joint.kind is JointKind.PRISMATIC)
-        return self._kinds[namespace]
+        return self._prismatic_by_namespace[namespace]
 
     def __getitem__(self, topic: str) -> TopicSeries:
         topic = self._recorded_name(topic)
-        if topic not in self._series:
+        if topic not in self._series_by_topic:
             channels = self._channels(topic)
             decode = self._decoder(channels[0])
-            times, data = self._read({channel.id for channel in channels})
-            self._series[topic] = TopicSeries(
-                topic, self.topics[topic], times, data, self._types.fields, decode, self._decodable
+            times, data = self._read_channels({channel.id for channel in channels})
+            self._series_by_topic[topic] = TopicSeries(
+                topic,
+                self.topics[topic],
+                times,
+                data,
+                self._message_types.fields,
+                decode,
+                self._max_decoded_bytes,
             )
-        return self._series[topic]
+        return self._series_by_topic[topic]
 
     @property
     def _statistics(self) -> Any:
@@ -405,7 +411,8 @@ class Bag:
         channels = self._channels_by_topic.get(self._recorded_name(topic), [])
         if not channels:
             raise RecordingError(
-                f"The bag {self.path} has no topic {topic}: it has {_listed(list(self.topics))}."
+                f"The bag {self.path} has no topic {topic}: it has "
+                f"{_format_list(list(self.topics))}."
                 f"{suggestion(topic, [*self.topics, *(name[1:] for name in self.topics)])}"
             )
         if len({channel.schema_id for channel in channels}) > 1:
@@ -421,13 +428,13 @@ class Bag:
                 "('cdr' defined by 'ros2msg')."
             )
         try:
-            return self._types.decoder(type_name, schema.data)
+            return self._message_types.decoder(type_name, schema.data)
         except ValueError as error:
             raise RecordingError(
                 f"The definition of {type_name} in the bag {self.path} cannot be read: {error}."
             ) from error
 
-    def _read(self, channel_ids: set[int]) -> tuple[NDArray[np.int64], list[bytes]]:
+    def _read_channels(self, channel_ids: set[int]) -> tuple[NDArray[np.int64], list[bytes]]:
         """Read some channels: log times in nanoseconds in order, serialised messages."""
         times: list[int] = []
         data: list[bytes] = []
@@ -442,7 +449,7 @@ def _type_name(schemas: dict[int, Any], channel: Channel) -> str:
     return "" if schema is None else schema.name
 
 
-def _listed(names: list[str], most: int = 40) -> str:
+def _format_list(names: list[str], most: int = 40) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 

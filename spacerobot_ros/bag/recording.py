@@ -45,7 +45,7 @@ _WAITING, _ON_CLOCK, _ON_WALL_TIME = (
 _DROPPING = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED)
 
 
-class _Early(NamedTuple):
+class _EarlyMessage(NamedTuple):
     """A message from before the time base was chosen."""
 
     channel: int
@@ -90,14 +90,14 @@ class Recording:
         """How many messages of each topic were published and never arrived."""
         self.attached: set[str] = set()
         """Names of the files in the bag."""
-        self.latched: dict[int, _Early | None] = {}
+        self.latched: dict[int, _EarlyMessage | None] = {}
         """Channels of latched topics, and the last message that each has sent during a pause."""
         self.failure: RecordingError | None = None
         self._clock_wait_ns = clock_wait * SECOND
         self._on_failure = on_failure
         self._wall_time = wall_time
-        self._early: list[_Early] = []
-        self._decided: RecordingState | None = None
+        self._early_messages: list[_EarlyMessage] = []
+        self._time_base: RecordingState | None = None
         self._write = writer.write
 
     @property
@@ -108,13 +108,13 @@ class Recording:
     @property
     def messages_waiting(self) -> int:
         """How many messages wait for the start, or for the time base of the bag."""
-        return len(self._early) + sum(last is not None for last in self.latched.values())
+        return len(self._early_messages) + sum(last is not None for last in self.latched.values())
 
     def start(self) -> None:
         """Record from now on, and the last messages of latched topics before that."""
         if self.state is not RecordingState.PAUSED:
             return
-        self.state = self._decided or _WAITING
+        self.state = self._time_base or _WAITING
         for channel, last in self.latched.items():
             self.latched[channel] = None
             if last is not None:
@@ -127,11 +127,11 @@ class Recording:
 
     def set_clock(self, time_ns: int) -> None:
         """Set the time that the clock shows; without effect once wall time was decided on."""
-        if self._decided is _ON_WALL_TIME:
+        if self._time_base is _ON_WALL_TIME:
             return
         self.now_ns = time_ns
         if self.state is _WAITING:
-            self._decide(_ON_CLOCK)
+            self._choose_time_base(_ON_CLOCK)
 
     def record(self, channel: int, message: bytes, published_ns: int = 0) -> None:
         """Write a message, or keep it until the time base of the bag is chosen.
@@ -142,10 +142,14 @@ class Recording:
             arrival_ns = self._wall_time()
             if not self.running:
                 if self.state is RecordingState.PAUSED and channel in self.latched:
-                    self.latched[channel] = _Early(channel, message, published_ns, arrival_ns)
+                    self.latched[channel] = _EarlyMessage(
+                        channel, message, published_ns, arrival_ns
+                    )
                 return
             if self.state is _WAITING:
-                self._early.append(_Early(channel, message, published_ns, arrival_ns))
+                self._early_messages.append(
+                    _EarlyMessage(channel, message, published_ns, arrival_ns)
+                )
                 return
             self.now_ns = arrival_ns
         try:
@@ -157,19 +161,19 @@ class Recording:
 
     def flush(self, clock_is_published: bool) -> None:
         """Hand the data in memory to the operating system if the period of wall time is over."""
-        if self._early and not clock_is_published:
-            waited_ns = self._wall_time() - self._early[0].arrival_ns
+        if self._early_messages and not clock_is_published:
+            waited_ns = self._wall_time() - self._early_messages[0].arrival_ns
             if waited_ns > self._clock_wait_ns:
-                self._decide(_ON_WALL_TIME)
-        self._guarded(self.writer.flush)
+                self._choose_time_base(_ON_WALL_TIME)
+        self._fail_on_error(self.writer.flush)
 
     def check(self) -> None:
         """Check that the file is still in its place, with its full size."""
-        self._guarded(self.writer.check)
+        self._fail_on_error(self.writer.check)
 
     def describe(self, name: str, values: dict[str, str]) -> None:
         """Put named values into the bag."""
-        self._guarded(lambda: self.writer.add_metadata(name, values))
+        self._fail_on_error(lambda: self.writer.add_metadata(name, values))
 
     def attach_robot(self, name: str, urdf: bytes) -> None:
         """Attach the description of a robot, and the meshes in it that are found here."""
@@ -186,7 +190,7 @@ class Recording:
     def attach(self, name: str, data: bytes, media_type: str) -> None:
         """Put a whole file into the bag."""
         self.attached.add(name)
-        self._guarded(lambda: self.writer.add_attachment(name, data, media_type, self.now_ns))
+        self._fail_on_error(lambda: self.writer.add_attachment(name, data, media_type, self.now_ns))
 
     def close(self) -> None:
         """Write the remaining data and the counts of messages, and complete the bag; once.
@@ -198,7 +202,7 @@ class Recording:
         """
         if self.state is RecordingState.CLOSED:
             return
-        self._decide(_ON_WALL_TIME)
+        self._choose_time_base(_ON_WALL_TIME)
         counts = {"messages": self.messages, "messages_lost": self.lost.total()}
         self.describe("recorder", {name: str(count) for name, count in counts.items()})
         self.check()
@@ -209,25 +213,25 @@ class Recording:
             self.failure = error
             raise
 
-    def _decide(self, state: RecordingState) -> None:
+    def _choose_time_base(self, state: RecordingState) -> None:
         """Choose the time base of the bag, unless it is chosen, and write the early messages."""
-        if self._decided is not None or self.failure is not None:
+        if self._time_base is not None or self.failure is not None:
             return
-        self._decided = state
+        self._time_base = state
         if self.state is _WAITING:
             self.state = state
         on_clock = state is _ON_CLOCK
-        early, self._early = self._early, []
+        early, self._early_messages = self._early_messages, []
 
-        def write_all() -> None:
+        def write_early_messages() -> None:
             for channel, message, published_ns, arrival_ns in early:
                 log_ns = self.now_ns if on_clock else arrival_ns
                 self._write(channel, message, log_ns, published_ns or log_ns)
                 self.messages += 1
 
-        self._guarded(write_all)
+        self._fail_on_error(write_early_messages)
 
-    def _guarded(self, act: Callable[[], None]) -> None:
+    def _fail_on_error(self, act: Callable[[], None]) -> None:
         if self.failure is None and self.state is not RecordingState.CLOSED:
             try:
                 act()

@@ -25,25 +25,25 @@ from spacerobot_ros.bag.mcap_file import (
     metadata_record,
 )
 from spacerobot_ros.bag.mcap_reading import (
-    DAMAGE,
+    DAMAGE_ERRORS,
     RECORD_HEADER,
-    Allowance,
+    InflationLimit,
     chunk_size,
     file_size,
     messages_in_file_order,
     open_bag,
     open_file,
-    parsed,
+    parse_record,
     read_summary,
     records,
-    records_in,
-    unpacked,
+    records_in_chunk,
+    unpack_chunk,
 )
 from spacerobot_ros.bag.reader import Array, RecordedRobot, columns, read_bag
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.times import SECOND
 
-_STATE = ("odom", "joint_states", "momentum")
+_STATE_TOPICS = ("odom", "joint_states", "momentum")
 _CHUNK_SIZE = 65536
 _CHANNEL_AND_TIME = struct.Struct("<H4xQ")
 """Channel and log time at the head of a message; between them is its sequence number."""
@@ -93,13 +93,13 @@ def salvage_bag(
     target = Path(out) if out is not None else source.with_name(f"{source.stem}-salvaged.mcap")
     if is_complete(source):
         raise RecordingError(f"The bag {source} is complete: there is nothing to salvage.")
-    found = _Found(source)
+    found = _ReadableRecords(source)
     first = next(found.records, None)
     if first is None:
         raise RecordingError(f"Nothing in the bag {source} can be read.")
     file = McapFile(target, compression="zstd", overwrite=False, profile=found.profile)
     try:
-        copy = _Copy(file)
+        copy = _SalvagedBag(file)
         copy.add(*first)
         for opcode, body in found.records:
             copy.add(opcode, body)
@@ -138,7 +138,7 @@ def _whole_records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, 
         yield from records(file, start, end)
 
 
-class _Found:
+class _ReadableRecords:
     """Opcodes and bodies of a bag's records as far as they can be read, chunks unpacked."""
 
     def __init__(self, path: Path) -> None:
@@ -147,9 +147,9 @@ class _Found:
         self.reason = ""
         """Why the first of the lost chunks cannot be read."""
         self._path = path
-        self.records = self._read()
+        self.records = self._read_records()
 
-    def _read(self) -> Iterator[tuple[int, bytes]]:
+    def _read_records(self) -> Iterator[tuple[int, bytes]]:
         with open_file(self._path) as file:
             size = file_size(file)
             start = file.read(len(MCAP0_MAGIC))
@@ -157,12 +157,12 @@ class _Found:
                 empty = start == MCAP0_MAGIC[: len(start)]
                 what = "holds nothing yet" if empty else "is not an MCAP file"
                 raise RecordingError(f"{self._path} {what}: there is nothing to salvage.")
-            whole, allowance = len(start), Allowance(size)
+            whole, allowance = len(start), InflationLimit(size)
             for place, opcode, body in _whole_records(file, len(start), size):
                 whole = place + RECORD_HEADER.size + len(body)
                 if opcode == Opcode.HEADER:
-                    with suppress(*DAMAGE):
-                        self.profile = parsed(Header.read, body, place).profile
+                    with suppress(*DAMAGE_ERRORS):
+                        self.profile = parse_record(Header.read, body, place).profile
                 elif opcode == Opcode.CHUNK:
                     yield from self._chunk(body, place, allowance)
                 elif opcode == Opcode.DATA_END:
@@ -172,20 +172,22 @@ class _Found:
                     yield opcode, body
             self.lost_bytes = size - whole
 
-    def _chunk(self, body: bytes, place: int, allowance: Allowance) -> Iterator[tuple[int, bytes]]:
+    def _chunk(
+        self, body: bytes, place: int, allowance: InflationLimit
+    ) -> Iterator[tuple[int, bytes]]:
         try:
             allowance.take(chunk_size(body), place)
-            data = unpacked(body, place)
-        except DAMAGE as error:
+            data = unpack_chunk(body, place)
+        except DAMAGE_ERRORS as error:
             self.lost_chunks += 1
             self.reason = self.reason or str(error) or type(error).__name__
             return
         with suppress(ValueError):
-            for opcode, start, end in records_in(data, place):
+            for opcode, start, end in records_in_chunk(data, place):
                 yield opcode, data[start + RECORD_HEADER.size : end]
 
 
-class _Copy:
+class _SalvagedBag:
     """A bag that is written from the records of another."""
 
     def __init__(self, file: McapFile) -> None:
@@ -197,19 +199,19 @@ class _Copy:
 
     def add(self, opcode: int, body: bytes) -> None:
         """Take a record; one that cannot be read is left out."""
-        with suppress(*DAMAGE):
+        with suppress(*DAMAGE_ERRORS):
             if opcode == Opcode.MESSAGE:
                 self._add_message(body)
             elif opcode == Opcode.SCHEMA:
-                schema = parsed(Schema.read, body, 0)
+                schema = parse_record(Schema.read, body, 0)
                 self._schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
-                channel = parsed(Channel.read, body, 0)
+                channel = parse_record(Channel.read, body, 0)
                 self._channels[channel.id] = channel
             elif opcode == Opcode.ATTACHMENT:
-                self._file.append_attachment(parsed(Attachment.read, body, 0))
+                self._file.append_attachment(parse_record(Attachment.read, body, 0))
             elif opcode == Opcode.METADATA:
-                metadata = parsed(Metadata.read, body, 0)
+                metadata = parse_record(Metadata.read, body, 0)
                 if metadata.name != METADATA_NAME:
                     self._file.append_metadata(metadata)
 
@@ -313,7 +315,7 @@ def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
 
 
 def _last_state(robot: RecordedRobot) -> LastState:
-    odom, joints, momentum = (robot[name] for name in _STATE)
+    odom, joints, momentum = (robot[name] for name in _STATE_TOPICS)
     # Momenta have no stamp; a state is published momenta first, and logged at its time.
     common = np.intersect1d(odom.stamp_ns, joints.stamp_ns)
     if not len(common):

@@ -17,12 +17,12 @@ from rosbags.serde import SerdeError
 
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.messages.definitions import Fields
-from spacerobot_ros.messages.layout import DTYPES, Columns, columns_of, widened
+from spacerobot_ros.messages.layout import DTYPES, Columns, column_dtype, read_columns
 from spacerobot_ros.times import SECOND
 
 _HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 
-_DAMAGE = (SerdeError, ValueError, IndexError, OverflowError, TypeError, struct.error)
+_DECODING_ERRORS = (SerdeError, ValueError, IndexError, OverflowError, TypeError, struct.error)
 """Exceptions of decoding a damaged message."""
 
 
@@ -45,7 +45,7 @@ class TopicSeries:
         data: Sequence[bytes],
         fields: Fields,
         decode: Callable[[bytes], Any],
-        decodable: float = math.inf,
+        max_decoded_bytes: float = math.inf,
     ) -> None:
         self.topic = topic
         self.type_name = type_name
@@ -55,7 +55,7 @@ class TopicSeries:
         self._data = data
         self._fields = fields
         self._decode = decode
-        self._decodable = decodable
+        self._max_decoded_bytes = max_decoded_bytes
 
     def __len__(self) -> int:
         return len(self._data)
@@ -69,12 +69,12 @@ class TopicSeries:
     @property
     def paths(self) -> list[str]:
         """Paths of the fields, for :meth:`field`; of lists of messages, that of the list."""
-        return list(self._leaves(self.type_name, ""))
+        return list(self._leaf_paths(self.type_name, ""))
 
-    def _leaves(self, type_name: str, prefix: str) -> Iterator[str]:
+    def _leaf_paths(self, type_name: str, prefix: str) -> Iterator[str]:
         for name, (kind, detail) in self._fields[type_name][1]:
             if kind == Nodetype.NAME:
-                yield from self._leaves(detail, f"{prefix}{name}.")
+                yield from self._leaf_paths(detail, f"{prefix}{name}.")
             else:
                 yield prefix + name
 
@@ -86,7 +86,7 @@ class TopicSeries:
         RecordingError
             There is no such field.
         """
-        return self._resolve(path)[3] or ""
+        return self._resolve_path(path)[3] or ""
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -133,17 +133,17 @@ class TopicSeries:
         RecordingError
             There is no such field, or a message is damaged.
         """
-        dtype, is_array, in_list, type_name = self._resolve(path)
+        dtype, is_array, in_list, type_name = self._resolve_path(path)
         if self._columns is not None and path in self._columns.paths:
             try:
                 return self._columns[path]
             except UnicodeDecodeError as error:
-                raise self._damaged(error) from error
+                raise self._damage_error(error) from error
         # Callers get copies, which they may change.
         fresh = in_list or type_name is not None
         messages = [m for _, m in self.messages()] if fresh else self._messages
         if in_list:
-            return [_values(message, path.split(".")) for message in messages]
+            return [_values_in_lists(message, path.split(".")) for message in messages]
         values = list(map(attrgetter(path), messages))
         if dtype is None or (is_array and len(set(map(len, values))) > 1):
             return [copy(value) for value in values] if is_array and not fresh else values
@@ -180,7 +180,7 @@ class TopicSeries:
         each = 1 if width is None else width // max(len(fields), 1)
         if not each:
             return np.empty((len(self), 0))
-        return np.column_stack([_matrix(self.field(path), each) for path in fields])
+        return np.column_stack([_field_matrix(self.field(path), each) for path in fields])
 
     def messages(self) -> Iterator[tuple[int, Any]]:
         """Iterate over the messages, without keeping them.
@@ -196,37 +196,37 @@ class TopicSeries:
         """
         self._require_decodable()
         for time_ns, data in zip(self.time_ns.tolist(), self._data, strict=True):
-            yield time_ns, self._decoded(data)
+            yield time_ns, self._decode_message(data)
 
     @cached_property
     def _messages(self) -> list[Any]:
         self._require_decodable()
-        return [self._decoded(data) for data in self._data]
+        return [self._decode_message(data) for data in self._data]
 
     @cached_property
     def _columns(self) -> Columns | None:
-        return columns_of(self._data, self.type_name, self._fields)
+        return read_columns(self._data, self.type_name, self._fields)
 
     def _require_decodable(self) -> None:
         """Refuse to make objects of much more than the file is large."""
         size = sum(map(len, self._data))
-        if size > self._decodable:
+        if size > self._max_decoded_bytes:
             raise RecordingError(
-                f"The messages on {self.topic} have {size} bytes, and {self._decodable:.0f} can be "
-                "decoded of a bag of this size."
+                f"The messages on {self.topic} have {size} bytes, and "
+                f"{self._max_decoded_bytes:.0f} can be decoded of a bag of this size."
             )
 
-    def _decoded(self, data: bytes) -> Any:
+    def _decode_message(self, data: bytes) -> Any:
         try:
             return self._decode(data)
-        except _DAMAGE as error:
-            raise self._damaged(error) from error
+        except _DECODING_ERRORS as error:
+            raise self._damage_error(error) from error
 
-    def _damaged(self, error: Exception) -> RecordingError:
+    def _damage_error(self, error: Exception) -> RecordingError:
         reason = str(error) or type(error).__name__
         return RecordingError(f"A message on {self.topic} is no {self.type_name}: {reason}.")
 
-    def _resolve(self, path: str) -> tuple[np.dtype[Any] | None, bool, bool, str | None]:
+    def _resolve_path(self, path: str) -> tuple[np.dtype[Any] | None, bool, bool, str | None]:
         """Follow a path: type of its numbers if any, whether an array, whether inside of a list,
         type of its messages if any.
         """
@@ -246,10 +246,10 @@ class TopicSeries:
                 kind, detail = detail[0]
             type_name = detail if kind == Nodetype.NAME else None
             dtype = DTYPES.get(detail[0]) if kind == Nodetype.BASE else None
-        return None if dtype is None else widened(dtype), is_array, in_list, type_name
+        return None if dtype is None else column_dtype(dtype), is_array, in_list, type_name
 
 
-def _matrix(values: Any, width: int) -> NDArray[np.float64]:
+def _field_matrix(values: Any, width: int) -> NDArray[np.float64]:
     """Return a field as (N, width), nan where a message has another number of values."""
     if isinstance(values, np.ndarray) and values.size == len(values) * width:
         return np.asarray(values, dtype=float).reshape(len(values), width)
@@ -257,9 +257,9 @@ def _matrix(values: Any, width: int) -> NDArray[np.float64]:
     return np.array([row if row.size == width else np.full(width, np.nan) for row in rows])
 
 
-def _values(value: Any, path: Sequence[str]) -> Any:
+def _values_in_lists(value: Any, path: Sequence[str]) -> Any:
     for depth, name in enumerate(path):
         if isinstance(value, list):
-            return [_values(element, path[depth:]) for element in value]
+            return [_values_in_lists(element, path[depth:]) for element in value]
         value = getattr(value, name)
     return value

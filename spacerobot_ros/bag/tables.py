@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 _KEY_VALUES = "diagnostic_msgs/msg/KeyValue"
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _HEADER_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
-_TIMES = ("time", "time_ns", "stamp", "stamp_ns")
+_TIME_COLUMNS = ("time", "time_ns", "stamp", "stamp_ns")
 """Columns of every table; a field of these names is below ``message``."""
 
-_MOST_ENTRIES = 1000
+_MAX_ARRAY_COLUMNS = 1000
 """Longest array that becomes columns; longer ones, such as the bytes of an image, do not."""
 
 _JOINT_UNITS = {
@@ -44,12 +44,12 @@ _JOINT_UNITS = {
     "velocity": ("m/s", "rad/s"),
     "effort": ("N", "N m"),
 }
-"""Units of a sliding joint and of a turning one."""
+"""Units of a prismatic joint and of a turning one."""
 
 _THRUSTER_UNITS = {"position": "s", "velocity": "1", "effort": "N"}
 _MOMENTUM_UNITS = {"linear": "kg m/s", "angular": "kg m^2/s", "kinetic": "J"}
 
-_UNITS = tuple(
+_UNITS_BY_PATH_ENDING = tuple(
     (re.compile(rf"(?:^|\.){ending}$"), unit)
     for ending, unit in (
         (r"(?:position|translation|point)\.[xyz]", "m"),
@@ -135,7 +135,7 @@ class TopicTable:
         return {name: unit for each in pairs for name, unit in each}
 
 
-def table_of(series: TopicSeries, sliding: Mapping[str, bool] | None = None) -> TopicTable:
+def table_of(series: TopicSeries, prismatic: Mapping[str, bool] | None = None) -> TopicTable:
     """Return the messages of a topic as a table.
 
     Numbers and texts become columns; an array that has the same length in every message, of at most
@@ -149,15 +149,15 @@ def table_of(series: TopicSeries, sliding: Mapping[str, bool] | None = None) -> 
     ----------
     series
         The topic.
-    sliding
-        Of each joint whether it slides, which decides on units; one that is not there has none.
+    prismatic
+        Whether each joint is prismatic, which decides on units; a joint that is missing has none.
 
     Raises
     ------
     RecordingError
         A message is damaged, or there is more than can be decoded.
     """
-    names = _names(series)
+    names = _joint_state_names(series)
     found = [Field("time_ns", series.time_ns, ("ns",))]
     if series.stamped:
         found.append(Field("stamp", series.stamp, ("s",)))
@@ -165,11 +165,11 @@ def table_of(series: TopicSeries, sliding: Mapping[str, bool] | None = None) -> 
     for path in series.paths:
         if path in _HEADER_STAMP or (path == "name" and names):
             continue
-        found += _fields(series, path, names, sliding or {})
+        found += _table_fields(series, path, names, prismatic or {})
     return TopicTable(series.topic, series.type_name, series.time, tuple(found))
 
 
-def _names(series: TopicSeries) -> tuple[str, ...]:
+def _joint_state_names(series: TopicSeries) -> tuple[str, ...]:
     """Return the names in joint states, where all messages have the same."""
     if series.type_name != _JOINT_STATE or not len(series):
         return ()
@@ -178,19 +178,19 @@ def _names(series: TopicSeries) -> tuple[str, ...]:
     return names if not found and len(set(names)) == len(names) else ()
 
 
-def _fields(
-    series: TopicSeries, path: str, names: tuple[str, ...], sliding: Mapping[str, bool]
+def _table_fields(
+    series: TopicSeries, path: str, names: tuple[str, ...], prismatic: Mapping[str, bool]
 ) -> list[Field]:
     values = series.field(path)
     if series.element_type(path) == _KEY_VALUES:
-        return _key_values(path, values)
-    if path in _TIMES:
+        return _key_value_fields(path, values)
+    if path in _TIME_COLUMNS:
         path = f"message.{path}"
-    if not isinstance(values, np.ndarray) or values[:1].size > _MOST_ENTRIES:
-        texts = [x if isinstance(x, str) else json.dumps(_plain(x)) for x in values]
-        return [Field(path, _objects(texts), ("",))]
+    if not isinstance(values, np.ndarray) or values[:1].size > _MAX_ARRAY_COLUMNS:
+        texts = [x if isinstance(x, str) else json.dumps(_json_value(x)) for x in values]
+        return [Field(path, _object_array(texts), ("",))]
     if values.ndim == 1:
-        return [Field(path, values, (_unit(path),))]
+        return [Field(path, values, (_unit_of_path(path),))]
     width = values.shape[1]
     if not width:
         return []
@@ -199,7 +199,7 @@ def _fields(
         thrusters = short == "thrusters"
         of = "thruster" if thrusters else "joint"
         units = tuple(
-            _THRUSTER_UNITS.get(path, "") if thrusters else _joint_unit(path, sliding.get(name))
+            _THRUSTER_UNITS.get(path, "") if thrusters else _joint_unit(path, prismatic.get(name))
             for name in names
         )
         return [Field(path, values, units, names, of)]
@@ -211,54 +211,54 @@ def _fields(
     return [Field(path, values, units, labels)]
 
 
-def _key_values(path: str, values: list[Any]) -> list[Field]:
+def _key_value_fields(path: str, values: list[Any]) -> list[Field]:
     """Return a column of texts for each key of lists of keys and values."""
     rows = [key_values(pairs) for pairs in values]
     keys = dict.fromkeys(key for row in rows for key in row)
-    return [Field(f"{path}[{k}]", _objects([r.get(k, "") for r in rows]), ("",)) for k in keys]
+    return [Field(f"{path}[{k}]", _object_array([r.get(k, "") for r in rows]), ("",)) for k in keys]
 
 
-def _joint_unit(path: str, slides: bool | None) -> str:
-    if path not in _JOINT_UNITS or slides is None:
+def _joint_unit(path: str, is_prismatic: bool | None) -> str:
+    if path not in _JOINT_UNITS or is_prismatic is None:
         return ""
-    return _JOINT_UNITS[path][0 if slides else 1]
+    return _JOINT_UNITS[path][0 if is_prismatic else 1]
 
 
-def _unit(path: str) -> str:
-    return next((unit for ending, unit in _UNITS if ending.search(path)), "")
+def _unit_of_path(path: str) -> str:
+    return next((unit for ending, unit in _UNITS_BY_PATH_ENDING if ending.search(path)), "")
 
 
-def _objects(values: list[str]) -> NDArray[Any]:
+def _object_array(values: list[str]) -> NDArray[Any]:
     made = np.empty(len(values), object)
     made[:] = values
     return made
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     """Return a part of a message as JSON has it."""
     if is_dataclass(value):
         # Constants are in capitals, and fields never are.
         names = (each.name for each in fields(value) if not each.name.isupper())
-        return {name: _plain(getattr(value, name)) for name in names if name[0] != "_"}
+        return {name: _json_value(getattr(value, name)) for name in names if name[0] != "_"}
     if isinstance(value, np.ndarray):
         return value.tolist()
-    return [_plain(each) for each in value] if isinstance(value, list) else value
+    return [_json_value(each) for each in value] if isinstance(value, list) else value
 
 
 COLUMNS = "_columns.csv"
 """File beside tables in CSV: topic, file, column and unit of every column."""
 
-_UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
-_LONGEST_NAME = 63
+_UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_.-]+")
+_MAX_VARIABLE_NAME = 63
 """Longest name of a variable in MATLAB, characters."""
 
-_KEYWORD = re.compile(
+_MATLAB_KEYWORD = re.compile(
     "break|case|catch|classdef|continue|else|elseif|end|for|function|global|if|otherwise|parfor|"
     "persistent|return|spmd|switch|try|while"
 )
 """Keywords of MATLAB, which no variable may be named by."""
 
-_QUOTED = re.compile(r'[,"\r\n]')
+_QUOTED_CHARACTERS = re.compile(r'[,"\r\n]')
 """Characters for which a text in CSV is quoted."""
 
 
@@ -294,7 +294,7 @@ def to_pandas(table: TopicTable) -> pandas.DataFrame:
     RecordingError
         pandas is not installed.
     """
-    pandas = _library("pandas")
+    pandas = _import_library("pandas")
     index = pandas.Index(table.time, name="time")
     frame = pandas.DataFrame(table.columns, index=index, copy=True)
     frame.attrs.update(topic=table.topic, type=table.type_name, units=table.units)
@@ -309,7 +309,7 @@ def to_xarray(table: TopicTable) -> xarray.Dataset:
     RecordingError
         xarray is not installed.
     """
-    xarray = _library("xarray")
+    xarray = _import_library("xarray")
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {"time": ("time", table.time.copy(), {"units": "s"})}
     for field in table.fields:
@@ -363,10 +363,10 @@ def export(
         target.parent.mkdir(parents=True, exist_ok=True)
         made = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
         try:
-            rows = write(_named(tables), made)
+            rows = write(_tables_by_file_name(tables), made)
             result = made / "tables.mat" if format is ExportFormat.MAT else made
             result.chmod(0o777 & ~_umask() if result.is_dir() else 0o666 & ~_umask())
-            _place(result, target)
+            _move_into_place(result, target)
         finally:
             shutil.rmtree(made, ignore_errors=True)
     except OSError as error:
@@ -389,7 +389,7 @@ def _require_suffix(target: Path, format: ExportFormat) -> None:
         )
 
 
-def _place(made: Path, target: Path) -> None:
+def _move_into_place(made: Path, target: Path) -> None:
     """Rename the finished file or folder, unless its name has been taken meanwhile."""
     if made.is_dir():
         # Takes the place of an empty folder at most.
@@ -406,17 +406,19 @@ def _umask() -> int:
     return mask
 
 
-def _named(tables: Iterable[TopicTable]) -> dict[str, TopicTable]:
+def _tables_by_file_name(tables: Iterable[TopicTable]) -> dict[str, TopicTable]:
     """Return the tables that have rows, by names that are safe for files, each once."""
     found: dict[str, TopicTable] = {}
     for table in tables:
         if len(table):
-            name = _UNSAFE.sub("_", table.topic.strip("/").replace("/", ".")).lstrip("._-")
-            found[_free(name[:100] or "topic", found)] = table
+            name = _UNSAFE_CHARACTERS.sub("_", table.topic.strip("/").replace("/", ".")).lstrip(
+                "._-"
+            )
+            found[_unused_name(name[:100] or "topic", found)] = table
     return found
 
 
-def _free(name: str, taken: Mapping[str, Any]) -> str:
+def _unused_name(name: str, taken: Mapping[str, Any]) -> str:
     """Return a name that no other differs from by case alone."""
     others = {each.lower() for each in taken}
     names = (name, *(f"{name}_{number}" for number in range(2, len(others) + 3)))
@@ -426,7 +428,7 @@ def _free(name: str, taken: Mapping[str, Any]) -> str:
 def _write_csv(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
     def rows(file: Path, head: list[str], columns: list[Iterable[str]]) -> None:
         with file.open("w", encoding="utf-8", newline="") as stream:
-            stream.write(",".join(map(_in_csv, head)) + "\n")
+            stream.write(",".join(map(_csv_text, head)) + "\n")
             stream.writelines(",".join(row) + "\n" for row in zip(*columns, strict=True))
 
     about: list[tuple[str, str, str, str]] = []
@@ -437,22 +439,22 @@ def _write_csv(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
             folder / file,
             list(columns),
             # Texts are objects, and numbers keep every digit.
-            [map(_in_csv if x.dtype == object else repr, x.tolist()) for x in columns.values()],
+            [map(_csv_text if x.dtype == object else repr, x.tolist()) for x in columns.values()],
         )
         units = {"time": "s", **table.units}
         about += [(table.topic, file, column, unit) for column, unit in units.items()]
     head = ["topic", "file", "column", "unit"]
-    rows(folder / COLUMNS, head, [map(_in_csv, each) for each in zip(*about, strict=True)])
+    rows(folder / COLUMNS, head, [map(_csv_text, each) for each in zip(*about, strict=True)])
     return {table.topic: len(table) for table in tables.values()}
 
 
-def _in_csv(text: str) -> str:
+def _csv_text(text: str) -> str:
     """Return a text as CSV has it (RFC 4180); a lone carriage return ends a row for readers too."""
-    return '"' + text.replace('"', '""') + '"' if _QUOTED.search(text) else text
+    return '"' + text.replace('"', '""') + '"' if _QUOTED_CHARACTERS.search(text) else text
 
 
 def _write_parquet(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
-    arrow, parquet = _library("pyarrow"), _library("pyarrow.parquet")
+    arrow, parquet = _import_library("pyarrow"), _import_library("pyarrow.parquet")
     for name, table in tables.items():
         made = arrow.Table.from_pandas(to_pandas(table), preserve_index=True)
         units = {"time": "s", **table.units}
@@ -474,15 +476,15 @@ def _write_mat(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
     variables: dict[str, Any] = {}
     about: dict[str, Any] = {}
     for table in tables.values():
-        name = _identifier(table.topic.strip("/"), variables)
-        variables[name] = _struct(table)
+        name = _matlab_variable(table.topic.strip("/"), variables)
+        variables[name] = _matlab_struct(table)
         about[name] = {
             "topic": table.topic,
             "type": table.type_name,
-            "columns": _cells(["time", *table.columns]),
-            "units": _cells(["s", *table.units.values()]),
+            "columns": _cell_array(["time", *table.columns]),
+            "units": _cell_array(["s", *table.units.values()]),
         }
-    variables[_identifier("about", variables)] = about
+    variables[_matlab_variable("about", variables)] = about
     try:
         savemat(folder / "tables.mat", variables, long_field_names=True, do_compression=True)
     except (MatWriteError, ValueError, OverflowError) as error:
@@ -490,7 +492,7 @@ def _write_mat(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
     return {table.topic: len(table) for table in tables.values()}
 
 
-def _struct(table: TopicTable) -> dict[str, Any]:
+def _matlab_struct(table: TopicTable) -> dict[str, Any]:
     """Return a topic as MATLAB has it: its fields (N, k) in structs of structs."""
     struct: dict[str, Any] = {"time": table.time[:, np.newaxis]}
     places: dict[tuple[str, ...], dict[str, Any]] = {(): struct}
@@ -501,27 +503,27 @@ def _struct(table: TopicTable) -> dict[str, Any]:
             inner = places.setdefault(tuple(way[:depth]), {})
             if not inner:
                 # Keys have dots too, and one may be called as a part of another is.
-                place[_identifier(part, place)] = inner
+                place[_matlab_variable(part, place)] = inner
             place = inner
         values = field.values[:, np.newaxis] if field.values.ndim == 1 else field.values
-        place[_identifier(last, place)] = values
+        place[_matlab_variable(last, place)] = values
     return struct
 
 
-def _identifier(name: str, taken: Mapping[str, Any]) -> str:
+def _matlab_variable(name: str, taken: Mapping[str, Any]) -> str:
     """Return a name of a variable for MATLAB that is not taken."""
     made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
-    made = f"x{made}" if _KEYWORD.fullmatch(made) or not made[:1].isalpha() else made
-    return _free(made[: _LONGEST_NAME - 4], taken)
+    made = f"x{made}" if _MATLAB_KEYWORD.fullmatch(made) or not made[:1].isalpha() else made
+    return _unused_name(made[: _MAX_VARIABLE_NAME - 4], taken)
 
 
-def _cells(texts: list[str]) -> Any:
+def _cell_array(texts: list[str]) -> Any:
     made = np.empty((len(texts), 1), object)
     made[:, 0] = texts
     return made
 
 
-def _library(name: str) -> Any:
+def _import_library(name: str) -> Any:
     """Import a library of the extra ``data``."""
     try:
         return importlib.import_module(name)

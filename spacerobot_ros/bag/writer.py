@@ -29,7 +29,7 @@ _MESSAGE_HEADER = struct.Struct("<BQHIQQ")
 """Opcode, length of the rest, channel, sequence, log time, publish time."""
 
 _pack_header = _MESSAGE_HEADER.pack
-_LENGTH_WITHOUT_DATA = _MESSAGE_HEADER.size - 9
+_HEADER_LENGTH = _MESSAGE_HEADER.size - 9
 _MESSAGE = int(Opcode.MESSAGE)
 
 
@@ -93,16 +93,16 @@ class BagWriter:
         max_size: int = 0,
         max_duration_ns: int = 0,
     ) -> None:
-        self._whole_path = Path(path)
+        self._unsplit_path = Path(path)
         self._limits = max_size, max_duration_ns
-        self._number = 0
+        self._file_number = 0
         self._compression, self._overwrite = compression, overwrite and not next_free
         self._next_free = next_free
         self.splits = 0
         """How many files were begun after the first."""
-        self._earlier: Counter[str] = Counter()
-        self._context: list[Attachment | Metadata] = []
-        self._file = self._first_file()
+        self._earlier_counts: Counter[str] = Counter()
+        self._repeated_records: list[Attachment | Metadata] = []
+        self._file = self._open_first_file()
         self._chunk_size = chunk_size
         self._chunk = bytearray()
         # Of each channel, log time and offset in the chunk of each message. Empty as soon as
@@ -129,7 +129,7 @@ class BagWriter:
     def message_counts(self) -> dict[str, int]:
         """How many messages of each topic are in the bag or in the chunk in progress."""
         return {
-            name: self._earlier[name] + self._count(channel)
+            name: self._earlier_counts[name] + self._message_count(channel)
             for name, (channel, _, _) in self._topics.items()
         }
 
@@ -219,7 +219,7 @@ class BagWriter:
         try:
             header = _pack_header(
                 _MESSAGE,
-                _LENGTH_WITHOUT_DATA + len(data),
+                _HEADER_LENGTH + len(data),
                 channel_id,
                 0,
                 log_time_ns,
@@ -248,7 +248,7 @@ class BagWriter:
         attachment = Attachment(
             create_time=0, log_time=log_time_ns, name=name, media_type=media_type, data=data
         )
-        self._context.append(attachment)
+        self._repeated_records.append(attachment)
         with self._refusing_after_failure():
             self._file.append_attachment(attachment)
 
@@ -262,7 +262,7 @@ class BagWriter:
         """
         self._require_open()
         metadata = Metadata(name=name, metadata=data)
-        self._context.append(metadata)
+        self._repeated_records.append(metadata)
         with self._refusing_after_failure():
             self._file.append_metadata(metadata)
 
@@ -341,19 +341,19 @@ class BagWriter:
         span = (self._file.end_ns or 0) - (self._file.start_ns or 0)
         return 0 < max_size <= self._file.size or 0 < max_duration_ns <= span
 
-    def _first_file(self) -> McapFile:
+    def _open_first_file(self) -> McapFile:
         """Make the file, or the first of several; names of one bag are not mixed with another's."""
-        asked, number = self._whole_path, 0
+        asked, number = self._unsplit_path, 0
         while True:
             try:
                 if any(self._limits) and not self._overwrite:
                     self._require_no_parts()
-                return self._new_file()
+                return self._open_numbered_file()
             except BagExistsError:
                 if not self._next_free:
                     raise
             number += 1
-            self._whole_path = asked.with_name(f"{asked.stem}-{number}{asked.suffix}")
+            self._unsplit_path = asked.with_name(f"{asked.stem}-{number}{asked.suffix}")
 
     def _require_no_parts(self) -> None:
         """Refuse a name of which there are files of a bag that was split.
@@ -363,7 +363,7 @@ class BagWriter:
         BagExistsError
             There are some.
         """
-        whole = self._whole_path
+        whole = self._unsplit_path
         pattern = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
         with suppress(OSError):
             for name in sorted(os.listdir(whole.parent)):
@@ -385,10 +385,10 @@ class BagWriter:
         with self._refusing_after_failure():
             self._file.check()
 
-    def _new_file(self) -> McapFile:
-        path = self._whole_path
+    def _open_numbered_file(self) -> McapFile:
+        path = self._unsplit_path
         if any(self._limits):
-            path = path.with_name(f"{path.stem}_{self._number}{path.suffix}")
+            path = path.with_name(f"{path.stem}_{self._file_number}{path.suffix}")
         return McapFile(path, compression=self._compression, overwrite=self._overwrite)
 
     def _begin_next_file(self) -> None:
@@ -397,12 +397,12 @@ class BagWriter:
         self._file.finish()
         self._file.close()
         for name, (channel, _, _) in self._topics.items():
-            self._earlier[name] += self._count(channel)
+            self._earlier_counts[name] += self._message_count(channel)
         schemas, channels = self._file.schemas, self._file.channels
-        self._file = self._next_file()
+        self._file = self._open_next_file()
         self.splits += 1
         self._append_rosbag2_metadata()
-        for record in self._context:
+        for record in self._repeated_records:
             if isinstance(record, Attachment):
                 self._file.append_attachment(record)
             else:
@@ -412,11 +412,11 @@ class BagWriter:
         for known in (*schemas, *channels):
             self._chunk += encode(known)
 
-    def _next_file(self) -> McapFile:
+    def _open_next_file(self) -> McapFile:
         while True:
-            self._number += 1
+            self._file_number += 1
             try:
-                return self._new_file()
+                return self._open_numbered_file()
             except BagExistsError:
                 # Not ours. Refused at the start, it is stepped over in flight.
                 if self._overwrite:
@@ -424,13 +424,15 @@ class BagWriter:
 
     def _append_rosbag2_metadata(self) -> None:
         topics = [
-            RecordedTopic(name, type_name, type_hash(type_name), qos, self._count(channel_id))
+            RecordedTopic(
+                name, type_name, type_hash(type_name), qos, self._message_count(channel_id)
+            )
             for name, (channel_id, type_name, qos) in self._topics.items()
         ]
         file = self._file
         file.append_metadata(metadata_record(file.path.name, topics, file.start_ns, file.end_ns))
 
-    def _count(self, channel_id: int) -> int:
+    def _message_count(self, channel_id: int) -> int:
         in_progress = len(self._entries.get(channel_id, ())) // 2
         return self._file.message_counts.get(channel_id, 0) + in_progress
 

@@ -69,7 +69,7 @@ def fly(
     GoalError
         The goal is no pose.
     """
-    scenario = _aimed(_scenario(what), goal, None, rotvec)
+    scenario = _with_goal(_scenario_to_fly(what), goal, None, rotvec)
     if not scenario.has_goal:
         raise ParameterError(
             f"'{scenario.name}' is a robot and has no goal: give one, for instance "
@@ -129,11 +129,11 @@ def plan(
         assert not isinstance(what, Scenario)
         if goal is not None:
             start = Goal.checked([0, 0, 0], [0, 0, 0, 1])
-            goal, position, rotvec = _goal(start, goal, position, rotvec), None, None
+            goal, position, rotvec = _changed_goal(start, goal, position, rotvec), None, None
             if (shape := options.pop("joint_positions", None)) is not None:
                 goal = Goal.checked(goal.position, goal.quaternion, shape)
-        position = None if position is None else _numbers(position, "position")
-        rotvec = None if rotvec is None else _numbers(rotvec, "rotvec")
+        position = None if position is None else _float_list(position, "position")
+        rotvec = None if rotvec is None else _float_list(rotvec, "rotvec")
         given = {"position": position, "rotvec": rotvec}
         chosen = {name: value for name, value in given.items() if value is not None}
         if method is None:
@@ -142,7 +142,7 @@ def plan(
             method = "optimal" if of_method else PlannerConfig().method
         return planning.plan(what, goal, method=method, **{**chosen, **options})
     scenario = what if isinstance(what, Scenario) else load_scenario(str(what))
-    scenario = _aimed(scenario, goal, position, rotvec)
+    scenario = _with_goal(scenario, goal, position, rotvec)
     settings: dict[str, Any] = {} if method is None else {"method": method}
     name = method or scenario.planner.method
     method_options(name, options)  # Refused here, by the names that were given.
@@ -163,7 +163,7 @@ def _is_scenario(what: SpaceRobot | Scenario | str | Path, *, aimed: bool) -> bo
     return name in scenario_names() and not (aimed and name in resource_names("urdf", ".urdf"))
 
 
-def _scenario(what: SpaceRobot | Scenario | str | Path) -> Scenario:
+def _scenario_to_fly(what: SpaceRobot | Scenario | str | Path) -> Scenario:
     """Return the scenario to fly; a robot alone is a scenario without a goal."""
     match what:
         case Scenario():
@@ -174,14 +174,14 @@ def _scenario(what: SpaceRobot | Scenario | str | Path) -> Scenario:
             return scenario_or_robot(str(what))
 
 
-def _aimed(scenario: Scenario, *given: Any) -> Scenario:
+def _with_goal(scenario: Scenario, *given: Any) -> Scenario:
     """Return a scenario with another goal, without published figures."""
     if all(each is None for each in given):
         return scenario
-    return replace(scenario, goal=_goal(scenario.goal, *given), published=(), has_goal=True)
+    return replace(scenario, goal=_changed_goal(scenario.goal, *given), published=(), has_goal=True)
 
 
-def _goal(
+def _changed_goal(
     before: Goal,
     goal: Goal | npt.ArrayLike | None,
     position: npt.ArrayLike | None,
@@ -192,21 +192,21 @@ def _goal(
     if isinstance(goal, Goal):
         made = goal
     elif goal is not None:
-        pose = _numbers(goal, "goal")
+        pose = _float_list(goal, "goal")
         if len(pose) not in (3, 7):
             raise GoalError(f"A goal is 3 or 7 numbers, not {len(pose)}: position, quaternion.")
         given = Goal.checked(pose[:3], pose[3:] or before.quaternion)
         made = replace(before, position=given.position, quaternion=given.quaternion)
     if position is not None:
-        given = Goal.checked(_numbers(position, "position"), made.quaternion)
+        given = Goal.checked(_float_list(position, "position"), made.quaternion)
         made = replace(made, position=given.position)
     if rotvec is not None:
-        given = Goal.from_rotvec(made.position.tolist(), _numbers(rotvec, "rotvec"))
+        given = Goal.from_rotvec(made.position.tolist(), _float_list(rotvec, "rotvec"))
         made = replace(made, quaternion=given.quaternion)
     return made
 
 
-def _numbers(values: npt.ArrayLike, what: str) -> list[float]:
+def _float_list(values: npt.ArrayLike, what: str) -> list[float]:
     try:
         return [float(x) for x in np.asarray(values, dtype=float).reshape(-1)]
     except (TypeError, ValueError, OverflowError):

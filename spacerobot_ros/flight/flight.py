@@ -44,18 +44,18 @@ if TYPE_CHECKING:
 
     from spacerobot_ros.scenario import Scenario
 
-_FIRST_CAPACITY = 1024
+_INITIAL_ROWS = 1024
 
-_TRUE = ("pose", "twist", "q", "qdot", "effort", "momentum")
+_TRUE_QUANTITIES = ("pose", "twist", "q", "qdot", "effort", "momentum")
 """Quantities that are attributes of a flight."""
 
-_WIDTHS = {
+_QUANTITY_SIZES = {
     **dict.fromkeys(("pose", "momentum", "measured_pose", "end_effector_pose"), 7),
     **dict.fromkeys(("twist", "measured_twist", "expected_momenta"), 6),
 }
 """Numbers in a sample; those of other quantities are one for each joint."""
 
-_FOLLOWED = frozenset(("executing", "reached", "failed", "aborted"))
+_FLOWN_STATES = frozenset(("executing", "reached", "failed", "aborted"))
 """States of a status whose goal is, or was, flown to."""
 
 
@@ -70,7 +70,7 @@ class Signal:
         return len(self.time)
 
     @classmethod
-    def none(cls, width: int) -> Signal:
+    def empty(cls, width: int) -> Signal:
         """Return a signal without samples."""
         return cls(np.empty(0), np.empty((0, width)))
 
@@ -176,7 +176,7 @@ class Flight:
         found = self.series.get(name)
         if found is not None:
             return found
-        return Signal.none(_WIDTHS.get(name, len(self.joint_names)))
+        return Signal.empty(_QUANTITY_SIZES.get(name, len(self.joint_names)))
 
     @property
     def time(self) -> Array:
@@ -220,7 +220,9 @@ class Flight:
         Names are those of :class:`~spacerobot_ros.simulation.sensors.ReportedState`:
         measured states (only where sensors err), the end-effector, thrusters, expected momenta.
         """
-        return {name: self.series[name].values for name in self.series if name not in _TRUE}
+        return {
+            name: self.series[name].values for name in self.series if name not in _TRUE_QUANTITIES
+        }
 
     def required_robot(self) -> RobotDescription:
         """Return the robot.
@@ -477,7 +479,7 @@ def goal_of(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
 def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal | None:
     """Return the goal that was flown to last, or else the one that was sent last."""
     for status in reversed(list(statuses)):
-        if status.state.value in _FOLLOWED:
+        if status.state.value in _FLOWN_STATES:
             goal = goal_of(status, goals)
             if goal is not None:
                 return goal
@@ -519,12 +521,13 @@ class FlightLog:
         if self._thrusters is not None:
             sources["propellant"] = self._propellant
         self._sources, self._parts = sources, tuple(sources.values())
-        self._states = _Rows(sum(source.size for source in self._parts))
+        self._states = _GrowingTable(sum(source.size for source in self._parts))
         """All quantities of a state side by side."""
         self._commands = {
-            source.topic: (array("q"), _Rows(len(source.limits))) for source in commands.sources
+            source.topic: (array("q"), _GrowingTable(len(source.limits)))
+            for source in commands.sources
         }
-        self._lost: list[int] = []
+        self._ticks_without_pose: list[int] = []
         self._sensors = reported.sensors
 
     def add_state(self, tick: int) -> None:
@@ -533,12 +536,12 @@ class FlightLog:
             self._propellant[0] = self._thrusters.propellant
         np.concatenate(self._parts, out=self._states.next_row())
         if self._sensors.dropout:
-            self._lost.append(tick)
+            self._ticks_without_pose.append(tick)
 
     def add_command(self, topic: str, tick: int, values: Array) -> None:
         """Add a command."""
         if topic not in self._commands:
-            self._commands[topic] = array("q"), _Rows(len(values))
+            self._commands[topic] = array("q"), _GrowingTable(len(values))
         ticks, rows = self._commands[topic]
         ticks.append(tick)
         rows.next_row()[:] = values
@@ -561,7 +564,7 @@ class FlightLog:
         columns = np.split(table, ends[:-1], axis=1)
         states = {name: each.copy() for name, each in zip(self._sources, columns, strict=True)}
         lost = np.zeros((count, 1))
-        lost[self._lost] = 1.0
+        lost[self._ticks_without_pose] = 1.0
         states["pose_lost"] = lost
         time: Array = np.arange(count) * self._period_ns / SECOND
         return Flight(
@@ -588,11 +591,11 @@ class FlightLog:
         )
 
 
-class _Rows:
+class _GrowingTable:
     """A table that grows by rows."""
 
     def __init__(self, size: int) -> None:
-        self._table = np.empty((_FIRST_CAPACITY, size))
+        self._table = np.empty((_INITIAL_ROWS, size))
         self._count = 0
 
     def next_row(self) -> Array:

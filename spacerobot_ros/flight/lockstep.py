@@ -56,10 +56,10 @@ Progress = Callable[[float, float], bool]
 """Called now and then with simulated time and the time the present schedule ends, s; returns
 whether the flight is to end."""
 
-_LOOK_PERIOD = 0.2
+_PROGRESS_PERIOD = 0.2
 """Wall s between two looks at whether the flight is to end."""
 
-_LOOKED_AT = 64
+_TICKS_PER_CLOCK_READ = 64
 """Ticks between two looks at the wall clock."""
 
 
@@ -165,7 +165,7 @@ def fly_scenario(
     return _LockstepFlight(scenario, robots or Robots.of(scenario)).fly(progress, longest)
 
 
-class _Moment(Enum):
+class _DecisionMoment(Enum):
     """When a commander has decided about the goal, as the plant sees it."""
 
     BEFORE_COMMAND = "before its command"
@@ -214,8 +214,8 @@ class _LockstepFlight:
         self._faults_seen = self._plant.active
         self.log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
         self._follower = GoalFollower(GoalIds().of(*_GOAL_STAMP))
-        self._decided: _Moment | None = None
-        self._moment = _Moment.BEFORE_COMMAND
+        self._decided: _DecisionMoment | None = None
+        self._moment = _DecisionMoment.BEFORE_COMMAND
         self._status: Status | None = None
         self._planner: PlannerCommander | None = None
         self._controller: ControllerCommander | None = None
@@ -240,7 +240,7 @@ class _LockstepFlight:
     def fly(self, progress: Progress, longest: float) -> Flight:
         """Fly to the decision about the goal."""
         began, interrupted = time.perf_counter(), ""
-        looked = began
+        reported_at = began
         self._commands.begin(0)
         for source in self._commands.sources:
             wrench = source.quantity == "wrench"
@@ -248,13 +248,13 @@ class _LockstepFlight:
         self._commands.require_commanded()
         for commander in self._commanders:
             commander.activate()
-        self._look_at_plant(PlantState.RUNNING)
-        self._moment = _Moment.BEFORE_COMMAND
+        self._report_plant_status(PlantState.RUNNING)
+        self._moment = _DecisionMoment.BEFORE_COMMAND
         self._send_goals()
         self._report_state()
         while True:
-            self._answer()
-            if self._decided is _Moment.BEFORE_COMMAND:
+            self._answer_state()
+            if self._decided is _DecisionMoment.BEFORE_COMMAND:
                 break
             if not self._commands.complete and not self._reported.sensors.dropout:
                 interrupted = f"No command answers the state of {self._time:g} s."
@@ -264,15 +264,18 @@ class _LockstepFlight:
                 break
             self._report_state()
             if self._plant.active is not self._faults_seen:
-                self._look_at_plant(PlantState.RUNNING)
+                self._report_plant_status(PlantState.RUNNING)
             if ends:
                 break
             if self._time >= longest:
                 interrupted = f"Interrupted after {self._time:.6g} s of simulated time."
                 break
-            if self._tick % _LOOKED_AT == 0 and time.perf_counter() - looked >= _LOOK_PERIOD:
-                looked = time.perf_counter()
-                if progress(self._time, self._ends_at):
+            if (
+                self._tick % _TICKS_PER_CLOCK_READ == 0
+                and time.perf_counter() - reported_at >= _PROGRESS_PERIOD
+            ):
+                reported_at = time.perf_counter()
+                if progress(self._time, self._expected_end):
                     interrupted = f"Interrupted after {self._time:.6g} s of simulated time."
                     break
         return self._result(time.perf_counter() - began, interrupted)
@@ -287,7 +290,7 @@ class _LockstepFlight:
         return self._tick * self._period_ns / SECOND
 
     @property
-    def _ends_at(self) -> float:
+    def _expected_end(self) -> float:
         return self._status.ends_at_s if isinstance(self._status, PlannerStatus) else 0.0
 
     def _report_state(self) -> None:
@@ -304,14 +307,14 @@ class _LockstepFlight:
             sentence = f"The plant stops at {self._time:g} s: {error}"
             self._monitor.failure = "model", sentence
             self._commands.rest()
-            self._look_at_plant(PlantState.FAILED)
+            self._report_plant_status(PlantState.FAILED)
             return False
         self._tick += 1
         return True
 
-    def _answer(self) -> None:
+    def _answer_state(self) -> None:
         """Have the commanders answer the present state."""
-        self._moment = _Moment.BEFORE_COMMAND
+        self._moment = _DecisionMoment.BEFORE_COMMAND
         quantities, now = self._reported.quantities, self._tick * self._period_ns
         q, qdot = quantities["measured_q"], quantities["measured_qdot"]
         if self._controller is not None:
@@ -330,8 +333,8 @@ class _LockstepFlight:
         source, setpoint = self._commands.sources[0], self._planner.setpoint
         velocity = source.quantity == "velocity"
         values = setpoint.velocity if velocity else np.zeros(len(setpoint.velocity))
-        self._offer(source, values, stamp_ns)
-        self._moment = _Moment.AFTER_COMMAND
+        self._offer_command(source, values, stamp_ns)
+        self._moment = _DecisionMoment.AFTER_COMMAND
 
     def _send_reference(self, stamp_ns: int) -> None:
         """Give the setpoint of a planner to the controller."""
@@ -350,24 +353,24 @@ class _LockstepFlight:
             values = self._controller.wrench if source.quantity == "wrench" else effort
             if source.quantity == "velocity":
                 values = np.zeros(len(effort))
-            self._offer(source, values, now)
-        self._moment = _Moment.AFTER_COMMAND
+            self._offer_command(source, values, now)
+        self._moment = _DecisionMoment.AFTER_COMMAND
 
-    def _offer(self, source: CommandSource, values: Array, now: int) -> None:
+    def _offer_command(self, source: CommandSource, values: Array, now: int) -> None:
         self.log.add_command(source.topic, self._tick, values)
-        if self._decided is _Moment.BEFORE_COMMAND:
+        if self._decided is _DecisionMoment.BEFORE_COMMAND:
             return
         refusal = self._commands.offer(source, now, values, now)
         if refusal is not None:
             self.log.refusals.append((self._time, source.topic, refusal))
             if refusal.latches:
-                self._look_at_plant(PlantState.RUNNING)
+                self._report_plant_status(PlantState.RUNNING)
 
     # -- the status of the plant --------------------------------------------------------------
 
-    def _look_at_plant(self, activity: PlantState) -> None:
+    def _report_plant_status(self, activity: PlantState) -> None:
         """Pass a change of the plant's status to the commanders."""
-        self._faults_seen, self._moment = self._plant.active, _Moment.AFTER_COMMAND
+        self._faults_seen, self._moment = self._plant.active, _DecisionMoment.AFTER_COMMAND
         before = self._monitor.status
         self.log.events += self._monitor.update(activity, self._time)
         status = self._monitor.status

@@ -38,18 +38,18 @@ from spacerobot_ros.scenario import COMMANDERS, CONFIGS, Published, Scenario
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS, StateField
 
-_SAME_CLOCK = 1.0
+_SAME_CLOCK_TOLERANCE = 1.0
 """Stamps this near to the log times, in s, come from the same clock."""
 
-_COMMANDS = ("joint_commands", "base_wrench", "joint_reference")
+_COMMAND_TOPICS = ("joint_commands", "base_wrench", "joint_reference")
 
-WRENCH = TOPICS["base_wrench_realised"].state[0].columns
+WRENCH_COLUMNS = TOPICS["base_wrench_realised"].state[0].columns
 """Paths of force and torque in a message of a wrench."""
 
 T = TypeVar("T")
 
 
-class _Lazy(Mapping[str, T]):
+class _LazyMapping(Mapping[str, T]):
     """A mapping whose values are made when they are first asked for."""
 
     def __init__(self, makers: Mapping[str, Callable[[], T]]) -> None:
@@ -86,7 +86,7 @@ class FlightBag:
         self.namespace = namespace
         self.parts = [RecordedRobot(bag, namespace) for bag in bags]
         states = [s for name in ("odom", "joint_states", "momentum") for s in self.all(name)[:1]]
-        self.stamped = all(abs(s.stamp[0] - s.time[0]) < _SAME_CLOCK for s in states)
+        self.stamped = all(abs(s.stamp[0] - s.time[0]) < _SAME_CLOCK_TOLERANCE for s in states)
         self.began = min((self._times(s)[0] for s in states), default=bags[0].start_time)
         """Time of the first state, s."""
 
@@ -139,11 +139,11 @@ class FlightBag:
         width
             Number of columns.
         """
-        found = [Signal.none(width)]
+        found = [Signal.empty(width)]
         for series in self.all(name):
             values = series.table(fields, width)
             if TOPICS[name].type == TOPICS["joint_states"].type:
-                values = _by_name(values, series, self.names(name))
+                values = _sort_by_name(values, series, self.names(name))
             whole = np.isfinite(values).all(axis=1)
             found.append(Signal(self._times(series)[whole], values[whole]))
         time: Array = np.concatenate([each.time for each in found])
@@ -201,7 +201,7 @@ class FlightBag:
         ):
             for field in TOPICS[name].state if self.all(name) else ():
                 makers[field.quantity] = partial(self.quantity, name, field)
-        return _Lazy(makers)
+        return _LazyMapping(makers)
 
     def _times(self, series: TopicSeries) -> Array:
         return series.stamp if self.stamped else series.time
@@ -254,7 +254,7 @@ class FlightBag:
 
         def read(name: str) -> Commands:
             config = scenario.plant
-            fields, width = (WRENCH, 6) if name == "base_wrench" else (["velocity"], n)
+            fields, width = (WRENCH_COLUMNS, 6) if name == "base_wrench" else (["velocity"], n)
             if name == "joint_commands" and config.actuation != "velocity":
                 fields = ["effort"]
             each = self.all(name)
@@ -263,10 +263,12 @@ class FlightBag:
                 np.concatenate([series.table(fields, width) for series in each]),
             )
 
-        return _Lazy({name: partial(read, name) for name in _COMMANDS if self.all(name)})
+        return _LazyMapping(
+            {name: partial(read, name) for name in _COMMAND_TOPICS if self.all(name)}
+        )
 
 
-def _by_name(values: Array, series: TopicSeries, names: list[str]) -> Array:
+def _sort_by_name(values: Array, series: TopicSeries, names: list[str]) -> Array:
     """Return numbers (N, n) of joints in the order of ``names``; nan of those that lack one."""
     if series.constant("name"):
         return values
@@ -296,7 +298,7 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
     RecordingError
         There is no such bag or robot, or it is damaged.
     """
-    bags = [read_bag(part) for part in _files(Path(path))]
+    bags = [read_bag(part) for part in _bag_files(Path(path))]
     prefixes = sorted({name for bag in bags for name in namespaces(bag)})
     chosen = prefixes[0] if prefixes else ""
     if namespace is not None:
@@ -319,7 +321,7 @@ def namespaces(bag: Bag) -> list[str]:
     )
 
 
-def _files(path: Path) -> list[Path]:
+def _bag_files(path: Path) -> list[Path]:
     """Return the files of a bag in order: one, or ``NAME_0``, ``NAME_1``, ... if it was split."""
     if path.exists():
         return [path]
@@ -342,7 +344,7 @@ def read_flight(bag: FlightBag) -> Flight:
     description, names = bag.description, bag.names("joint_states")
     if not names and description is not None:
         names = list(description.joint_names)
-    scenario = _scenario(bag)
+    scenario = _scenario_in_bag(bag)
     statuses = {name: _read_statuses(bag, name) for name in COMMANDERS}
     decider = next((name for name in COMMANDERS if statuses[name]), COMMANDERS[0])
     goals, tool_goals = bag.goals("goal_pose"), bag.goals("end_effector/goal_pose")
@@ -415,7 +417,7 @@ def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Fli
         return impulse(flight.signal("thruster_force"), table.mass_flow / table.force)
 
     makers = {name: partial(series.__getitem__, name) for name in series}
-    return replace(flight, series=_Lazy({**makers, "propellant": used}))
+    return replace(flight, series=_LazyMapping({**makers, "propellant": used}))
 
 
 def impulse(thrust: Signal, weights: Array) -> Signal:
@@ -429,11 +431,11 @@ def _read_statuses(bag: FlightBag, commander: str) -> list[tuple[int, Status]]:
     return [(time, s) for time, s in bag.statuses(commander) if not isinstance(s, str)]
 
 
-def _scenario(bag: FlightBag) -> Scenario:
+def _scenario_in_bag(bag: FlightBag) -> Scenario:
     """Return the scenario of a flight, as far as its bag holds it."""
     about = bag.metadata.get("scenario", {})
     nodes = {
-        node: {name: _json(text) for name, text in bag.metadata[f"parameters/{node}"].items()}
+        node: {name: _parse_json(text) for name, text in bag.metadata[f"parameters/{node}"].items()}
         for node in CONFIGS
         if f"parameters/{node}" in bag.metadata
     }
@@ -446,10 +448,10 @@ def _scenario(bag: FlightBag) -> Scenario:
     with suppress(KeyError, TypeError, ValueError):
         published = tuple(
             Published(str(r["quantity"]), [float(x) for x in r["printed"]], str(r["note"]))
-            for r in _json(about.get("published", "[]"))
+            for r in _parse_json(about.get("published", "[]"))
         )
     with suppress(KeyError, ValueError):
-        goal, end_effector_goal = _goal(about, "goal"), _goal(about, "end_effector_goal")
+        goal, end_effector_goal = _sent_goal(about, "goal"), _sent_goal(about, "end_effector_goal")
     shape = next(bag.messages("goal_joint_states"), None)
     # Without any joint positions the shape was free.
     if goal is not None and shape is not None and len(shape[1].position):
@@ -470,7 +472,7 @@ def _scenario(bag: FlightBag) -> Scenario:
     )
 
 
-def _json(text: str) -> Any:
+def _parse_json(text: str) -> Any:
     """Return a value that was written as JSON; None where it cannot be read."""
     try:
         return json.loads(text)
@@ -489,7 +491,7 @@ def recorded_scenario(bag: Bag) -> Scenario:
     RecordingError
         The bag lacks the goal or the parameters.
     """
-    scenario = _scenario(FlightBag([bag]))
+    scenario = _scenario_in_bag(FlightBag([bag]))
     if not scenario.has_goal or "plant" not in scenario.in_file:
         raise RecordingError(
             f"The bag {bag.path} lacks the goal or the parameters of its flight, which bags of "
@@ -498,7 +500,7 @@ def recorded_scenario(bag: Bag) -> Scenario:
     return scenario
 
 
-def _goal(about: Mapping[str, str], name: str) -> Goal | None:
+def _sent_goal(about: Mapping[str, str], name: str) -> Goal | None:
     """Return a goal exactly as it was sent."""
     if f"{name}_position" not in about:
         return None

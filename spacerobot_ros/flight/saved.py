@@ -52,7 +52,7 @@ def save_flight(flight: Flight, path: str | os.PathLike[str], *, overwrite: bool
         installed.
     """
     scenario, robot = flight.scenario, flight.required_robot()
-    streams = [*_states(flight), *_others(flight)]
+    streams = [*_state_streams(flight), *_other_streams(flight)]
     with BagWriter(path, overwrite=overwrite) as writer:
         writer.add_metadata("spacerobot", {"version": __version__})
         nodes = ["plant", *scenario.commanders]
@@ -76,12 +76,12 @@ def save_flight(flight: Flight, path: str | os.PathLike[str], *, overwrite: bool
             writer.write(channel, data, time, time)
 
 
-def _states(flight: Flight) -> Iterator[_Stream]:
+def _state_streams(flight: Flight) -> Iterator[_Stream]:
     """Yield the topics of the plant's state, in the order of their publication."""
     period = round(flight.control_period * SECOND)
     stamps: NDArray[np.int64] = np.arange(len(flight.time), dtype=np.int64) * period
     config, robot = flight.scenario.plant, flight.required_robot()
-    quantities = _quantities(flight)
+    quantities = _topic_quantities(flight)
     thrusters: tuple[str, ...] = ()
     if "thruster_duty" in quantities:
         thrusters = tuple(find_thrusters(config.thrusters, robot).names)
@@ -111,7 +111,7 @@ def _states(flight: Flight) -> Iterator[_Stream]:
         )
 
 
-def _quantities(flight: Flight) -> dict[str, Array]:
+def _topic_quantities(flight: Flight) -> dict[str, Array]:
     """Return all quantities by the names of the table of topics."""
     true = {"pose": flight.pose, "twist": flight.twist, "q": flight.q, "qdot": flight.qdot}
     found = {**flight.quantities, "effort": flight.effort, "momentum": flight.momentum}
@@ -123,7 +123,7 @@ def _quantities(flight: Flight) -> dict[str, Array]:
     return {**found, "pose": flight.pose}
 
 
-def _others(flight: Flight) -> Iterator[_Stream]:
+def _other_streams(flight: Flight) -> Iterator[_Stream]:
     """Yield goals, commands, plans, statuses, events and the description of the robot."""
     scenario, zero = flight.scenario, np.zeros(1, dtype=np.int64)
     world = scenario.plant.world_frame
@@ -138,8 +138,8 @@ def _others(flight: Flight) -> Iterator[_Stream]:
     for name, goal in goals.items():
         if goal is not None:
             yield _Stream(TOPICS[name], zero, [goal_message(goal, world, stamp_ns=1)])
-    yield from _commands(flight)
-    yield from _plans(flight, world)
+    yield from _command_streams(flight)
+    yield from _plan_streams(flight, world)
     named = {"planner/status": PlannerStatus, "controller/status": ControllerStatus}
     for name, kind in named.items():
         found = [(time, status) for time, status in flight.statuses if isinstance(status, kind)]
@@ -159,7 +159,7 @@ def _others(flight: Flight) -> Iterator[_Stream]:
     yield _Stream(TOPICS["events"], times, events)
 
 
-def _commands(flight: Flight) -> Iterator[_Stream]:
+def _command_streams(flight: Flight) -> Iterator[_Stream]:
     period = round(flight.control_period * SECOND)
     velocity = flight.scenario.plant.actuation == "velocity"
     for name, commands in flight.commands.items():
@@ -179,7 +179,7 @@ def _commands(flight: Flight) -> Iterator[_Stream]:
             )
 
 
-def _plans(flight: Flight, world: str) -> Iterator[_Stream]:
+def _plan_streams(flight: Flight, world: str) -> Iterator[_Stream]:
     if not flight.schedules:
         return
     times = np.array([time for time, _ in flight.schedules], dtype=np.int64)

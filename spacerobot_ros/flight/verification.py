@@ -37,10 +37,10 @@ TOLERANCE = 1e-9
 """Deviation that is no difference, absolute below 1 (SI units) and relative above."""
 
 
-_MOST_TICKS_A_STATE, _MOST_SILENT_TICKS = 10, 20_000
+_MAX_TICKS_PER_STATE, _MAX_SILENT_TICKS = 10, 20_000
 """A recorder that was paused for a while leaves a gap; stamps of no flight leave a larger one."""
 
-_EXPLAINING = ("joint_states", "odom")
+_TOPICS_COMPARED_FIRST = ("joint_states", "odom")
 """Topics in which a difference is looked for first, because it explains those in the others."""
 
 Floats = NDArray[np.float64]
@@ -123,7 +123,7 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
         Its robot or its plant's parameters are refused.
     """
     flight = _RecordedPlant.of(read_bag(path))
-    published = _published(flight)
+    published = _published_topics(flight)
     first = min(int(p.ticks.min()) for p in published)
     last = max(int(p.ticks.max()) for p in published)
     if first == last:
@@ -131,15 +131,15 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
             f"The bag {flight.path} holds the states of one tick: there is nothing to verify."
         )
     states = sum(len(p.ticks) for p in published)
-    if first < 0 or last - first > _MOST_SILENT_TICKS + _MOST_TICKS_A_STATE * states:
+    if first < 0 or last - first > _MAX_SILENT_TICKS + _MAX_TICKS_PER_STATE * states:
         raise RecordingError(
             f"The states in the bag {flight.path} are stamped {first * flight.config.period_ns}"
             f" to {last * flight.config.period_ns} ns, and there are {states} of them: a flight "
             "has a state in every tick."
         )
-    resimulation = _resimulate(flight, _initial(first, published, flight), first, last)
+    resimulation = _resimulate(flight, _initial_state(first, published, flight), first, last)
     published = [p for p in published if p.follows_from(resimulation.states)]
-    missing = _missing(flight, published, resimulation)
+    missing = _missing_states(flight, published, resimulation)
     if first > 0:
         # The first state is an input: the commands before it are not in the bag.
         published = [p.after(first) for p in published]
@@ -187,8 +187,8 @@ class _RecordedPlant:
         RobotDescriptionError
             Its URDF is refused.
         """
-        recorded = _recorded(bag)
-        config = _config(recorded)
+        recorded = _recorded_robot(bag)
+        config = _plant_config(recorded)
         urdf = recorded.urdf
         if urdf is None:
             raise RecordingError(f"The bag {bag.path} holds no description of its robot.")
@@ -253,7 +253,7 @@ def read_command(
     return values
 
 
-def _recorded(bag: Bag) -> RecordedRobot:
+def _recorded_robot(bag: Bag) -> RecordedRobot:
     """Return the one robot of which the bag holds odom and joint_states."""
     candidates = [RecordedRobot(bag, name) for name in namespaces(bag)]
     found = [each for each in candidates if each.get("odom") and each.get("joint_states")]
@@ -267,7 +267,7 @@ def _recorded(bag: Bag) -> RecordedRobot:
     return found[0]
 
 
-def _config(recorded: RecordedRobot) -> PlantConfig:
+def _plant_config(recorded: RecordedRobot) -> PlantConfig:
     bag, texts = recorded.bag, recorded.metadata.get("parameters/plant")
     if texts is None:
         raise RecordingError(
@@ -295,7 +295,7 @@ def _config(recorded: RecordedRobot) -> PlantConfig:
 
 
 @dataclass(frozen=True)
-class _Published:
+class _PublishedTopic:
     """The messages of one topic: ticks (N,), numbers (N, m), and what each number is called."""
 
     topic: Topic
@@ -304,7 +304,7 @@ class _Published:
     values: Floats
     labels: list[str]
 
-    def after(self, tick: int) -> _Published:
+    def after(self, tick: int) -> _PublishedTopic:
         """Leave out the messages until a tick, from which on-times of thrusters count."""
         kept = self.ticks > tick
         values = self.values[kept]
@@ -336,12 +336,12 @@ class _Published:
         return expected
 
 
-def _published(flight: _RecordedPlant) -> list[_Published]:
+def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
     """Read the state topics; the plant stamps those without a header like its odometry."""
     recorded, period, names = flight.recorded, flight.config.period_ns, flight.robot.joint_names
-    published: list[_Published] = []
+    published: list[_PublishedTopic] = []
     clock = recorded["odom"].stamp_ns
-    for topic in sorted(state_topics(), key=_rank):
+    for topic in sorted(state_topics(), key=_comparison_rank):
         series = recorded.get(topic.name)
         if series is None:
             continue
@@ -366,12 +366,12 @@ def _published(flight: _RecordedPlant) -> list[_Published]:
         # A message with another number of values than it should have.
         table[np.isnan(table).any(axis=1)] = np.nan
         flat = [label for words in labels for label in words]
-        published.append(_Published(topic, series.topic, ticks, table, flat))
+        published.append(_PublishedTopic(topic, series.topic, ticks, table, flat))
     return published
 
 
-def _missing(
-    flight: _RecordedPlant, published: list[_Published], resimulation: _Resimulation
+def _missing_states(
+    flight: _RecordedPlant, published: list[_PublishedTopic], resimulation: _Resimulation
 ) -> str:
     """Return a message about states that the bag lacks; empty for none.
 
@@ -380,7 +380,7 @@ def _missing(
     """
     recorded = flight.recorded
     counts = recorded.metadata.get("recorder", {})
-    written, lost = (_count(counts.get(name)) for name in ("messages", "messages_lost"))
+    written, lost = (_parse_count(counts.get(name)) for name in ("messages", "messages_lost"))
     held = recorded.bag.message_count()
     if resimulation.first == 0 and written > held:
         return f"its recorder wrote {written} messages, and it holds {held}."
@@ -395,16 +395,20 @@ def _missing(
     return ""
 
 
-def _count(text: str | None) -> int:
+def _parse_count(text: str | None) -> int:
     return int(text) if text is not None and text.isdecimal() else 0
 
 
-def _rank(topic: Topic) -> int:
-    return _EXPLAINING.index(topic.name) if topic.name in _EXPLAINING else len(_EXPLAINING)
+def _comparison_rank(topic: Topic) -> int:
+    return (
+        _TOPICS_COMPARED_FIRST.index(topic.name)
+        if topic.name in _TOPICS_COMPARED_FIRST
+        else len(_TOPICS_COMPARED_FIRST)
+    )
 
 
-def _initial(
-    first: int, published: list[_Published], flight: _RecordedPlant
+def _initial_state(
+    first: int, published: list[_PublishedTopic], flight: _RecordedPlant
 ) -> InitialState | None:
     """Return the first state in the bag; None, for the parameters, if it is the very first."""
     if first == 0:
@@ -504,7 +508,7 @@ def _resimulate(
 
 
 def _require_no_reset(
-    flight: _RecordedPlant, published: list[_Published], resimulation: _Resimulation
+    flight: _RecordedPlant, published: list[_PublishedTopic], resimulation: _Resimulation
 ) -> None:
     """Refuse a bag in which a state is published a second time, and is the initial one again."""
     for p in published:
@@ -531,11 +535,11 @@ class _Comparison:
     def __init__(
         self,
         flight: _RecordedPlant,
-        published: list[_Published],
+        published: list[_PublishedTopic],
         resimulation: _Resimulation,
         tolerance: float,
     ) -> None:
-        self._flight, self._done, self._tolerance = flight, resimulation, tolerance
+        self._flight, self._resimulation, self._tolerance = flight, resimulation, tolerance
         self._period = flight.config.period_ns
         self._pairs = [(p, *self._deviation(p)) for p in published]
 
@@ -550,8 +554,8 @@ class _Comparison:
             if counted.size and counted.max() > largest:
                 row, column = map(int, np.unravel_index(int(counted.argmax()), counted.shape))
                 largest = float(counted.max())
-                largest_at = self._at(p, expected, row, column)
-        ticks = self._done.end - self._done.first
+                largest_at = self._difference_at(p, expected, row, column)
+        ticks = self._resimulation.end - self._resimulation.first
         return Verification(
             ticks=ticks,
             duration=ticks * self._period / SECOND,
@@ -562,12 +566,12 @@ class _Comparison:
             difference=difference,
         )
 
-    def _deviation(self, p: _Published) -> tuple[Floats, Floats]:
+    def _deviation(self, p: _PublishedTopic) -> tuple[Floats, Floats]:
         """Return the expected values and the deviations, both in the shape of the bag's values."""
-        rows = np.minimum(p.ticks, self._done.end) - self._done.first
-        expected = p.expected(self._done.states, rows)
+        rows = np.minimum(p.ticks, self._resimulation.end) - self._resimulation.first
+        expected = p.expected(self._resimulation.states, rows)
         deviation = np.abs(p.values - expected) / np.maximum(1.0, np.abs(expected))
-        deviation[p.ticks > self._done.end] = np.nan
+        deviation[p.ticks > self._resimulation.end] = np.nan
         return expected, deviation
 
     def _first_difference(self) -> Difference | None:
@@ -582,11 +586,14 @@ class _Comparison:
             tick = int(p.ticks[row])
             if found is None or tick < found[0]:
                 column = int(np.flatnonzero(wrong[row])[0])
-                found = tick, self._at(p, expected, row, column, self._remark(tick))
+                found = (
+                    tick,
+                    self._difference_at(p, expected, row, column, self._command_remark(tick)),
+                )
         return found[1] if found else None
 
-    def _at(
-        self, p: _Published, expected: Floats, row: int, column: int, remark: str = ""
+    def _difference_at(
+        self, p: _PublishedTopic, expected: Floats, row: int, column: int, remark: str = ""
     ) -> Difference:
         return Difference(
             float(p.ticks[row] * self._period / SECOND),
@@ -597,22 +604,23 @@ class _Comparison:
             remark,
         )
 
-    def _remark(self, tick: int) -> str:
+    def _command_remark(self, tick: int) -> str:
         """Return a clause on why the commands of a tick had no effect; empty where they had."""
-        done, before = self._done, tick - 1
+        done, before = self._resimulation, tick - 1
         if tick > done.end:
             return f" (its plant had stopped: {done.stopped.rstrip('.')})"
         if done.latched is not None and tick > done.latched:
-            time = self._time(done.latched)
+            time = self._format_time(done.latched)
             return f" (a fault latched at {time}; rearming is not in a bag)"
         if before in done.refusals:
             topic, refusal = done.refusals[before]
             name = f"{self._flight.recorded.namespace}/{topic}"
-            return f" (that on {name} stamped {self._time(before)} is refused: {refusal.clause})"
+            stamp = self._format_time(before)
+            return f" (that on {name} stamped {stamp} is refused: {refusal.clause})"
         if tick > done.first and before not in done.given:
             name = f"{self._flight.recorded.namespace}/joint_commands"
-            return f" (no message on {name} is stamped {self._time(before)})"
+            return f" (no message on {name} is stamped {self._format_time(before)})"
         return ""
 
-    def _time(self, tick: int) -> str:
+    def _format_time(self, tick: int) -> str:
         return f"{tick * self._period / SECOND:.9g} s"

@@ -29,10 +29,10 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _DASHES = ("-", "--", "-.", ":")
 """Line styles of the joints beyond the number of colours."""
 
-_INK, _GOAL = "#1f2328", "#CC79A7"
-_MOST_FRAMES = 1000
+_ROBOT_COLOUR, _GOAL_COLOUR = "#1f2328", "#CC79A7"
+_MAX_FRAMES = 1000
 
-_NAMES = {
+_COLUMN_NAMES = {
     "pose": ("x", "y", "z", "qx", "qy", "qz", "qw"),
     "twist": ("vx", "vy", "vz", "wx", "wy", "wz"),
     "momentum": ("px", "py", "pz", "Lx", "Ly", "Lz", "kinetic_energy"),
@@ -94,13 +94,13 @@ def table(flight: Flight) -> pd.DataFrame:
         ) from None
     names = flight.joint_names
     columns: dict[str, Array] = {}
-    for quantity, words in _NAMES.items():
+    for quantity, words in _COLUMN_NAMES.items():
         for word, column in zip(words, getattr(flight, quantity).T, strict=True):
             columns[f"{quantity}.{word}"] = column
     for quantity in ("q", "qdot", "effort"):
         for word, column in zip(names, getattr(flight, quantity).T, strict=True):
             columns[f"{quantity}.{word}"] = column
-    labels = _labels(flight)
+    labels = _quantity_labels(flight)
     for quantity, values in flight.quantities.items():
         if len(values) == len(flight.time):
             for word, column in zip(labels.get(quantity, ()), values.T, strict=False):
@@ -108,12 +108,12 @@ def table(flight: Flight) -> pd.DataFrame:
     return pd.DataFrame(columns, index=pd.Index(flight.time, name="time"))
 
 
-def _labels(flight: Flight) -> dict[str, tuple[str, ...]]:
+def _quantity_labels(flight: Flight) -> dict[str, tuple[str, ...]]:
     """Return the names of the numbers in the other quantities."""
     names: dict[str, tuple[str, ...]] = {"propellant": ("",), "pose_lost": ("",)}
     for part in ("measured_pose", "end_effector_pose"):
-        names[part] = _NAMES["pose"]
-    names["measured_twist"] = _NAMES["twist"]
+        names[part] = _COLUMN_NAMES["pose"]
+    names["measured_twist"] = _COLUMN_NAMES["twist"]
     names["measured_q"] = names["measured_qdot"] = flight.joint_names
     for name in ("momentum_expected", "base_wrench_realised"):
         for field in TOPICS[name].state:
@@ -138,24 +138,24 @@ def figure(flight: Flight) -> Picture:
     place = target = None
     if goal is not None:
         place, target = goal.position, rotvec_from_quaternion(goal.quaternion)
-    _lines(panels[0], time, flight.pose[:, :3], "xyz", "position, m", place)
-    _lines(panels[1], time, attitude, "xyz", "rotation vector, rad", target)
+    _plot_lines(panels[0], time, flight.pose[:, :3], "xyz", "position, m", place)
+    _plot_lines(panels[1], time, attitude, "xyz", "rotation vector, rad", target)
     names = flight.joint_names
-    _lines(panels[2], time, flight.q, names, "joints, m or rad")
+    _plot_lines(panels[2], time, flight.q, names, "joints, m or rad")
     if efforts:
-        _lines(panels[3], time, flight.effort, names, "joint efforts, N or N m")
+        _plot_lines(panels[3], time, flight.effort, names, "joint efforts, N or N m")
     else:
-        _lines(panels[3], time, flight.qdot, names, "joint rates, 1/s")
+        _plot_lines(panels[3], time, flight.qdot, names, "joint rates, 1/s")
     if thrust and wrench is not None:
         norms: Array = np.linalg.norm(wrench.values.reshape(-1, 2, 3), axis=2)
         at = wrench.tick * np.float64(flight.control_period)
-        _lines(panels[4], at, norms, ("force, N", "torque, N m"), "thrust")
+        _plot_lines(panels[4], at, norms, ("force, N", "torque, N m"), "thrust")
     panels[-1].set_xlabel("time, s")
     made.suptitle(f"{flight.scenario.name}, {flight.method}: {flight.message}", fontsize=10)
     return made
 
 
-def _lines(
+def _plot_lines(
     axes: Any, time: Array, values: Array, names: Any, label: str, goal: Array | None = None
 ) -> None:
     for i, name in enumerate(names):
@@ -173,8 +173,8 @@ def animation(flight: Flight, seconds: float, frames: int) -> Animation:
     """Draw the robot in motion: its joints as points, the links between them as lines."""
     from matplotlib.animation import FuncAnimation
 
-    if not isinstance(frames, int) or not 1 <= frames <= _MOST_FRAMES:
-        raise ParameterError(f"An animation has 1 to {_MOST_FRAMES} frames, and not {frames!r}.")
+    if not isinstance(frames, int) or not 1 <= frames <= _MAX_FRAMES:
+        raise ParameterError(f"An animation has 1 to {_MAX_FRAMES} frames, and not {frames!r}.")
     if not (isinstance(seconds, int | float) and 0 < seconds < math.inf):
         raise ParameterError(f"An animation lasts more than 0 s, and not {seconds!r}.")
     rows = np.unique(np.linspace(0, len(flight.time) - 1, frames).round().astype(int))
@@ -199,9 +199,9 @@ def animation(flight: Flight, seconds: float, frames: int) -> Animation:
         zlabel="z, m",
     )
     for a, b in skeleton.links if len(ghost) else ():
-        axes.plot(*ghost[[a, b]].T, color=_GOAL, alpha=0.35, linewidth=3)
+        axes.plot(*ghost[[a, b]].T, color=_GOAL_COLOUR, alpha=0.35, linewidth=3)
     axes.plot(*flight.pose[:, :3].T, color="#8a919c", linewidth=0.8)
-    lines = [axes.plot([], [], [], color=_INK, linewidth=2.5)[0] for _ in skeleton.links]
+    lines = [axes.plot([], [], [], color=_ROBOT_COLOUR, linewidth=2.5)[0] for _ in skeleton.links]
     (dots,) = axes.plot([], [], [], "o", color=_COLOURS[0], markersize=4)
 
     def draw(k: int) -> list[Any]:
@@ -214,7 +214,7 @@ def animation(flight: Flight, seconds: float, frames: int) -> Animation:
 
     interval = 1000.0 * seconds / len(rows)
     moving = FuncAnimation(made, draw, frames=len(rows), interval=interval)
-    return Animation(_offline(str(moving.to_jshtml(default_mode="loop"))))
+    return Animation(_without_remote_icons(str(moving.to_jshtml(default_mode="loop"))))
 
 
 _ICONS = {
@@ -230,7 +230,7 @@ _ICONS = {
 }
 
 
-def _offline(html: str) -> str:
+def _without_remote_icons(html: str) -> str:
     """Return matplotlib's page with characters for icons, which it would take from a server."""
     html = re.sub(r"<link\b[^>]*>", "", html)
     return re.sub(

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spacerobot_ros.errors import CommandError
-from spacerobot_ros.messages.layout import ENCAPSULATION, encode, encode_list, layout_of, times_of
+from spacerobot_ros.messages.layout import (
+    ENCAPSULATION,
+    encode,
+    encode_list,
+    layout_of,
+    stamp_pairs,
+)
 from spacerobot_ros.messages.readers import ODOMETRY, JointReader, TemplateReader
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, Frames
@@ -21,8 +27,8 @@ TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 TRANSFORMS, STATIC_TRANSFORMS = "/tf", "/tf_static"
 """Names of the topics where no remap moves them."""
 
-_NUMBERS = 7
-_POSE = "pose.pose.position.x"
+_NUMBERS_PER_POSE = 7
+_POSE_PATH = "pose.pose.position.x"
 
 
 class TransformTemplate:
@@ -51,7 +57,7 @@ class TransformTemplate:
         self._doubles = np.frombuffer(self._buffer, np.float64, count, ENCAPSULATION)
         self._stamps = offsets("header.stamp.sec") // 4
         first = offsets("transform.translation.x") // 8
-        self._numbers = first[:, np.newaxis] + np.arange(_NUMBERS)
+        self._numbers = first[:, np.newaxis] + np.arange(_NUMBERS_PER_POSE)
 
     def serialised(self, time_ns: int, poses: Array) -> bytes:
         """Return the message with the poses (k, 7), all of one time."""
@@ -80,10 +86,10 @@ class RobotTransforms:
     ) -> None:
         self._links = ForwardKinematics(description) if links else None
         moving, fixed = ((), ()) if self._links is None else (self._links.moving, self._links.fixed)
-        frames = ((world_frame, prefix + description.base_link), *_prefixed(moving, prefix))
+        frames = ((world_frame, prefix + description.base_link), *_prefix_frames(moving, prefix))
         self._template = TransformTemplate(frames)
-        self._poses = np.zeros((len(frames), _NUMBERS))
-        self._fixed = _prefixed(fixed, prefix)
+        self._poses = np.zeros((len(frames), _NUMBERS_PER_POSE))
+        self._fixed = _prefix_frames(fixed, prefix)
 
     def message(self, time_ns: int, pose: Array, q: Array) -> bytes:
         """Return the message of a pose (7,) of the base link and positions (n,) of the joints."""
@@ -100,7 +106,7 @@ class RobotTransforms:
         return TransformTemplate(self._fixed).serialised(time_ns, self._links.fixed_transforms)
 
 
-def _prefixed(frames: Iterable[tuple[str, str]], prefix: str) -> Frames:
+def _prefix_frames(frames: Iterable[tuple[str, str]], prefix: str) -> Frames:
     return tuple((prefix + parent, prefix + child) for parent, child in frames)
 
 
@@ -109,7 +115,7 @@ class StateFrames:
 
     def __init__(self, description: RobotDescription) -> None:
         self._description = description
-        self._odom = TemplateReader(ODOMETRY, {_POSE: _NUMBERS})
+        self._odom = TemplateReader(ODOMETRY, {_POSE_PATH: _NUMBERS_PER_POSE})
         self._joints = JointReader(description.joint_names, ["position"], complete=True)
 
     def accept(self, odom: bytes, joint_states: bytes) -> None:
@@ -131,7 +137,7 @@ class StateFrames:
     @property
     def pose(self) -> Array:
         """Pose of the base link (7,)."""
-        return self._odom.floats(_POSE)
+        return self._odom.floats(_POSE_PATH)
 
     @property
     def q(self) -> Array:
@@ -211,7 +217,7 @@ def trajectory_message(schedule: GaitSchedule, stamp_ns: int, frame: str) -> byt
         {
             "positions": schedule.positions,
             "velocities": np.vstack([schedule.velocities, np.zeros(n)]),
-            "time_from_start.sec": times_of(np.arange(count, dtype=np.int64) * period_ns),
+            "time_from_start.sec": stamp_pairs(np.arange(count, dtype=np.int64) * period_ns),
         },
     )
 
@@ -225,7 +231,7 @@ def path_message(path: BasePath, start_ns: int, frame: str) -> bytes:
         "poses",
         {"header": {"frame_id": frame}},
         {
-            "header.stamp.sec": times_of(np.minimum(times, LATEST_NS)),
+            "header.stamp.sec": stamp_pairs(np.minimum(times, LATEST_NS)),
             "pose.position.x": np.hstack([path.position, path.quaternion]),
         },
     )

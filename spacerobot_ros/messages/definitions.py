@@ -70,7 +70,7 @@ def message_definition(type_name: str) -> str:
 
 
 def _with_dependencies(type_name: str, seen: set[str]) -> str:
-    package, name = _split(type_name)
+    package, name = _split_type_name(type_name)
     try:
         text = _message_file(package, name).read_bytes().decode()
     except RecordingError:
@@ -99,7 +99,7 @@ def type_hash(type_name: str) -> str:
     description of its types (``share/<package>/msg/<Type>.json``). Raises as
     :func:`message_definition` does.
     """
-    package, name = _split(type_name)
+    package, name = _split_type_name(type_name)
     try:
         description = _message_file(package, name).with_suffix(".json")
     except RecordingError:
@@ -114,7 +114,7 @@ def type_hash(type_name: str) -> str:
     )
 
 
-def _split(type_name: str) -> tuple[str, str]:
+def _split_type_name(type_name: str) -> tuple[str, str]:
     match = _SHORT_TYPE_NAME.fullmatch(type_name)
     if match is None:
         raise RecordingError(
@@ -162,12 +162,12 @@ def fields_of(type_name: str) -> Fields:
 # -- types of bags ----------------------------------------------------------------------------
 
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*/(msg|srv|action)/[A-Za-z]\w*", re.ASCII)
-_LONGEST_TEXT = 262_144
-_MOST_LINES = 5_000
-_MOST_FIELDS = 1_000
+_MAX_TEXT_BYTES = 262_144
+_MAX_LINES = 5_000
+_MAX_FIELDS = 1_000
 """Arrays of numbers count as one field, arrays of messages and strings with every element."""
 
-_DEEPEST = 32
+_MAX_NESTING = 32
 
 
 class MessageTypes:
@@ -193,8 +193,8 @@ class MessageTypes:
         ValueError
             The definition is refused.
         """
-        store, definition = _known(type_name, text)
-        self._take(store)
+        store, definition = _type_store(type_name, text)
+        self._add_types(store)
         little, big = definition.deserialize_cdr_le, definition.deserialize_cdr_be
 
         def decode(data: bytes) -> Any:
@@ -205,7 +205,7 @@ class MessageTypes:
 
         return decode
 
-    def _take(self, store: Typestore) -> None:
+    def _add_types(self, store: Typestore) -> None:
         """Add the types of another store.
 
         Raises
@@ -215,18 +215,20 @@ class MessageTypes:
         """
         own = self._store
         for name, (_, fields) in store.fielddefs.items():
-            if name in own.fielddefs and _layout(own.fielddefs[name][1]) != _layout(fields):
+            if name in own.fielddefs and _field_kinds(own.fielddefs[name][1]) != _field_kinds(
+                fields
+            ):
                 raise ValueError(f"Type '{name}' is already present with different definition.")
         for name in store.fielddefs.keys() - own.fielddefs.keys():
             own.fielddefs[name], own.types[name] = store.fielddefs[name], store.types[name]
 
 
-def _layout(fields: Any) -> list[Any]:
+def _field_kinds(fields: Any) -> list[Any]:
     return [(name.lower(), kind) for name, kind in fields]
 
 
 @lru_cache(maxsize=64)
-def _known(type_name: str, text: bytes) -> tuple[Typestore, Any]:
+def _type_store(type_name: str, text: bytes) -> tuple[Typestore, Any]:
     """Return a store of the types in a text, and the code for the type: made once for all bags.
 
     Raises
@@ -234,7 +236,7 @@ def _known(type_name: str, text: bytes) -> tuple[Typestore, Any]:
     ValueError
         The definition is refused.
     """
-    parsed, store = _parsed(type_name, text), get_typestore(Stores.EMPTY)
+    parsed, store = _parse_definition(type_name, text), get_typestore(Stores.EMPTY)
     try:
         store.register(parsed)
         return store, store.get_msgdef(type_name)
@@ -243,12 +245,12 @@ def _known(type_name: str, text: bytes) -> tuple[Typestore, Any]:
         raise ValueError(_one_line(error)) from error
 
 
-def _parsed(type_name: str, text: bytes) -> Any:
+def _parse_definition(type_name: str, text: bytes) -> Any:
     if not _TYPE_NAME.fullmatch(type_name):
         raise ValueError("a type is called 'package/msg/Type'")
-    if len(text) > _LONGEST_TEXT or text.count(b"\n") > _MOST_LINES:
+    if len(text) > _MAX_TEXT_BYTES or text.count(b"\n") > _MAX_LINES:
         raise ValueError(
-            f"its text is longer than {_LONGEST_TEXT} bytes or {_MOST_LINES} lines, which no "
+            f"its text is longer than {_MAX_TEXT_BYTES} bytes or {_MAX_LINES} lines, which no "
             "message needs"
         )
     try:
@@ -257,7 +259,7 @@ def _parsed(type_name: str, text: bytes) -> Any:
         raise ValueError(_one_line(error)) from error
     if type_name not in types:
         raise ValueError(f"it does not define {type_name}")
-    _Sizes(types).of(type_name, 0)
+    _FieldCounts(types).of(type_name, 0)
     return types
 
 
@@ -266,12 +268,12 @@ def _one_line(error: Exception) -> str:
     return words if len(words) <= 200 else f"{words[:200]} ..."
 
 
-class _Sizes:
+class _FieldCounts:
     """How many fields each type has, with all messages inside of it written out."""
 
     def __init__(self, types: dict[str, Any]) -> None:
         self._types = types
-        self._known: dict[str, int] = {}
+        self._type_store: dict[str, int] = {}
 
     def of(self, name: str, depth: int) -> int:
         """Return the number for one type.
@@ -281,12 +283,14 @@ class _Sizes:
         ValueError
             It has too many, is not defined, or contains itself.
         """
-        if name in self._known:
-            return self._known[name]
+        if name in self._type_store:
+            return self._type_store[name]
         if name not in self._types:
             raise ValueError(f"it does not define {name}")
-        if depth > _DEEPEST:
-            raise ValueError(f"its types are nested more than {_DEEPEST} deep, or in themselves")
+        if depth > _MAX_NESTING:
+            raise ValueError(
+                f"its types are nested more than {_MAX_NESTING} deep, or in themselves"
+            )
         count = 0
         for field, (kind, detail) in self._types[name][1]:
             length = 1
@@ -300,10 +304,10 @@ class _Sizes:
                 count += length * self.of(detail, depth + 1)
             else:
                 count += length if detail[0] == "string" else 1
-            if count > _MOST_FIELDS:
+            if count > _MAX_FIELDS:
                 raise ValueError(
-                    f"{name} has more than {_MOST_FIELDS} fields, counting those of the messages "
+                    f"{name} has more than {_MAX_FIELDS} fields, counting those of the messages "
                     "in it"
                 )
-        self._known[name] = max(count, 1)
-        return self._known[name]
+        self._type_store[name] = max(count, 1)
+        return self._type_store[name]

@@ -43,7 +43,7 @@ ENCAPSULATION = 4
 BIG_ENDIAN, LITTLE_ENDIAN = b"\x00\x00", b"\x00\x01"
 """First two bytes of a message in CDR of either byte order."""
 
-_TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+_TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
 class TooLongError(Exception):
@@ -86,7 +86,7 @@ class Layout:
         The definitions of the type and of all types in it; by default those installed.
     elements
         Whether fields inside of lists get paths, such as ``markers[2].pose.position.x``.
-    longest
+    max_elements
         Largest number of texts or messages in a list.
 
     Attributes
@@ -113,7 +113,7 @@ class Layout:
     IndexError
         The message ends before its fields.
     TooLongError
-        A list has more than ``longest`` texts or messages; ``leaves`` has the fields before it.
+        A list has more texts or messages than ``max_elements``; ``leaves`` has the fields before.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Layout:
         fields: Fields | None = None,
         *,
         elements: bool = False,
-        longest: float = math.inf,
+        max_elements: float = math.inf,
     ) -> None:
         self.leaves: dict[str, Leaf] = {}
         self.counts: dict[str, int] = {}
@@ -133,7 +133,7 @@ class Layout:
         self.lengths: list[int] = []
         self.fixed: list[tuple[int, int]] = []
         self.end = ENCAPSULATION
-        self._message, self._elements, self._longest = message, elements, longest
+        self._message, self._elements, self._max_elements = message, elements, max_elements
         self._fields = fields_of(type_name) if fields is None else fields
 
     def walk(self, type_name: str, prefix: str | None = "") -> Layout:
@@ -141,21 +141,25 @@ class Layout:
         for name, (kind, detail) in self._fields[type_name][1]:
             path = None if prefix is None else prefix + name
             if kind == Nodetype.BASE:
-                self._value(detail[0], path)
+                self._add_value(detail[0], path)
             elif kind == Nodetype.NAME:
                 self.walk(detail, None if path is None else f"{path}.")
             else:
                 element, count = detail
-                self._list(element, self._length() if kind == Nodetype.SEQUENCE else count, path)
+                self._add_list(
+                    element, self._read_length() if kind == Nodetype.SEQUENCE else count, path
+                )
         return self
 
-    def _list(self, element: tuple[Any, Any], count: int, path: str | None) -> None:
+    def _add_list(self, element: tuple[Any, Any], count: int, path: str | None) -> None:
         kind, detail = element
         if kind == Nodetype.BASE and detail[0] != "string":
-            self._numbers(DTYPES[detail[0]], path, (count,))
+            self._add_numbers(DTYPES[detail[0]], path, (count,))
             return
-        if count > self._longest:
-            raise TooLongError(f"it has a list of {count} entries, more than {self._longest:.0f}")
+        if count > self._max_elements:
+            raise TooLongError(
+                f"it has a list of {count} entries, more than {self._max_elements:.0f}"
+            )
         begin, inner = self.end, None
         for i in range(count):
             if self._elements and path is not None:
@@ -163,7 +167,7 @@ class Layout:
             if kind == Nodetype.NAME:
                 self.walk(detail, None if inner is None else f"{inner}.")
             else:
-                self._value(detail[0], inner)
+                self._add_value(detail[0], inner)
             if inner is not None:
                 self.ends[inner] = self.end
         if path is not None:
@@ -171,18 +175,18 @@ class Layout:
             if kind == Nodetype.BASE:
                 self.texts[path] = slice(begin, self.end)
 
-    def _value(self, base: str, path: str | None) -> None:
+    def _add_value(self, base: str, path: str | None) -> None:
         if base != "string":
-            self._numbers(DTYPES[base], path, ())
+            self._add_numbers(DTYPES[base], path, ())
             return
-        length = self._length()
+        length = self._read_length()
         self.fixed.append((self.end, self.end + length))
         if path is not None:
             # The serialised string ends with a zero.
             self.leaves[path] = Leaf(self.end, max(length - 1, 0), None, ())
         self._advance(length)
 
-    def _numbers(self, dtype: np.dtype[Any], path: str | None, shape: tuple[int, ...]) -> None:
+    def _add_numbers(self, dtype: np.dtype[Any], path: str | None, shape: tuple[int, ...]) -> None:
         size = dtype.itemsize * math.prod(shape)
         if size:
             self._align(dtype.itemsize)
@@ -196,7 +200,7 @@ class Layout:
             # Or a count of 4e9 messages in a list would be believed.
             raise IndexError("the message ends before its fields")
 
-    def _length(self) -> int:
+    def _read_length(self) -> int:
         self._align(4)
         word = self._message[self.end : self.end + 4]
         if len(word) < 4:
@@ -248,7 +252,7 @@ def encode(type_name: str, values: Mapping[str, Any] | None = None) -> bytes:
 
 
 def _encode(buffer: bytearray, fields: Fields, type_name: str, values: Any) -> None:
-    if type_name in _TIMES and isinstance(values, int):
+    if type_name in _TIME_TYPES and isinstance(values, int):
         values = dict(zip(("sec", "nanosec"), divmod(values, SECOND), strict=True))
     own = fields[type_name][1]
     unknown = values.keys() - {name for name, _ in own}
@@ -269,13 +273,13 @@ def _encode_field(buffer: bytearray, fields: Fields, node: Any, value: Any) -> N
         numbers = element[0] == Nodetype.BASE and element[1][0] != "string"
         if kind == Nodetype.SEQUENCE:
             count = 0 if value is None else len(value)
-            _append(buffer, np.uint32(count).tobytes(), 4)
+            _append_aligned(buffer, np.uint32(count).tobytes(), 4)
         if numbers:
             dtype = DTYPES[element[1][0]]
             data = np.zeros(count, dtype) if value is None else np.asarray(value, dtype)
             if data.shape != (count,):
                 raise ValueError(f"{count} numbers are wanted, not {data.shape}")
-            _append(buffer, data.tobytes(), dtype.itemsize)
+            _append_aligned(buffer, data.tobytes(), dtype.itemsize)
         else:
             for each in [None] * count if value is None else value:
                 _encode_field(buffer, fields, element, each)
@@ -284,13 +288,13 @@ def _encode_field(buffer: bytearray, fields: Fields, node: Any, value: Any) -> N
 def _encode_number_or_text(buffer: bytearray, base: str, value: Any) -> None:
     if base == "string":
         text = ("" if value is None else value).encode() + b"\0"
-        _append(buffer, np.uint32(len(text)).tobytes() + text, 4)
+        _append_aligned(buffer, np.uint32(len(text)).tobytes() + text, 4)
     else:
         dtype = DTYPES[base]
-        _append(buffer, np.array(value or 0, dtype).tobytes(), dtype.itemsize)
+        _append_aligned(buffer, np.array(value or 0, dtype).tobytes(), dtype.itemsize)
 
 
-def _append(buffer: bytearray, data: bytes, alignment: int) -> None:
+def _append_aligned(buffer: bytearray, data: bytes, alignment: int) -> None:
     if data:
         buffer += bytes(-(len(buffer) - ENCAPSULATION) % alignment) + data
 
@@ -357,7 +361,7 @@ def stamped_copies(
     for path in ("header.stamp.sec", "clock.sec"):
         if path in leaves:
             begin = leaves[path].offset
-            table[:, begin : begin + 8] = times_of(stamps_ns).view(np.uint8)
+            table[:, begin : begin + 8] = stamp_pairs(stamps_ns).view(np.uint8)
     for path, values in columns.items():
         data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)
         begin = leaves[path].offset
@@ -365,7 +369,7 @@ def stamped_copies(
     return [row.tobytes() for row in table]
 
 
-def times_of(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
+def stamp_pairs(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
     """Return times (N,) in ns as seconds and nanoseconds (N, 2) of stamps."""
     return np.stack([times_ns // SECOND, times_ns % SECOND], axis=1).astype("<u4")
 
@@ -399,10 +403,10 @@ class Columns:
         if leaf.dtype is None:
             return [row.tobytes().decode() for row in rows]
         column = rows.reshape(-1).view(leaf.dtype).reshape(len(rows), *leaf.shape)
-        return column.astype(widened(leaf.dtype))
+        return column.astype(column_dtype(leaf.dtype))
 
 
-def widened(dtype: np.dtype[Any]) -> np.dtype[Any]:
+def column_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
     """Return the type of a column of ``dtype``, in which sums do not soon overflow."""
     if dtype.kind == "f":
         return np.dtype(np.float64)
@@ -411,7 +415,7 @@ def widened(dtype: np.dtype[Any]) -> np.dtype[Any]:
     return dtype.newbyteorder("=")
 
 
-def columns_of(messages: Sequence[bytes], type_name: str, fields: Fields) -> Columns | None:
+def read_columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> Columns | None:
     """Return the fields that have the same place in every message of one type.
 
     They are those outside of lists of messages and of texts; None if the layouts differ.

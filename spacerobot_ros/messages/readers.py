@@ -40,14 +40,14 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 ODOMETRY = "nav_msgs/msg/Odometry"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 
-_LARGEST_ALIGNMENT = 8
-_LONGEST = 10_000
+_MAX_ALIGNMENT = 8
+_MAX_LIST_TEXTS = 10_000
 """Texts in a list that are read, against a faulty publisher: a million of them take a second."""
 
-_ROOM = 4096
+_HEADER_BYTES = 4096
 """Bytes for the header of a message of joints, and for a writer that packs it differently."""
 
-_POSE, _TWIST = "pose.pose.position.x", "twist.twist.linear.x"
+_POSE_PATH, _TWIST_PATH = "pose.pose.position.x", "twist.twist.linear.x"
 
 Quantity = Literal["position", "velocity", "effort"]
 """The numbers of a JointState."""
@@ -140,9 +140,9 @@ class TemplateReader:
         self._fields = fields_of(type_name)
         self._size = -1
         self._raw = bytes(2)  # Of no message.
-        self._fixed: list[tuple[slice, bytes]] = []
-        self._stretches: list[tuple[slice, bytes]] = []
-        self._reads: dict[str, tuple[int, int]] = {}
+        self._fixed_spans: list[tuple[slice, bytes]] = []
+        self._joined_spans: list[tuple[slice, bytes]] = []
+        self._value_spans: dict[str, tuple[int, int]] = {}
         self._layout: Layout | None = None
         self.changes = 0
         """How often the layout has changed."""
@@ -159,31 +159,31 @@ class TemplateReader:
             return
         if len(raw) == self._size:
             # One writer repeats its padding too: a few whole stretches are compared first.
-            for place, text in self._stretches:
+            for place, text in self._joined_spans:
                 if raw[place] != text:
                     break
             else:
                 self._raw = raw
                 return
-            if all(raw[place] == text for place, text in self._fixed):
+            if all(raw[place] == text for place, text in self._fixed_spans):
                 self._raw = raw
-                self._remember_stretches(raw)
+                self._join_fixed_spans(raw)
                 return
-        self._learn(raw)
+        self._learn_layout(raw)
 
     def floats(self, path: str) -> Array:
         """Return a read-only view of the values at ``path``."""
-        offset, count = self._reads[path]
+        offset, count = self._value_spans[path]
         return np.frombuffer(self._raw, np.float64, count, offset)
 
     def place(self, path: str) -> slice:
         """Return where the bytes of the values at ``path`` are in messages of this layout."""
-        offset, count = self._reads[path]
+        offset, count = self._value_spans[path]
         return slice(offset, offset + 8 * count)
 
     def count(self, path: str) -> int:
         """Return the number of values at ``path`` in messages of this layout."""
-        return self._reads[path][1] if path in self._reads else 0
+        return self._value_spans[path][1] if path in self._value_spans else 0
 
     def text(self, path: str) -> str:
         """Return a text of messages of this layout."""
@@ -198,7 +198,7 @@ class TemplateReader:
 
     def has(self, path: str) -> bool:
         """Whether the accepted message has values at ``path``."""
-        return path in self._reads
+        return path in self._value_spans
 
     @property
     def stamp_ns(self) -> int:
@@ -206,26 +206,28 @@ class TemplateReader:
         seconds, nanoseconds = unpack_stamp(self._raw)
         return int(seconds * SECOND + nanoseconds)
 
-    def _remember_stretches(self, raw: bytes) -> None:
+    def _join_fixed_spans(self, raw: bytes) -> None:
         """Keep the fixed spans joined where only padding can lie between them."""
         stretches: list[slice] = []
-        for place, _ in self._fixed:
-            if stretches and place.start - stretches[-1].stop < _LARGEST_ALIGNMENT:
+        for place, _ in self._fixed_spans:
+            if stretches and place.start - stretches[-1].stop < _MAX_ALIGNMENT:
                 place = slice(stretches.pop().start, place.stop)
             stretches.append(place)
-        self._stretches = [(place, raw[place]) for place in stretches]
+        self._joined_spans = [(place, raw[place]) for place in stretches]
 
-    def _learn(self, raw: bytes) -> None:
+    def _learn_layout(self, raw: bytes) -> None:
         if len(raw) > self._largest:
             raise UnreadableError(
                 f"it has {len(raw)} bytes, of which at most {self._largest} can be meant"
             )
         name = self._type_name
-        layout = Layout(raw, name, self._fields, elements=True, longest=_LONGEST)
+        layout = Layout(raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS)
         try:
             if raw[:2] == BIG_ENDIAN:
-                raw = _little_endian(raw, name)
-                layout = Layout(raw, name, self._fields, elements=True, longest=_LONGEST)
+                raw = _as_little_endian(raw, name)
+                layout = Layout(
+                    raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS
+                )
             if raw[:2] != LITTLE_ENDIAN:
                 raise IndexError("it is not in CDR")
             layout.walk(name)
@@ -238,18 +240,18 @@ class TemplateReader:
             raise CommandError(str(error)) from error
         self._raw, self._size, self._layout = raw, len(raw), layout
         fixed = [(0, len(LITTLE_ENDIAN)), *layout.fixed]
-        self._fixed = [(slice(a, b), raw[a:b]) for a, b in fixed]
-        self._reads = {}
+        self._fixed_spans = [(slice(a, b), raw[a:b]) for a, b in fixed]
+        self._value_spans = {}
         for path, wanted in self._spans.items():
             leaf = layout.leaves[path]
             count = leaf.shape[0] if wanted is None else wanted
             if count:
-                self._reads[path] = leaf.offset, count
-        self._remember_stretches(raw)
+                self._value_spans[path] = leaf.offset, count
+        self._join_fixed_spans(raw)
         self.changes += 1
 
 
-def _little_endian(raw: bytes, type_name: str) -> bytes:
+def _as_little_endian(raw: bytes, type_name: str) -> bytes:
     """Return a message of another byte order as this machine's clients serialise it.
 
     Raises
@@ -291,11 +293,11 @@ class JointReader:
         largest = math.inf
         if complete:
             # Of each joint a name with its length and three numbers.
-            largest = _ROOM + 2 * sum(len(name.encode()) + 32 for name in joint_names)
+            largest = _HEADER_BYTES + 2 * sum(len(name.encode()) + 32 for name in joint_names)
         self._reader = TemplateReader(JOINT_STATE, dict.fromkeys(quantities), largest)
         self._changes = 0
         self._problem = ""
-        self._required: bytes | None = None
+        self._last_accepted: bytes | None = None
         """The last message that was accepted: the same bytes are often received again."""
         self._order: npt.NDArray[np.intp] | None = None
         self._copies: list[tuple[memoryview, slice]] = []
@@ -330,23 +332,23 @@ class JointReader:
         CommandError
             As :meth:`accept` does.
         """
-        if raw is self._required:
+        if raw is self._last_accepted:
             return
-        self._required = None
+        self._last_accepted = None
         self._reader.accept(raw)
         if self._reader.changes != self._changes:
             self._changes = self._reader.changes
-            self._check()
+            self._check_names_and_lengths()
         if self._problem:
             raise CommandError(self._problem)
-        self._required = raw
+        self._last_accepted = raw
 
     @property
     def stamp_ns(self) -> int:
         """Stamp of the last message given to :meth:`accept`, refused or not, ns."""
         return self._reader.stamp_ns
 
-    def _check(self) -> None:
+    def _check_names_and_lengths(self) -> None:
         """Check names and lengths, once for every layout."""
         names = self._reader.texts("name")
         self._problem, self._order, self._copies = "", None, []
@@ -386,14 +388,14 @@ class MessageDecoder:
     def __init__(self, joint_names: Sequence[str]) -> None:
         self._joints = JointReader(joint_names, ["position", "velocity"], complete=True)
         self._references = JointReader(joint_names, ["position", "velocity"])
-        self._odom = TemplateReader(ODOMETRY, {_POSE: 7, _TWIST: 6})
+        self._odom = TemplateReader(ODOMETRY, {_POSE_PATH: 7, _TWIST_PATH: 6})
         self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
         self.require, self.accept = self._joints.require, self._joints.accept
 
     def base(self, odom: bytes) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an Odometry."""
         self._odom.accept(odom)
-        return self._odom.floats(_POSE), self._odom.floats(_TWIST)
+        return self._odom.floats(_POSE_PATH), self._odom.floats(_TWIST_PATH)
 
     def joint_reference(self, message: bytes) -> tuple[Array, Array]:
         """Return positions and rates (n,) of a JointState; joints that it does not name are 0."""

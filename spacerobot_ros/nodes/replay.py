@@ -21,7 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.bag import Playback, QosProfile, ReplayMessage, read_bag
 from spacerobot_ros.bag.config import ReplayConfig
-from spacerobot_ros.bag.playback import ReaderWait, ReplayStatus, renamed
+from spacerobot_ros.bag.playback import ReaderWait, ReplayStatus, renamed_topics
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE
 from spacerobot_ros.model.visuals import MeshFolder, carries_meshes
@@ -105,7 +105,7 @@ class ReplayNode(FlightNode):
         if carries_meshes(bag.attachments):
             self._meshes = MeshFolder(bag.attachments)
         replayed = {topic.name for topic in self._playback.topics}
-        self._create_publishers(renamed(config.remap, replayed))
+        self._create_publishers(renamed_topics(config.remap, replayed))
         self._paused = config.paused
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -216,7 +216,7 @@ class ReplayNode(FlightNode):
         self._set_timer()
 
     def _set_timer(self) -> None:
-        due = self._playback.next_due()
+        due = self._playback.next_due_time()
         if due is None:
             self._timer.cancel()
             return
@@ -227,7 +227,7 @@ class ReplayNode(FlightNode):
     def _play(self) -> None:
         """Send the messages that are due, and set the timer for the next one."""
         try:
-            for message in self._playback.due(self._now(), _BURST):
+            for message in self._playback.take_due(self._now(), _BURST):
                 self._send(message)
         except RecordingError as error:
             self._end_with(error)

@@ -635,7 +635,7 @@ def sensors_figure(flight: FlightReport) -> ReportFigure | None:
 def _at_the_same_times(measured: Signal, true: Signal) -> tuple[Signal, Indices]:
     """Return the measured samples that have a true one of equal time, and its index."""
     if not len(true):
-        return Signal.none(measured.width), np.zeros(0, int)
+        return Signal.empty(measured.width), np.zeros(0, int)
     at = np.clip(np.searchsorted(true.time, measured.time - 1e-9), 0, len(true) - 1)
     same = np.abs(true.time[at] - measured.time) < 1e-9
     return Signal(measured.time[same], measured.values[same]), at[same]

@@ -13,7 +13,7 @@ import numpy as np
 from spacerobot_ros.control.status import CommandReport, ControllerStatus
 from spacerobot_ros.flight.flight import Flight, SentGoal, Signal, goal_of, pose_error
 from spacerobot_ros.flight.reading import (
-    WRENCH,
+    WRENCH_COLUMNS,
     FlightBag,
     impulse,
     namespaces,
@@ -188,7 +188,7 @@ class FlightReport:
     @property
     def wrench(self) -> Signal:
         """Commanded force (N) and torque (N m) of the thrusters, in the base link (N, 6)."""
-        wrench = self.bag.signal("base_wrench", WRENCH, 6)
+        wrench = self.bag.signal("base_wrench", WRENCH_COLUMNS, 6)
         return _since(wrench, self.bag.began)
 
     @property
@@ -199,7 +199,7 @@ class FlightReport:
         velocity = self.parameter("plant", "actuation") == "velocity"
         given = [] if velocity else self.bag.names("joint_commands")
         if not given or sorted(given) != sorted(names):
-            return Signal.none(len(names))
+            return Signal.empty(len(names))
         efforts = _since(self.bag.signal("joint_commands", ["effort"], len(names)), self.bag.began)
         return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
 

@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 
 from spacerobot_ros.bag import BagWriter, Recording, RecordingError, free_name, iterate_raw
 from spacerobot_ros.bag.mcap_file import McapFile
-from spacerobot_ros.bag.mcap_reading import open_bag, read_summary, record_at, unpacked
+from spacerobot_ros.bag.mcap_reading import open_bag, read_record, read_summary, unpack_chunk
 from spacerobot_ros.bag.salvage import is_complete, salvage_bag
 
 STRING = "std_msgs/msg/String"
@@ -263,7 +263,9 @@ def test_the_fastest_compression_makes_telemetry_little_larger() -> None:
     for path in sorted((Path(__file__).parents[2] / "bags").glob("*.mcap")):
         with open_bag(path) as file:
             places = [i.chunk_start_offset for i in read_summary(path, file).chunk_indexes]
-            chunks = [unpacked(record_at(file, place, Opcode.CHUNK), place) for place in places]
+            chunks = [
+                unpack_chunk(read_record(file, place, Opcode.CHUNK), place) for place in places
+            ]
         records = b"".join(chunks)
         size = {
             level: sum(

@@ -84,9 +84,9 @@ def test_messages_in_order_are_read_chunk_by_chunk(tmp_path: Path) -> None:
         summary = make_reader(file).get_summary()
     assert summary is not None
     assert len(summary.chunk_indexes) > 30
-    from spacerobot_ros.bag.mcap_reading import _clusters
+    from spacerobot_ros.bag.mcap_reading import _overlapping_chunks
 
-    groups = list(_clusters(summary, {1, 2}, 0, S))
+    groups = list(_overlapping_chunks(summary, {1, 2}, 0, S))
     assert max(map(len, groups)) == 1
 
 
@@ -120,7 +120,7 @@ def replayed(path: Path, start: float) -> Playback:
 def test_what_was_latched_comes_once(tmp_path: Path, start: float, expected: list[str]) -> None:
     playback = replayed(tmp_path / "a.mcap", start)
     playback.run(5 * S)
-    due = playback.due(5 * S, 100)
+    due = playback.take_due(5 * S, 100)
     assert [message.data[8:-1].decode() for message in due] == expected
     # What was sent before is due at the start: a clock made of it does not go back.
     assert {message.log_time_ns for message in due} == {77 * S + round(start * S)}
@@ -130,9 +130,9 @@ def test_the_time_of_a_late_replay_is_not_ahead_of_what_is_still_to_come(tmp_pat
     playback = replayed(tmp_path / "a.mcap", 0.0)
     playback.run(5 * S)
     assert playback.bag_time(9 * S) == 77 * S
-    playback.due(5 * S, 100)
+    playback.take_due(5 * S, 100)
     assert playback.bag_time(9 * S) == 77 * S + S // 10
-    playback.due(9 * S, 100)
+    playback.take_due(9 * S, 100)
     assert playback.ended
     assert playback.bag_time(9 * S) == 81 * S
 

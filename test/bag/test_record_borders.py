@@ -22,14 +22,14 @@ from rosbags.interfaces import Nodetype
 from spacerobot_ros.bag import RecordingError, read_bag
 from spacerobot_ros.bag.mcap_reading import (
     LIMIT_VARIABLE,
-    Allowance,
+    InflationLimit,
     _check_entries,
-    record_at,
+    read_record,
     records,
-    records_in,
-    unpacked,
+    records_in_chunk,
+    unpack_chunk,
 )
-from spacerobot_ros.messages.definitions import MessageTypes, _Sizes
+from spacerobot_ros.messages.definitions import MessageTypes, _FieldCounts
 
 
 def record(opcode: int, body: bytes, claims: int | None = None) -> bytes:
@@ -51,12 +51,12 @@ def test_a_record_may_end_where_the_file_does() -> None:
         (0, Opcode.HEADER, b"abc"),
         (12, Opcode.FOOTER, b""),
     ]
-    assert record_at(file, 0, Opcode.HEADER) == b"abc"
-    assert record_at(file, 12, Opcode.FOOTER) == b""
+    assert read_record(file, 0, Opcode.HEADER) == b"abc"
+    assert read_record(file, 12, Opcode.FOOTER) == b""
     with pytest.raises(ValueError, match="there is no footer at byte 0"):
-        record_at(file, 0, Opcode.FOOTER)
+        read_record(file, 0, Opcode.FOOTER)
     with pytest.raises(ValueError, match="its index names byte 13, and it has 21 bytes"):
-        record_at(file, 13, Opcode.FOOTER)
+        read_record(file, 13, Opcode.FOOTER)
 
 
 def test_a_record_that_claims_one_byte_more_than_is_left_is_refused() -> None:
@@ -65,7 +65,7 @@ def test_a_record_that_claims_one_byte_more_than_is_left_is_refused() -> None:
     with pytest.raises(ValueError, match=words):
         list(records(BytesIO(content), 0, len(content)))
     with pytest.raises(ValueError, match=words):
-        record_at(BytesIO(content), 12, Opcode.CHUNK)
+        read_record(BytesIO(content), 12, Opcode.CHUNK)
     # What lies behind the end that is asked for does not count.
     with pytest.raises(ValueError, match="claims 3 bytes, where 1 are left"):
         list(records(BytesIO(content), 0, len(content) - 1))
@@ -81,15 +81,15 @@ def test_a_file_may_end_inside_of_the_head_of_a_record() -> None:
 
 def test_records_of_a_chunk_end_with_it() -> None:
     whole = message(b"") + record(Opcode.SCHEMA, b"")
-    assert list(records_in(whole, 40)) == [(Opcode.MESSAGE, 0, 31), (Opcode.SCHEMA, 31, 40)]
-    assert list(records_in(b"", 40)) == []
+    assert list(records_in_chunk(whole, 40)) == [(Opcode.MESSAGE, 0, 31), (Opcode.SCHEMA, 31, 40)]
+    assert list(records_in_chunk(b"", 40)) == []
     for chunk, words in (
         (whole[:-1], "the chunk at byte 40 ends inside of a record"),
         (message(b"", claims=23), "a record reaches out of the chunk at byte 40"),
         (record(0, b"abc"), "the chunk at byte 40 has records of no kind"),
     ):
         with pytest.raises(ValueError, match=words):
-            list(records_in(chunk, 40))
+            list(records_in_chunk(chunk, 40))
 
 
 # -- indexes of messages ----------------------------------------------------------------------
@@ -124,7 +124,7 @@ def test_an_index_that_names_anything_else_does_not_fit(chunk: bytes, places: li
 
 
 def test_chunks_may_inflate_to_the_limit_together_and_no_further() -> None:
-    allowance = Allowance(1000)
+    allowance = InflationLimit(1000)
     assert allowance.most == 32_000_000
     allowance.take(31_999_999, 8)
     allowance.take(1, 50)
@@ -132,8 +132,8 @@ def test_chunks_may_inflate_to_the_limit_together_and_no_further() -> None:
     words = "the chunk at byte 70 it inflates to 32000001 bytes, more than the 32000000 that"
     with pytest.raises(ValueError, match=words):
         allowance.take(1, 70)
-    assert Allowance(160_000).most == Allowance(0).most == 32_000_000
-    assert Allowance(160_001).most == 32_000_200
+    assert InflationLimit(160_000).most == InflationLimit(0).most == 32_000_000
+    assert InflationLimit(160_001).most == 32_000_200
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_the_limit_is_a_positive_number_of_megabytes(
     text: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(LIMIT_VARIABLE, text)
-    assert Allowance(0).most == most
+    assert InflationLimit(0).most == most
 
 
 PACKED: dict[str, Callable[[bytes], bytes]] = {
@@ -172,23 +172,23 @@ def chunk(compression: str, data: bytes, size: int, crc: int = 0, off: int = 0) 
 def test_a_chunk_holds_what_it_claims_to_the_byte(compression: str) -> None:
     data = message(b"text") * 3
     for held in (data, b"", b"x"):
-        assert unpacked(chunk(compression, held, len(held)), 40) == held
-        assert unpacked(chunk(compression, held, len(held), zlib.crc32(held)), 40) == held
+        assert unpack_chunk(chunk(compression, held, len(held)), 40) == held
+        assert unpack_chunk(chunk(compression, held, len(held), zlib.crc32(held)), 40) == held
     for size in (len(data) - 1, len(data) + 1):
         with pytest.raises(ValueError, match="the chunk at byte 40 "):
-            unpacked(chunk(compression, data, size), 40)
+            unpack_chunk(chunk(compression, data, size), 40)
     with pytest.raises(ValueError, match="the checksum of the chunk at byte 40 is wrong"):
-        unpacked(chunk(compression, data, len(data), zlib.crc32(data) ^ 1), 40)
+        unpack_chunk(chunk(compression, data, len(data), zlib.crc32(data) ^ 1), 40)
     packed = len(PACKED[compression](data))
     words = f"holds {packed} packed bytes, not the {packed + 1} that it claims"
     with pytest.raises(ValueError, match=words):
-        unpacked(chunk(compression, data, len(data), off=1), 40)
+        unpack_chunk(chunk(compression, data, len(data), off=1), 40)
 
 
 @pytest.mark.parametrize(("size", "more"), [(2, "more"), (4, "less")])
 def test_whether_a_chunk_holds_more_or_less_is_said(size: int, more: str) -> None:
     with pytest.raises(ValueError, match=f"holds {more} than the {size} bytes it claims"):
-        unpacked(chunk("", b"abc", size), 40)
+        unpack_chunk(chunk("", b"abc", size), 40)
 
 
 # -- definitions ------------------------------------------------------------------------------
@@ -223,7 +223,7 @@ def test_a_message_may_have_a_thousand_fields_and_no_more() -> None:
 
 
 def test_a_message_without_fields_counts_as_one() -> None:
-    sizes = _Sizes({"E": ([], []), "A": ([], [("e", (Nodetype.NAME, "E"))] * 1000)})
+    sizes = _FieldCounts({"E": ([], []), "A": ([], [("e", (Nodetype.NAME, "E"))] * 1000)})
     assert sizes.of("E", 0) == 1
     assert sizes.of("A", 0) == 1000
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from spacerobot_ros.bag import LATCHED, BagWriter, RecordingError, Timeline, read_bag
-from spacerobot_ros.bag.playback import Playback, ReaderWait, ReplayMessage, renamed
+from spacerobot_ros.bag.playback import Playback, ReaderWait, ReplayMessage, renamed_topics
 from spacerobot_ros.errors import ParameterError
 
 STRING = "std_msgs/msg/String"
@@ -54,7 +54,7 @@ def played(playback: Playback, end: float, step: float = 0.01) -> list[tuple[flo
     found = []
     for k in range(round(end / step) + 1):
         now = round(k * step * S)
-        for message in playback.due(CLOCK + now, 1000):
+        for message in playback.take_due(CLOCK + now, 1000):
             found.append((now / S, message.data[8:-1].decode()))
     return found
 
@@ -67,7 +67,7 @@ def test_every_message_comes_at_its_time(path: Path) -> None:
         times = [time for time, text in found if text.startswith(topic)]
         assert times == pytest.approx([period * k for k in range(len(times))])
     assert playback.ended
-    assert playback.next_due() is None
+    assert playback.next_due_time() is None
 
 
 @pytest.mark.parametrize("rate", [0.5, 3.0, 1000.0])
@@ -75,11 +75,11 @@ def test_the_rate_divides_the_spacing(path: Path, rate: float) -> None:
     playback = Playback(read_bag(path), topics=["/b"], rate=rate)
     playback.run(CLOCK)
     for k in range(5):
-        due = playback.next_due()
+        due = playback.next_due_time()
         assert due is not None
         assert due == pytest.approx(CLOCK + 0.25 * k / rate * S, abs=2)
-        assert playback.due(due - 10, 9) == []
-        (message,) = playback.due(due + 2, 9)
+        assert playback.take_due(due - 10, 9) == []
+        (message,) = playback.take_due(due + 2, 9)
         assert message.log_time_ns == BEGAN + k * S // 4
     assert playback.ended
 
@@ -101,8 +101,8 @@ def test_what_was_latched_before_the_start_comes_first(path: Path) -> None:
 def test_a_late_clock_gets_everything_that_is_due_in_order(path: Path) -> None:
     playback = Playback(read_bag(path))
     playback.run(CLOCK)
-    first = playback.due(CLOCK + 2 * S, 5)
-    rest = playback.due(CLOCK + 2 * S, 100)
+    first = playback.take_due(CLOCK + 2 * S, 5)
+    rest = playback.take_due(CLOCK + 2 * S, 100)
     assert (len(first), len(rest)) == (5, 13)
     times = [message.log_time_ns for message in first + rest]
     assert times == sorted(times)
@@ -111,14 +111,14 @@ def test_a_late_clock_gets_everything_that_is_due_in_order(path: Path) -> None:
 def test_a_pause_shifts_what_follows(path: Path) -> None:
     playback = Playback(read_bag(path), topics=["/a"])
     playback.run(CLOCK)
-    assert len(playback.due(CLOCK + S // 4, 100)) == 3
+    assert len(playback.take_due(CLOCK + S // 4, 100)) == 3
     playback.pause(CLOCK + S // 4)
     assert not playback.running
-    assert playback.due(CLOCK + 50 * S, 100) == []
-    assert playback.next_due() is None
+    assert playback.take_due(CLOCK + 50 * S, 100) == []
+    assert playback.next_due_time() is None
     assert playback.bag_time(CLOCK + 50 * S) == BEGAN + S // 4
     playback.run(CLOCK + 60 * S)
-    assert playback.next_due() == CLOCK + 60 * S + S // 20
+    assert playback.next_due_time() == CLOCK + 60 * S + S // 20
 
 
 def test_steps_move_the_time_of_the_bag(path: Path) -> None:
@@ -128,7 +128,7 @@ def test_steps_move_the_time_of_the_bag(path: Path) -> None:
         assert message is not None
         assert message.log_time_ns == BEGAN + k * S // 4
     playback.run(CLOCK + 5 * S)
-    assert playback.next_due() == CLOCK + 5 * S + S // 4
+    assert playback.next_due_time() == CLOCK + 5 * S + S // 4
     while playback.step(CLOCK + 9 * S) is not None:
         pass
     assert playback.ended
@@ -149,7 +149,7 @@ def test_a_jump_brings_what_a_subscriber_would_have(path: Path) -> None:
     playback = Playback(read_bag(path))
     everything = played(Playback(read_bag(path)), 1.0)
     playback.run(CLOCK)
-    playback.due(CLOCK + S // 2, 1000)
+    playback.take_due(CLOCK + S // 2, 1000)
     # Back and forth, running: the last of each topic, then all that follows in its time.
     for seconds in (0.05, 0.62, 0.3, 0.0):
         at = BEGAN + round(seconds * S)
@@ -159,7 +159,7 @@ def test_a_jump_brings_what_a_subscriber_would_have(path: Path) -> None:
         assert all(message.log_time_ns == at for message in shown)
         assert playback.running
         assert playback.bag_time(CLOCK) == at
-        rest = texts_of(playback.due(CLOCK + 2 * S, 1000))
+        rest = texts_of(playback.take_due(CLOCK + 2 * S, 1000))
         assert rest == [text for time, text in everything if time >= seconds]
         assert playback.ended
     # Beyond the ends: at them. What is there last is still to come.
@@ -183,7 +183,7 @@ def test_a_jump_to_the_beginning_while_time_stands_still_shows_what_is_there(pat
         assert set(there.values()) <= set(shown)
         # Everything comes when it goes on.
         playback.run(CLOCK)
-        rest = texts_of(playback.due(CLOCK + 2 * S, 1000))
+        rest = texts_of(playback.take_due(CLOCK + 2 * S, 1000))
         assert rest == [text for time, text in everything if time >= start]
 
 
@@ -193,7 +193,7 @@ def test_a_jump_stays_in_the_part_that_is_played(path: Path) -> None:
     playback.run(CLOCK)
     shown = playback.seek(BEGAN, CLOCK)
     assert texts_of(shown) == ["/latched 2"]
-    last = texts_of(playback.due(CLOCK + 9 * S, 1000))[-1]
+    last = texts_of(playback.take_due(CLOCK + 9 * S, 1000))[-1]
     assert last == [text for time, text in played(Playback(read_bag(path)), 1.0) if time <= 0.7][-1]
 
 
@@ -281,11 +281,11 @@ def test_a_replay_without_readers_begins_after_the_longest_wait() -> None:
 
 def test_topics_get_new_names() -> None:
     topics = ["/odom", "/joint_states"]
-    assert renamed("", topics) == {}
-    assert renamed("/odom:=/a/odom  /joint_states:=/b", topics) == {
+    assert renamed_topics("", topics) == {}
+    assert renamed_topics("/odom:=/a/odom  /joint_states:=/b", topics) == {
         "/odom": "/a/odom",
         "/joint_states": "/b",
     }
     for rule in ("/odom", "/odom:=", ":=/odom", "/odom=/a", "/momentum:=/a"):
         with pytest.raises(ParameterError, match="'remap'"):
-            renamed(rule, topics)
+            renamed_topics(rule, topics)

@@ -11,7 +11,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from spacerobot_ros.bag import RecordingError, message_definition, type_hash
-from spacerobot_ros.messages.definitions import MessageTypes, _known
+from spacerobot_ros.messages.definitions import MessageTypes, _type_store
 
 TYPES = [
     "diagnostic_msgs/msg/DiagnosticArray",
@@ -174,6 +174,6 @@ def test_code_is_made_once_for_all_bags_and_types_of_a_bag_agree() -> None:
     # Another bag may mean another type by the name.
     third = MessageTypes()
     assert third.decoder("own/msg/Another", text % b"number")(data).part.number == 7
-    made = _known.cache_info().misses
+    made = _type_store.cache_info().misses
     third.decoder("own/msg/Another", text % b"number")
-    assert _known.cache_info().misses == made
+    assert _type_store.cache_info().misses == made

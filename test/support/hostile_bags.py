@@ -56,7 +56,7 @@ def play(path: Path) -> None:
     playback = Playback(read_bag(path), rate=1e9)
     playback.run(0)
     while not playback.ended:
-        playback.next_due()
+        playback.next_due_time()
         playback.bag_time(1)
         playback.step(0)
 
