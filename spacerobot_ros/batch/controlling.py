@@ -130,7 +130,7 @@ class BatchController:
             time,
             controller.reference_at_rest(time),
             controller.errors(),
-            controller.largest_rate_share(qdot),
+            controller.joint_rate_limits.largest_share(qdot),
             self.law.largest_error_share(bounds),
             self._config,
         )
@@ -225,7 +225,8 @@ class BatchController:
         ):
             largest[kind] = ca.fmax(largest[kind], ca.fabs(error))
             error_share = ca.fmax(error_share, ca.fabs(error) / bound)
-        for rate, limit in zip(ca.vertsplit(qdot), self.controller.joint_rates, strict=True):
+        limits = self.controller.joint_rate_limits.rates
+        for rate, limit in zip(ca.vertsplit(qdot), limits, strict=True):
             rate_share = ca.fmax(rate_share, ca.fabs(rate) * (1.0 / limit))
         monitor = GoalMonitor(0.0, *ca.vertsplit(memory))
         verdict = monitor.decision(

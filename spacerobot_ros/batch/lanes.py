@@ -91,8 +91,8 @@ def _fly_in_lanes(flights: Flights) -> BatchResult:
     for first in range(0, len(rows), size):
         block = _Block(flights, tick, model, p, rows[first : first + size])
         block.fly(result, failures)
-    lanes, unit = tick.driver.unit.lanes, tick.driver.unit.name
-    return replace(result, engine=f"{lanes} lanes ({unit})", failures=failures)
+    engine = f"{tick.unit.lanes} lanes ({tick.unit.name})"
+    return replace(result, engine=engine, failures=failures)
 
 
 def _regular_starts(flights: Flights) -> Flags:
@@ -120,7 +120,7 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
         case Controlled():
             tables = []
     each += sum(2 * table[0].nbytes for table in tables if table.ndim == 3)
-    lanes = tick.driver.unit.lanes
+    lanes = tick.unit.lanes
     groups = max(1, min(_MOST_GROUPS, _BLOCK_BYTES // (each * lanes)))
     return int(groups * lanes)
 
@@ -135,7 +135,7 @@ class _Block:
         self, flights: Flights, tick: CompiledTick, model: ModelFunctions, p: Array, rows: Counts
     ) -> None:
         self._flights, self._tick, self._flown = flights, tick, rows
-        self._lanes, self._rows = tick.driver.unit.lanes, tick.rows
+        self._lanes, self._rows = tick.unit.lanes, tick.rows
         self._groups = -(-len(rows) // self._lanes)
         count = self._groups * self._lanes
         self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], count - len(rows))])
@@ -272,9 +272,9 @@ class _Block:
 
     def fly(self, result: BatchResult, failures: dict[int, str]) -> None:
         """Fly the flights and write their results."""
-        flights, job, driver = self._flights, self._job, self._tick.driver
+        flights, job, library = self._flights, self._job, self._tick.library
         # A tick of no duration under no command reports the start.
-        driver.start(job)
+        library.start_flights(job)
         self._set("h", np.full(len(self._rows_of_lanes), flights.control_period))
         alive = self._memory[:, self._rows.first("alive")]
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
@@ -289,10 +289,10 @@ class _Block:
                 job.normals_from, job.normals_ticks, job.normals_width = begin, *normals.shape[1:3]
             if not begin:
                 self._begin_control(failures)
-            while driver.fly_until(job, end):
+            while library.fly_until(job, end):
                 self._step_outside_lanes(result, failures)
         if self._tick.controller is not None:
-            driver.end(job)
+            library.end_flights(job)
         self._write(result)
 
     def _fail(self, index: int, tick: int, message: str, failures: dict[int, str]) -> None:
@@ -308,7 +308,7 @@ class _Block:
         controller = self._tick.controller
         if controller is None:
             return
-        self._tick.driver.measure_starts(self._job)
+        self._tick.library.measure_starts(self._job)
         states = self._get("measured")
         numbers = np.zeros((len(states), self._rows.size("profile")))
         most = np.zeros((len(states), self._rows.size("bounds")))
@@ -327,7 +327,7 @@ class _Block:
         """Do the step that lanes wait for: a command, an allocation, or a tick of the plant."""
         rows, alive = self._rows, self._rows.first("alive")
         steps: dict[Pending, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
-            Pending.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._step_plant),
+            Pending.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._step_plant)
         }
         if self._tick.controller is not None:
             steps[Pending.TICK] = rows.first("exact"), self._command
@@ -396,15 +396,13 @@ class _Block:
         names = ("q", "qdot", "pose", "twist", "momentum")
         for name, part in zip(names, np.split(reports[:count], ends[:-1], axis=2), strict=True):
             getattr(result, name)[rows] = part
-        for name in ("peak_rate", "peak_effort", "peak_wrench", "impulse"):
+        for name in ("peak_rate", "peak_effort", "peak_wrench", "impulse", "lowest", "highest"):
             getattr(result, name)[rows] = self._get(name)[:count]
         limits = self._get("limits")[:count].astype(np.int64)
         first = "effort" if self._flights.actuation == "effort" else "rate"
         result.limited[first][rows] = limits[:, :n]
         if first == "rate":
             result.limited["stroke"][rows] = limits[:, n:]
-        for name in ("lowest", "highest"):
-            getattr(result, name)[rows] = self._get(name)[:count]
         if self._modulator is not None:
             result.propellant[rows] = self._get("propellant")[:count, 0]
         if self._tick.controller is not None:

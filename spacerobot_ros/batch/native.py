@@ -170,72 +170,24 @@ class Rows:
         return self.first(source), self.first(target), self.size(source)
 
 
-class Driver:
-    """The compiled loop over ticks and groups of lanes.
-
-    Parameters
-    ----------
-    functions
-        CasADi's functions by their names in the driver: ``FLIGHT`` and ``REPORT``, the tick without
-        and with the results of reports; ``CONTROL``, the command for a state, and ``PULSES``, those
-        of thrusters, where there are any.
-    declarations
-        C++ for the driver: constants of the memory.
-    thrusters
-        Number of thrusters that realise the commanded wrench; 0: the wrench acts as commanded.
-
-    Raises
-    ------
-    NoLibraryError
-        It cannot be compiled here.
-    """
-
-    def __init__(
-        self, functions: Mapping[str, ca.Function], declarations: str, thrusters: int
-    ) -> None:
-        self.unit = vector_unit()
-        self._library = _library(functions, declarations, self.unit, thrusters)
-        job, whole = ctypes.POINTER(Job), ctypes.c_longlong
-        names = ["start_flights"]
-        names += ["measure_starts", "end_flights"] if "CONTROL" in functions else []
-        for name in names:
-            function = getattr(self._library, name)
-            function.argtypes, function.restype = [job], None
-        self._library.fly_until.argtypes = [job, whole]
-        self._library.fly_until.restype = whole
-
-    def start(self, job: Job) -> None:
-        """Evaluate and report the state at the start."""
-        self._library.start_flights(ctypes.byref(job))
-
-    def measure_starts(self, job: Job) -> None:
-        """Measure the state at the start; only with a controller."""
-        self._library.measure_starts(ctypes.byref(job))
-
-    def fly_until(self, job: Job, tick: int) -> int:
-        """Fly to a tick; return the number of groups that wait for a step of Python before it."""
-        return int(self._library.fly_until(ctypes.byref(job), tick))
-
-    def end(self, job: Job) -> None:
-        """End the flights that are still under way; only with a controller."""
-        self._library.end_flights(ctypes.byref(job))
-
-
 @dataclass(frozen=True)
 class CompiledTick:
     """The compiled tick of flights that differ in numbers alone, and the rows of its memory.
 
     Attributes
     ----------
-    driver
-        The loop.
+    library
+        The functions of ``driver.hpp``, which take a :class:`Job`.
+    unit
+        Vector registers that they use.
     rows
         Memory of a group.
     controller
         Source of the commands; None: tables.
     """
 
-    driver: Driver
+    library: Any
+    unit: VectorUnit
     rows: Rows
     controller: BatchController | None = None
 
@@ -250,27 +202,23 @@ class CompiledTick:
         ParameterError
             The law cannot drive the selected outputs, or cannot be flown in lanes.
         """
-        key: tuple[Any, ...] = (
-            cls,
-            flights.actuation,
-            flights.substeps,
-            vector_unit(),
-            compilation_settings(),
-        )
+        key: tuple[Any, ...] = (cls, flights.actuation, flights.substeps)
+        key = (*key, vector_unit(), compilation_settings())
         program = flights.program
         if isinstance(program, Controlled):
             # All parameters but the gains, which each flight has of its own, are in the function.
-            given = values_of(program.config).items()
-            parameters = [each for each in given if not each[0].startswith("gains.")]
+            values = values_of(program.config).items()
+            parameters = [each for each in values if not each[0].startswith("gains.")]
             believed = program.robot or flights.robot
             key = (*key, believed, repr(parameters), repr(program.config.motion))
             key = (*key, flights.thruster_count)
         if key not in model.derived:
             model.derived[key] = cls._new(flights, model)
-        found: CompiledTick = model.derived[key]
-        if found.controller is not None and isinstance(program, Controlled):
-            return replace(found, controller=BatchController(program, found.controller.controller))
-        return found
+        compiled: CompiledTick = model.derived[key]
+        if compiled.controller is not None and isinstance(program, Controlled):
+            controller = BatchController(program, compiled.controller.controller)
+            return replace(compiled, controller=controller)
+        return compiled
 
     @classmethod
     def _new(cls, flights: Flights, model: ModelFunctions) -> CompiledTick:
@@ -352,8 +300,9 @@ class CompiledTick:
             )
         if controller is not None:
             constants["EXPECTED_ROW"] = state + 2 * n + 4
-        declarations = _declarations(rows, constants, arrays, spans)
-        return cls(Driver(functions, declarations, count), rows, controller)
+        declarations, unit = _declarations(rows, constants, arrays, spans), vector_unit()
+        library = _library(functions, declarations, unit, count)
+        return cls(library, unit, rows, controller)
 
 
 @dataclass(frozen=True)
@@ -399,7 +348,27 @@ _TICKS = {
 def _library(
     functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit, thrusters: int
 ) -> ctypes.CDLL:
-    """Return the library, with the vector functions of the C library if it has them."""
+    """Return the library of ``driver.hpp``, with the C library's vector functions if it has them.
+
+    ``functions`` are CasADi's by their names in the driver: ``FLIGHT`` and ``REPORT``, the tick
+    without and with the results of reports; ``CONTROL``, the command for a state, and ``PULSES``,
+    those of thrusters, where there are any.
+    """
+    library = _compile_library(functions, declarations, unit, thrusters)
+    names = ["start_flights", "fly_until"]
+    names += ["measure_starts", "end_flights"] if "CONTROL" in functions else []
+    for name in names:
+        function = getattr(library, name)
+        function.argtypes, function.restype = [ctypes.POINTER(Job)], None
+    fly_until = library.fly_until
+    fly_until.argtypes = [*fly_until.argtypes, ctypes.c_longlong]
+    fly_until.restype = ctypes.c_longlong
+    return library
+
+
+def _compile_library(
+    functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit, thrusters: int
+) -> ctypes.CDLL:
     given = list(functions.values())
     renamed = [_renamed(function, f"vector_{function.name()}") for function in given]
     parts = [

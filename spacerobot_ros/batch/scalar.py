@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -29,6 +28,9 @@ from spacerobot_ros.simulation.config import SensorConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
 from spacerobot_ros.times import SECOND
+
+_Commands = Callable[[int, Plant | Sensors], Sequence[Array]]
+"""Function from a tick and the measured state to the commands of a flight."""
 
 
 def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> BatchResult:
@@ -70,15 +72,15 @@ def _fly(
     config = SensorConfig() if flights.sensors is None else flights.sensors.config(row)
     faulty = FaultyPlant(plant, (), period, wrench=flights.actuation == "effort")
     sensors = Sensors(faulty, config, period)
-    commander: _Commander
+    ends = False  # Whether the flight ends with the tick of the decision about its goal.
     match flights.program:
         case FollowedSchedule() as program:
-            commander = _Follower(flights, program, row)
+            command = _schedule_commands(flights, program, row)
         case HeldCommands() as program:
-            commander = _Table(flights, program, row)
-        case Controlled():
+            command = _held_commands(flights, program, row)
+        case Controlled(until_decided=ends):
             assert controller is not None
-            commander = _Control(controller, row, result)
+            command = _controlled_commands(controller, row, result)
     instants = {tick: column for column, tick in enumerate(flights.instants)}
     momenta, drift = _unexplained(plant), np.zeros(2)
     try:
@@ -87,10 +89,11 @@ def _fly(
             measured = sensors if sensors.used else plant
             if tick in instants:
                 _report(plant, measured, result, row, instants[tick])
-            if tick == flights.ticks or commander.decided:
+            decided = result.decision[row] != Decision.NONE
+            if tick == flights.ticks or (ends and decided):
                 result.end_tick[row] = tick
                 break
-            commands = commander.at(tick, measured)
+            commands = command(tick, measured)
             plant.step(*commands)
             _account(plant, commands, period, result, row)
             if controller is not None:
@@ -106,74 +109,54 @@ def _fly(
             result.limited[name][row] = counts
 
 
-class _Commander(Protocol):
-    """Source of the commands of one flight."""
+def _held_commands(flights: Flights, program: HeldCommands, row: int) -> _Commands:
+    """Return the commands of a table, zero after its end."""
+    tables = [program.joints] if program.wrench is None else [program.joints, program.wrench]
+    tables = [_of_row(table, row) for table in tables]
 
-    decided: bool
-    """Whether the flight ends with the tick of the last command."""
+    def command(tick: int, measured: Plant | Sensors) -> Sequence[Array]:
+        return [table[tick] if tick < len(table) else np.zeros(table.shape[1]) for table in tables]
 
-    def at(self, tick: int, measured: Plant | Sensors) -> Sequence[Array]:
-        """Return the commands of a tick by its measured state."""
-
-
-class _Table:
-    """Commands of a table, and zero after its end."""
-
-    decided = False
-
-    def __init__(self, flights: Flights, program: HeldCommands, row: int) -> None:
-        tables = [program.joints] if program.wrench is None else [program.joints, program.wrench]
-        self._tables = [_of_row(table, row) for table in tables]
-
-    def at(self, tick: int, measured: Plant | Sensors) -> Sequence[Array]:
-        return [
-            table[tick] if tick < len(table) else np.zeros(table.shape[1]) for table in self._tables
-        ]
+    return command
 
 
-class _Follower:
-    """Velocities of the planner's tracker along a schedule."""
+def _schedule_commands(flights: Flights, program: FollowedSchedule, row: int) -> _Commands:
+    """Return the velocities of the planner's tracker along a schedule."""
+    goal = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    path = BasePath(np.zeros(1), goal.position[None], goal.quaternion[None])
+    names, period = flights.robot.joint_names, flights.control_period
+    schedule = GaitSchedule("", names, period, _of_row(program.positions, row), path, goal)
+    follower = ScheduleFollower(schedule, 0, program.shape_gain, program.deadband)
+    period_ns = round(period * SECOND)
+    position, velocity = np.zeros(flights.robot.n), np.zeros(flights.robot.n)
 
-    decided = False
+    def command(tick: int, measured: Plant | Sensors) -> Sequence[Array]:
+        follower.command(tick * period_ns, measured.q, position, velocity)
+        return [velocity]
 
-    def __init__(self, flights: Flights, program: FollowedSchedule, row: int) -> None:
-        goal = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
-        path = BasePath(np.zeros(1), goal.position[None], goal.quaternion[None])
-        positions = _of_row(program.positions, row)
-        names, period = flights.robot.joint_names, flights.control_period
-        schedule = GaitSchedule("", names, period, positions, path, goal)
-        self._follower = ScheduleFollower(schedule, 0, program.shape_gain, program.deadband)
-        self._period_ns = round(period * SECOND)
-        self._position, self._velocity = np.zeros(flights.robot.n), np.zeros(flights.robot.n)
-
-    def at(self, tick: int, measured: Plant | Sensors) -> Sequence[Array]:
-        self._follower.command(tick * self._period_ns, measured.q, self._position, self._velocity)
-        return [self._velocity]
+    return command
 
 
-class _Control:
-    """Commands of a controller, and the decision about its goal."""
+def _controlled_commands(controller: BatchController, row: int, result: BatchResult) -> _Commands:
+    """Return the commands of a controller, which writes the decision about its goal."""
+    monitor, bounds, goal = GoalMonitor(), np.zeros(0), Reference()
 
-    def __init__(self, controller: BatchController, row: int, result: BatchResult) -> None:
-        self._controller, self._row, self._result = controller, row, result
-        self._monitor, self._bounds, self._goal = GoalMonitor(), np.zeros(0), Reference()
-        self.decided = False
-
-    def at(self, tick: int, measured: Plant | Sensors) -> Sequence[Array]:
+    def command(tick: int, measured: Plant | Sensors) -> Sequence[Array]:
+        nonlocal bounds, goal
         pose, twist = measured.pose, measured.twist
         parts = pose[:3], pose[3:], twist[:3], twist[3:], measured.q, measured.qdot
         state = ControlState(*(part.copy() for part in parts))
-        controller, result, row = self._controller, self._result, self._row
         if tick == 0:
-            profile, self._bounds = controller.begin(row, state)
-            self._goal = profile.goal
+            profile, bounds = controller.begin(row, state)
+            goal = profile.goal
         commands = controller.command(tick, state)
-        decision = controller.decision(self._monitor, tick, state.qdot, self._bounds)
+        decision = controller.decision(monitor, tick, state.qdot, bounds)
         if decision is not Decision.NONE and result.decision[row] == Decision.NONE:
             result.decision[row], result.decided_tick[row] = decision, tick
-            result.decided_distance[row] = astuple(controller.distance(state, self._goal))
-            self.decided = controller.program.until_decided
+            result.decided_distance[row] = astuple(controller.distance(state, goal))
         return commands
+
+    return command
 
 
 def _unexplained(plant: Plant) -> Array:

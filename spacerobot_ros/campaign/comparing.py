@@ -33,11 +33,7 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
     """
 
     def drawn(campaign: Campaign) -> dict[str, object]:
-        return {
-            "seed": campaign.seed,
-            "sampler": campaign.sampler,
-            "flights": campaign.flights,
-        }
+        return {"seed": campaign.seed, "sampler": campaign.sampler, "flights": campaign.flights}
 
     ours, theirs = drawn(first), drawn(second)
     sentence = f"The campaigns '{first.name}' and '{second.name}' do not have the same draws: "

@@ -183,10 +183,7 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
 
 
 def parse_campaign(
-    name: str,
-    section: Mapping[str, Any],
-    folder: Path = Path(),
-    scenario: Scenario | None = None,
+    name: str, section: Mapping[str, Any], folder: Path = Path(), scenario: Scenario | None = None
 ) -> Campaign:
     """Return a campaign from the content of its file.
 

@@ -112,11 +112,7 @@ class Draws:
             return self._saltelli_shares(size)
         from scipy.stats import qmc
 
-        kinds = {
-            "latin_hypercube": qmc.LatinHypercube,
-            "sobol": qmc.Sobol,
-            "halton": qmc.Halton,
-        }
+        kinds = {"latin_hypercube": qmc.LatinHypercube, "sobol": qmc.Sobol, "halton": qmc.Halton}
         rng = np.random.default_rng(np.random.SeedSequence(campaign.seed))
         # The name before scipy 1.15, which later ones take, too.
         engine = kinds[campaign.sampler](d=size, seed=rng)

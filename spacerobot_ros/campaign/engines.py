@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 
@@ -52,7 +52,7 @@ def engine_by_name(name: str) -> Engine:
 
 
 def fly_all(
-    engine: Engine, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+    engine: Engine, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
 ) -> Iterator[Row]:
     """Yield a row for each draw; fallbacks are flown after the others."""
     fallbacks: list[Fallback] = []

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,12 +26,7 @@ from spacerobot_ros.batch import (
 from spacerobot_ros.batch.flights import BatchResult
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
-from spacerobot_ros.campaign.one_by_one import (
-    FlightsEngine,
-    node_robot,
-    nominal_robots,
-    robots_of,
-)
+from spacerobot_ros.campaign.one_by_one import FlightsEngine, nominal_robots, plant_robot, robots_of
 from spacerobot_ros.campaign.rows import LANES, Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.control.controller import build_controller
@@ -153,7 +148,7 @@ class LanesEngine:
         return "lanes have velocities of a planner, or efforts of coordinated control"
 
     def fly(
-        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+        self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
     ) -> Iterator[Row | Fallback]:
         """Fly draws in batches."""
         lanes: _ScheduledLanes | _ControlledLanes = self._controlled
@@ -441,7 +436,7 @@ def _batch_of_flights(
     instants: tuple[int, ...] = (),
 ) -> Flights:
     """Return the batch of drawn flights under the commands of a program."""
-    robot, nominal = node_robot("plant", drawn[0]), InertialParameters.of(drawn[0].nominal)
+    robot, nominal = plant_robot(drawn[0]), InertialParameters.of(drawn[0].nominal)
     plants = [each.scenario.plant for each in drawn]
     source = plants[0].thrusters
     return Flights(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import tempfile
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -35,7 +35,7 @@ class _OneByOneEngine(ABC):
     least = 1
 
     def fly(
-        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+        self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
     ) -> Iterator[Row]:
         """Yield a row for each draw; fewer where it is stopped."""
         common = DrawnFlight.of(campaign.scenario)
@@ -75,18 +75,9 @@ class FlightsEngine(_OneByOneEngine):
         return ""
 
     def flown(
-        self,
-        campaign: Campaign,
-        flight: DrawnFlight,
-        stopped: Callable[[], bool] = lambda: False,
+        self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool] = lambda: False
     ) -> Flight:
-        """Fly one draw.
-
-        Raises
-        ------
-        SpaceRobotError
-            A parameter, the robot or the goal is refused.
-        """
+        """Fly one draw; see the base class."""
         return fly_scenario(
             flight.scenario,
             robots=robots_of(flight),
@@ -103,7 +94,7 @@ def robots_of(flight: DrawnFlight) -> Robots:
         robots = replace(robots, method=_method_of_planner(robots.planner, scenario.planner))
     if flight.inertial is None:
         return robots
-    weighing = node_robot("plant", flight).with_inertial(flight.inertial)
+    weighing = plant_robot(flight).with_inertial(flight.inertial)
     return replace(robots, plant=weighing)
 
 
@@ -111,57 +102,43 @@ def nominal_robots(scenario: Scenario) -> Robots:
     """Return the models of a scenario without dispersions of masses, the same objects each time."""
     plant = description_of(scenario).urdf
 
-    def built(node: str, config: RobotConfig) -> SpaceRobot | None:
+    def build(node: str, config: RobotConfig) -> SpaceRobot | None:
         text = config.robot_description
         if not (config.robot or text):
             text = plant  # The robot of commanders that name none.
-        return _robot_of_node(node, text, config)
+        error, seed = 0.0, 0
+        if isinstance(config, BelievedRobotConfig):
+            error, seed = config.model_error, config.model_error_seed
+        return _build_robot(node, text, config.robot, error, seed)
 
-    return Robots.of(scenario, built)
-
-
-@dataclass(frozen=True)
-class _BuiltMethod:
-    """A gait method, and the robot and the configuration that it was built for."""
-
-    robot: SpaceRobot
-    config: PlannerConfig
-    method: GaitMethod
-
-    def serves(self, robot: SpaceRobot, config: PlannerConfig) -> bool:
-        """Whether it is the method of a planner."""
-        return self.robot is robot and (self.config is config or self.config == config)
+    return Robots.of(scenario, build)
 
 
-_last_method: _BuiltMethod | None = None
-"""The method of the last flight: its solvers serve all flights, and no plan depends on another."""
+_last_method: tuple[SpaceRobot, PlannerConfig, GaitMethod] | None = None
+"""Robot, configuration and gait method of the last planner: the solvers of a method serve all
+flights, and no plan depends on another."""
 
 
 def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
     """Return the method of a planner: that of the last flight if its planner was equal."""
     global _last_method
-    if _last_method is None or not _last_method.serves(robot, config):
-        method = build_method(
-            *(config.method, robot, config.control_period, config.integration_step),
-            config.method_options,
-        )
-        _last_method = _BuiltMethod(robot, config, method)
-    return _last_method.method
+    if _last_method is not None and _last_method[0] is robot:
+        known, method = _last_method[1:]
+        if known is config or known == config:
+            return method
+    method = build_method(
+        *(config.method, robot, config.control_period, config.integration_step),
+        config.method_options,
+    )
+    _last_method = robot, config, method
+    return method
 
 
-def node_robot(node: str, flight: DrawnFlight) -> SpaceRobot:
-    """Return the robot of a node without dispersions of its masses."""
-    robot = _build_robot(node, flight.nominal.urdf, "", 0.0, 0)
+def plant_robot(flight: DrawnFlight) -> SpaceRobot:
+    """Return the robot of the plant without dispersions of its masses."""
+    robot = _build_robot("plant", flight.nominal.urdf, "", 0.0, 0)
     assert robot is not None
     return robot
-
-
-def _robot_of_node(node: str, text: str, config: RobotConfig) -> SpaceRobot | None:
-    """Return the robot that a node assumes, the same object as long as it assumes it."""
-    error, seed = 0.0, 0
-    if isinstance(config, BelievedRobotConfig):
-        error, seed = config.model_error, config.model_error_seed
-    return _build_robot(node, text, config.robot, error, seed)
 
 
 @lru_cache(maxsize=32)

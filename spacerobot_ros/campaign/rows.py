@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -107,6 +107,6 @@ class Engine(Protocol):
         """
 
     def fly(
-        self, campaign: Campaign, draws: Sequence[Draw], stopped: Callable[[], bool]
+        self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
     ) -> Iterator[Row | Fallback]:
         """Yield a row or a fallback for each draw; fewer if it is stopped."""

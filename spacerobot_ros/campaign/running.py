@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.dataset import Dataset
-from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight
+from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
 from spacerobot_ros.campaign.rows import LANES, Row
-from spacerobot_ros.campaign.workers import THIS_PROCESS, Cluster, Distribution, workers_of
+from spacerobot_ros.campaign.workers import THIS_PROCESS, Cluster, Distribution, open_workers
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
@@ -81,10 +80,8 @@ def run_campaign(
     SpaceRobotError
         The engine cannot fly it, the folder holds another campaign, or a package is missing.
     """
-    draws = Draws(campaign)
-    wanted = campaign.engine if engine == "auto" else engine
-    chosen = select_engine(campaign, wanted)
-    dataset = Dataset(folder)
+    draws, dataset = Draws(campaign), Dataset(folder)
+    chosen = select_engine(campaign, campaign.engine if engine == "auto" else engine)
     done = dataset.begin(campaign)
     numbers = [number for number in range(len(draws)) if number not in done]
     began, before = time.monotonic(), len(draws) - len(numbers)
@@ -118,26 +115,12 @@ def _fly_rows(
     if not numbers:
         return
     if not cluster.workers and not cluster.scheduler:
-        for row in fly_all(
-            engine_by_name(engine), campaign, _SelectedDraws(draws, numbers), stopped
-        ):
+        selected = (draws[number] for number in numbers)  # Each is made when it is flown.
+        for row in fly_all(engine_by_name(engine), campaign, selected, stopped):
             yield [row]
         return
-    with workers_of(cluster, len(numbers)) as workers:
+    with open_workers(cluster, len(numbers)) as workers:
         yield from Distribution(workers, campaign, draws, engine, stopped).rows(numbers)
-
-
-class _SelectedDraws(Sequence[Draw]):
-    """The draws of a list of numbers, each made when it is used."""
-
-    def __init__(self, draws: Draws, numbers: list[int]) -> None:
-        self._draws, self._numbers = draws, numbers
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    def __getitem__(self, index: Any) -> Any:
-        return self._draws[self._numbers[index]]
 
 
 RERUN_TOLERANCE = 1e-9
@@ -191,15 +174,12 @@ class Rerun:
             f"drawn       {drawn or 'nothing'}; seed {row.draw.seed}",
             f"bag         {self.bag}",
         ]
+        comparison = "has no such flight yet"
         if self.deviation is not None:
             where = f" ({self.worst_metric})" if self.worst_metric else ""
-            deviation = f"largest deviation {self.deviation:.2g}{where}"
-            lines.append(f"dataset     {self.outcome}; {deviation}")
-        else:
-            lines.append("dataset     has no such flight yet")
-        if self.note:
-            lines.append(self.note)
-        return lines
+            comparison = f"{self.outcome}; largest deviation {self.deviation:.2g}{where}"
+        lines.append(f"dataset     {comparison}")
+        return [*lines, self.note] if self.note else lines
 
 
 def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
@@ -226,7 +206,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     scenario = drawn_flight(campaign, draw).finished().scenario
     run_scenario(scenario, bag, longest=campaign.longest)
     row = Row.of(campaign, draw, read_run(bag).measures, "ros")
-    known = known_flight(dataset, campaign, number)
+    known = stored_flight(dataset, number)
     if known is None:
         return Rerun(row, None, "", "", bag)
     outcome, engine, metrics = known
@@ -239,20 +219,17 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     return Rerun(row, deviation, at, outcome, bag, note)
 
 
-def known_flight(
-    dataset: Dataset, campaign: Campaign, number: int
-) -> tuple[str, str, dict[str, float]] | None:
+def stored_flight(dataset: Dataset, number: int) -> tuple[str, str, dict[str, float]] | None:
     """Return outcome, engine and metrics of a flight in a dataset; None: it is not there."""
     if number not in dataset.done():
         return None
-    table = dataset.table()
-    (record,) = [row for row in table.to_pylist() if row["flight"] == number]
-    names = [
-        name
-        for name in table.column_names
-        if isinstance(record[name], float) and not name.startswith(("draw.", "wall_", "plan_"))
-    ]
-    return record["outcome"], record["engine"], {name: record[name] for name in names}
+    (record,) = [row for row in dataset.table().to_pylist() if row["flight"] == number]
+    metrics = {
+        name: value
+        for name, value in record.items()
+        if isinstance(value, float) and not name.startswith(("draw.", "wall_", "plan_"))
+    }
+    return record["outcome"], record["engine"], metrics
 
 
 def largest_deviation(

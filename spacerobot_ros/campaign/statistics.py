@@ -54,11 +54,7 @@ def share(count: int, total: int) -> Share:
     wilson = test.proportion_ci(CONFIDENCE, "wilson")
     exact = test.proportion_ci(CONFIDENCE, "exact")
     return Share(
-        count,
-        total,
-        float(wilson.low),
-        float(wilson.high),
-        (float(exact.low), float(exact.high)),
+        count, total, float(wilson.low), float(wilson.high), (float(exact.low), float(exact.high))
     )
 
 

@@ -10,6 +10,7 @@ import logging
 import math
 import multiprocessing
 import os
+import pickle
 import signal
 import time
 from collections import Counter, deque
@@ -37,13 +38,10 @@ from spacerobot_ros.version import __version__
 TASK_TIME = 2.0
 """Wall time that a task should take, s: the overhead of its distribution is small beside it."""
 
-_FIRST_TASK_FLIGHTS, _MOST_TASK_FLIGHTS = 4, 2000
-"""Numbers of flights in the first tasks, and in the largest."""
+_MIN_FIRST_TASK_FLIGHTS, _MAX_TASK_FLIGHTS = 4, 2000
+"""Smallest number of flights in the first tasks, and largest number in any task."""
 
-_TASKS_PER_WORKER = 2
-"""Tasks per worker that are submitted at a time, the running one included."""
-
-_MOST_WORKER_DEATHS = 2
+_MAX_WORKER_DEATHS = 2
 """Workers that may die during a flight; then it is reported as killed and not repeated."""
 
 _PACKAGE = "spacerobot_ros"
@@ -83,43 +81,29 @@ THIS_PROCESS = Cluster()
 # -- a task in a worker -----------------------------------------------------------------------
 
 
-class Specification:
-    """A campaign as it is sent to workers: the content of its file and its scenario."""
-
-    def __init__(self, campaign: Campaign) -> None:
-        self.name, self.section = campaign.name, dict(campaign.section)
-        self.scenario = campaign.scenario
-        self.version = __version__
-        self.key = os.urandom(8).hex()
-
-    def campaign(self) -> Campaign:
-        """Return the campaign, parsed once in each process."""
-        return _parse_specification(self)
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Specification) and other.key == self.key
+def pack_campaign(campaign: Campaign) -> bytes:
+    """Return a campaign as it is sent to workers: the content of its file, and its scenario."""
+    campaign = self_contained(campaign)
+    return pickle.dumps((campaign.name, dict(campaign.section), Path(), campaign.scenario))
 
 
 @lru_cache(maxsize=4)
-def _parse_specification(specification: Specification) -> Campaign:
-    return parse_campaign(
-        specification.name, specification.section, scenario=specification.scenario
-    )
+def _unpack_campaign(packed: bytes) -> Campaign:
+    return parse_campaign(*pickle.loads(packed))
 
 
 def fly_task(
-    specification: Specification, draws: list[Draw], engine: str, *, all_of_them: bool = False
+    packed: bytes, version: str, draws: list[Draw], engine: str, include_fallbacks: bool
 ) -> list[Row | Fallback]:
     """Fly some draws: a task of a worker.
 
     Parameters
     ----------
-    specification, draws, engine
-        Campaign, draws and name of the engine.
-    all_of_them
+    packed, version
+        Result of :func:`pack_campaign`, and the version of the package that made it.
+    draws, engine
+        Draws, and name of the engine.
+    include_fallbacks
         Fly the fallbacks of the engine in this task, too.
 
     Raises
@@ -127,13 +111,13 @@ def fly_task(
     SpaceRobotError
         The worker has another version of this package.
     """
-    if specification.version != __version__:
+    if version != __version__:
         raise SpaceRobotError(
-            f"A worker has spacerobot_ros {__version__}, and this process {specification.version}: "
+            f"A worker has spacerobot_ros {__version__}, and this process {version}: "
             "all need the same."
         )
-    flying, campaign = engine_by_name(engine), specification.campaign()
-    fly = partial(fly_all, flying) if all_of_them else flying.fly
+    flying, campaign = engine_by_name(engine), _unpack_campaign(packed)
+    fly = partial(fly_all, flying) if include_fallbacks else flying.fly
     return list(fly(campaign, draws, lambda: False))
 
 
@@ -144,23 +128,14 @@ class WorkerDeath(Exception):  # noqa: N818
     """A worker died during a task."""
 
 
-class _LocalTask:
-    """Arguments of :func:`fly_task`, and its result or exception once it has ended."""
-
-    def __init__(self, arguments: tuple[Any, ...], *, all_of_them: bool) -> None:
-        self.arguments, self.all_of_them = arguments, all_of_them
-        self.answer: Any = None
-        self.ended = False
-
-
 class _LocalWorker:
-    """A process that flies one task at a time."""
+    """A process that flies one task at a time, and takes its arguments from a pipe."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, other = context.Pipe()
         self.process = context.Process(target=_run_worker, args=(other,), daemon=True)
-        self.task: _LocalTask | None = None
+        self.busy = False
         # Compilers and linear algebra of several workers would compete for the cores.
         before = {name: os.environ.get(name) for name in _THREAD_COUNT_VARIABLES}
         os.environ.update(dict.fromkeys(_THREAD_COUNT_VARIABLES, "1"))
@@ -178,22 +153,6 @@ class _LocalWorker:
                     os.environ[name] = value
             other.close()
 
-    def begin(self, task: _LocalTask) -> None:
-        """Send a task to the process."""
-        self.task = task
-        with suppress(OSError):  # It has died since: the end of its pipe says so.
-            self.connection.send((task.arguments, task.all_of_them))
-
-    def finish(self) -> None:
-        """Receive the answer to the task."""
-        assert self.task is not None
-        try:
-            self.task.answer = self.connection.recv()
-        except (EOFError, OSError):
-            self.task.answer = WorkerDeath()
-            self.process.join()
-        self.task.ended, self.task = True, None
-
     def close(self) -> None:
         """End the process."""
         self.process.kill()
@@ -204,8 +163,9 @@ class _LocalWorker:
 class LocalWorkers:
     """Processes on this machine, each behind an anonymous pipe: nobody else can reach them.
 
-    Each has one task at a time, so a death has one cause. Together they may use half of the memory
-    of the machine; a worker that uses more than its share is killed.
+    Each has one task at a time, so a death has one cause; the busy worker stands for its task.
+    Together they may use half of the memory of the machine; a worker that uses more than its share
+    is killed.
 
     Parameters
     ----------
@@ -213,42 +173,50 @@ class LocalWorkers:
         The number of processes.
     """
 
+    tasks_per_worker = 1
+
     def __init__(self, count: int) -> None:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         self._memory = max(512 * 2**20, total // (2 * count))
-        self._queue: deque[_LocalTask] = deque()
         self._workers = [_LocalWorker() for _ in range(count)]
 
     def count(self) -> int:
         """Return the number of workers."""
         return len(self._workers)
 
-    def submit(self, *task: Any, all_of_them: bool) -> _LocalTask:
-        """Queue a task."""
-        made = _LocalTask(task, all_of_them=all_of_them)
-        self._queue.append(made)
-        self._assign_tasks()
-        return made
+    def submit(self, *arguments: Any) -> _LocalWorker:
+        """Begin a task in an idle worker; the arguments are those of :func:`fly_task`."""
+        place = next(place for place, worker in enumerate(self._workers) if not worker.busy)
+        if not self._workers[place].process.is_alive():
+            self._workers[place].close()
+            self._workers[place] = _LocalWorker()
+        worker = self._workers[place]
+        worker.busy = True
+        with suppress(OSError):  # It has died since: the end of its pipe says so.
+            worker.connection.send(arguments)
+        return worker
 
-    def ended(self, tasks: list[_LocalTask]) -> list[_LocalTask]:
+    def ended(self, tasks: list[_LocalWorker]) -> list[_LocalWorker]:
         """Return those of the tasks that have ended, after a while also none."""
-        busy = {worker.connection: worker for worker in self._workers if worker.task is not None}
-        for ready in wait(list(busy), timeout=_POLL_PERIOD):
-            busy.pop(ready).finish()  # type: ignore[call-overload]
-        for worker in busy.values():
+        ready = wait([worker.connection for worker in tasks], timeout=_POLL_PERIOD)
+        for worker in tasks:
             if _resident_bytes(worker.process.pid) > self._memory:
                 worker.process.kill()
-        self._assign_tasks()
-        return [task for task in tasks if task.ended]
+        return [worker for worker in tasks if worker.connection in ready]
 
-    def result(self, task: _LocalTask) -> list[Row | Fallback]:
+    def result(self, task: _LocalWorker) -> list[Row | Fallback]:
         """Return the result of a task that has ended, or raise its exception."""
-        if isinstance(task.answer, BaseException):
-            raise task.answer
-        result: list[Row | Fallback] = task.answer
-        return result
+        task.busy = False
+        try:
+            answer: list[Row | Fallback] | Exception = task.connection.recv()
+        except (EOFError, OSError):
+            task.process.join()
+            raise WorkerDeath from None
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
 
-    def cancel(self, tasks: list[_LocalTask]) -> None:
+    def cancel(self, tasks: list[_LocalWorker]) -> None:
         """Stop tasks: :meth:`close` ends the processes."""
 
     def close(self) -> None:
@@ -256,24 +224,15 @@ class LocalWorkers:
         for worker in self._workers:
             worker.close()
 
-    def _assign_tasks(self) -> None:
-        """Send waiting tasks to idle workers."""
-        for place, worker in enumerate(self._workers):
-            if worker.task is None and self._queue:
-                if not worker.process.is_alive():
-                    worker.close()
-                    self._workers[place] = _LocalWorker()
-                self._workers[place].begin(self._queue.popleft())
-
 
 def _run_worker(connection: Connection) -> None:
     """Fly the tasks that come through a pipe until it is closed."""
     Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):
         while True:
-            arguments, all_of_them = connection.recv()
+            arguments = connection.recv()
             try:
-                answer: Any = fly_task(*arguments, all_of_them=all_of_them)
+                answer: list[Row | Fallback] | Exception = fly_task(*arguments)
             except Exception as error:  # Raised again in the parent.
                 answer = error
             connection.send(answer)
@@ -305,6 +264,8 @@ class DaskWorkers:
         A client of dask.distributed.
     """
 
+    tasks_per_worker = 2  # The running one, and one that follows it without a round trip.
+
     def __init__(self, client: Any) -> None:
         self._client = client
         self._checked: set[str] = set()
@@ -334,9 +295,9 @@ class DaskWorkers:
             warn_once("The scheduler has no worker: the flights wait for one.")
         return max(1, workers)
 
-    def submit(self, *task: Any, all_of_them: bool) -> Any:
-        """Queue a task."""
-        return self._client.submit(fly_task, *task, all_of_them=all_of_them, pure=False, retries=0)
+    def submit(self, *arguments: Any) -> Any:
+        """Queue a task; the arguments are those of :func:`fly_task`."""
+        return self._client.submit(fly_task, *arguments, pure=False, retries=0)
 
     def ended(self, tasks: list[Any]) -> list[Any]:
         """Return those of the tasks that have ended, after a while also none."""
@@ -409,7 +370,7 @@ Workers = LocalWorkers | DaskWorkers
 
 
 @contextmanager
-def workers_of(cluster: Cluster, flights: int) -> Iterator[Workers]:
+def open_workers(cluster: Cluster, flights: int) -> Iterator[Workers]:
     """Yield the workers of a cluster, at most as many processes as there are flights.
 
     Raises
@@ -486,10 +447,10 @@ class Distribution:
         engine: str,
         stopped: Callable[[], bool],
     ) -> None:
-        self._workers, self._specification = workers, Specification(self_contained(campaign))
+        self._workers, self._packed = workers, pack_campaign(campaign)
         self._draws, self._engine, self._stopped = draws, engine, stopped
         self._sizes = {
-            name: float(max(_FIRST_TASK_FLIGHTS, engine_by_name(name).least))
+            name: float(max(_MIN_FIRST_TASK_FLIGHTS, engine_by_name(name).least))
             for name in (engine, FLIGHTS)
         }
         """Flights of a task, by the engine."""
@@ -521,10 +482,11 @@ class Distribution:
 
     def _submit_tasks(self, waiting: deque[int]) -> None:
         """Keep the workers busy."""
-        if self._retry_alone and self._alone is None:
-            self._alone = self._submit_task([self._retry_alone.popleft()], self._engine, alone=True)
         workers = self._workers.count()
-        while (self._fallbacks or waiting) and len(self._running) < _TASKS_PER_WORKER * workers:
+        most = workers * self._workers.tasks_per_worker
+        if self._retry_alone and self._alone is None and len(self._running) < most:
+            self._alone = self._submit_task([self._retry_alone.popleft()], self._engine, alone=True)
+        while (self._fallbacks or waiting) and len(self._running) < most:
             queue, engine = (
                 (self._fallbacks, FLIGHTS) if self._fallbacks else (waiting, self._engine)
             )
@@ -535,7 +497,7 @@ class Distribution:
 
     def _submit_task(self, numbers: list[int], engine: str, *, alone: bool = False) -> Any:
         draws = [self._draws[number] for number in numbers]
-        task = self._workers.submit(self._specification, draws, engine, all_of_them=alone)
+        task = self._workers.submit(self._packed, __version__, draws, engine, alone)
         self._running[task] = _SubmittedTask(numbers, engine)
         return task
 
@@ -558,7 +520,7 @@ class Distribution:
             if took > 0:
                 size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TASK_TIME / took
                 least = engine_by_name(task.engine).least
-                self._sizes[task.engine] = max(least, min(_MOST_TASK_FLIGHTS, size))
+                self._sizes[task.engine] = max(least, min(_MAX_TASK_FLIGHTS, size))
         return [
             replace(row, fallback=self._reasons[number])
             if (number := row.draw.number) in self._reasons
@@ -572,8 +534,8 @@ class Distribution:
         for number in numbers:
             if alone or not self._deaths[number]:
                 self._deaths[number] += 1
-            if self._deaths[number] >= _MOST_WORKER_DEATHS:
-                reason = f"The process that flew it died {_MOST_WORKER_DEATHS} times."
+            if self._deaths[number] >= _MAX_WORKER_DEATHS:
+                reason = f"The process that flew it died {_MAX_WORKER_DEATHS} times."
                 row = Row(self._draws[number], KILLED, reason, engine=self._engine)
                 given_up.append(row)
             else:

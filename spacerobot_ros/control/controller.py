@@ -78,11 +78,12 @@ class CoordinatedController:
         estimation_time: float,
     ) -> None:
         self.law, self._kinds = law, law.outputs.selection.kinds
-        self._limits, self._rates = limits, rates
+        self._limits, self.joint_rate_limits = limits, rates
         self._profile_type, self._motion = profile, motion
         self._control_period, self._estimation_time = control_period, estimation_time
         self.mode = Mode.MEASURED
-        self._profile: ReferenceProfile | None = None
+        self.profile: ReferenceProfile | None = None
+        """The profile of the present goals; None before the first state."""
         self._began = 0.0
         self._followed = Reference()
         self._sent: Actuation | None = None
@@ -95,7 +96,7 @@ class CoordinatedController:
 
     def reset(self) -> None:
         """Drop goals and measurements; the next state counts as the first."""
-        self._profile, self._followed = None, Reference()
+        self.profile, self._followed = None, Reference()
         self.coming_to_rest = False
         self._sent = self._estimator = self._brake = None
         self.mode = Mode.MEASURED
@@ -118,9 +119,9 @@ class CoordinatedController:
         A robot that was brought to rest has no earlier goals: such a group stays where it is.
         """
         if self.coming_to_rest:
-            self._profile, self.coming_to_rest = None, False
+            self.profile, self.coming_to_rest = None, False
         start = self._present(time, state)
-        goal = start if self._profile is None else self._profile.goal
+        goal = start if self.profile is None else self.profile.goal
         if base is not None:
             goal = replace(goal, base=base)
         if end_effector is not None:
@@ -128,18 +129,18 @@ class CoordinatedController:
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
         motion = self._motion.within_thrust(self._limits, self.law.robot, state.q)
-        self._profile = self._profile_type(start, goal, motion)
+        self.profile = self._profile_type(start, goal, motion)
         self._began = time
 
     def begin_anew(self, time: float, state: ControlState) -> None:
         """Start towards the present goals from the measured pose, not from the reference."""
-        goal, self._profile = self.goal, None
+        goal, self.profile = self.goal, None
         joints = None if goal.joints is None else goal.joints.q
         self.set_goals(time, state, base=goal.base, end_effector=goal.end_effector, joints=joints)
 
     def hold_here(self, time: float, state: ControlState) -> None:
         """Hold the measured pose and shape; the earlier reference is dropped."""
-        self._profile = None
+        self.profile = None
         self.set_goals(time, state)
 
     def come_to_rest(self) -> None:
@@ -172,15 +173,15 @@ class CoordinatedController:
         if state is None:
             commanded = self._stopping(q, qdot)
         else:
-            if self._profile is None:
-                self._profile = StepReference(
+            if self.profile is None:
+                self.profile = StepReference(
                     self._present(time, state), self._present(time, state), self._motion
                 )
                 self._began = time
             # Evaluated in any case: errors and status are those of the law.
             commanded = self.law.command(state, self._reference(time))
             if self.coming_to_rest:
-                commanded = self._rates.to_rest(state)
+                commanded = self.joint_rate_limits.to_rest(state)
         if state is not None:
             result = self.limited(state, commanded, self._periods_held(time))
         else:
@@ -191,7 +192,7 @@ class CoordinatedController:
     def limited(self, state: ControlState, commanded: Actuation, periods: int = 1) -> Saturated:
         """Return the realised part of a command that is held for some control periods."""
         result = self._limits.apply(commanded)
-        kept = self._rates.apply(state, result.realised, self._limits.effort, periods)
+        kept = self.joint_rate_limits.apply(state, result.realised, self._limits.effort, periods)
         return result if kept is result.realised else Saturated.of(commanded, kept)
 
     def limited_expression(
@@ -201,26 +202,12 @@ class CoordinatedController:
         limits of joint rates lower it further, which only :meth:`limited` can do.
         """
         realised = self._limits.expression(actuation)
-        return realised, self._rates.lowered(omega, q, qdot, realised)
-
-    @property
-    def profile(self) -> ReferenceProfile | None:
-        """The profile of the present goals; None before the first state."""
-        return self._profile
+        return realised, self.joint_rate_limits.lowered(omega, q, qdot, realised)
 
     @property
     def goal(self) -> Reference:
         """Pose and shape in which the references come to rest; empty before the first state."""
-        return Reference() if self._profile is None else self._profile.goal
-
-    @property
-    def joint_rates(self) -> Array:
-        """Largest joint rates (n,), m/s or rad/s; infinite: no limit."""
-        return self._rates.rates
-
-    def largest_rate_share(self, qdot: Array) -> float:
-        """Return the largest of rates (n,) as a share of its limit."""
-        return self._rates.largest_share(qdot)
+        return Reference() if self.profile is None else self.profile.goal
 
     @property
     def estimated_for(self) -> float:
@@ -229,7 +216,7 @@ class CoordinatedController:
 
     def reference_at_rest(self, time: float) -> bool:
         """Whether the reference has reached its goal at ``time`` (s)."""
-        return self._profile is not None and time - self._began >= self._profile.duration
+        return self.profile is not None and time - self._began >= self.profile.duration
 
     def errors(self) -> Errors:
         """Return the errors of the last command's outputs from the reference."""
@@ -263,8 +250,8 @@ class CoordinatedController:
         reference travels and the largest present error, with the error that its rate adds until it
         is damped.
         """
-        assert self._profile is not None
-        law, far = self.law, self._profile.distances()
+        assert self.profile is not None
+        law, far = self.law, self.profile.distances()
         Kp, Kd = law.gain_diagonals
         reach = np.abs(law.error) + Kd / Kp * np.abs(law.error_rate)
         bounds = np.empty(len(self._kinds))
@@ -286,14 +273,14 @@ class CoordinatedController:
 
     def _present(self, time: float, state: ControlState) -> Reference:
         """Return the present reference; before the first one, the pose of the robot."""
-        if self._profile is not None:
-            return self._profile.at(time - self._began)
+        if self.profile is not None:
+            return self.profile.at(time - self._began)
         link = self.law.outputs.selection.end_effector_link
         return Reference.present(self.law.robot, state, link)
 
     def _reference(self, time: float) -> Reference:
-        assert self._profile is not None
-        own, given = self._profile.at(time - self._began), self._followed
+        assert self.profile is not None
+        own, given = self.profile.at(time - self._began), self._followed
         if given.base is None and given.joints is None and given.end_effector is None:
             return own
         return Reference(

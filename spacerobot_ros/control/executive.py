@@ -302,10 +302,10 @@ class ControlExecutive:
 
     def _watch_rates(self, qdot: Array) -> None:
         """Give up if a joint stays far beyond its rate: its motor does not master it."""
-        lost = self._monitor.rates_lost(self.controller.largest_rate_share(qdot))
+        lost = self._monitor.rates_lost(self.controller.joint_rate_limits.largest_share(qdot))
         if not lost or self._not_in_charge:
             return
-        rates = self.controller.joint_rates
+        rates = self.controller.joint_rate_limits.rates
         joint = int(np.argmax(np.abs(qdot) / rates))
         name = self.controller.law.robot.joint_names[joint]
         self._lose(f"joint '{name}' moves at {qdot[joint]:.3g}/s instead of {rates[joint]:.3g}/s")

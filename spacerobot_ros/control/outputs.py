@@ -131,11 +131,7 @@ class OutputDistance:
     joints: float
 
     def __str__(self) -> str:
-        parts = (
-            (self.position, " m"),
-            (self.attitude, " rad"),
-            (self.joints, " at the joints"),
-        )
+        parts = ((self.position, " m"), (self.attitude, " rad"), (self.joints, " at the joints"))
         return ", ".join(f"{value:.3g}{unit}" for value, unit in parts if not math.isnan(value))
 
 

@@ -136,13 +136,7 @@ class ControllerStatus:
             raise SpaceRobotError(f"This is no status of a controller: {error}.") from error
 
 
-_NUMBERS = (
-    "smallest_singular_value",
-    "damping",
-    "lost_force_N",
-    "lost_torque_Nm",
-    "lost_effort",
-)
+_NUMBERS = ("smallest_singular_value", "damping", "lost_force_N", "lost_torque_Nm", "lost_effort")
 """Values of a command report that are one number each."""
 
 

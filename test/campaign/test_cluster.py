@@ -22,7 +22,8 @@ from support.campaigns import campaign, section
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.running import run_campaign
-from spacerobot_ros.campaign.workers import Cluster, Distribution, Specification, workers_of
+from spacerobot_ros.campaign.workers import Cluster, Distribution, open_workers, pack_campaign
+from spacerobot_ros.version import __version__
 
 pytestmark = pytest.mark.slow
 
@@ -212,11 +213,11 @@ def test_workers_of_this_machine_listen_nowhere() -> None:
         ]
 
     before = listening()
-    specification = Specification(campaign(**{**GIVEN, "flights": 2}))
-    with workers_of(Cluster(workers=2), 2) as workers:
+    made = campaign(**{**GIVEN, "flights": 2})
+    with open_workers(Cluster(workers=2), 2) as workers:
         tasks = [
-            workers.submit(specification, [draw], "flights", all_of_them=True)
-            for draw in Draws(specification.campaign())
+            workers.submit(pack_campaign(made), __version__, [draw], "flights", True)
+            for draw in Draws(made)
         ]
         ended: list[Any] = []
         while len(ended) < len(tasks):

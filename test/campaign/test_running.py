@@ -30,6 +30,7 @@ from spacerobot_ros.campaign.running import (
 )
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.version import __version__
 
 MASSES: dict[str, Any] = {
     "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
@@ -221,20 +222,19 @@ def test_a_flight_is_flown_again_as_often_as_one_likes(
 
 def test_a_worker_of_another_version_flies_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     made = small(flights=1)
-    specification = workers.Specification(made)
-    assert len(workers.fly_task(specification, [_draw(made, 0)], "flights")) == 1
+    task = workers.pack_campaign(made), __version__, [_draw(made, 0)], "flights", False
+    assert len(workers.fly_task(*task)) == 1
     monkeypatch.setattr(workers, "__version__", "9.9")
     with pytest.raises(SpaceRobotError, match=r"A worker has spacerobot_ros 9\.9, and this"):
-        workers.fly_task(specification, [_draw(made, 0)], "flights")
+        workers.fly_task(*task)
 
 
 def test_a_task_of_lanes_leaves_what_others_fly_unless_all_of_it_is_asked_for() -> None:
     """What is flown at once is sent back before flights that take long."""
     settings = {"planner.attitude_tolerance": 0.002, "planner.max_corrections": 3}
     made = campaign(flights=8, set=settings, disperse={"mass.*": {"norm": [1.0, 0.03]}}, seed=8)
-    specification, draws = workers.Specification(made), list(Draws(made))
-    part = workers.fly_task(specification, draws, "lanes")
-    whole = workers.fly_task(specification, draws, "lanes", all_of_them=True)
+    task = workers.pack_campaign(made), __version__, list(Draws(made)), "lanes"
+    part, whole = workers.fly_task(*task, False), workers.fly_task(*task, True)
     assert all(isinstance(each, Row) for each in whole)
     left = {each.draw.number: each.reason for each in part if isinstance(each, Fallback)}
     assert 0 < len(left) < 8

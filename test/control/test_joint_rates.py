@@ -401,7 +401,7 @@ def test_a_goal_is_begun_anew_from_where_a_reset_puts_the_robot() -> None:
     loop = ExecutiveLoop(None, profile="quintic", **pace)
     loop.aim(base=goal_at(4 * AIM, "g"), end_effector=goal_at(TIP + 4 * AIM, "g"))
     loop.answer()
-    profile = loop.executive.controller._profile
+    profile = loop.executive.controller.profile
     assert profile is not None
     middle = profile.duration / 2
     loop.place = 2 * AIM
