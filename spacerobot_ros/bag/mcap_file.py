@@ -184,13 +184,7 @@ _MAX_YAML_DEPTH = 8
 
 
 def _require_flat_yaml(text: str) -> None:
-    """Refuse YAML that is nested, or multiplies itself by references.
-
-    Raises
-    ------
-    ValueError
-        It does.
-    """
+    """Raise ValueError for YAML that is deeply nested, or multiplies itself by references."""
     if len(text) > _MAX_YAML_CHARACTERS:
         raise ValueError(f"it is longer than {_MAX_YAML_CHARACTERS} characters")
     depth = 0
@@ -321,15 +315,7 @@ class BagExistsError(RecordingError):
 
 
 def _create_locked_file(path: Path, overwrite: bool) -> io.FileIO:
-    """Open a file of our own for writing: regular, empty and locked.
-
-    Raises
-    ------
-    RecordingError
-        A file exists and is not to be overwritten.
-    OSError
-        It cannot be opened.
-    """
+    """Open a regular, empty, locked file; BagExistsError where it is not to be overwritten."""
     with suppress(FileNotFoundError):
         require_regular(os.stat(path).st_mode, path, "make")
     flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
@@ -372,7 +358,8 @@ class McapFile:
     Every append goes to the operating system at once, and one that fails is undone, so that the
     file of a process that dies is whole but for the record that it was appending. While it is open
     it is locked: no second one can be opened on the same path. ``compression`` and ``overwrite``
-    are as of :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` is that of the MCAP header.
+    are as of :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` is that of the MCAP header. Every
+    append raises RecordingError where the disk refuses it; the file is then as it was.
 
     Raises
     ------
@@ -419,37 +406,26 @@ class McapFile:
         return self._size
 
     def check(self) -> None:
-        """Check that the path still leads to this file, with its full size.
-
-        Raises
-        ------
-        RecordingError
-            It was removed, replaced, moved or cut, so the path no longer leads to the data.
-        """
-        what = ""
+        """Check that the path still leads to this file, uncut; RecordingError where it does not."""
+        problem = ""
         try:
             ours, theirs = os.fstat(self._raw.fileno()), os.stat(self.path)
             if (ours.st_dev, ours.st_ino) != (theirs.st_dev, theirs.st_ino):
-                what = "another file is in its place"
+                problem = "another file is in its place"
             elif ours.st_size != self._size:
-                what = f"it has {ours.st_size} bytes, and {self._size} were written"
+                problem = f"it has {ours.st_size} bytes, and {self._size} were written"
         except FileNotFoundError:
-            what = "it was removed or moved"
+            problem = "it was removed or moved"
         except (OSError, ValueError) as error:
-            what = str(getattr(error, "strerror", None) or error)
-        if what:
-            raise RecordingError(f"The bag {self.path} is lost while it is written: {what}.")
+            problem = str(getattr(error, "strerror", None) or error)
+        if problem:
+            raise RecordingError(f"The bag {self.path} is lost while it is written: {problem}.")
 
     def append_chunk(self, records: bytearray, entries: dict[int, list[int]]) -> None:
         """Append a chunk of encoded records and the indexes of its messages.
 
         ``entries`` are, of each channel, for each of its messages, log time in nanoseconds and
         offset in ``records``, one after the other.
-
-        Raises
-        ------
-        RecordingError
-            The disk refused it; the file is as it was.
         """
         entries = {channel: entry for channel, entry in entries.items() if entry}
         times = [entry[::2] for entry in entries.values()]
@@ -491,13 +467,7 @@ class McapFile:
         self.end_ns = end if self.end_ns is None else max(end, self.end_ns)
 
     def append_attachment(self, attachment: Attachment) -> None:
-        """Append an attachment.
-
-        Raises
-        ------
-        RecordingError
-            The disk refused it; the file is as it was.
-        """
+        """Append an attachment."""
         record, offset = encode(attachment), self._size
         self._append(record)
         self._attachment_indexes.append(
@@ -513,13 +483,7 @@ class McapFile:
         )
 
     def append_metadata(self, metadata: Metadata) -> None:
-        """Append a metadata record.
-
-        Raises
-        ------
-        RecordingError
-            The disk refused it; the file is as it was.
-        """
+        """Append a metadata record."""
         record, offset = encode(metadata), self._size
         self._append(record)
         self._metadata_indexes.append(
@@ -527,13 +491,7 @@ class McapFile:
         )
 
     def finish(self) -> None:
-        """Append the summary, after which the file is complete.
-
-        Raises
-        ------
-        RecordingError
-            The disk refused it; the file is as it was.
-        """
+        """Append the summary, after which the file is complete."""
         data_end = encode(DataEnd(data_section_crc=0))
         start = self._size + len(data_end)
         groups: tuple[tuple[Opcode, Iterable[bytes]], ...] = (
@@ -581,6 +539,10 @@ class McapFile:
             metadata_count=len(self._metadata_indexes),
             schema_count=len(self.schemas),
         )
+
+    def append_rosbag2_metadata(self, topics: Sequence[RecordedTopic]) -> None:
+        """Append rosbag2's metadata record of the messages so far."""
+        self.append_metadata(metadata_record(self.path.name, topics, self.start_ns, self.end_ns))
 
     def _append(self, data: bytes) -> None:
         rest = memoryview(data)

@@ -84,13 +84,7 @@ _FILE_KINDS = (
 
 
 def require_regular(mode: int, path: Path, act: str = "read") -> None:
-    """Refuse paths that are no regular file: opening a pipe blocks, writing to a device does harm.
-
-    Raises
-    ------
-    RecordingError
-        ``mode``, of the inode at ``path``, is not that of a regular file.
-    """
+    """Raise RecordingError for what is no regular file: a pipe blocks, a device takes harm."""
     if not stat.S_ISREG(mode):
         kind = next((words for test, words in _FILE_KINDS if test(mode)), "no file")
         raise RecordingError(f"Cannot {act} the bag {path}: it is {kind}.")
@@ -170,13 +164,7 @@ def file_size(file: BinaryIO) -> int:
 
 
 def records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
-    """Iterate over the records between two places of a file: where each begins, opcode and body.
-
-    Raises
-    ------
-    ValueError
-        A record is larger than the rest of the file.
-    """
+    """Iterate over the records between two bytes of a file: where each begins, opcode and body."""
     while start < end:
         file.seek(start)
         opcode, length = _read_record_header(file, start, end)
@@ -185,13 +173,7 @@ def records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, by
 
 
 def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int, int]]:
-    """Iterate over the records of the unpacked chunk at ``place``: opcode, first and last place.
-
-    Raises
-    ------
-    ValueError
-        A record reaches out of the chunk.
-    """
+    """Iterate over the records of the unpacked chunk at ``place``: opcode, first and last byte."""
     position, size = 0, len(data)
     unpack, header = RECORD_HEADER.unpack_from, RECORD_HEADER.size
     while position < size:
@@ -209,13 +191,7 @@ def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int, int]]:
 
 
 def read_record(file: BinaryIO, place: int, wanted: Opcode) -> bytes:
-    """Return the body of the record that begins somewhere in a file.
-
-    Raises
-    ------
-    ValueError
-        There is no such record.
-    """
+    """Return the body of the record of a kind that begins at a byte of a file."""
     end = file_size(file)
     if place + RECORD_HEADER.size > end:
         raise ValueError(f"its index names byte {place}, and it has {end} bytes")
@@ -240,13 +216,7 @@ def _read_record_header(file: BinaryIO, place: int, end: int) -> tuple[int, int]
 
 
 def parse_record(read: Callable[[ReadDataStream], T], body: bytes, place: int) -> T:
-    """Return the object that a class of ``mcap.records`` reads from the record at ``place``.
-
-    Raises
-    ------
-    ValueError
-        The body is damaged.
-    """
+    """Return the object that a class of ``mcap.records`` reads from the record at ``place``."""
     try:
         return read(ReadDataStream(BytesIO(body)))
     except DAMAGE_ERRORS as error:
@@ -272,13 +242,7 @@ class InflationLimit:
         self._inflated_size = 0
 
     def take(self, size: int, place: int) -> None:
-        """Count the inflated size of the chunk at ``place``.
-
-        Raises
-        ------
-        ValueError
-            The sum exceeds the allowance.
-        """
+        """Count the inflated size of the chunk at ``place``; ValueError if the sum is too large."""
         if self._inflated_size + size > self.most:
             raise ValueError(
                 f"with the chunk at byte {place} it inflates to {self._inflated_size + size} "
@@ -297,25 +261,12 @@ def _limit_mb() -> float:
 
 
 def chunk_size(body: bytes) -> int:
-    """Return how many bytes a chunk claims to hold.
-
-    Raises
-    ------
-    struct.error
-        The body is too short for a chunk.
-    """
+    """Return how many bytes a chunk claims to hold; struct.error where it is too short for one."""
     return int(_CHUNK_HEAD.unpack_from(body)[2])
 
 
 def unpack_chunk(body: bytes, place: int) -> bytes:
-    """Return the records of a chunk, whose size was allowed.
-
-    Raises
-    ------
-    ValueError
-        It is damaged: its compression, its checksum, or it holds another number of bytes than it
-        claims to.
-    """
+    """Return the records of the chunk at ``place``, of the size and checksum that it claims."""
     chunk = parse_record(Chunk.read, body, place)
     if chunk.compression not in _DECOMPRESSORS:
         raise ValueError(
@@ -433,13 +384,7 @@ def read_summary(path: Path, file: BinaryIO) -> Summary:
 
 
 def _check_chunks(summary: Summary, end: int) -> None:
-    """Check that the indexed chunks do not overlap, and fit the allowance.
-
-    Raises
-    ------
-    ValueError
-        Two chunks overlap, or all together are too large.
-    """
+    """Check that the indexed chunks do not overlap, and inflate to an allowed size."""
     allowance = InflationLimit(end)
     free = 0
     for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
@@ -453,13 +398,7 @@ def _check_chunks(summary: Summary, end: int) -> None:
 def indexed_records(
     file: BinaryIO, indexes: Sequence[AttachmentIndex | MetadataIndex], wanted: Opcode
 ) -> Iterator[tuple[int, bytes]]:
-    """Iterate over the records that an index of a summary names, each once: its place and body.
-
-    Raises
-    ------
-    ValueError
-        One is not there.
-    """
+    """Iterate over the records that an index of a summary names, each once: its place and body."""
     for place in dict.fromkeys(index.offset for index in indexes):
         yield place, read_record(file, place, wanted)
 
@@ -468,13 +407,7 @@ def indexed_records(
 
 
 def messages_in_file_order(file: BinaryIO) -> Iterator[RawMessage]:
-    """Iterate over all messages of a bag in the order they were written.
-
-    Raises
-    ------
-    ValueError
-        A record is damaged.
-    """
+    """Iterate over all messages of a bag in the order they were written."""
     size = file_size(file)
     allowance = InflationLimit(size)
     for place, opcode, body in records(file, len(MCAP0_MAGIC), size):
@@ -594,13 +527,7 @@ def _messages_in_chunks(
 def _chunk_and_entries(
     file: BinaryIO, index: ChunkIndex, channel_ids: set[int]
 ) -> tuple[bytes, NDArray[np.uint64]]:
-    """Return the records of a chunk; log time and place in it of each message wanted (N, 2).
-
-    Raises
-    ------
-    ValueError
-        The chunk is damaged, or its indexes name other records, or a message twice.
-    """
+    """Return the records of a chunk; log time and offset in it of each selected message (N, 2)."""
     place = index.chunk_start_offset
     body = read_record(file, place, Opcode.CHUNK)
     if chunk_size(body) != index.uncompressed_size:
@@ -622,13 +549,7 @@ def _chunk_and_entries(
 
 
 def _check_entries(chunk: bytes, positions: NDArray[np.uint64], place: int) -> None:
-    """Refuse positions in a chunk (N,) that are not those of messages, each once.
-
-    Raises
-    ------
-    ValueError
-        They are not.
-    """
+    """Check that offsets in a chunk (N,) are those of messages that do not overlap."""
     if not len(positions):
         return
     wrong = f"the message indexes of the chunk at byte {place} do not fit it"

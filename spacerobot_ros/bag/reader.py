@@ -509,40 +509,6 @@ class RecordedRobot:
             raise RecordingError(f"The bag {self.bag.path} holds no state: nothing is on {topic}.")
         return series
 
-    def truth(self, name: str, fields: list[str], width: int | None = None) -> tuple[Array, Array]:
-        """Return what ``odom`` or ``joint_states`` would be with perfect sensors.
-
-        That is ``<name>_true``, which a plant publishes while its sensors err, and ``name`` before
-        that begins.
-
-        Parameters
-        ----------
-        name
-            ``odom`` or ``joint_states``.
-        fields, width
-            See :meth:`TopicSeries.table`.
-
-        Returns
-        -------
-        Stamps (N,) in s, numbers (N, width).
-
-        Raises
-        ------
-        RecordingError
-            Neither has a message, or one is damaged.
-        """
-        true = self.get(f"{name}_true")
-        if true is None:
-            return self[name].stamp, self[name].table(fields, width)
-        measured = self.get(name)
-        if measured is None:
-            return true.stamp, true.table(fields, width)
-        before = measured.stamp < true.stamp[0]
-        return (
-            np.concatenate([measured.stamp[before], true.stamp]),
-            np.concatenate([measured.table(fields, width)[before], true.table(fields, width)]),
-        )
-
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records of the bag by name, those of this robot's nodes as ``parameters/NODE``.

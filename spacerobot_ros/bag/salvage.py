@@ -22,7 +22,6 @@ from spacerobot_ros.bag.mcap_file import (
     QosProfile,
     RecordedTopic,
     encode,
-    metadata_record,
 )
 from spacerobot_ros.bag.mcap_reading import (
     DAMAGE_ERRORS,
@@ -263,8 +262,7 @@ class _SalvagedBag:
                         self._file.message_counts.get(channel.id, 0),
                     )
                 )
-        file = self._file
-        file.append_metadata(metadata_record(file.path.name, topics, file.start_ns, file.end_ns))
+        self._file.append_rosbag2_metadata(topics)
 
 
 # -- the state to resume from -----------------------------------------------------------------

@@ -35,6 +35,8 @@ class TopicSeries:
         Name of the topic and of the type of its messages.
     time_ns
         Log times in nanoseconds, not decreasing, shape (N,), read-only.
+    data
+        Serialised messages.
     """
 
     def __init__(
@@ -52,13 +54,13 @@ class TopicSeries:
         self.time_ns = time_ns
         # Those who would change it in place would change it for all.
         self.time_ns.flags.writeable = False
-        self._data = data
+        self.data = data
         self._fields = fields
         self._decode = decode
         self._max_decoded_bytes = max_decoded_bytes
 
     def __len__(self) -> int:
-        return len(self._data)
+        return len(self.data)
 
     def __repr__(self) -> str:
         span = f", {self.time[0]:.6g} to {self.time[-1]:.6g} s" if len(self) else ""
@@ -195,21 +197,21 @@ class TopicSeries:
             A message is damaged.
         """
         self._require_decodable()
-        for time_ns, data in zip(self.time_ns.tolist(), self._data, strict=True):
+        for time_ns, data in zip(self.time_ns.tolist(), self.data, strict=True):
             yield time_ns, self._decode_message(data)
 
     @cached_property
     def _messages(self) -> list[Any]:
         self._require_decodable()
-        return [self._decode_message(data) for data in self._data]
+        return [self._decode_message(data) for data in self.data]
 
     @cached_property
     def _columns(self) -> Columns | None:
-        return read_columns(self._data, self.type_name, self._fields)
+        return read_columns(self.data, self.type_name, self._fields)
 
     def _require_decodable(self) -> None:
         """Refuse to make objects of much more than the file is large."""
-        size = sum(map(len, self._data))
+        size = sum(map(len, self.data))
         if size > self._max_decoded_bytes:
             raise RecordingError(
                 f"The messages on {self.topic} have {size} bytes, and "

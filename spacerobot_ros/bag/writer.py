@@ -20,7 +20,6 @@ from spacerobot_ros.bag.mcap_file import (
     QosProfile,
     RecordedTopic,
     encode,
-    metadata_record,
 )
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.messages.definitions import message_definition, type_hash
@@ -356,13 +355,7 @@ class BagWriter:
             self._unsplit_path = asked.with_name(f"{asked.stem}-{number}{asked.suffix}")
 
     def _require_no_parts(self) -> None:
-        """Refuse a name of which there are files of a bag that was split.
-
-        Raises
-        ------
-        BagExistsError
-            There are some.
-        """
+        """Raise BagExistsError for a name of which there are files of a bag that was split."""
         whole = self._unsplit_path
         pattern = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
         with suppress(OSError):
@@ -429,8 +422,7 @@ class BagWriter:
             )
             for name, (channel_id, type_name, qos) in self._topics.items()
         ]
-        file = self._file
-        file.append_metadata(metadata_record(file.path.name, topics, file.start_ns, file.end_ns))
+        self._file.append_rosbag2_metadata(topics)
 
     def _message_count(self, channel_id: int) -> int:
         in_progress = len(self._entries.get(channel_id, ())) // 2

@@ -7,7 +7,6 @@ import os
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,22 +14,16 @@ from numpy.typing import NDArray
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.flight.reading import namespaces
+from spacerobot_ros.messages.readers import CommandReader, UnreadableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import build_plant
-from spacerobot_ros.simulation.commands import (
-    CommandSource,
-    CommandValidator,
-    Refusal,
-    joint_order,
-    require_frame,
-    require_values,
-)
+from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
-from spacerobot_ros.times import SECOND, stamp_to_ns
+from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import Topic, state_topics
 
 TOLERANCE = 1e-9
@@ -178,15 +171,7 @@ class _RecordedPlant:
 
     @classmethod
     def of(cls, bag: Bag) -> _RecordedPlant:
-        """Read the plant of a bag.
-
-        Raises
-        ------
-        RecordingError
-            The bag holds no flight of one plant in lockstep, or is damaged.
-        RobotDescriptionError
-            Its URDF is refused.
-        """
+        """Read the plant of a bag, which must hold a flight of one plant in lockstep."""
         recorded = _recorded_robot(bag)
         config = _plant_config(recorded)
         urdf = recorded.urdf
@@ -208,49 +193,26 @@ class _RecordedPlant:
         return cls(recorded, config, SpaceRobot(config.believed(description)), injections)
 
     def commands(self, source: CommandSource) -> dict[int, RecordedCommand]:
-        """Return the first command of each tick; later ones and those between ticks are stale.
-
-        Raises
-        ------
-        RecordingError
-            A message is damaged.
-        """
+        """Return the first command of each tick; later ones and those between ticks are stale."""
         commands: dict[int, RecordedCommand] = {}
         series = self.recorded.get(source.topic)
-        for _, message in series.messages() if series is not None else ():
-            stamp = message.header.stamp
-            tick, rest = divmod(stamp_to_ns(stamp), self.config.period_ns)
+        if series is None:
+            return commands
+        reader = CommandReader(source, self.robot, self.config.frame_prefix)
+        for raw in series.data:
+            try:
+                stamp_ns, command = reader.read(raw)
+            except UnreadableError as error:
+                raise RecordingError(f"A message on {series.topic}: {error}.") from error
+            tick, rest = divmod(stamp_ns, self.config.period_ns)
             if not rest and tick not in commands:
-                prefix = self.config.frame_prefix
-                commands[tick] = read_command(message, source, self.robot, prefix)
+                commands[tick] = command if isinstance(command, CommandError) else command.copy()
         return commands
 
     @property
     def path(self) -> Path:
         """The bag."""
         return self.recorded.bag.path
-
-
-def read_command(
-    message: Any, source: CommandSource, robot: SpaceRobot, frame_prefix: str = ""
-) -> RecordedCommand:
-    """Return the command in a decoded message, in the order of the robot's joints.
-
-    ``frame_prefix`` is the prefix of the frames of the robot.
-    """
-    try:
-        if source.quantity == "wrench":
-            require_frame(message.header.frame_id, robot.base_link, frame_prefix)
-            force, torque = message.wrench.force, message.wrench.torque
-            return np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
-        order = joint_order(robot.joint_names, message.name)
-        given = getattr(message, source.quantity)
-        require_values(message.name, source.quantity, len(given))
-    except CommandError as error:
-        return error
-    values = np.zeros(robot.n)
-    values[order] = given
-    return values
 
 
 def _recorded_robot(bag: Bag) -> RecordedRobot:
@@ -375,8 +337,7 @@ def _missing_states(
 ) -> str:
     """Return a message about states that the bag lacks; empty for none.
 
-    Every command answers a state, and a recorder counts its messages: those that it wrote, and
-    those that never reached it.
+    Every command answers a state, and a recorder counts messages written and messages lost.
     """
     recorded = flight.recorded
     counts = recorded.metadata.get("recorder", {})
@@ -458,12 +419,7 @@ def _resimulate(
 ) -> _Resimulation:
     """Step the plant of a flight from tick ``first`` to tick ``last``, or as far as it goes.
 
-    Raises
-    ------
-    RecordingError
-        The sensors err, and the first state is not the very first one.
-    SpaceRobotError
-        The plant's parameters are refused.
+    RecordingError where sensors err, whose noise is only known from the very first state on.
     """
     plant = build_plant(flight.robot, flight.config, initial)
     state = ReportedState(plant, flight.config)

@@ -116,7 +116,7 @@ class StateFrames:
     def __init__(self, description: RobotDescription) -> None:
         self._description = description
         self._odom = TemplateReader(ODOMETRY, {_POSE_PATH: _NUMBERS_PER_POSE})
-        self._joints = JointReader(description.joint_names, ["position"], complete=True)
+        self._joints = JointReader(description.joint_names, ["position"], measured=True)
 
     def accept(self, odom: bytes, joint_states: bytes) -> None:
         """Make these the state.

@@ -206,13 +206,7 @@ class MessageTypes:
         return decode
 
     def _add_types(self, store: Typestore) -> None:
-        """Add the types of another store.
-
-        Raises
-        ------
-        ValueError
-            The bag has defined one of them otherwise.
-        """
+        """Add the types of another store; ValueError where the bag has defined one otherwise."""
         own = self._store
         for name, (_, fields) in store.fielddefs.items():
             if name in own.fielddefs and _field_kinds(own.fielddefs[name][1]) != _field_kinds(
@@ -229,13 +223,7 @@ def _field_kinds(fields: Any) -> list[Any]:
 
 @lru_cache(maxsize=64)
 def _type_store(type_name: str, text: bytes) -> tuple[Typestore, Any]:
-    """Return a store of the types in a text, and the code for the type: made once for all bags.
-
-    Raises
-    ------
-    ValueError
-        The definition is refused.
-    """
+    """Return a store of the types in a text, and the code for the type: made once for all bags."""
     parsed, store = _parse_definition(type_name, text), get_typestore(Stores.EMPTY)
     try:
         store.register(parsed)
@@ -276,13 +264,7 @@ class _FieldCounts:
         self._type_store: dict[str, int] = {}
 
     def of(self, name: str, depth: int) -> int:
-        """Return the number for one type.
-
-        Raises
-        ------
-        ValueError
-            It has too many, is not defined, or contains itself.
-        """
+        """Return the count for one type; ValueError where it is too large, unknown or endless."""
         if name in self._type_store:
             return self._type_store[name]
         if name not in self._types:

@@ -252,13 +252,7 @@ class TemplateReader:
 
 
 def _as_little_endian(raw: bytes, type_name: str) -> bytes:
-    """Return a message of another byte order as this machine's clients serialise it.
-
-    Raises
-    ------
-    IndexError
-        It is no message of the type.
-    """
+    """Return a big-endian message as little-endian; IndexError where it is not of the type."""
     types = MessageTypes()
     decode = types.decoder(type_name, message_definition(type_name).encode())
     try:
@@ -278,8 +272,8 @@ class JointReader:
         The model's joints.
     quantities
         What to read; the first is required in every message.
-    complete
-        Whether it is a measured state, whose stamp and size are bounded.
+    measured
+        Whether messages are measured states, whose stamp and size are bounded.
     """
 
     def __init__(
@@ -287,11 +281,11 @@ class JointReader:
         joint_names: Sequence[str],
         quantities: Sequence[Quantity],
         *,
-        complete: bool = False,
+        measured: bool = False,
     ) -> None:
-        self._complete, self._joints, self._quantities = complete, list(joint_names), quantities
+        self._measured, self._joints, self._quantities = measured, list(joint_names), quantities
         largest = math.inf
-        if complete:
+        if measured:
             # Of each joint a name with its length and three numbers.
             largest = _HEADER_BYTES + 2 * sum(len(name.encode()) + 32 for name in joint_names)
         self._reader = TemplateReader(JOINT_STATE, dict.fromkeys(quantities), largest)
@@ -314,7 +308,7 @@ class JointReader:
         """
         self.require(raw)
         stamp = self._reader.stamp_ns
-        if stamp > LATEST_NS and self._complete:
+        if stamp > LATEST_NS and self._measured:
             raise UnreadableError(f"no answer can carry its stamp of {stamp / SECOND:.10g} s")
         for target, place in self._copies:
             target[:] = raw[place]
@@ -386,7 +380,7 @@ class MessageDecoder:
     """
 
     def __init__(self, joint_names: Sequence[str]) -> None:
-        self._joints = JointReader(joint_names, ["position", "velocity"], complete=True)
+        self._joints = JointReader(joint_names, ["position", "velocity"], measured=True)
         self._references = JointReader(joint_names, ["position", "velocity"])
         self._odom = TemplateReader(ODOMETRY, {_POSE_PATH: 7, _TWIST_PATH: 6})
         self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
@@ -398,7 +392,7 @@ class MessageDecoder:
         return self._odom.floats(_POSE_PATH), self._odom.floats(_TWIST_PATH)
 
     def joint_reference(self, message: bytes) -> tuple[Array, Array]:
-        """Return positions and rates (n,) of a JointState; joints that it does not name are 0."""
+        """Return positions and rates (n,) of a JointState; a quantity that it lacks is 0."""
         self._references.accept(message)
         return self._references.values["position"], self._references.values["velocity"]
 
@@ -429,12 +423,23 @@ class CommandReader:
     def offer(self, commands: CommandValidator, raw: bytes, now_ns: int) -> Refusal | None:
         """Offer a message to the validator; return why it is refused, if it is."""
         try:
-            stamp = self._reader.accept(raw)
+            stamp_ns, command = self.read(raw)
         except UnreadableError as error:
             return commands.unreadable(self.source, error, now_ns)
+        return commands.offer(self.source, stamp_ns, command, now_ns)
+
+    def read(self, raw: bytes) -> tuple[int, Array | CommandError]:
+        """Return the stamp of a message, ns, and its values, or the reason why they are malformed.
+
+        The values are overwritten by the next message. Raises UnreadableError for bytes that are
+        no message of the type.
+        """
+        try:
+            return self._reader.accept(raw), self._values
+        except UnreadableError:
+            raise
         except CommandError as error:
-            return commands.offer(self.source, self._reader.stamp_ns, error, now_ns)
-        return commands.offer(self.source, stamp, self._values, now_ns)
+            return self._reader.stamp_ns, error
 
 
 class _WrenchReader:

@@ -11,6 +11,7 @@ from support.made_bags import Say, array, joint_states, made_bag, odometry
 
 from spacerobot_ros.bag import RecordedRobot, RecordingError, read_bag
 from spacerobot_ros.bag.salvage import last_state
+from spacerobot_ros.flight.reading import FlightBag
 
 NAMES = ["elbow", "wrist"]
 STILL = (0.0,) * 6
@@ -133,10 +134,9 @@ def test_the_truth_is_what_was_measured_until_the_sensors_err(tmp_path: Path) ->
             if noise:
                 say("/odom_true", odometry(0.5 * k, *position(k)), 0.5 * k)
             say_odom(say, 0.5 * k, k + noise)
-    robot = RecordedRobot(read_bag(tmp_path / "a.mcap"))
-    stamps, values = robot.truth("odom", ["pose.pose.position.x"])
-    np.testing.assert_array_equal(stamps, [0.0, 0.5, 1.0, 1.5, 2.0])
-    np.testing.assert_array_equal(values[:, 0], range(5))
+    pose = FlightBag([read_bag(tmp_path / "a.mcap")]).truth("odom", 0)
+    np.testing.assert_array_equal(pose.time, [0.0, 0.5, 1.0, 1.5, 2.0])
+    np.testing.assert_array_equal(pose.values[:, 0], range(5))
 
 
 def test_a_robot_is_described_by_its_file_or_else_by_the_last_message(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from spacerobot_ros.bag import (
     iterate_raw,
     read_bag,
 )
+from spacerobot_ros.flight.reading import FlightBag
 
 Sample = tuple[str, str, Any]
 AssertSame = Callable[[Any, Any], None]
@@ -296,7 +297,7 @@ def test_the_truth_is_what_was_measured_until_it_is_published(tmp_path: Path) ->
         channel = writer.add_topic(topic, "sensor_msgs/msg/JointState")
         for second, value in values.items():
             header = Header(stamp=Time(sec=second))
-            message = JointState(header=header, position=[value], velocity=[-value])
+            message = JointState(header=header, name=["c"], position=[value], velocity=[-value])
             writer.write(channel, serialize_message(message), second, second)
 
     with BagWriter(tmp_path / "a.mcap") as writer:
@@ -307,16 +308,15 @@ def test_the_truth_is_what_was_measured_until_it_is_published(tmp_path: Path) ->
     bag = read_bag(tmp_path / "a.mcap")
 
     def truth(namespace: str) -> list[list[float]]:
-        time, values = RecordedRobot(bag, namespace).truth(
-            "joint_states", ["position", "velocity"], 2
-        )
-        return np.column_stack([time, values]).tolist()
+        flight = FlightBag([bag], namespace)
+        q, qdot = (flight.truth("joint_states", number) for number in (0, 1))
+        return np.column_stack([q.time, q.values, qdot.values]).tolist()
 
     assert truth("") == [[0, 0.1, -0.1], [1, 1.1, -1.1], [2, 2.0, -2.0], [3, 3.0, -3.0]]
     assert truth("/perfect") == [[0, 5.0, -5.0]]
     assert truth("/alone") == [[0, 6.0, -6.0]]
     with pytest.raises(RecordingError, match="nothing is on /nobody/joint_states"):
-        truth("/nobody")
+        RecordedRobot(bag, "/nobody")["joint_states"]
 
 
 @pytest.mark.parametrize(("count", "more"), [(39, ""), (40, ""), (41, " and 1 more")])

@@ -48,7 +48,7 @@ def raw(message: object) -> bytes:
 
 
 def reader() -> JointReader:
-    return JointReader(["a", "b"], ["position", "velocity"], complete=True)
+    return JointReader(["a", "b"], ["position", "velocity"], measured=True)
 
 
 # -- stamps -----------------------------------------------------------------------------------
