@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Literal, Protocol
 
@@ -103,15 +102,21 @@ class StateDecoder(Protocol):
         """Return positions and rates (n,) of a joint reference, or raise CommandError."""
 
 
-@dataclass(frozen=True, eq=False)
 class StateArrays:
     """A state as arrays: joints, and where it is measured the base; all messages in one."""
 
-    stamp_ns: int
-    q: Array
-    qdot: Array
-    pose: Array | None = None
-    twist: Array | None = None
+    # One is made for every state: a frozen dataclass takes four times as long.
+    __slots__ = ("pose", "q", "qdot", "stamp_ns", "twist")
+
+    def __init__(
+        self,
+        stamp_ns: int,
+        q: Array,
+        qdot: Array,
+        pose: Array | None = None,
+        twist: Array | None = None,
+    ) -> None:
+        self.stamp_ns, self.q, self.qdot, self.pose, self.twist = stamp_ns, q, qdot, pose, twist
 
 
 class ArrayDecoder:

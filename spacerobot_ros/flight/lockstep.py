@@ -112,7 +112,7 @@ def require_flyable(scenario: Scenario) -> None:
     Raises
     ------
     ParameterError
-        The scenario asks for it; the sentence says how it is flown.
+        The scenario asks for it; the message says how it is flown.
     """
     why = ""
     if not scenario.lockstep:
@@ -304,8 +304,7 @@ class _LockstepFlight:
         try:
             self._plant.step(*commands)
         except SpaceRobotError as error:
-            sentence = f"The plant stops at {self._time:g} s: {error}"
-            self._monitor.failure = "model", sentence
+            self._monitor.failure = "model", f"The plant stops at {self._time:g} s: {error}"
             self._commands.rest()
             self._report_plant_status(PlantState.FAILED)
             return False

@@ -236,11 +236,6 @@ class RecorderNode(FlightNode):
             self._asked[name] = None
             self.recording.describe(name, values)
 
-    def attach(self, name: str, data: bytes, media_type: str) -> None:
-        """Put a whole file into the bag; the URDF of a recorded robot_description is by itself."""
-        if self.recording is not None:
-            self.recording.attach(name, data, media_type)
-
     def scan(self) -> None:
         """Subscribe to topics that have appeared."""
         recording = self.recording

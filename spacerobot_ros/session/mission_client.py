@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 
 import rclpy
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.clock import Clock, ClockType
@@ -15,25 +14,24 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
 
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
-from spacerobot_ros.nodes.common.node import EVENTS, LATCHED, STREAM
+from spacerobot_ros.nodes.common.messages import goal_message, shape_message
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
-from spacerobot_ros.times import set_stamp
 
 _LOOK_PERIOD = 0.2
 """Wall s from one look of a follower to the next."""
 
 _LONGEST_DELIVERY = 5.0
-"""Wall s in which a goal reaches those that take it."""
+"""Wall s within which a goal reaches every node that subscribes to it."""
 
 
 class MissionClient:
@@ -92,7 +90,7 @@ class MissionClient:
             self._sends.append(self._end_effector_topic)
         self.failures: dict[str, str] = {}
         """Messages of the nodes that have failed, by the last part of their names."""
-        self.node.create_subscription(DiagnosticStatus, "events", self._on_event, EVENTS)
+        self.node.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
         topic, self._read = STATUS_TOPICS[decider]
         self._status_topic = self.node.create_subscription(
             DiagnosticStatus, topic, self._on_status, LATCHED
@@ -162,19 +160,15 @@ class MissionClient:
         sent with its own, and one without any is sent with none.
         """
         self._sent += 1
-        stamp = Time()
-        set_stamp(stamp, self._now() + self._sent)
+        time_ns = self._now() + self._sent
+        message = goal_message(goal, self._frame, time_ns)
+        stamp = message.header.stamp
         self._follower = GoalFollower(GoalIds().of(stamp.sec, stamp.nanosec))
         if self._shape_topic is not None and self._joint_names is not None:
-            shape = goal.joint_positions
-            self._shape_topic.publish(
-                JointState()
-                if shape is None
-                else JointState(name=list(self._joint_names()), position=shape.tolist())
-            )
-        self._goal_topic.publish(self._pose(goal, stamp))
+            self._shape_topic.publish(shape_message(goal, self._joint_names()))
+        self._goal_topic.publish(message)
         if end_effector is not None:
-            self._end_effector_topic.publish(self._pose(end_effector, stamp))
+            self._end_effector_topic.publish(goal_message(end_effector, self._frame, time_ns))
 
     def await_delivery(self) -> None:
         """Wait until all readers of goals have received the goal that was sent."""
@@ -219,13 +213,6 @@ class MissionClient:
             # Here and not when the spin returns: a run ends at the same tick every time.
             self._on_end()
             self._done.set_result(outcome)
-
-    def _pose(self, goal: Goal, stamp: Time) -> PoseStamped:
-        message = PoseStamped(header=Header(stamp=stamp, frame_id=self._frame))
-        p, o = message.pose.position, message.pose.orientation
-        p.x, p.y, p.z = goal.position.tolist()
-        o.x, o.y, o.z, o.w = goal.quaternion.tolist()
-        return message
 
     def _on_event(self, received: DiagnosticStatus) -> None:
         event = read_status(received)

@@ -25,7 +25,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
-from spacerobot_ros.nodes.common.streams import Connections, unconnected
+from spacerobot_ros.nodes.common.streams import Connections
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import COMMANDERS, Kill, Scenario
@@ -33,7 +33,6 @@ from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.stack import Stack, namespace_words
 from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.times import SECOND, stamp_to_ns
-from spacerobot_ros.topics import NOT_RECORDED
 
 _START = 60.0
 """Longest wait for the start of all nodes, wall s."""
@@ -279,23 +278,14 @@ class MultiProcessStack(Stack):
         self._clock_seen = time.monotonic()
 
     def _connected(self) -> bool:
-        """Whether all nodes are connected, and the recorder records all that they publish."""
+        """Ask every node for its endpoints; return whether all is connected."""
         requests = {name: Trigger.Request() for name in self.names}
         answers = self._call_all(self._get_connections, requests)
         nodes = {name: Connections.from_json(answer.message) for name, answer in answers.items()}
         self._spin_for(_LOOK_PERIOD)
-        if unconnected([*nodes.values(), Connections.of(self.client.node)]):
-            return False
-        if self.bag is None:
-            return True
-        wanted = set(self.scenario.config("recorder").topics.split())
-        recorded = {topic for topic, _ in nodes.pop("recorder").subscriptions}
-        published = {topic for node in nodes.values() for topic, _ in node.publishers}
-        if wanted:
-            published &= {self.client.node.resolve_topic_name(topic) for topic in wanted}
-        else:
-            published = {topic for topic in published if not topic.endswith(NOT_RECORDED)}
-        return published <= recorded
+        recorder = nodes.get("recorder")
+        recorded = () if recorder is None else dict(recorder.subscriptions)
+        return self._all_connected(nodes, recorded)
 
     def _transit(self, transition: int, names: Sequence[str]) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
@@ -28,6 +28,7 @@ from spacerobot_ros.nodes import (
     PlantNode,
     RecorderNode,
 )
+from spacerobot_ros.nodes.common.streams import Connections, unconnected
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import Scenario
@@ -159,6 +160,30 @@ class Stack(ABC):
     @abstractmethod
     def close(self) -> None:
         """End what still runs; safe to call twice."""
+
+    def _all_connected(self, nodes: Mapping[str, Connections], recorded: Iterable[str]) -> bool:
+        """Whether nodes and client are connected, and the recorder records all that is to be.
+
+        Parameters
+        ----------
+        nodes
+            The endpoints of the nodes, by their names.
+        recorded
+            Topics that the recorder takes.
+        """
+        client = Connections.of(self.client.node)
+        if unconnected([*nodes.values(), client]):
+            return False
+        if self.bag is None:
+            return True
+        senders = [client, *(node for name, node in nodes.items() if name != "recorder")]
+        published = {topic for sender in senders for topic, _ in sender.publishers}
+        chosen = self.scenario.config("recorder").topics.split()
+        if chosen:
+            published &= {self.client.node.resolve_topic_name(topic) for topic in chosen}
+        else:
+            published = {topic for topic in published if not topic.endswith(NOT_RECORDED)}
+        return published <= set(recorded)
 
 
 class InProcessStack(Stack):
@@ -346,17 +371,9 @@ class InProcessStack(Stack):
             )
 
     def _connected(self) -> bool:
-        ours = [p for node in self._nodes for p in node.publishers if node is not self._recorder]
-        topics = {p.topic_name for p in ours} - {"/rosout", "/parameter_events"}
-        recorded = {topic for topic in topics if not topic.endswith(NOT_RECORDED)}
-        if self._recorder is not None and not recorded <= self._recorder.topics:
-            return False
-        expected: dict[str, int] = {}
-        for node in self._nodes:
-            for subscription in node.subscriptions:
-                expected[subscription.topic_name] = expected.get(subscription.topic_name, 0) + 1
-        return all(
-            publisher.get_subscription_count() >= expected.get(publisher.topic_name, 0)
-            for publisher in ours
-            if publisher.topic_name in topics
-        )
+        nodes = {
+            node.get_name(): Connections.of(node)
+            for node in self._nodes
+            if node is not self.client.node
+        }
+        return self._all_connected(nodes, self._recorder.topics if self._recorder else ())

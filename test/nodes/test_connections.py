@@ -67,7 +67,7 @@ def test_a_node_that_was_shut_down_ends_without_another_transition(
     plant.drain(harness.executor)
     plant.finalize()
     plant.finalize()
-    assert plant._is_in(State.PRIMARY_STATE_FINALIZED)
+    assert plant.lifecycle_state == State.PRIMARY_STATE_FINALIZED
 
 
 def test_a_plant_in_real_time_rests_before_its_process_ends(harness: Harness) -> None:

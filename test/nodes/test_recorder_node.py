@@ -82,7 +82,8 @@ def test_description_parameters_and_version_are_in_the_bag(stack: Stack) -> None
     for node in (stack.plant, stack.planner):
         stack.recorder.describe(f"parameters/{node.get_name()}", parameters_of(node))
     urdf = stack.plant.plant.robot.description.urdf
-    stack.recorder.attach("robot_description.urdf", urdf.encode(), "application/xml")
+    assert stack.recorder.recording is not None
+    stack.recorder.recording.attach("robot_description.urdf", urdf.encode(), "application/xml")
     stack.fly()
     stack.stop()
     bag = stack.close_bag()

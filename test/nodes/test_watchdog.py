@@ -237,12 +237,12 @@ def test_a_planner_that_plans_is_busy_and_not_silent(
         flight.plant._liveness._watchdog._looked = time.monotonic()  # type: ignore[union-attr]
         while time.monotonic() < end:
             # Another process would look meanwhile.
-            flight.plant._liveness._look()  # type: ignore[union-attr]
+            flight.plant._liveness._look()
             flight.plant._liveness._watchdog.hear("/planner", heard[-1])  # type: ignore[union-attr]
         return plan(*given)
 
     heard = ["active"]
-    beat = flight.planner._liveness._publish  # type: ignore[union-attr]
+    beat = flight.planner._liveness._publish
 
     def publish(pulse: Pulse) -> None:
         heard.append(pulse.value)

@@ -54,6 +54,14 @@ def result(tmp_path: Path) -> RunResult:
     return run_scenario(short(attitude_tolerance=1e-4), tmp_path / "run.mcap")
 
 
+def test_a_run_records_the_topics_that_are_chosen(tmp_path: Path) -> None:
+    topics = {"/odom", "/joint_states", "/momentum", "/robot_description"}
+    chosen = short().with_overrides("recorder", {"topics": " ".join(sorted(topics))})
+    result = run_scenario(chosen, tmp_path / "run.mcap")
+    assert result.succeeded
+    assert set(read_bag(tmp_path / "run.mcap").topics) == topics
+
+
 def test_summary_is_what_the_bag_says(result: RunResult, tmp_path: Path) -> None:
     """The summary against the bag decoded by another library."""
     write_json(tmp_path / "sub" / "run.json", result.summary)

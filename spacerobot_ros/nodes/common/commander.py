@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import time
 from abc import abstractmethod
@@ -39,6 +38,7 @@ from spacerobot_ros.nodes.common.messages import (
     goal_of,
 )
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
+from spacerobot_ros.nodes.common.streams import with_information
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -238,15 +238,13 @@ class CommanderNode(FlightNode):
         self._doubted = False
         """Whether a status came that was perhaps not the plant's."""
         receive = self._guarded(self._on_plant_status, "a message on 'plant/status'")
-
-        def callback(message: Any, information: Any = None) -> None:
-            # rclpy's events executor hands over message and information as one tuple (7.1).
-            receive(*(message if information is None else (message, information)))
-
-        # By the number of parameters rclpy finds out that the information is wanted.
-        callback.__signature__ = inspect.signature(lambda message, information: None)  # type: ignore[attr-defined]
+        # Guarded already, and rclpy looks at the parameters of the callback.
         self._statuses = LifecycleNode.create_subscription(
-            self, DiagnosticStatus, "plant/status", callback, _STATUSES
+            self,
+            DiagnosticStatus,
+            "plant/status",
+            with_information(lambda message, information: receive(message, information)),
+            _STATUSES,
         )
 
     def _on_plant_status(self, message: DiagnosticStatus, information: Any) -> None:

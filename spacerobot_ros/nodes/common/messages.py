@@ -25,18 +25,22 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.planning import BasePath, Goal
+from spacerobot_ros.times import set_stamp
 
-_KINDS = {
+_MARKER_TYPES = {
     "box": Marker.CUBE,
     "cylinder": Marker.CYLINDER,
     "sphere": Marker.SPHERE,
     "mesh": Marker.MESH_RESOURCE,
 }
-_LISTENED = 200
-"""Messages of /tf that are kept: some seconds of a robot with several publishers."""
+_MAX_KEPT_TRANSFORMS, _MAX_KEPT_STATIC_TRANSFORMS = 200, 100
+"""Messages of /tf and /tf_static that are kept: some seconds of a robot with several publishers."""
 
-_LISTENED_STATIC = 100
-_LONGEST_CHAIN = 1000
+_MAX_CHAINED_FRAMES = 1000
+"""Frames between a frame and the world; frames may be connected in a circle."""
+
+_SHORTEST_QUATERNION = 1e-6
+"""Least length of the four numbers of a quaternion."""
 
 
 def message_class(type_name: str) -> Any:
@@ -80,7 +84,7 @@ def diagnostic_status(
 
 def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> Marker:
     """Return the marker of a URDF visual, its pose left open."""
-    marker = Marker(ns=namespace, id=number, type=_KINDS[shape.kind], action=Marker.ADD)
+    marker = Marker(ns=namespace, id=number, type=_MARKER_TYPES[shape.kind], action=Marker.ADD)
     marker.header.frame_id = frame
     size = shape.size
     if shape.kind == "cylinder":
@@ -108,9 +112,7 @@ def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str
         marker = shape_marker(shape, frame, "goal", len(markers))
         marker.color.a = 0.25
         placed = base @ link_pose @ shape.pose
-        p, o = marker.pose.position, marker.pose.orientation
-        p.x, p.y, p.z = placed.r.tolist()
-        o.x, o.y, o.z, o.w = quaternion_from_matrix(placed.R).tolist()
+        _set_pose(marker.pose, placed.r, quaternion_from_matrix(placed.R))
         markers.append(marker)
     line = Marker(ns="planned_path", id=len(markers), type=Marker.LINE_STRIP, action=Marker.ADD)
     line.header.frame_id = frame
@@ -119,6 +121,44 @@ def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str
     line.pose.orientation.w = 1.0
     line.points = [Point(x=x, y=y, z=z) for x, y, z in path.position.tolist()]
     return MarkerArray(markers=[*markers, line])
+
+
+def goal_message(goal: Goal, frame: str, time_ns: int) -> PoseStamped:
+    """Return the pose of a goal in ``frame`` as a message."""
+    message = PoseStamped()
+    message.header.frame_id = frame
+    set_stamp(message.header.stamp, time_ns)
+    _set_pose(message.pose, goal.position, goal.quaternion)
+    return message
+
+
+def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
+    """Return the joint positions that a goal is to end in; an empty message: any."""
+    positions = goal.joint_positions
+    if positions is None:
+        return JointState()
+    return JointState(name=list(joint_names), position=positions.tolist())
+
+
+def pose_array(position: Any, orientation: Any) -> Array | None:
+    """Return the pose (7,) of a point or vector and a quaternion message, which is scaled to 1.
+
+    None where a number is not finite, or the quaternion zero.
+    """
+    p, o = position, orientation
+    pose = np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
+    length = float(np.linalg.norm(pose[3:]))
+    if not np.all(np.isfinite(pose)) or length < _SHORTEST_QUATERNION:
+        return None
+    pose[3:] /= length
+    return pose
+
+
+def _set_pose(pose: Any, position: Array, quaternion: Array) -> None:
+    """Set the numbers of a geometry_msgs/Pose."""
+    p, o = pose.position, pose.orientation
+    p.x, p.y, p.z = position.tolist()
+    o.x, o.y, o.z, o.w = quaternion.tolist()
 
 
 def goal_of(
@@ -206,18 +246,17 @@ class KnownFrames:
     """
 
     def __init__(self, node: Any) -> None:
-        self._recent: deque[bytes] = deque(maxlen=_LISTENED)
-        self._static: deque[bytes] = deque(maxlen=_LISTENED_STATIC)
+        self._recent: deque[bytes] = deque(maxlen=_MAX_KEPT_TRANSFORMS)
+        self._static: deque[bytes] = deque(maxlen=_MAX_KEPT_STATIC_TRANSFORMS)
         self._kind = transform_class()
         if self._kind is None:
             return
-        reliable = ReliabilityPolicy.RELIABLE
         latched = QoSProfile(
-            depth=_LISTENED_STATIC,
-            reliability=reliable,
+            depth=_MAX_KEPT_STATIC_TRANSFORMS,
+            reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )
-        stream = QoSProfile(depth=100, reliability=reliable)
+        stream = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
         for topic, kept, qos in (
             (TRANSFORMS, self._recent, stream),
             (STATIC_TRANSFORMS, self._static, latched),
@@ -230,9 +269,9 @@ class KnownFrames:
         ``own`` goes before what /tf says: by frame its parent and its pose in that. None: nothing
         connects the two.
         """
-        parents = {**self._heard(), **own}
+        parents = {**self._received_parents(), **own}
         pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-        for _ in range(_LONGEST_CHAIN):  # Frames may be connected in a circle.
+        for _ in range(_MAX_CHAINED_FRAMES):
             if frame == world:
                 return pose
             if frame not in parents:
@@ -241,7 +280,7 @@ class KnownFrames:
             pose = chained(step, pose)
         return None
 
-    def _heard(self) -> dict[str, tuple[str, Array]]:
+    def _received_parents(self) -> dict[str, tuple[str, Array]]:
         received: dict[str, tuple[str, Array]] = {}
         for raw in (*self._static, *self._recent):
             try:
@@ -251,10 +290,7 @@ class KnownFrames:
             except RuntimeError:
                 continue  # Bytes that are no such message.
             for each in transforms:
-                r, o = each.transform.translation, each.transform.rotation
-                pose = np.array([r.x, r.y, r.z, o.x, o.y, o.z, o.w])
-                length = float(np.linalg.norm(pose[3:]))
-                if np.all(np.isfinite(pose)) and length > 0.5:
-                    pose[3:] /= length
+                pose = pose_array(each.transform.translation, each.transform.rotation)
+                if pose is not None:
                     received[each.child_frame_id] = each.header.frame_id, pose
         return received

@@ -37,13 +37,10 @@ from spacerobot_ros.nodes.common.watchdog import Liveness, Role, Silence
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""State and commands: reliable, deep enough for a reader that is briefly busy."""
+"""State, commands and events: reliable, deep enough for a reader that is briefly busy."""
 
 BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 """The same from drivers of sensors, which repeat nothing that was lost."""
-
-EVENTS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""Events: none may be lost, and a late subscriber gets none of before."""
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -62,13 +59,6 @@ _CAN_SHUT_DOWN = (
     State.PRIMARY_STATE_INACTIVE,
     State.PRIMARY_STATE_ACTIVE,
 )
-
-_WITHOUT_ENTITIES = (
-    State.PRIMARY_STATE_UNKNOWN,
-    State.PRIMARY_STATE_UNCONFIGURED,
-    State.PRIMARY_STATE_FINALIZED,
-)
-"""States in which what configure created is destroyed."""
 
 
 class FlightNode(LifecycleNode):
@@ -114,8 +104,8 @@ class FlightNode(LifecycleNode):
         self.raw_streams: list[RawStream] = []
         """The streams of bytes through the node, from its configuration to its cleanup."""
         self._failure, self._destroyed = "", False
-        self._liveness: Liveness | None = None
-        self._event_stream: RawOutput | None = None
+        self._liveness = Liveness(self, self.role, self.depends_on, self.on_silence)
+        self._event_stream = self.send_raw(DiagnosticStatus, "events")
         self.events_have_wall_time = True
         """False in a run whose recorded values must be repeatable."""
         self._raising = False
@@ -127,9 +117,7 @@ class FlightNode(LifecycleNode):
             self._autostart = bool(values[AUTOSTART.name])
             self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
-            self._event_stream = self.send_raw(DiagnosticStatus, "events", EVENTS)
             self.create_service(Trigger, "~/connections", self._on_connections)
-            self._liveness = Liveness(self, self.role, self.depends_on, self._on_silence)
             self.prepare()
             self._permanent_streams = list(self.raw_streams)
             self._permanent = set(self._entities())
@@ -204,8 +192,6 @@ class FlightNode(LifecycleNode):
 
     def report_event(self, event: Event) -> None:
         """Publish an event of this node, once; its time is the node's unless it has one."""
-        if self._event_stream is None:
-            return
         if event.time_s is None:
             event = replace(event, time_s=self.simulated_time_s)
         values = event.to_values(time.time() if self.events_have_wall_time else None)
@@ -273,7 +259,7 @@ class FlightNode(LifecycleNode):
 
     def _fail(self, what: str, error: Exception) -> None:
         """Stop working after an exception of a callback; the executor goes on."""
-        if self._destroyed or (isinstance(error, InvalidHandle) and not self._is_configured):
+        if self._destroyed or (isinstance(error, InvalidHandle) and not self._has_entities):
             return  # The executor had the callback in its queue when its entity was destroyed.
         self.get_logger().debug("".join(traceback.format_exception(error)))
         if isinstance(error, SpaceRobotError):
@@ -324,26 +310,31 @@ class FlightNode(LifecycleNode):
     @property
     def is_active(self) -> bool:
         """Whether the node is in its active state."""
-        return self._is_in(State.PRIMARY_STATE_ACTIVE)
-
-    def _is_in(self, state: int) -> bool:
-        machine = self._state_machine
-        return bool(machine and machine.current_state[0] == state)
+        return self.lifecycle_state == State.PRIMARY_STATE_ACTIVE
 
     @property
-    def _is_configured(self) -> bool:
+    def lifecycle_state(self) -> int:
+        """The present state, a constant of lifecycle_msgs/State."""
         machine = self._state_machine
-        return bool(machine and machine.current_state[0] not in _WITHOUT_ENTITIES)
+        return machine.current_state[0] if machine else State.PRIMARY_STATE_UNKNOWN
+
+    @property
+    def _has_entities(self) -> bool:
+        """Whether what configure created is there: the node is configured, or in a transition."""
+        return self.lifecycle_state not in (
+            State.PRIMARY_STATE_UNKNOWN,
+            State.PRIMARY_STATE_UNCONFIGURED,
+            State.PRIMARY_STATE_FINALIZED,
+        )
 
     def finalize(self) -> None:
         """Take the transition to the end, unless the node has taken it before."""
-        machine = self._state_machine
-        if machine and machine.current_state[0] in _CAN_SHUT_DOWN:
+        if self.lifecycle_state in _CAN_SHUT_DOWN:
             self.trigger_shutdown()
 
     def destroy_node(self) -> None:
         """Destroy the node and let go of its state machine, which would keep it in the graph."""
-        self._end_heartbeats()
+        self._liveness.end()
         self._destroyed = True
         super().destroy_node()
         self._state_machine = None
@@ -389,9 +380,6 @@ class FlightNode(LifecycleNode):
     @contextmanager
     def long_work(self) -> Iterator[None]:
         """Tell those that depend on this node that it works on something that may take long."""
-        if self._liveness is None:
-            yield
-            return
         with self._liveness.busy():
             yield
 
@@ -405,8 +393,7 @@ class FlightNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run the hook; where it fails, the entities that it has created are destroyed."""
-        if self._liveness is not None:
-            self._liveness.configure(float(getattr(self.config, "watchdog_timeout", 0.0)))
+        self._liveness.configure(float(getattr(self.config, "watchdog_timeout", 0.0)))
         result = self._run(self.configure)
         if result is TransitionCallbackReturn.FAILURE:
             self._destroy_configured()
@@ -417,14 +404,14 @@ class FlightNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run the hook and begin the heartbeats."""
         result = self._run(self.activate)
-        if result is TransitionCallbackReturn.SUCCESS and self._liveness is not None:
+        if result is TransitionCallbackReturn.SUCCESS:
             self._liveness.begin()
             self.get_logger().info(self.start_message())
         return self._report_transition(result, EventKind.ACTIVATED)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run the hook."""
-        self._end_heartbeats()
+        self._liveness.end()
         return self._report_transition(self._run(self.deactivate), EventKind.DEACTIVATED)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -435,13 +422,13 @@ class FlightNode(LifecycleNode):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop working and release all resources."""
-        self._end_heartbeats()
+        self._liveness.end()
         self._run(self.deactivate)
         return self._report_transition(self._run(self.cleanup), EventKind.SHUT_DOWN)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Release all resources after a failed transition; the node may be configured again."""
-        self._end_heartbeats()
+        self._liveness.end()
         with suppress(Exception):  # What failed may have left anything.
             self.cleanup()
         self._destroy_configured()
@@ -483,13 +470,6 @@ class FlightNode(LifecycleNode):
             self.report_event(Event(kind, f"Node '{self.get_name()}' is {words}."))
         return result
 
-    def _on_silence(self, silence: Silence) -> None:
-        self.on_silence(silence)
-
-    def _end_heartbeats(self) -> None:
-        if self._liveness is not None:
-            self._liveness.end()
-
     def _guard_transitions(self) -> None:
         """Have a request for an impossible transition answered instead of ending the process."""
         service = self._service_change_state
@@ -515,8 +495,6 @@ class FlightNode(LifecycleNode):
         """Destroy the entities of configure; the services of every ROS node stay."""
         self._fix_parameters(fixed=False)
         self.raw_streams[:] = self._permanent_streams
-        if self._liveness is not None:
-            self._liveness.forget_configured()
         destroy = {
             Timer: self.destroy_timer,
             Subscription: self.destroy_subscription,
@@ -549,7 +527,7 @@ class FlightNode(LifecycleNode):
             declaration = self._parameters_declared.get(change.name)
             if declaration is None or not declaration.read_only:
                 continue
-            if not self._is_in(State.PRIMARY_STATE_UNCONFIGURED):
+            if self.lifecycle_state != State.PRIMARY_STATE_UNCONFIGURED:
                 name = self.get_fully_qualified_name()
                 raise ParameterError(
                     f"Parameter '{change.name}' keeps its value while the node is configured: "

@@ -71,7 +71,17 @@ def _own(matches: Iterable[Iterable[object]]) -> Matches:
 
 Take = Callable[[bytes], None]
 
-_TWO_PARAMETERS = inspect.signature(lambda message, information: None)
+
+def with_information(callback: Callable[[Any, Any], None]) -> Callable[..., None]:
+    """Return a callback of a subscription that is given each message with its information."""
+
+    def take(*given: Any) -> None:
+        # rclpy's events executor hands over message and information as one tuple (7.1).
+        callback(*(given[0] if len(given) == 1 else given))
+
+    # By the number of parameters rclpy finds out that the information is wanted.
+    take.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
+    return take
 
 
 def raw_publish(publisher: Publisher) -> Take:
@@ -177,15 +187,11 @@ class RawInput(RawStream):
         if number is None:
             return take
 
-        def take_numbered(*given: Any) -> None:
-            # rclpy's events executor hands over message and information as one tuple (7.1).
-            raw, information = given[0] if len(given) == 1 else given
+        def take_numbered(raw: bytes, information: Any) -> None:
             number(information.get("publication_sequence_number") or 0)  # 0: it has none.
             take(raw)
 
-        # By the number of parameters rclpy finds out that the information is wanted.
-        take_numbered.__signature__ = _TWO_PARAMETERS  # type: ignore[attr-defined]
-        return take_numbered
+        return with_information(take_numbered)
 
 
 class StreamingNode(Protocol):

@@ -11,7 +11,6 @@ from enum import Enum
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
@@ -160,7 +159,6 @@ class Liveness:
         on_silence: Callable[[Silence], None],
     ) -> None:
         self._node, self._role, self._on_silence = node, role, on_silence
-        self._diagnostics: Publisher | None = None
         self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, _HEARTBEATS)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers: list[Timer] = []
@@ -177,7 +175,9 @@ class Liveness:
         """
         self._timeout = timeout
         if self._watched and timeout:
-            self._node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, _HEARTBEATS)
+            node = self._node
+            node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, _HEARTBEATS)
+            self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", _HEARTBEATS)
 
     def begin(self) -> None:
         """Give heartbeats, and watch, from now on."""
@@ -189,10 +189,6 @@ class Liveness:
         self._timers.append(beat)
         if self._watched and self._timeout:
             self._watchdog = Watchdog(self._timeout)
-            if self._diagnostics is None:
-                self._diagnostics = node.create_publisher(
-                    DiagnosticArray, "/diagnostics", _HEARTBEATS
-                )
             self._timers.append(node.create_timer(_LOOK_PERIOD, self._look, clock=self._steady))
             self._next_report = 0.0
         self.beat()
@@ -204,10 +200,6 @@ class Liveness:
             self._watchdog = None
             with suppress(Exception):  # The context may be gone.
                 self._publish(Pulse.INACTIVE)
-
-    def forget_configured(self) -> None:
-        """Note that the entities created since the construction are destroyed."""
-        self._diagnostics = None
 
     def beat(self) -> None:
         """Give a heartbeat, if the node is active."""
@@ -262,7 +254,7 @@ class Liveness:
         for silence in news:
             self._on_silence(silence)
         watchdog, node = self._watchdog, self._node
-        if watchdog is None or self._diagnostics is None:
+        if watchdog is None:
             return  # The reaction was to stop.
         self._next_report = time.monotonic() + _REPORT_PERIOD
         silent = sorted(watchdog.silent)

@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import Pose, PoseStamped
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -30,13 +30,13 @@ from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.nodes.common.messages import goal_of
+from spacerobot_ros.nodes.common.messages import goal_of, pose_array
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.watchdog import Pulse, Role
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.status import PlantStatus
-from spacerobot_ros.times import SECOND
+from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.viewer.state import Firing, Measured, Momenta, Part, StackState
 
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -215,7 +215,7 @@ class Listener:
     def _take_streams(self, now: float) -> None:
         odom, joints = self._odom.take(), self._joints.take()
         if odom is not None:
-            pose = _pose_of(odom.pose.pose)
+            pose = pose_array(odom.pose.pose.position, odom.pose.pose.orientation)
             if pose is not None:
                 self._pose = pose
         if joints is not None:
@@ -225,7 +225,7 @@ class Listener:
             self._measured = Measured(self._stamp_s, self._pose, *self._q)
         tool = self._tool.take()
         if tool is not None:
-            self._tool_pose = _pose_of(tool.pose)
+            self._tool_pose = pose_array(tool.pose.position, tool.pose.orientation)
         self._take_momenta()
         thrusters = self._thrusters.take()
         if thrusters is not None and len(thrusters.name) == len(thrusters.velocity):
@@ -276,7 +276,7 @@ class Listener:
 
         if len(message.position) == len(message.name) and np.all(np.isfinite(message.position)):
             self._q = read(message.position), read(message.velocity), read(message.effort)
-            self._stamp_s = _seconds(message.header.stamp)
+            self._stamp_s = stamp_to_ns(message.header.stamp) / SECOND
 
     # -- statuses, goals, heartbeats ------------------------------------------------------------
 
@@ -354,17 +354,3 @@ class _Beat:
         return self.pulse is Pulse.BUSY or (
             self.pulse is Pulse.ACTIVE and now - self.at <= _SILENT_AFTER
         )
-
-
-def _pose_of(pose: Pose) -> Array | None:
-    p, o = pose.position, pose.orientation
-    numbers = np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
-    length = float(np.linalg.norm(numbers[3:]))
-    if not np.all(np.isfinite(numbers)) or length < 1e-6:
-        return None
-    numbers[3:] /= length
-    return numbers
-
-
-def _seconds(stamp: Any) -> float:
-    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)

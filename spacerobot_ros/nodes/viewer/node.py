@@ -28,7 +28,8 @@ from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.nodes.common.node import EVENTS, LATCHED, STREAM, FlightNode
+from spacerobot_ros.nodes.common.messages import goal_message, shape_message
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
 from spacerobot_ros.nodes.viewer.listener import Listener
@@ -37,7 +38,6 @@ from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import Targets
 from spacerobot_ros.simulation.status import PlantState
-from spacerobot_ros.times import LATEST_NS, SECOND
 from spacerobot_ros.viewer.page import Page
 from spacerobot_ros.viewer.reachability import Check, GoalChecker, Question, Verdict, question_of
 from spacerobot_ros.viewer.server import (
@@ -150,7 +150,7 @@ class ViewerNode(FlightNode):
         )
         self._listener = Listener(self._streams, self, config.world_frame, self._on_status)
         self.create_subscription(String, "robot_description", self._on_description, LATCHED)
-        self.create_subscription(DiagnosticStatus, "events", self._on_event, EVENTS)
+        self.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
         self.create_subscription(RosoutLog, "/rosout", self._on_log, _ROSOUT)
         self.create_subscription(ParameterEvent, "/parameter_events", self._on_change, STREAM)
         self._goal_topics = {
@@ -394,15 +394,11 @@ class ViewerNode(FlightNode):
         self._sent += 1
         flag = time.time_ns() // _MICROSECOND_NS * _MICROSECOND_NS % _FLAG_NS
         time_ns = self._listener.time_ns() + flag + self._sent % 1000
-        sec, nanosec = divmod(min(time_ns, LATEST_NS), SECOND)
-        self._send_shape(goals["base"])
+        # Without it planners keep the joint positions of an earlier goal, perhaps of another tool.
+        names = () if self._robot is None else self._robot.joint_names
+        self._shape_topic.publish(shape_message(goals["base"], names))
         for part, goal in goals.items():
-            message = PoseStamped()
-            message.header.frame_id = self.config.world_frame
-            message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
-            p, o = message.pose.position, message.pose.orientation
-            p.x, p.y, p.z = goal.position.tolist()
-            o.x, o.y, o.z, o.w = goal.quaternion.tolist()
+            message = goal_message(goal, self.config.world_frame, time_ns)
             self._goal_topics[part].publish(message)
         readers = self._goal_topics["base"].get_subscription_count()
         # One of them belongs to this node.
@@ -410,20 +406,12 @@ class ViewerNode(FlightNode):
             self._note("No planner or controller takes the goal: none is running.", 2, "page")
         else:
             self._note("Goal sent.", source="page")
-            goal_id = GoalIds().of(sec, nanosec)
+            stamp = message.header.stamp
+            goal_id = GoalIds().of(stamp.sec, stamp.nanosec)
             self._unanswered = goal_id, time.monotonic() + _LONGEST_ANSWER
         editor = self._page.editor
         if self._checker.cancel() and not editor.moving:
             editor.show_check(Check(Verdict.UNCHECKED, "It was sent before it was checked."))
-
-    def _send_shape(self, goal: Goal) -> None:
-        """Send the final joint positions of the goal that follows; empty for any.
-
-        Without them planners keep those of an earlier goal, which may be of another tool.
-        """
-        shape, names = goal.joint_positions, () if self._robot is None else self._robot.joint_names
-        message = JointState() if shape is None else JointState(name=names, position=shape.tolist())
-        self._shape_topic.publish(message)
 
     def _request(self, request: Request) -> None:
         """Call the service of a request on every node that has it."""
