@@ -165,16 +165,15 @@ class FlightBag:
         true = self.quantity(f"{name}_true", TOPICS[f"{name}_true"].state[number])
         if not len(true):
             return measured
+        if not len(measured):
+            return true
         before, after = measured.time < true.time[0], measured.time > true.time[-1]
         parts = [
-            Signal(measured.time[before], measured.values[before]),
-            true,
-            Signal(measured.time[after], measured.values[after]),
+            (measured.time[before], measured.values[before]),
+            (true.time, true.values),
+            (measured.time[after], measured.values[after]),
         ]
-        return Signal(
-            np.concatenate([part.time for part in parts]),
-            np.concatenate([part.values for part in parts]),
-        )
+        return Signal(*map(np.concatenate, zip(*parts, strict=True)))
 
     def sensed(self, name: str, number: int) -> Signal:
         """Return a field of ``odom`` or ``joint_states`` while sensors err."""
