@@ -42,7 +42,7 @@ from spacerobot_ros.errors import RecordingError
 
 T = TypeVar("T")
 
-LIMIT_VARIABLE = "SPACEROBOT_BAG_LIMIT"
+INFLATED_SIZE_VARIABLE = "SPACEROBOT_BAG_LIMIT"
 """Environment variable: how many MB a bag may inflate to, however small its file is."""
 
 _DEFAULT_LIMIT_MB = 32.0
@@ -83,11 +83,11 @@ _FILE_KINDS = (
 )
 
 
-def require_regular(mode: int, path: Path, act: str = "read") -> None:
+def require_regular(mode: int, path: Path, action: str = "read") -> None:
     """Raise RecordingError for what is no regular file: a pipe blocks, a device takes harm."""
     if not stat.S_ISREG(mode):
         kind = next((words for test, words in _FILE_KINDS if test(mode)), "no file")
-        raise RecordingError(f"Cannot {act} the bag {path}: it is {kind}.")
+        raise RecordingError(f"Cannot {action} the bag {path}: it is {kind}.")
 
 
 @contextmanager
@@ -237,24 +237,24 @@ class InflationLimit:
     """
 
     def __init__(self, compressed: int) -> None:
-        self.most = max(round(1e6 * _limit_mb()), _MAX_INFLATION_RATIO * compressed)
+        self.max_bytes = max(round(1e6 * _limit_mb()), _MAX_INFLATION_RATIO * compressed)
         """In bytes."""
         self._inflated_size = 0
 
-    def take(self, size: int, place: int) -> None:
+    def count(self, size: int, place: int) -> None:
         """Count the inflated size of the chunk at ``place``; ValueError if the sum is too large."""
-        if self._inflated_size + size > self.most:
+        if self._inflated_size + size > self.max_bytes:
             raise ValueError(
                 f"with the chunk at byte {place} it inflates to {self._inflated_size + size} "
-                f"bytes, more than the {self.most} that its size allows (set {LIMIT_VARIABLE} to "
-                "more MB if you trust it)"
+                f"bytes, more than the {self.max_bytes} that its size allows (set "
+                f"{INFLATED_SIZE_VARIABLE} to more MB if you trust it)"
             )
         self._inflated_size += size
 
 
 def _limit_mb() -> float:
     try:
-        limit = float(os.environ.get(LIMIT_VARIABLE, _DEFAULT_LIMIT_MB))
+        limit = float(os.environ.get(INFLATED_SIZE_VARIABLE, _DEFAULT_LIMIT_MB))
     except ValueError:
         return _DEFAULT_LIMIT_MB
     return limit if 0.0 < limit < 1e12 else _DEFAULT_LIMIT_MB
@@ -392,7 +392,7 @@ def _check_chunks(summary: Summary, end: int) -> None:
         if place < free:
             raise ValueError(f"the chunks that its index has at byte {place} overlap")
         free = place + index.chunk_length
-        allowance.take(index.uncompressed_size, place)
+        allowance.count(index.uncompressed_size, place)
 
 
 def indexed_records(
@@ -412,7 +412,7 @@ def messages_in_file_order(file: BinaryIO) -> Iterator[RawMessage]:
     allowance = InflationLimit(size)
     for place, opcode, body in records(file, len(MCAP0_MAGIC), size):
         if opcode == Opcode.CHUNK:
-            allowance.take(chunk_size(body), place)
+            allowance.count(chunk_size(body), place)
             yield from _messages_in_records(unpack_chunk(body, place), place)
         elif opcode == Opcode.MESSAGE:
             channel, _, log_ns, publish_ns = _MESSAGE_BODY.unpack_from(body)

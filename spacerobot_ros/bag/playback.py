@@ -365,9 +365,7 @@ class Playback:
         return message
 
     def _messages(self, start_ns: int) -> Generator[ReplayMessage, None, None]:
-        earlier: dict[str, ReplayMessage] = {}
-        for message in self._latched_before(start_ns):
-            earlier[message.topic] = message
+        earlier = {message.topic: message for message in self._latched_before(start_ns)}
         in_time = self._messages_between(set(self._topic_by_channel), start_ns, self._end_ns)
         first = next(in_time, None)
         if first is None:

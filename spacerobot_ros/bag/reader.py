@@ -91,8 +91,13 @@ class Bag:
     """A bag as time series: ``bag["odom"].field("pose.pose.position.x")``.
 
     It is a mapping from the names of its topics, with the slash before them or without, to their
-    messages. A topic is read when it is first asked for and kept. The file is not held open. Raises
-    as :func:`read_bag` does.
+    messages. A topic is read when it is first asked for and kept. The file is not held open.
+
+    Raises
+    ------
+    RecordingError
+        From the constructor, as :func:`read_bag`; from methods, where there is no such topic, the
+        bag is damaged, or pandas or xarray is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -134,17 +139,11 @@ class Bag:
         return isinstance(topic, str) and self._recorded_name(topic) in self.topics
 
     def items(self) -> Iterator[tuple[str, TopicSeries]]:
-        """Iterate over names and messages of all topics.
-
-        Raises
-        ------
-        RecordingError
-            The bag is damaged.
-        """
+        """Iterate over names and messages of all topics."""
         return ((topic, self[topic]) for topic in self)
 
     def values(self) -> Iterator[TopicSeries]:
-        """Iterate over the messages of all topics; raises as :meth:`items` does."""
+        """Iterate over the messages of all topics."""
         return (self[topic] for topic in self)
 
     @overload
@@ -231,26 +230,14 @@ class Bag:
         return int(self._statistics.message_end_time)
 
     def message_count(self, topic: str | None = None) -> int:
-        """Return the number of messages of a topic, or of the whole bag.
-
-        Raises
-        ------
-        RecordingError
-            There is no such topic.
-        """
+        """Return the number of messages of a topic, or of the whole bag."""
         if topic is None:
             return int(self._statistics.message_count)
         counts = self._statistics.channel_message_counts
         return sum(counts.get(channel.id, 0) for channel in self._channels(topic))
 
     def channel_ids(self, topic: str) -> set[int]:
-        """Return the numbers under which a topic's messages are in the file.
-
-        Raises
-        ------
-        RecordingError
-            There is no such topic.
-        """
+        """Return the numbers under which a topic's messages are in the file."""
         return {channel.id for channel in self._channels(topic)}
 
     def raw_messages(
@@ -261,33 +248,16 @@ class Bag:
         Yields
         ------
         Channel, log time and publish time in nanoseconds, serialised message.
-
-        Raises
-        ------
-        RecordingError
-            The bag is damaged.
         """
         return messages_in_time_order(self.path, channel_ids, start_ns, end_ns, self._summary)
 
     def qos(self, topic: str) -> list[QosProfile]:
-        """Return the recorded quality of service of the publishers of a topic.
-
-        Raises
-        ------
-        RecordingError
-            There is no such topic, or its record cannot be read.
-        """
+        """Return the recorded quality of service of the publishers of a topic."""
         texts = [c.metadata.get("offered_qos_profiles", "") for c in self._channels(topic)]
         return [profile for text in texts for profile in QosProfile.from_yaml(text)]
 
     def times(self, topic: str) -> NDArray[np.float64]:
-        """Return the log times of a topic in seconds, shape (N,).
-
-        Raises
-        ------
-        RecordingError
-            There is no such topic, or the bag is damaged.
-        """
+        """Return the log times of a topic in seconds, shape (N,)."""
         return self[topic].time
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
@@ -296,11 +266,6 @@ class Bag:
         Yields
         ------
         Log time in nanoseconds, message.
-
-        Raises
-        ------
-        RecordingError
-            There is no such topic, or the bag is damaged.
         """
         return self[topic].messages()
 
@@ -313,11 +278,6 @@ class Bag:
 
         The index is the log time in seconds, ``attrs["units"]`` has the units of the columns; see
         :func:`~spacerobot_ros.bag.tables.table_of` for the columns.
-
-        Raises
-        ------
-        RecordingError
-            There is no such topic, the bag is damaged, or pandas is not installed.
         """
         if topic is not None:
             return to_pandas(self.table(topic))
@@ -332,24 +292,13 @@ class Bag:
 
         Arrays stay arrays, over ``time`` and ``joint`` for joint states; every variable has its
         ``units``.
-
-        Raises
-        ------
-        RecordingError
-            There is no such topic, the bag is damaged, or xarray is not installed.
         """
         if topic is not None:
             return to_xarray(self.table(topic))
         return {name: to_xarray(self.table(name)) for name in self}
 
     def table(self, topic: str) -> TopicTable:
-        """Return a topic as a table; the units of joints are those of the robot in the bag.
-
-        Raises
-        ------
-        RecordingError
-            There is no such topic, or the bag is damaged.
-        """
+        """Return a topic as a table; the units of joints are those of the robot in the bag."""
         series = self[topic]
         return table_of(series, self._prismatic_joints(series.topic.rpartition("/")[0]))
 
@@ -357,11 +306,6 @@ class Bag:
         """Return what may be the URDF of the robot in a namespace, the likeliest first.
 
         That is the file attached for it, then the last message about it, then all other files.
-
-        Raises
-        ------
-        RecordingError
-            The bag is damaged.
         """
         topic = f"{namespace}/robot_description"
         attached = {n: text for n, text in self.attachments.items() if n.endswith(".urdf")}

@@ -175,7 +175,7 @@ class _ReadableRecords:
         self, body: bytes, place: int, allowance: InflationLimit
     ) -> Iterator[tuple[int, bytes]]:
         try:
-            allowance.take(chunk_size(body), place)
+            allowance.count(chunk_size(body), place)
             data = unpack_chunk(body, place)
         except DAMAGE_ERRORS as error:
             self.lost_chunks += 1

@@ -153,7 +153,7 @@ class TopicSeries:
             return np.empty((0, 0), dtype)
         return np.array(values, dtype)
 
-    def constant(self, path: str) -> bool:
+    def has_constant_texts(self, path: str) -> bool:
         """Whether a list of texts is the same in all messages, as far as the layout shows.
 
         True is certain; false may mean that messages differ elsewhere.

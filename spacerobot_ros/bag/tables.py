@@ -77,7 +77,7 @@ class Field:
         One for each column; empty where it is not known or there is none.
     labels
         Names of the k entries of an array; empty for one value a message.
-    of
+    column_kind
         Kind of the entries: ``joint``, ``thruster``, or ``entry``.
     """
 
@@ -85,7 +85,7 @@ class Field:
     values: NDArray[Any]
     units: tuple[str, ...]
     labels: tuple[str, ...] = ()
-    of: str = "entry"
+    column_kind: str = "entry"
 
     @property
     def columns(self) -> list[str]:
@@ -197,12 +197,12 @@ def _table_fields(
     short = series.topic.rpartition("/")[2]
     if names and width == len(names):
         thrusters = short == "thrusters"
-        of = "thruster" if thrusters else "joint"
+        column_kind = "thruster" if thrusters else "joint"
         units = tuple(
             _THRUSTER_UNITS.get(path, "") if thrusters else _joint_unit(path, prismatic.get(name))
             for name in names
         )
-        return [Field(path, values, units, names, of)]
+        return [Field(path, values, units, names, column_kind)]
     stack = TOPICS.get(short)
     labels = stack.state[0].entries if stack is not None and stack.state else ()
     if path != "data" or len(labels) != width:
@@ -318,7 +318,7 @@ def to_xarray(table: TopicTable) -> xarray.Dataset:
             units = field.units[0]
         dimensions = ["time"]
         if field.values.ndim == 2:
-            name = field.of if field.of != "entry" else f"{field.path} entry"
+            name = field.column_kind if field.column_kind != "entry" else f"{field.path} entry"
             dimensions.append(name)
             coordinates[name] = (name, list(field.labels))
         variables[field.path] = (dimensions, field.values.copy(), {"units": units} if units else {})

@@ -237,11 +237,6 @@ class BagWriter:
         """Put a whole file into the bag.
 
         ``media_type`` is such as ``application/xml``, ``log_time_ns`` when it was recorded.
-
-        Raises
-        ------
-        RecordingError
-            The disk refused it, or nothing more can be written.
         """
         self._require_open()
         attachment = Attachment(
@@ -252,13 +247,7 @@ class BagWriter:
             self._file.append_attachment(attachment)
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Put a record of keys and values into the bag.
-
-        Raises
-        ------
-        RecordingError
-            The disk refused it, or nothing more can be written.
-        """
+        """Put a record of keys and values into the bag."""
         self._require_open()
         metadata = Metadata(name=name, metadata=data)
         self._repeated_records.append(metadata)
@@ -266,13 +255,7 @@ class BagWriter:
             self._file.append_metadata(metadata)
 
     def flush(self) -> None:
-        """Hand the chunk in progress to the operating system, so that a kill loses nothing of it.
-
-        Raises
-        ------
-        RecordingError
-            The disk refused it, or nothing more can be written.
-        """
+        """Hand the chunk in progress to the operating system: a kill loses nothing of it."""
         self._require_open()
         self._finish_chunk()
 

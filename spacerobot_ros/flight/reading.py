@@ -85,18 +85,20 @@ class FlightBag:
         self.path = bags[0].path
         self.namespace = namespace
         self.parts = [RecordedRobot(bag, namespace) for bag in bags]
-        states = [s for name in ("odom", "joint_states", "momentum") for s in self.all(name)[:1]]
+        states = [
+            s for name in ("odom", "joint_states", "momentum") for s in self.series_of(name)[:1]
+        ]
         self.stamped = all(abs(s.stamp[0] - s.time[0]) < _SAME_CLOCK_TOLERANCE for s in states)
         self.began = min((self._times(s)[0] for s in states), default=bags[0].start_time)
         """Time of the first state, s."""
 
-    def all(self, name: str) -> list[TopicSeries]:
+    def series_of(self, name: str) -> list[TopicSeries]:
         """Return a topic in the files that have messages of it."""
         return [series for part in self.parts if (series := part.get(name)) is not None]
 
     def messages(self, name: str) -> Iterator[tuple[int, Any]]:
         """Go through the messages of a topic, each with its log time in ns."""
-        for series in self.all(name):
+        for series in self.series_of(name):
             yield from series.messages()
 
     def names(self, topic: str) -> list[str]:
@@ -140,7 +142,7 @@ class FlightBag:
             Number of columns.
         """
         found = [Signal.empty(width)]
-        for series in self.all(name):
+        for series in self.series_of(name):
             values = series.table(fields, width)
             if TOPICS[name].type == TOPICS["joint_states"].type:
                 values = _sort_by_name(values, series, self.names(name))
@@ -155,7 +157,7 @@ class FlightBag:
         width = len(field.members) or len(field.entries) or len(self.names(name))
         return self.signal(name, field.columns, width)
 
-    def truth(self, name: str, number: int) -> Signal:
+    def true_signal(self, name: str, number: int) -> Signal:
         """Return a field of ``odom`` or ``joint_states`` as with perfect sensors.
 
         That is ``<name>_true``, which a plant publishes while its sensors err, and ``name`` before
@@ -175,30 +177,30 @@ class FlightBag:
         ]
         return Signal(*map(np.concatenate, zip(*parts, strict=True)))
 
-    def sensed(self, name: str, number: int) -> Signal:
+    def measured_signal(self, name: str, number: int) -> Signal:
         """Return a field of ``odom`` or ``joint_states`` while sensors err."""
-        true = self.all(f"{name}_true")
+        true = self.series_of(f"{name}_true")
         began, ended = self._times(true[0])[0], self._times(true[-1])[-1]
         return self.quantity(name, TOPICS[name].state[number]).between(began, ended)
 
     def series(self) -> Mapping[str, Signal]:
         """Return all quantities of :attr:`Flight.series` that the bag has."""
         makers: dict[str, Callable[[], Signal]] = {}
-        erring = bool(self.all("odom_true"))
+        erring = bool(self.series_of("odom_true"))
         for name, quantities in {
             "odom": ("pose", "twist"),
             "joint_states": ("q", "qdot", "effort"),
         }.items():
             for number, quantity in enumerate(quantities):
-                if self.all(name) or self.all(f"{name}_true"):
-                    makers[quantity] = partial(self.truth, name, number)
-                if erring and quantity != "effort" and self.all(f"{name}_true"):
-                    makers[f"measured_{quantity}"] = partial(self.sensed, name, number)
+                if self.series_of(name) or self.series_of(f"{name}_true"):
+                    makers[quantity] = partial(self.true_signal, name, number)
+                if erring and quantity != "effort" and self.series_of(f"{name}_true"):
+                    makers[f"measured_{quantity}"] = partial(self.measured_signal, name, number)
         for name in (
             *("momentum", "end_effector_pose", "momentum_expected"),
             *("base_wrench_realised", "thrusters"),
         ):
-            for field in TOPICS[name].state if self.all(name) else ():
+            for field in TOPICS[name].state if self.series_of(name) else ():
                 makers[field.quantity] = partial(self.quantity, name, field)
         return _LazyMapping(makers)
 
@@ -256,20 +258,20 @@ class FlightBag:
             fields, width = (WRENCH_COLUMNS, 6) if name == "base_wrench" else (["velocity"], n)
             if name == "joint_commands" and config.actuation != "velocity":
                 fields = ["effort"]
-            each = self.all(name)
+            each = self.series_of(name)
             return Commands(
                 np.concatenate([series.stamp_ns // config.period_ns for series in each]),
                 np.concatenate([series.table(fields, width) for series in each]),
             )
 
         return _LazyMapping(
-            {name: partial(read, name) for name in _COMMAND_TOPICS if self.all(name)}
+            {name: partial(read, name) for name in _COMMAND_TOPICS if self.series_of(name)}
         )
 
 
 def _sort_by_name(values: Array, series: TopicSeries, names: list[str]) -> Array:
     """Return numbers (N, n) of joints in the order of ``names``; nan of those that lack one."""
-    if series.constant("name"):
+    if series.has_constant_texts("name"):
         return values
     made = np.full_like(values, np.nan)
     for row, given in enumerate(series.field("name")):

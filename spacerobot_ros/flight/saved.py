@@ -34,12 +34,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Stream:
-    """The messages of a topic: when each was published, ns, its place in a tick, its bytes."""
+    """The messages of a topic: when each was published, ns, and its bytes."""
 
     topic: Topic
     time_ns: NDArray[np.int64]
     messages: list[bytes]
-    name: str = ""
 
 
 def save_flight(flight: Flight, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:

@@ -346,7 +346,7 @@ def _missing_states(
     if resimulation.first == 0 and written > held:
         return f"its recorder wrote {written} messages, and it holds {held}."
     states = {int(t) for p in published if p.topic.name == "joint_states" for t in p.ticks}
-    lacking = {tick for tick in resimulation.given if tick >= resimulation.first} - states
+    lacking = {tick for tick in resimulation.commanded_ticks if tick >= resimulation.first} - states
     if len(lacking) > lost:
         time = min(lacking) * flight.config.period_ns / SECOND
         return (
@@ -401,14 +401,14 @@ class _Resimulation:
 
     ``states`` are the quantities of the topics, (ticks + 1, size) each, from tick ``first`` to tick
     ``end``; ``stopped`` says why the plant went no further, ``latched`` in which tick a fault
-    latched, after which nothing moved. ``given`` are the ticks with a command for the joints,
+    latched, after which nothing moved. ``commanded_ticks`` are those with a command for the joints,
     ``refusals`` those whose command was refused, with its topic.
     """
 
     first: int
     end: int
     states: dict[str, Floats]
-    given: frozenset[int]
+    commanded_ticks: frozenset[int]
     stopped: str = ""
     latched: int | None = None
     refusals: dict[int, tuple[str, Refusal]] = field(default_factory=dict)
@@ -573,7 +573,7 @@ class _Comparison:
             name = f"{self._flight.recorded.namespace}/{topic}"
             stamp = self._format_time(before)
             return f" (that on {name} stamped {stamp} is refused: {refusal.clause})"
-        if tick > done.first and before not in done.given:
+        if tick > done.first and before not in done.commanded_ticks:
             name = f"{self._flight.recorded.namespace}/joint_commands"
             return f" (no message on {name} is stamped {self._format_time(before)})"
         return ""

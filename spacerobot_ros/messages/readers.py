@@ -129,14 +129,14 @@ class TemplateReader:
     spans
         Paths to read, and how many float64 follow each: ``{"pose.pose.position.x": 7}``; None for
         an array of any length.
-    largest
+    max_size
         Messages of another layout that are longer are refused unread, bytes.
     """
 
     def __init__(
-        self, type_name: str, spans: Mapping[str, int | None], largest: float = math.inf
+        self, type_name: str, spans: Mapping[str, int | None], max_size: float = math.inf
     ) -> None:
-        self._type_name, self._spans, self._largest = type_name, spans, largest
+        self._type_name, self._spans, self._max_size = type_name, spans, max_size
         self._fields = fields_of(type_name)
         self._size = -1
         self._raw = bytes(2)  # Of no message.
@@ -144,7 +144,7 @@ class TemplateReader:
         self._joined_spans: list[tuple[slice, bytes]] = []
         self._value_spans: dict[str, tuple[int, int]] = {}
         self._layout: Layout | None = None
-        self.changes = 0
+        self.layout_changes = 0
         """How often the layout has changed."""
 
     def accept(self, raw: bytes) -> None:
@@ -176,12 +176,12 @@ class TemplateReader:
         offset, count = self._value_spans[path]
         return np.frombuffer(self._raw, np.float64, count, offset)
 
-    def place(self, path: str) -> slice:
+    def byte_span(self, path: str) -> slice:
         """Return where the bytes of the values at ``path`` are in messages of this layout."""
         offset, count = self._value_spans[path]
         return slice(offset, offset + 8 * count)
 
-    def count(self, path: str) -> int:
+    def value_count(self, path: str) -> int:
         """Return the number of values at ``path`` in messages of this layout."""
         return self._value_spans[path][1] if path in self._value_spans else 0
 
@@ -196,7 +196,7 @@ class TemplateReader:
         assert self._layout is not None
         return [self.text(f"{path}[{i}]") for i in range(self._layout.counts[path])]
 
-    def has(self, path: str) -> bool:
+    def has_values(self, path: str) -> bool:
         """Whether the accepted message has values at ``path``."""
         return path in self._value_spans
 
@@ -216,9 +216,9 @@ class TemplateReader:
         self._joined_spans = [(place, raw[place]) for place in stretches]
 
     def _learn_layout(self, raw: bytes) -> None:
-        if len(raw) > self._largest:
+        if len(raw) > self._max_size:
             raise UnreadableError(
-                f"it has {len(raw)} bytes, of which at most {self._largest} can be meant"
+                f"it has {len(raw)} bytes, of which at most {self._max_size} can be meant"
             )
         name = self._type_name
         layout = Layout(raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS)
@@ -248,7 +248,7 @@ class TemplateReader:
             if count:
                 self._value_spans[path] = leaf.offset, count
         self._join_fixed_spans(raw)
-        self.changes += 1
+        self.layout_changes += 1
 
 
 def _as_little_endian(raw: bytes, type_name: str) -> bytes:
@@ -284,12 +284,12 @@ class JointReader:
         measured: bool = False,
     ) -> None:
         self._measured, self._joints, self._quantities = measured, list(joint_names), quantities
-        largest = math.inf
+        max_size = math.inf
         if measured:
             # Of each joint a name with its length and three numbers.
-            largest = _HEADER_BYTES + 2 * sum(len(name.encode()) + 32 for name in joint_names)
-        self._reader = TemplateReader(JOINT_STATE, dict.fromkeys(quantities), largest)
-        self._changes = 0
+            max_size = _HEADER_BYTES + 2 * sum(len(name.encode()) + 32 for name in joint_names)
+        self._reader = TemplateReader(JOINT_STATE, dict.fromkeys(quantities), max_size)
+        self._known_layout = 0
         self._problem = ""
         self._last_accepted: bytes | None = None
         """The last message that was accepted: the same bytes are often received again."""
@@ -314,7 +314,7 @@ class JointReader:
             target[:] = raw[place]
         if self._order is not None:
             for name, values in self.values.items():
-                if self._reader.has(name):
+                if self._reader.has_values(name):
                     values[self._order] = self._reader.floats(name)
         return stamp
 
@@ -330,8 +330,8 @@ class JointReader:
             return
         self._last_accepted = None
         self._reader.accept(raw)
-        if self._reader.changes != self._changes:
-            self._changes = self._reader.changes
+        if self._reader.layout_changes != self._known_layout:
+            self._known_layout = self._reader.layout_changes
             self._check_names_and_lengths()
         if self._problem:
             raise CommandError(self._problem)
@@ -349,7 +349,7 @@ class JointReader:
         try:
             order = joint_order(self._joints, names)
             for i, quantity in enumerate(self._quantities):
-                count = self._reader.count(quantity)
+                count = self._reader.value_count(quantity)
                 if count or i == 0:
                     require_values(names, quantity, count)
         except CommandError as error:
@@ -360,9 +360,9 @@ class JointReader:
         # Joints in the model's order, as the stack's own nodes send them, are copied as bytes.
         if names == self._joints:
             self._copies = [
-                (values.data.cast("B"), self._reader.place(name))
+                (values.data.cast("B"), self._reader.byte_span(name))
                 for name, values in self.values.items()
-                if self._reader.has(name)
+                if self._reader.has_values(name)
             ]
         else:
             self._order = order

@@ -18,7 +18,7 @@ from support.hostile_bags import QUICK
 
 import spacerobot_ros
 from spacerobot_ros.bag import BagWriter, RecordingError, iterate_raw, read_bag
-from spacerobot_ros.bag.mcap_reading import LIMIT_VARIABLE
+from spacerobot_ros.bag.mcap_reading import INFLATED_SIZE_VARIABLE
 from spacerobot_ros.bag.salvage import last_state, salvage_bag
 from spacerobot_ros.cli.main import main
 
@@ -70,9 +70,9 @@ def test_what_inflates_much_is_read_where_the_user_says_so(
     path = tmp_path / "a.mcap"
     size = 40 * 2**20
     path.write_bytes(bag(Part("zstd", zstd_zeros(size, claims=size), size)))
-    with pytest.raises(RecordingError, match=f"inflates to {size} bytes.*{LIMIT_VARIABLE}"):
+    with pytest.raises(RecordingError, match=f"inflates to {size} bytes.*{INFLATED_SIZE_VARIABLE}"):
         read_bag(path)
-    monkeypatch.setenv(LIMIT_VARIABLE, "50")
+    monkeypatch.setenv(INFLATED_SIZE_VARIABLE, "50")
     assert read_bag(path).message_count() == 1
 
 

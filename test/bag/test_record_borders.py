@@ -21,7 +21,7 @@ from rosbags.interfaces import Nodetype
 
 from spacerobot_ros.bag import RecordingError, read_bag
 from spacerobot_ros.bag.mcap_reading import (
-    LIMIT_VARIABLE,
+    INFLATED_SIZE_VARIABLE,
     InflationLimit,
     _check_entries,
     read_record,
@@ -125,15 +125,15 @@ def test_an_index_that_names_anything_else_does_not_fit(chunk: bytes, places: li
 
 def test_chunks_may_inflate_to_the_limit_together_and_no_further() -> None:
     allowance = InflationLimit(1000)
-    assert allowance.most == 32_000_000
-    allowance.take(31_999_999, 8)
-    allowance.take(1, 50)
-    allowance.take(0, 60)
+    assert allowance.max_bytes == 32_000_000
+    allowance.count(31_999_999, 8)
+    allowance.count(1, 50)
+    allowance.count(0, 60)
     words = "the chunk at byte 70 it inflates to 32000001 bytes, more than the 32000000 that"
     with pytest.raises(ValueError, match=words):
-        allowance.take(1, 70)
-    assert InflationLimit(160_000).most == InflationLimit(0).most == 32_000_000
-    assert InflationLimit(160_001).most == 32_000_200
+        allowance.count(1, 70)
+    assert InflationLimit(160_000).max_bytes == InflationLimit(0).max_bytes == 32_000_000
+    assert InflationLimit(160_001).max_bytes == 32_000_200
 
 
 @pytest.mark.parametrize(
@@ -151,8 +151,8 @@ def test_chunks_may_inflate_to_the_limit_together_and_no_further() -> None:
 def test_the_limit_is_a_positive_number_of_megabytes(
     text: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(LIMIT_VARIABLE, text)
-    assert InflationLimit(0).most == most
+    monkeypatch.setenv(INFLATED_SIZE_VARIABLE, text)
+    assert InflationLimit(0).max_bytes == most
 
 
 PACKED: dict[str, Callable[[bytes], bytes]] = {
