@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -34,40 +36,29 @@ def campaign_command() -> None:
     """
 
 
-def _cluster_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    # A decorator adds its option before those of the decorators below it.
-    for option in (
-        click.option(
-            "--scheduler",
-            default="",
-            metavar="tcp://HOST:PORT",
-            help="Address of a dask scheduler, whose workers fly.",
-        ),
-        click.option(
-            "--workers",
-            type=click.IntRange(min=0),
-            default=2,
-            show_default=True,
-            help="Worker processes on this machine; 0: none, fly in this process.",
-        ),
-        click.option(
-            "--engine",
-            type=click.Choice(_ENGINES),
-            default="auto",
-            show_default=True,
-            help="What flies the draws.",
-        ),
-        click.option(
-            "--flights", type=click.IntRange(min=1), help="Number of flights [as in FILE]."
-        ),
-    ):
-        function = option(function)
-    return function
-
-
 @campaign_command.command("fly")
 @click.argument("file", type=PATH, required=False)
-@_cluster_options
+@click.option("--flights", type=click.IntRange(min=1), help="Number of flights [as in FILE].")
+@click.option(
+    "--engine",
+    type=click.Choice(_ENGINES),
+    default="auto",
+    show_default=True,
+    help="Engine that flies the draws.",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(min=0),
+    default=2,
+    show_default=True,
+    help="Worker processes on this machine; 0: none, fly in this process.",
+)
+@click.option(
+    "--scheduler",
+    default="",
+    metavar="tcp://HOST:PORT",
+    help="Address of a dask scheduler, whose workers fly.",
+)
 @out_option("Folder of the results [out/NAME].")
 @report_option("Report to write [OUT/report.html].")
 @click.option(
@@ -95,14 +86,13 @@ def fly(
     from spacerobot_ros.campaign.workers import Cluster
 
     cluster = Cluster(0 if scheduler else workers, scheduler)
-    if compare:
-        if file is not None:
-            raise ParameterError("Give one FILE, or two after --compare.")
+    if (file is None) == (compare is None):
+        raise ParameterError("Give the FILE of a campaign, or two after --compare, not both.")
+    if compare is not None:
         _compare(compare, flights, engine, cluster, out, report)
         return
-    if file is None:
-        raise ParameterError("Give the FILE of a campaign, or two after --compare.")
-    folder = _flown(file, flights, engine, cluster, out)
+    assert file is not None
+    folder = _fly_campaign(file, flights, engine, cluster, out)
     _write_report(folder, report)
     end_if_requested()
 
@@ -136,10 +126,10 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
         fail("The flight is another one than that in the dataset.")
 
 
-def _flown(
+def _fly_campaign(
     file: Path, flights: int | None, engine: str, cluster: Cluster, out: Path | None, name: str = ""
 ) -> Path:
-    """Fly a campaign, say how far it has come, and return its folder; ``name`` replaces its own."""
+    """Fly a campaign, print how far it came, and return its folder; ``name`` replaces its own."""
     from spacerobot_ros.campaign.config import load_campaign
     from spacerobot_ros.campaign.running import run_campaign
     from spacerobot_ros.termination import ended_on_request
@@ -148,17 +138,17 @@ def _flown(
     if name:
         campaign = replace(campaign, name=name)
     folder = out or Path("out") / campaign.name
-    with ended_on_request() as stopped, _shown(campaign.name) as show:
-        end = run_campaign(
+    with ended_on_request() as stopped, _progress_bar(campaign.name) as show:
+        progress = run_campaign(
             campaign, folder, engine=engine, cluster=cluster, show=show, stopped=stopped
         )
-    flown = f"{end.done} of {end.total} flights"
-    click.echo(f"{campaign.name}: {flown}, {end.rate:.3g} a second; {folder}")
+    flown = f"{progress.done} of {progress.total} flights"
+    click.echo(f"{campaign.name}: {flown}, {progress.rate:.3g} a second; {folder}")
     return folder
 
 
 @contextmanager
-def _shown(label: str) -> Iterator[Callable[[Progress], None]]:
+def _progress_bar(label: str) -> Iterator[Callable[[Progress], None]]:
     """Show progress, rate and time left of a campaign, if standard error is a terminal."""
     if not sys.stderr.isatty():
         yield lambda progress: None
@@ -168,20 +158,12 @@ def _shown(label: str) -> Iterator[Callable[[Progress], None]]:
     ) as bar:
 
         def show(progress: Progress) -> None:
-            share = progress.done / progress.total
             flown = f"{progress.done}/{progress.total}, {progress.rate:.3g}/s"
-            step = max(0, int(1000 * share) - bar.pos)
-            bar.update(step, f"{flown}, {_time(progress.left)} left")
+            left = "?" if math.isinf(progress.left) else timedelta(seconds=round(progress.left))
+            step = max(0, 1000 * progress.done // progress.total - bar.pos)
+            bar.update(step, f"{flown}, {left} left")
 
         yield show
-
-
-def _time(seconds: float) -> str:
-    if seconds == float("inf"):
-        return "?"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def _write_report(folder: Path, report: Path | None) -> None:
@@ -212,7 +194,7 @@ def _compare(
     base = out or Path("out") / "_".join(names)
     folders = []
     for file, name in zip(files, names, strict=True):
-        folders.append(_flown(file, flights, engine, cluster, base / name, name))
+        folders.append(_fly_campaign(file, flights, engine, cluster, base / name, name))
         end_if_requested()
     path = report or base / "report.html"
     for line in write_comparison((folders[0], folders[1]), path):

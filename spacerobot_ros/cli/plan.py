@@ -74,22 +74,20 @@ def plan_command(
     The gait is simulated. Exit code 0: it ends within tolerance; 1: it does not, or the goal cannot
     be reached; 2: bad input.
     """
-    from spacerobot_ros.simulation.trials import PlanEvaluation, compare, try_method
+    from spacerobot_ros.simulation.trials import PlanEvaluation, compare, fastest, try_method
 
     problem = problem_of(scenario, goal, settings)
     method = method or problem.config.method
     if count is not None:
-        _try_random(problem, [method] if beside is None else [method, beside], count, within)
+        _plan_random_goals(problem, [method] if beside is None else [method, beside], count, within)
         return
-    found: Mapping[str, PlanEvaluation | SpaceRobotError]
+    plans: Mapping[str, PlanEvaluation | SpaceRobotError]
     with display(scenario):
-        found = compare(problem) if comparing else {method: try_method(problem, method)}
+        plans = compare(problem) if comparing else {method: try_method(problem, method)}
     if comparing:
-        for line in table(found):
+        for line in comparison_lines(plans):
             click.echo(line)
-    if comparing and method == "auto":
-        method = _shortest(found)
-    trial = found.get(method)
+    trial = fastest(plans) if comparing and method == "auto" else plans.get(method)
     if not isinstance(trial, PlanEvaluation):
         fail()
     left = f"{trial.error.angle:.3g} rad and {trial.error.distance:.3g} m from the goal"
@@ -101,7 +99,7 @@ def plan_command(
         if comparing:
             content["compared"] = {
                 name: each.duration if isinstance(each, PlanEvaluation) else str(each)
-                for name, each in found.items()
+                for name, each in plans.items()
             }
         write_json(json_file, content, indent=None)
         click.echo(f"json        {json_file}")
@@ -113,18 +111,6 @@ def plan_command(
         click.echo(f"picture     {picture}")
     if not trial.reached:
         fail(f"The goal is not reached within the planner's tolerance: {left}.")
-
-
-def _shortest(found: Mapping[str, PlanEvaluation | SpaceRobotError]) -> str:
-    """Return the method of the shortest plan that ends within tolerance; empty without one."""
-    from spacerobot_ros.simulation.trials import PlanEvaluation
-
-    reached = [
-        (each.duration, name)
-        for name, each in found.items()
-        if isinstance(each, PlanEvaluation) and each.reached
-    ]
-    return min(reached, default=(0.0, ""))[1]
 
 
 def problem_of(name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] = ()) -> Problem:
@@ -150,7 +136,7 @@ def problem_of(name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] 
 
 
 def json_of(problem: Problem, trial: PlanEvaluation) -> dict[str, Any]:
-    """Return what ``--json`` writes of a trial."""
+    """Return the content of the file that ``--json`` names."""
     from spacerobot_ros.model.rotations import rotvec_from_quaternion
 
     goal, path = problem.goal, trial.path
@@ -180,11 +166,11 @@ def json_of(problem: Problem, trial: PlanEvaluation) -> dict[str, Any]:
     }
 
 
-def table(found: Mapping[str, PlanEvaluation | SpaceRobotError]) -> Iterator[str]:
-    """Yield the lines of a comparison; errors that a method does not control are in brackets."""
+def comparison_lines(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> Iterator[str]:
+    """Yield a table of plans by method; errors that a method does not control are in brackets."""
     yield f"{'method':<14}{'manoeuvre':>12}{'planned in':>12}{'attitude':>14}{'position':>14}"
     yield f"{'':<14}{'s':>12}{'s':>12}{'rad off':>14}{'m off':>14}"
-    for name, trial in found.items():
+    for name, trial in plans.items():
         if isinstance(trial, SpaceRobotError):
             yield f"{name:<14}{trial}"
             continue
@@ -196,20 +182,20 @@ def table(found: Mapping[str, PlanEvaluation | SpaceRobotError]) -> Iterator[str
         yield f"{name:<14}{times}{angle:>14}{distance:>14}"
 
 
-def _goals(problem: Problem, count: int, within: tuple[float, float]) -> list[Goal]:
+def _random_goals(problem: Problem, count: int, within: tuple[float, float]) -> list[Goal]:
     """Return random goals; ``within`` are the largest distance, m, and angle, deg."""
     from spacerobot_ros.simulation.trials import random_goals
 
     return random_goals(problem, count, within[0], math.radians(within[1]))
 
 
-def _try_random(
+def _plan_random_goals(
     problem: Problem, methods: list[str], count: int, within: tuple[float, float]
 ) -> None:
     """Plan and print random goals; exit code 0: all that were simulated were reached."""
     from spacerobot_ros.simulation.trials import try_goals
 
-    goals = _goals(problem, count, within)
+    goals = _random_goals(problem, count, within)
     show = partial(click.echo, err=True) if sys.stderr.isatty() else lambda line: None
     records = try_goals(problem, goals, methods, show)
     click.echo(
@@ -217,7 +203,7 @@ def _try_random(
         f"{'median':>10}{'longest':>10}{'planned in':>11}{'at most':>9}"
     )
     for record in records:
-        click.echo(_row(record))
+        click.echo(_record_row(record))
     for record in records:
         for reason in dict.fromkeys(record.refused):
             click.echo(f"{record.method} refused: {reason}")
@@ -225,7 +211,7 @@ def _try_random(
         fail()
 
 
-def _row(record: Record) -> str:
+def _record_row(record: Record) -> str:
     import numpy as np
 
     goals = record.reached + record.missed + len(record.refused)
@@ -271,7 +257,7 @@ def library_command(
     problem = problem_of(scenario, settings=settings)
     method = problem.method("optimal")
     assert isinstance(method, OptimalGait)
-    goals = _goals(problem, count, within)
+    goals = _random_goals(problem, count, within)
     with click.progressbar(goals, label=problem.name, file=sys.stderr) as bar:
         state, tolerance = state_of(problem.plant()), problem.config.tolerance
         library = method.build_library(PlanRequest(state, goal, tolerance) for goal in bar)

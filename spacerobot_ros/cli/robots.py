@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning.analysis import Analysis
     from spacerobot_ros.planning.core.controllability import Controllability
 
-_MOST_ROWS = 12
-"""Joints that are listed; of more the rest is counted."""
+_MAX_LISTED_JOINTS = 12
+"""Number of joints that are listed; the others are counted."""
 
 
 @click.command("analyze")
@@ -43,7 +43,7 @@ def analyze_command(
     from spacerobot_ros.resources import robot_file
 
     model = SpaceRobot.from_file(robot_file(robot))
-    found = analyze(model, None if shape is None else _parsed(shape))
+    found = analyze(model, None if shape is None else _parse_shape(shape))
     for line in lines_of(found):
         click.echo(line)
     if json_file is not None:
@@ -60,7 +60,7 @@ def analyze_command(
     click.echo(f"{'picture':<13}{target}")
 
 
-def _parsed(text: str) -> list[float]:
+def _parse_shape(text: str) -> list[float]:
     try:
         return [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
@@ -75,7 +75,7 @@ def lines_of(found: Analysis) -> list[str]:
     lines = [f"{name}: {n} joint(s), {robot.total_mass:.6g} kg, of which the base {base:.6g} kg"]
     lines += _joint_rows(robot)
     lines += ["", *_rotation_lines(found)]
-    lines += [f"{'position':<13}{_position(found)}", ""]
+    lines += [f"{'position':<13}{_position_text(found)}", ""]
     for method, objection in found.objections.items():
         lines.append(f"{method:<13}{'no: ' + objection if objection else 'yes'}")
     lines.append(f"{'auto':<13}{found.chosen or 'no method suits this robot'}")
@@ -85,7 +85,7 @@ def lines_of(found: Analysis) -> list[str]:
 def json_of(found: Analysis) -> dict[str, Any]:
     """Return the findings for JSON; infinite condition numbers and limits are null."""
     robot = found.robot
-    finite = _finite(found)
+    finite = _finite_conditions(found)
     return {
         "robot": robot.description.name,
         "mass_kg": robot.total_mass,
@@ -94,16 +94,16 @@ def json_of(found: Analysis) -> dict[str, Any]:
             {
                 "name": joint.name,
                 "kind": joint.kind.value,
-                "lower": _number(joint.limits.lower),
-                "upper": _number(joint.limits.upper),
-                "velocity": _number(joint.limits.velocity),
-                "effort": _number(joint.limits.effort),
+                "lower": _finite_or_none(joint.limits.lower),
+                "upper": _finite_or_none(joint.limits.upper),
+                "velocity": _finite_or_none(joint.limits.velocity),
+                "effort": _finite_or_none(joint.limits.effort),
             }
             for joint in robot.description.movable_joints
         ],
         "shape": found.shape.tolist(),
-        "at_shape": _finding(found.at_shape),
-        "anywhere": _finding(found.anywhere),
+        "at_shape": _finding_json(found.at_shape),
+        "anywhere": _finding_json(found.anywhere),
         "curvature_matrix": None if found.nominal is None else found.nominal.M.tolist(),
         "condition_over_shapes": {
             "shapes": len(found.conditions),
@@ -111,8 +111,8 @@ def json_of(found: Analysis) -> dict[str, Any]:
             "best": min(finite, default=None),
             "median": median(finite) if finite else None,
         },
-        "planar": _finding(found.planar),
-        "sliding": _finding(found.sliding),
+        "planar": _finding_json(found.planar),
+        "sliding": _finding_json(found.sliding),
         "methods": found.objections,
         "auto": found.chosen or None,
     }
@@ -122,24 +122,24 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
     from spacerobot_ros.model.description import JointKind
 
     joints, bodies = robot.description.moving_joints, robot.description.bodies[1:]
-    width = max([5, *(len(joint.name) for joint in joints[:_MOST_ROWS])])
+    width = max([5, *(len(joint.name) for joint in joints[:_MAX_LISTED_JOINTS])])
     head = f"{'joint':<{width}}  {'kind':<11}{'on':<16}{'limits':>19}{'speed':>12}{'effort':>10}"
     rows = [f"{head}{'mass':>12}"]
-    for joint, body in list(zip(joints, bodies, strict=True))[:_MOST_ROWS]:
-        unit, of_effort = ("m", "N") if joint.kind is JointKind.PRISMATIC else ("rad", "N m")
+    for joint, body in list(zip(joints, bodies, strict=True))[:_MAX_LISTED_JOINTS]:
+        unit, effort_unit = ("m", "N") if joint.kind is JointKind.PRISMATIC else ("rad", "N m")
         limits = joint.limits
-        room = f"{limits.lower:.4g} .. {limits.upper:.4g} {unit}"
+        range_text = f"{limits.lower:.4g} .. {limits.upper:.4g} {unit}"
         if math.isinf(limits.lower):
-            room = "free"
-        speed, effort = f"{limits.velocity:.3g} {unit}/s", f"{limits.effort:.4g} {of_effort}"
+            range_text = "free"
+        speed, effort = f"{limits.velocity:.3g} {unit}/s", f"{limits.effort:.4g} {effort_unit}"
         follows = joint.mimic
         rows.append(
-            f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent[:15]:<16}{room:>19}"
+            f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent[:15]:<16}{range_text:>19}"
             f"{speed:>12}{effort:>10}{body.inertia.mass:>9.4g} kg"
             + (f"  follows {follows.joint}" if follows is not None else "")
         )
-    if len(joints) > _MOST_ROWS:
-        rows.append(f"and {len(joints) - _MOST_ROWS} more")
+    if len(joints) > _MAX_LISTED_JOINTS:
+        rows.append(f"and {len(joints) - _MAX_LISTED_JOINTS} more")
     return rows
 
 
@@ -155,7 +155,7 @@ def _rotation_lines(found: Analysis) -> list[str]:
             f"{'at shape':<13}({shape}): rank {found.at_shape.rank}, condition {at.condition:.3g}",
             f"{'':<13}singular values ({values}) rad a unit of area, joints {names}",
         ]
-        finite = _finite(found)
+        finite = _finite_conditions(found)
         lines.append(
             f"{'shape space':<13}rank 3 at {len(finite)} of {len(found.conditions)} shapes; "
             f"condition {min(finite):.3g} at best, {median(finite):.3g} the median"
@@ -163,7 +163,7 @@ def _rotation_lines(found: Analysis) -> list[str]:
     return lines
 
 
-def _position(found: Analysis) -> str:
+def _position_text(found: Analysis) -> str:
     from spacerobot_ros.planning.core.controllability import sliders_of
 
     count = len(sliders_of(found.robot))
@@ -172,12 +172,12 @@ def _position(found: Analysis) -> str:
     return "follows from attitude and shape: the centre of mass rests"
 
 
-def _finding(found: Controllability) -> dict[str, Any]:
+def _finding_json(found: Controllability) -> dict[str, Any]:
     return {
         "controllable": found.controllable,
         "rank": found.rank,
         "wanted": found.needed,
-        "condition": _number(found.condition),
+        "condition": _finite_or_none(found.condition),
         "singular_values": found.singular_values.tolist(),
         "joints": list(found.joints),
         "shape": found.shape.tolist(),
@@ -185,12 +185,12 @@ def _finding(found: Controllability) -> dict[str, Any]:
     }
 
 
-def _finite(found: Analysis) -> list[float]:
+def _finite_conditions(found: Analysis) -> list[float]:
     """Return the condition numbers of the shapes where the brackets span all rotations."""
     return [float(x) for x in found.conditions if math.isfinite(x)]
 
 
-def _number(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
@@ -204,12 +204,12 @@ def new_command(robot: str, out: Path | None) -> None:
     goal is written; 1: no method reaches one; 2: the robot is refused.
     """
     from spacerobot_ros.bag import free_name
-    from spacerobot_ros.cli.plan import table
+    from spacerobot_ros.cli.plan import comparison_lines
     from spacerobot_ros.model import SpaceRobot
     from spacerobot_ros.planning.analysis import analyze
     from spacerobot_ros.resources import is_path, robot_file
-    from spacerobot_ros.session.own_robot import fastest, first_problem, remarks, scenario_text
-    from spacerobot_ros.simulation.trials import compare
+    from spacerobot_ros.session.own_robot import first_problem, remarks, scenario_text
+    from spacerobot_ros.simulation.trials import compare, fastest
 
     file = robot_file(robot)
     model = SpaceRobot.from_file(file)
@@ -223,10 +223,10 @@ def new_command(robot: str, out: Path | None) -> None:
     click.echo()
     problem = first_problem(name, model, file)
     with display(name):
-        found = compare(problem)
-    for line in table(found):
+        plans = compare(problem)
+    for line in comparison_lines(plans):
         click.echo(line)
-    best = fastest(found)
+    best = fastest(plans)
     if best is None:
         fail("No method reaches the goal of a first flight; no scenario is written.")
     target = free_name(out or Path(f"{name}.yaml"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.trials import PlanEvaluation, Problem
+from spacerobot_ros.simulation.trials import Problem
 
 _FIRST_TURN = math.radians(5.0)
 """Largest turn of the base in the first scenario of a robot, rad."""
@@ -182,12 +182,6 @@ def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
     axis = np.round(U[:, 0] * np.sign(U[np.argmax(np.abs(U[:, 0])), 0]), 3) + 0.0
     degrees = float(f"{math.degrees(angle):.2g}")
     return np.asarray(math.radians(degrees) * axis / np.linalg.norm(axis))
-
-
-def fastest(found: Mapping[str, object]) -> PlanEvaluation | None:
-    """Return the trial that reaches its goal in the shortest time, None if none does."""
-    reached = [each for each in found.values() if isinstance(each, PlanEvaluation) and each.reached]
-    return min(reached, key=lambda trial: trial.duration, default=None)
 
 
 def scenario_text(problem: Problem, method: str, robot_path: str) -> str:

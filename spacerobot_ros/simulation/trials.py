@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -196,6 +196,12 @@ def compare(problem: Problem) -> dict[str, PlanEvaluation | SpaceRobotError]:
         except (ParameterError, PlanningError) as refusal:
             found[name] = refusal
     return found
+
+
+def fastest(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> PlanEvaluation | None:
+    """Return the shortest plan that ends within tolerance, None without one."""
+    reached = [each for each in plans.values() if isinstance(each, PlanEvaluation) and each.reached]
+    return min(reached, key=lambda plan: plan.duration, default=None)
 
 
 @dataclass
