@@ -34,10 +34,10 @@ from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance
 _PERIOD = 0.05
 """Control period of the plans, s."""
 
-_LEAST_ANGLE = 0.05
+_MIN_GOAL_ANGLE = 0.05
 """Smallest rotation of a goal, rad."""
 
-_SCATTER = 0.3
+_START_SCATTER = 0.3
 """Largest distance of a start from the case's, m or rad a joint."""
 
 # -- flights ----------------------------------------------------------------------------------
@@ -45,13 +45,13 @@ _SCATTER = 0.3
 _SHORT_FLIGHT = 5.0
 """Simulated time of the flight that is subtracted: start, planning, end, s."""
 
-_SLIDING_PERIOD, _GAIT_START, _CYCLE = 0.05, 100.0, 3.0
+_SLIDING_PERIOD, _TIME_BEFORE_CYCLES, _CYCLE_PERIOD = 0.05, 100.0, 3.0
 """Of sliding_masses with ``lie_bracket``: control period, time before the cycles, one cycle, s."""
 
-_FEWEST_CYCLES = 170
+_MIN_CYCLES = 170
 """Fewer cycles have too large loops for the rotation of the goal."""
 
-_PLANNED: tuple[tuple[str, str, dict[str, Any]], ...] = (
+_PLANNED_SCENARIOS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("sliding_masses", "lie_bracket", {}),
     ("arm_attitude", "area_loop", {}),
     ("planar_chain", "square_path", {}),
@@ -59,9 +59,14 @@ _PLANNED: tuple[tuple[str, str, dict[str, Any]], ...] = (
 )
 """Scenarios, methods and options of the plans."""
 
-_PLANS = 15
-_FLIGHTS = 3
+_PLANS_PER_MEDIAN = 15
+_FLIGHTS_PER_MEDIAN = 3
 """Number of flights without ROS of which medians are taken."""
+
+
+def gait_cycles(duration: float) -> int:
+    """Return the cycles of ``lie_bracket`` with which sliding_masses moves for a time, s."""
+    return max(_MIN_CYCLES, math.ceil((duration - _TIME_BEFORE_CYCLES) / _CYCLE_PERIOD) + 1)
 
 
 def tick_times(ticks: int) -> dict[str, float]:
@@ -81,8 +86,8 @@ def tick_times(ticks: int) -> dict[str, float]:
     (with coordinated control), ``loop_us`` and ``controlled_loop_us`` (without ROS); in ms a plan:
     ``plan_METHOD_ms``.
     """
-    public = _public()
-    cycles = max(_FEWEST_CYCLES, math.ceil((ticks * _SLIDING_PERIOD - _GAIT_START) / _CYCLE) + 1)
+    package = _imported_package()
+    cycles = gait_cycles(ticks * _SLIDING_PERIOD)
     gait = {"planner.lie_bracket.cycles": cycles}
     words = ["sliding_masses", "--method", "lie_bracket"]
     words += [f"--set={name}={value}" for name, value in gait.items()]
@@ -91,23 +96,24 @@ def tick_times(ticks: int) -> dict[str, float]:
         "controlled_stack_us": _stack_tick(["coordinated_control"], math.inf),
     }
     scenario = "sliding_masses"
-    planning = _cpu_time(lambda: public.plan(scenario, method="lie_bracket", cycles=cycles))
+    planning = _cpu_time(lambda: package.plan(scenario, method="lie_bracket", cycles=cycles))
     figures["loop_us"] = _loop_tick(planning, scenario, method="lie_bracket", parameters=gait)
     figures["controlled_loop_us"] = _loop_tick(0.0, "coordinated_control")
-    for scenario, method, options in _PLANNED:
-        plan = partial(public.plan, scenario, method=method, **options)
+    for scenario, method, options in _PLANNED_SCENARIOS:
+        plan = partial(package.plan, scenario, method=method, **options)
         figures[f"plan_{method}_ms"] = 1e3 * _cpu_time(plan)
     return figures
 
 
 def _stack_tick(words: list[str], longest: float) -> float:
     """Return the CPU time of a tick of ``spacerobot run`` in this process, us."""
-    _run(words, _SHORT_FLIGHT)  # Imports, and compiles.
-    (first, few), (second, many) = (_run(words, each) for each in (_SHORT_FLIGHT, longest))
-    return 1e6 * (second - first) / (many - few)
+    _fly_by_command(words, _SHORT_FLIGHT)  # Imports, and compiles.
+    short_time, short_ticks = _fly_by_command(words, _SHORT_FLIGHT)
+    long_time, long_ticks = _fly_by_command(words, longest)
+    return 1e6 * (long_time - short_time) / (long_ticks - short_ticks)
 
 
-def _run(words: list[str], longest: float) -> tuple[float, int]:
+def _fly_by_command(words: list[str], longest: float) -> tuple[float, int]:
     """Fly; return the CPU time, s, and the number of ticks."""
     with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
         result = Path(folder, "result.json")
@@ -122,20 +128,20 @@ def _run(words: list[str], longest: float) -> tuple[float, int]:
         return used, json.loads(result.read_text("utf-8"))["ticks"]
 
 
-def _public() -> Any:
+def _imported_package() -> Any:
     """Return the package as a program of a user imports it."""
     return import_module("spacerobot_ros")
 
 
 def _loop_tick(planning: float, scenario: str, **arguments: Any) -> float:
     """Return the CPU time of a tick of a flight without ROS, us; ``planning`` s are subtracted."""
-    fly = _public().fly
+    fly = _imported_package().fly
     ticks = len(fly(scenario, **arguments).time) - 1
-    flying = _cpu_time(lambda: fly(scenario, **arguments), _FLIGHTS)
+    flying = _cpu_time(lambda: fly(scenario, **arguments), _FLIGHTS_PER_MEDIAN)
     return 1e6 * (flying - planning) / ticks
 
 
-def _cpu_time(run: Callable[[], object], count: int = _PLANS) -> float:
+def _cpu_time(run: Callable[[], object], count: int = _PLANS_PER_MEDIAN) -> float:
     """Return the median CPU time of a call after the first one, s."""
     times = []
     for _ in range(1 + count):
@@ -190,12 +196,12 @@ def requests(robot: SpaceRobot, case: Case, count: int, seed: int) -> Iterator[P
     """Yield random plan requests of a case; the same seed gives the same ones."""
     rng = np.random.default_rng(seed)
     for _ in range(count):
-        scattered = np.array(case.start) + rng.uniform(-_SCATTER, _SCATTER, robot.n)
+        scattered = np.array(case.start) + rng.uniform(-_START_SCATTER, _START_SCATTER, robot.n)
         q = np.clip(scattered, robot.lower, robot.upper)
         axis = rng.normal(size=3)
         if case.planar:
             axis = np.array([0.0, 0.0, axis[2]])
-        angle = rng.uniform(_LEAST_ANGLE, case.angle)
+        angle = rng.uniform(_MIN_GOAL_ANGLE, case.angle)
         turn = quaternion_from_rotvec(axis / np.linalg.norm(axis) * angle)
         position = np.zeros(3)
         if case.sliding:
@@ -225,11 +231,11 @@ def plans(
     method = OptimalGait(robot, _PERIOD, options=OptimalOptions(**chosen))
     goals = list(requests(robot, chosen_case, count + 1, seed))
     if library:
-        made = method.build_library(requests(robot, chosen_case, library, seed + 1))
-        assert made is not None
+        solutions = method.build_library(requests(robot, chosen_case, library, seed + 1))
+        assert solutions is not None
         with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
             file = Path(folder, "library.npz")
-            file.write_bytes(made.to_bytes())
+            file.write_bytes(solutions.to_bytes())
             chosen["library"] = str(file)
             method = OptimalGait(robot, _PERIOD, options=OptimalOptions(**chosen))
     times: list[float] = []
@@ -245,7 +251,7 @@ def plans(
     return {"cpu_s": times[1:], "duration_s": durations[1:]}
 
 
-_TURN = (0.1, -0.15, 0.2)
+_FIRST_GOAL_ROTVEC = (0.1, -0.15, 0.2)
 """Rotation vector of the goal of a first plan, rad."""
 
 
@@ -264,7 +270,7 @@ def first_plan(urdf: str) -> dict[str, float]:
     method = OptimalGait(robot, _PERIOD, options=OptimalOptions(cache=0))
     q = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
-    goal = Goal.checked(np.zeros(3), quaternion_from_rotvec(_TURN))
+    goal = Goal.checked(np.zeros(3), quaternion_from_rotvec(_FIRST_GOAL_ROTVEC))
     request = PlanRequest(state, goal, Tolerance(2e-3, 2e-3))
     method.plan(request)
     used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
@@ -278,5 +284,5 @@ MEASUREMENTS = {"tick_times": tick_times, "plans": plans, "first_plan": first_pl
 
 if __name__ == "__main__":
     _, name_of, arguments, file_of = sys.argv
-    found: Any = MEASUREMENTS[name_of](**json.loads(arguments))  # type: ignore[operator]
-    Path(file_of).write_text(json.dumps(found), encoding="utf-8")
+    result: Any = MEASUREMENTS[name_of](**json.loads(arguments))  # type: ignore[operator]
+    Path(file_of).write_text(json.dumps(result), encoding="utf-8")

@@ -12,9 +12,8 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from itertools import cycle
-from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread
 from urllib.parse import urlsplit
@@ -23,6 +22,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 
 from spacerobot_ros.bag import Bag, read_bag
+from spacerobot_ros.benchmarks.measurements import gait_cycles
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.messages.statuses import key_values
 from spacerobot_ros.model.description import Array
@@ -48,10 +48,7 @@ _PRIORITIES = {"plant": 30, "planner": 20, "coordinated_control": 20, "recorder"
 """Priorities of the kernel's real-time scheduling, where it is allowed; `chrt -f` sets the same."""
 
 _GOAL = Goal.checked([0.2, -0.15, 0.05], quaternion_from_rotvec([0.1, -0.05, 0.02]))
-_FEWEST_CYCLES = 170
-"""Fewer cycles have too large loops for the rotation of the goal."""
-
-_STATES = ("/clock", "/odom", "/joint_states", "/momentum")
+_COUNTED_STATE_TOPICS = ("/clock", "/odom", "/joint_states", "/momentum")
 
 
 @contextmanager
@@ -175,35 +172,36 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
         load_scenario("sliding_masses")
         .in_real_time(1.0)
         .with_overrides("plant", {"tick_rate": rate, "diagnostics_period": 1.0})
-        .with_overrides("planner", {"tick_rate": rate, **_gait(duration)})
+        .with_method("lie_bracket")
+        .with_overrides("planner", {"tick_rate": rate, "lie_bracket.cycles": gait_cycles(duration)})
     )
     memory: list[float] = []
-    with stack_in_processes(scenario) as (stack, bag, stopped), ExitStack() as closing:
-        idle = _IdleProcess(1.0 / rate, duration)
-        closing.callback(idle.kill)
+    with (
+        stack_in_processes(scenario) as (stack, bag, stopped),
+        multiprocessing.get_context("spawn").Pool(1) as idle_process,
+    ):
+        idle = idle_process.apply_async(_wait_for_ticks, (1.0 / rate, duration))
         prioritised = prioritise(stack)
         stack.start(_GOAL)
         began = sampled = time.monotonic()
 
-        def look() -> bool:
+        def sample_memory() -> bool:
             nonlocal sampled
             now = time.monotonic()
             if now - sampled >= _MEMORY_PERIOD:
                 sampled = now
-                memory.append(_resident(stack))
+                memory.append(_resident_memory(stack))
             return stopped() or now - began >= duration
 
-        stack.spin(look)
+        stack.spin(sample_memory)
         finish(stack, stopped)
         published = stack.statistics.commands_published
-        late = idle.counts()
-        return _figures(rate, read_bag(bag), published, memory, late, prioritised=prioritised)
-
-
-def _gait(duration: float) -> dict[str, object]:
-    """Return the planner's parameters for a gait that lasts longer: 100 s, and cycles of 3 s."""
-    cycles = max(_FEWEST_CYCLES, math.ceil((duration - 100.0) / 3.0) + 1)
-    return {"method": "lie_bracket", "lie_bracket.cycles": cycles}
+        idle_delays = 0, math.nan
+        with suppress(multiprocessing.TimeoutError):
+            idle_delays = idle.get(_LONGEST_IDLE_END)
+        return _figures(
+            rate, read_bag(bag), published, memory, idle_delays, prioritised=prioritised
+        )
 
 
 def _figures(
@@ -211,7 +209,7 @@ def _figures(
     bag: Bag,
     published: int,
     memory: list[float],
-    idle: tuple[int, float],
+    idle_delays: tuple[int, float],
     *,
     prioritised: bool,
 ) -> RealTimeFigures:
@@ -223,7 +221,7 @@ def _figures(
     # Every tick publishes each state once, and the first one comes before the first tick.
     stamps = bag["/joint_states"].stamp
     states = round((stamps[-1] - stamps[0]) * rate) + 1
-    lost = max(states - bag.message_count(topic) for topic in _STATES)
+    lost = max(states - bag.message_count(topic) for topic in _COUNTED_STATE_TOPICS)
     settled = memory[int(_WARM_UP * len(memory)) :]
     third = max(len(settled) // 3, 1)
     return RealTimeFigures(
@@ -240,8 +238,8 @@ def _figures(
         commands_lost=published - bag.message_count("/joint_commands"),
         memory_MiB=memory[-1],
         memory_growth_MiB=statistics.median(settled[-third:]) - statistics.median(settled[:third]),
-        idle_late=idle[0],
-        idle_worst_ms=idle[1],
+        idle_late=idle_delays[0],
+        idle_worst_ms=idle_delays[1],
         prioritised=prioritised,
     )
 
@@ -269,40 +267,11 @@ def prioritise(stack: MultiProcessStack) -> bool:
     return True
 
 
-class _IdleProcess:
-    """A process that only waits for ticks: its delays are those of the machine.
+def _wait_for_ticks(period: float, duration: float) -> tuple[int, float]:
+    """Only wait for ticks, with a period and for a duration, s: delays are those of the machine.
 
-    Parameters
-    ----------
-    period
-        Time from one tick to the next, s.
-    duration
-        Time until the last tick, s.
+    Return how often it was late by more than a period, and the most beyond that, ms.
     """
-
-    def __init__(self, period: float, duration: float) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._receiver, sender = context.Pipe(duplex=False)
-        self._process = context.Process(
-            target=_wait_for_ticks, args=(period, duration, sender), daemon=True
-        )
-        self._process.start()
-        sender.close()
-
-    def counts(self) -> tuple[int, float]:
-        """Return how often it was late by more than a period, and the most beyond that, ms."""
-        if self._receiver.poll(_LONGEST_IDLE_END):
-            counts: tuple[int, float] = self._receiver.recv()
-            return counts
-        return 0, math.nan
-
-    def kill(self) -> None:
-        """End the process."""
-        self._process.kill()
-        self._process.join()
-
-
-def _wait_for_ticks(period: float, duration: float, sender: Connection) -> None:
     Thread(target=_end_with_parent, daemon=True).start()
     began = time.perf_counter()
     late, worst = 0, 0.0
@@ -312,7 +281,7 @@ def _wait_for_ticks(period: float, duration: float, sender: Connection) -> None:
         beyond = time.perf_counter() - due - period
         late += beyond > 0
         worst = max(worst, 1e3 * beyond)
-    sender.send((late, worst))
+    return late, worst
 
 
 def _end_with_parent() -> None:
@@ -322,27 +291,28 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _resident(stack: MultiProcessStack) -> float:
+def process_facts(pid: int, name: str = "status") -> dict[str, str]:
+    """Return the facts about a process in a file of ``/proc/PID``, by name."""
+    text = Path(f"/proc/{pid}/{name}").read_text("utf-8")
+    pairs = (line.partition(":") for line in text.splitlines())
+    return {key: value.strip() for key, _, value in pairs}
+
+
+def _resident_memory(stack: MultiProcessStack) -> float:
     """Return the resident memory of the stack's processes, MiB."""
-    return sum(
-        int(line.split()[1]) / 1024
-        for process in stack.processes.values()
-        for line in Path(f"/proc/{process.pid}/status").read_text("utf-8").splitlines()
-        if line.startswith("VmRSS:")
-    )
+    facts = (process_facts(process.pid) for process in stack.processes.values())
+    return sum(int(each["VmRSS"].split()[0]) / 1024 for each in facts)
 
 
 # -- beside a viewer -------------------------------------------------------------------------
 
-_SCENARIO = "servicer"
-
-_SETTLING = 10.0
+_SETTLING_TIME = 10.0
 """Wall time after the start or end of a viewer and its browser that does not count, s."""
 
 _GOAL_PERIOD = 15.0
 """Wall time from one goal to the next, s: a robot at rest is not drawn again."""
 
-_GOALS = ((0.0, 0.0, 0.0), (0.3, 0.1, -0.1))
+_GOAL_POSITIONS = ((0.0, 0.0, 0.0), (0.3, 0.1, -0.1))
 """Positions of the base, which goals name in turns, m."""
 
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -353,67 +323,12 @@ _BROWSER_OPTIONS = (
 )
 
 
-@dataclass(frozen=True)
-class Phase:
-    """Number of deadlines in a part of the flight, and of those that were missed."""
-
-    deadlines: int = 0
-    missed: int = 0
-
-    def __add__(self, other: Phase) -> Phase:
-        """Count two parts together."""
-        return Phase(self.deadlines + other.deadlines, self.missed + other.missed)
-
-    @property
-    def percent(self) -> float:
-        """Part of the deadlines that was missed, %."""
-        return 100.0 * self.missed / max(self.deadlines, 1)
-
-
-@dataclass(frozen=True)
-class ViewerFigures:
-    """Figures of a flight in real time with and without a viewer.
-
-    Attributes
-    ----------
-    updates_per_s
-        Messages that a client beside the browser received a second while the robot moved.
-    missed_without_percent, missed_with_percent
-        Deadlines of plant and controller that were missed.
-    deadlines_without, deadlines_with
-        Number of deadlines.
-    browser
-        Whether a browser had the page open as well.
-    prioritised
-        Whether the kernel let the plant and its controller go first.
-    """
-
-    updates_per_s: float
-    missed_without_percent: float
-    missed_with_percent: float
-    deadlines_without: int
-    deadlines_with: int
-    browser: bool
-    prioritised: bool
-
-    def lines(self) -> Iterator[str]:
-        """Yield the figures as lines for the user."""
-        client = "a browser and a client" if self.browser else "a client (no browser is installed)"
-        priorities = f"{'with' if self.prioritised else 'without'} real-time priorities"
-        yield f"viewer with {client}: {self.updates_per_s:.1f} updates a second received"
-        yield (
-            f"deadlines missed: {self.missed_without_percent:.3f} % of {self.deadlines_without} "
-            f"without it, {self.missed_with_percent:.3f} % of {self.deadlines_with} with it "
-            f"({priorities})"
-        )
-
-
 def viewer_benchmark(
     seconds: float, show: Callable[[str], None], *, priorities: bool = True
 ) -> dict[str, float]:
     """Fly the servicer in real time in separate processes, in turns without and with a viewer.
 
-    There are two turns of each; the figures are returned by name.
+    There are two turns of each. A browser opens the page as well, where one is installed.
 
     Parameters
     ----------
@@ -424,13 +339,18 @@ def viewer_benchmark(
     priorities
         Whether the kernel is asked to let the plant and its controller go first.
 
+    Returns
+    -------
+    By name: messages that a client beside the browser received a second while the robot moved, and
+    number and missed share (%) of the deadlines of plant and controller with and without a viewer.
+
     Raises
     ------
     SpaceRobotError
         A node has ended by itself, viser is not installed, or the flight was interrupted.
     """
     scenario = (
-        load_scenario(_SCENARIO)
+        load_scenario("servicer")
         .in_real_time(1.0)
         .with_overrides("plant", {"diagnostics_period": 1.0})
     )
@@ -438,7 +358,7 @@ def viewer_benchmark(
     counts: list[float] = []
     browser = False
     with stack_in_processes(scenario) as (stack, bag, stopped):
-        goals = _Goals(stack)
+        goals = _GoalSender(stack)
         prioritised = priorities and prioritise(stack)
         stack.start(None)
         for viewed in (False, True, False, True):
@@ -447,7 +367,7 @@ def viewer_benchmark(
                 if viewed:
                     client = closing.enter_context(_viewer_and_browser(bag.parent))
                     browser = client.browser
-                goals.spin(_SETTLING, stopped)
+                goals.spin(_SETTLING_TIME, stopped)
                 before, began = client.count if client else 0, stack.time_ns / SECOND
                 goals.spin(seconds, stopped)
                 spans.append((viewed, began, stack.time_ns / SECOND))
@@ -455,28 +375,28 @@ def viewer_benchmark(
                     counts.append((client.count - before) / seconds)
         finish(stack, stopped)
         table = _deadlines(read_bag(bag))
-    phases = {False: Phase(), True: Phase()}
-    for viewed, start, end in spans:
-        phases[viewed] += _between(table, start, end)
-    figures = ViewerFigures(
-        updates_per_s=min(counts),
-        missed_without_percent=phases[False].percent,
-        missed_with_percent=phases[True].percent,
-        deadlines_without=phases[False].deadlines,
-        deadlines_with=phases[True].deadlines,
-        browser=browser,
-        prioritised=prioritised,
-    )
-    for line in figures.lines():
-        show(line)
-    return {f"viewer_{name}": float(value) for name, value in asdict(figures).items()}
+    updates = min(counts)
+    figures = {"viewer_updates_per_s": updates}
+    shares = []
+    for viewed, which in ((False, "without"), (True, "with")):
+        turns = [_between(table, start, end) for each, start, end in spans if each == viewed]
+        deadlines, missed = np.sum(turns, axis=0)
+        figures[f"viewer_missed_{which}_percent"] = percent = 100.0 * missed / max(deadlines, 1)
+        figures[f"viewer_deadlines_{which}"] = deadlines
+        shares.append(f"{percent:.3f} % of {deadlines:.0f} {which} it")
+    clients = "a browser and a client" if browser else "a client (no browser is installed)"
+    show(f"viewer with {clients}: {updates:.1f} updates a second received")
+    with_priorities = f"{'with' if prioritised else 'without'} real-time priorities"
+    show(f"deadlines missed: {', '.join(shares)} ({with_priorities})")
+    switches = {"viewer_browser": float(browser), "viewer_prioritised": float(prioritised)}
+    return {**figures, **switches}
 
 
-class _Goals:
+class _GoalSender:
     """Goals that are sent in turns, so that the robot moves."""
 
     def __init__(self, stack: MultiProcessStack) -> None:
-        self._stack, self._positions = stack, cycle(_GOALS)
+        self._stack, self._positions = stack, cycle(_GOAL_POSITIONS)
         self._topic = stack.client.node.create_publisher(PoseStamped, "goal_pose", STREAM)
         self._due = 0.0
 
@@ -495,7 +415,7 @@ class _Goals:
             self._stack.executor.spin_once(timeout_sec=0.05)
 
 
-class _Client:
+class _CountingClient:
     """A client of the page that counts the messages that it receives.
 
     ``browser`` says whether there is a real one beside it.
@@ -512,10 +432,10 @@ class _Client:
             subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
             max_size=None,
         )
-        self._thread = Thread(target=self._read, daemon=True)
+        self._thread = Thread(target=self._count_messages, daemon=True)
         self._thread.start()
 
-    def _read(self) -> None:
+    def _count_messages(self) -> None:
         with suppress(Exception):  # It is closed.
             for _ in self._connection:
                 self.count += 1
@@ -527,12 +447,12 @@ class _Client:
 
 
 @contextmanager
-def _viewer_and_browser(folder: Path) -> Iterator[_Client]:
+def _viewer_and_browser(folder: Path) -> Iterator[_CountingClient]:
     """Run a viewer with a client, and with a browser where one is installed."""
-    said: list[str] = []
+    lines: list[str] = []
     with ExitStack() as closing:
-        closing.enter_context(viewing({"port": 0}, said.append))
-        url = said[0].split()[-1]
+        closing.enter_context(viewing({"port": 0}, lines.append))
+        url = lines[0].split()[-1]
         program = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
         if program is not None:
             profile = tempfile.mkdtemp(prefix="browser_", dir=folder)
@@ -543,7 +463,7 @@ def _viewer_and_browser(folder: Path) -> Iterator[_Client]:
                     stderr=subprocess.DEVNULL,
                 )
             )
-        client = _Client(url, browser=program is not None)
+        client = _CountingClient(url, browser=program is not None)
         closing.callback(client.close)
         yield client
 
@@ -562,8 +482,7 @@ def _deadlines(bag: Bag) -> Array:
     return np.array(rows, float)
 
 
-def _between(table: Array, start: float, end: float) -> Phase:
-    """Return the counts between two times, s, by a table of counts from the beginning."""
-    time_s, deadlines, missed = table.T
-    at = np.clip(np.searchsorted(time_s, (start, end)), 0, len(time_s) - 1)
-    return Phase(int(np.ptp(deadlines[at])), int(np.ptp(missed[at])))
+def _between(table: Array, start: float, end: float) -> Array:
+    """Return the counts (2,) between two times, s, by a table of counts from the beginning."""
+    rows = np.clip(np.searchsorted(table[:, 0], (start, end)), 0, len(table) - 1)
+    return np.asarray(np.ptp(table[rows, 1:], axis=0))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.benchmarks.real_time import finish, stack_in_processes
+from spacerobot_ros.benchmarks.real_time import finish, process_facts, stack_in_processes
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.planning import Goal
@@ -28,15 +28,14 @@ _SAMPLE_PERIOD = 2.0
 _WARM_UP = 0.25
 """Part of the time that does not count: buffers fill, first plans are made."""
 
-_MOST_SAMPLES = 400
+_MAX_SLOPE_SAMPLES = 400
 """A slope is the median over all pairs: of more samples only every second, third, ... counts."""
 
 _SEED = 13
-_FARTHEST, _WIDEST = 0.05, 0.0001
-"""Largest coordinate of goals, m and rad."""
+_MAX_GOAL_DISTANCE, _MAX_GOAL_ROTATION = 0.05, 0.0001
+"""Largest coordinates of goals, m and rad."""
 
-_MIB = 1024.0
-"""KiB."""
+_KIB_PER_MIB = 1024.0
 
 QUANTITIES: Mapping[str, tuple[str, float, float]] = {
     "rss": ("MiB", 1.0, 6.0),
@@ -92,7 +91,7 @@ def robust_slope(times: Floats, values: Floats) -> float:
     values
         (n,) samples.
     """
-    step = max(1, -(-len(times) // _MOST_SAMPLES))
+    step = max(1, -(-len(times) // _MAX_SLOPE_SAMPLES))
     t, x = times[::step], values[::step]
     if len(t) < 2:
         return 0.0
@@ -102,18 +101,18 @@ def robust_slope(times: Floats, values: Floats) -> float:
 
 def trend_of(process: str, quantity: str, times: Floats, values: Floats) -> Trend:
     """Return the trend of the samples (n,) of one quantity at times (n,), s, after the warm-up."""
-    counts = times >= times[0] + _WARM_UP * (times[-1] - times[0])
-    t, x = times[counts], values[counts]
+    is_warm = times >= times[0] + _WARM_UP * (times[-1] - times[0])
+    t, x = times[is_warm], values[is_warm]
     tenth = max(1, len(t) // 10)
     duration = float(t[-1] - t[0])
-    _, least, hourly = QUANTITIES[quantity]
+    _, allowed_growth, hourly_growth = QUANTITIES[quantity]
     return Trend(
         process,
         quantity,
         first=float(np.median(x[:tenth])),
         last=float(np.median(x[-tenth:])),
         growth=robust_slope(t, x) * duration,
-        allowed=least + hourly * duration / 3600,
+        allowed=allowed_growth + hourly_growth * duration / 3600,
     )
 
 
@@ -148,7 +147,7 @@ def soak_benchmark(
     )
     with stack_in_processes(scenario) as (stack, _, stopped):
         stack.start(None)
-        times, samples, goals = _fly(stack, duration, stopped)
+        times, samples, goals = _fly_and_sample(stack, duration, stopped)
         finish(stack, stopped)
     trends = [
         trend_of(process, quantity, times, samples[process][quantity])
@@ -174,7 +173,7 @@ def soak_benchmark(
     }
 
 
-def _fly(
+def _fly_and_sample(
     stack: MultiProcessStack, duration: float, stopped: Callable[[], bool]
 ) -> tuple[Floats, dict[str, dict[str, Floats]], dict[str, int]]:
     """Return the times, the samples by process and quantity, and counts of the goals' results."""
@@ -199,9 +198,9 @@ def _fly(
                     samples[name][quantity].append(value)
         if now >= next_goal:
             next_goal += GOAL_PERIOD
-            _count(stack, goals)
-            stack.client.send(_goal(rng))
-    _count(stack, goals)
+            _count_result(stack, goals)
+            stack.client.send(_random_goal(rng))
+    _count_result(stack, goals)
     arrays = {
         name: {quantity: np.array(values) for quantity, values in of.items()}
         for name, of in samples.items()
@@ -209,13 +208,13 @@ def _fly(
     return np.array(times), arrays, goals
 
 
-def _goal(rng: random.Random) -> Goal:
-    position = [rng.uniform(-_FARTHEST, _FARTHEST) for _ in range(3)]
-    rotvec = [rng.uniform(-_WIDEST, _WIDEST) for _ in range(3)]
+def _random_goal(rng: random.Random) -> Goal:
+    position = [rng.uniform(-_MAX_GOAL_DISTANCE, _MAX_GOAL_DISTANCE) for _ in range(3)]
+    rotvec = [rng.uniform(-_MAX_GOAL_ROTATION, _MAX_GOAL_ROTATION) for _ in range(3)]
     return Goal.checked(position, quaternion_from_rotvec(np.array(rotvec)))
 
 
-def _count(stack: MultiProcessStack, goals: dict[str, int]) -> None:
+def _count_result(stack: MultiProcessStack, goals: dict[str, int]) -> None:
     """Count the result of the goal that was sent last."""
     status = stack.client.status
     if status is not None and status.state is not PlannerState.IDLE:
@@ -224,23 +223,17 @@ def _count(stack: MultiProcessStack, goals: dict[str, int]) -> None:
 
 def _sample(pid: int) -> Iterator[float]:
     """Yield the quantities of a process in their order."""
-    folder = Path("/proc", str(pid))
-    status = _lines(folder / "status")
-    yield int(status["VmRSS"].split()[0]) / _MIB
-    yield int(_lines(folder / "smaps_rollup")["Pss"].split()[0]) / _MIB
-    yield len(os.listdir(folder / "fd"))
+    status = process_facts(pid)
+    yield int(status["VmRSS"].split()[0]) / _KIB_PER_MIB
+    yield int(process_facts(pid, "smaps_rollup")["Pss"].split()[0]) / _KIB_PER_MIB
+    yield len(os.listdir(f"/proc/{pid}/fd"))
     yield int(status["Threads"])
-
-
-def _lines(file: Path) -> dict[str, str]:
-    pairs = (line.partition(":") for line in file.read_text("utf-8").splitlines())
-    return {key: value.strip() for key, _, value in pairs}
 
 
 def _table(trends: Sequence[Trend], goals: Mapping[str, int], duration: float) -> Iterator[str]:
     """Yield the trends as lines for the user."""
-    became = ", ".join(f"{count} {state}" for state, count in sorted(goals.items()))
-    yield f"{duration:.0f} s in separate processes, a goal every {GOAL_PERIOD:g} s: {became}"
+    results = ", ".join(f"{count} {state}" for state, count in sorted(goals.items()))
+    yield f"{duration:.0f} s in separate processes, a goal every {GOAL_PERIOD:g} s: {results}"
     yield f"{'process':<22}{'':<13}{'first':>9}{'last':>9}{'growth':>9}{'allowed':>9}"
     for trend in trends:
         unit = QUANTITIES[trend.quantity][0]

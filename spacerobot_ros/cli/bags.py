@@ -42,27 +42,29 @@ def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[
     from spacerobot_ros.bag.tables import ExportFormat, export
 
     opened = read_bag(bag)
-    stem = opened.path.with_suffix("")
-    beside = stem.with_suffix(".mat") if format_name == "mat" else Path(f"{stem}_{format_name}")
+    if out is None:
+        stem = opened.path.with_suffix("")
+        out = stem.with_suffix(".mat") if format_name == "mat" else Path(f"{stem}_{format_name}")
     chosen = dict.fromkeys(opened[topic].topic for topic in topics) or opened.keys()
     tables = (opened.table(topic) for topic in chosen)
-    made = export(tables, out or beside, ExportFormat(format_name))
+    exported = export(tables, out, ExportFormat(format_name))
     for topic in chosen:
-        rows = made.rows.get(topic)
+        rows = exported.rows.get(topic)
         click.echo(
             f"{printable(topic):<27} {'no messages, left out' if rows is None else f'{rows} rows'}"
         )
-    click.echo(f"{'tables':<27} {made.path}")
+    click.echo(f"{'tables':<27} {exported.path}")
 
 
-_MILLIMETRES = {"": 1.0, "mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72}
+_MILLIMETRES_BY_UNIT = {"": 1.0, "mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72}
 
 
-def _millimetres(context: click.Context, option: click.Parameter, text: str) -> float:
-    found = re.fullmatch(r"([0-9]*\.?[0-9]+) *([a-z]*)", text.strip().lower())
-    if found is None or found[2] not in _MILLIMETRES:
+def _parse_length(context: click.Context, option: click.Parameter, text: str) -> float:
+    """Return a length in mm."""
+    match = re.fullmatch(r"([0-9]*\.?[0-9]+) *([a-z]*)", text.strip().lower())
+    if match is None or match[2] not in _MILLIMETRES_BY_UNIT:
         raise click.BadParameter(f"'{text}' is no length such as 88mm, 18cm, 3.5in or 246pt.")
-    return float(found[1]) * _MILLIMETRES[found[2]]
+    return float(match[1]) * _MILLIMETRES_BY_UNIT[match[2]]
 
 
 @click.command("figures")
@@ -75,7 +77,7 @@ def _millimetres(context: click.Context, option: click.Parameter, text: str) -> 
 )
 @click.option(
     "--width",
-    callback=_millimetres,
+    callback=_parse_length,
     default="88mm",
     show_default=True,
     help="Width of a figure in mm, cm, in or pt; 88mm is one column.",
@@ -90,14 +92,7 @@ def _millimetres(context: click.Context, option: click.Parameter, text: str) -> 
 @out_option("Folder of the figures [BAG_figures].")
 @namespace_option
 def figures_command(
-    bag: Path,
-    only: str,
-    format_name: str,
-    width: float,
-    style: Path | None,
-    events: bool,
-    out: Path | None,
-    namespace: str | None,
+    bag: Path, only: str, format_name: str, out: Path | None, **options: Any
 ) -> None:
     """Draw figures of a BAG for a paper, one file each.
 
@@ -109,22 +104,13 @@ def figures_command(
 
     names = [name.strip().lower() for name in only.split(",") if name.strip()]
     folder = out or beside(bag, "_figures")
-    made = write_figures(
-        bag,
-        folder,
-        names,
-        format=PictureFormat(format_name),
-        width=width,
-        style=style,
-        events=events,
-        namespace=namespace,
-    )
-    drawn = {name: result for name, result in made.items() if isinstance(result, Path)}
+    results = write_figures(bag, folder, names, format=PictureFormat(format_name), **options)
+    drawn = {name: result for name, result in results.items() if isinstance(result, Path)}
     for name, path in drawn.items():
         click.echo(f"{name:<11} {path}")
-    for name in names or () if drawn else made:
+    for name in names or () if drawn else results:
         if name not in drawn:
-            click.echo(f"{name:<11} none: {made[name]}", err=True)
+            click.echo(f"{name:<11} none: {results[name]}", err=True)
     if not drawn or not drawn.keys() >= set(names):
         fail()
 
@@ -159,44 +145,23 @@ def figures_command(
 @view_option
 @click.option("--wait", default=3.0, show_default=True, help="Longest wait for readers (s).")
 def replay_command(
-    bag: Path,
-    rate: float,
-    start: float,
-    duration: float,
-    loop: bool,
-    topics: tuple[str, ...],
-    remap: tuple[str, ...],
-    clock: float,
-    paused: bool,
-    wait: float,
-    view: bool,
+    bag: Path, topics: tuple[str, ...], remap: tuple[str, ...], view: bool, **options: Any
 ) -> None:
     """Publish the messages of a BAG again, at their recorded times.
 
     The services /replay/pause, /replay/resume and /replay/step control it. With --view it stays
     paused at the end until Ctrl-C, and can be played again.
     """
-    values: dict[str, Any] = {
-        "bag": str(bag),
-        "rate": rate,
-        "start": start,
-        "duration": duration,
-        "loop": loop,
-        "topics": " ".join(topics),
-        "remap": " ".join(remap),
-        "clock": clock,
-        "paused": paused,
-        "wait": wait,
-        "hold": view,
-    }
     from rclpy.parameter import Parameter
 
     from spacerobot_ros.nodes import ReplayNode
     from spacerobot_ros.nodes.common.process import run_node
 
-    given = [Parameter(name, value=value) for name, value in values.items()]
+    texts = {"bag": str(bag), "topics": " ".join(topics), "remap": " ".join(remap)}
+    values = {**options, **texts, "hold": view}
+    overrides = [Parameter(name, value=value) for name, value in values.items()]
     with viewing_if(view, {}):
-        code = run_node(lambda: ReplayNode(parameter_overrides=given), [])
+        code = run_node(lambda: ReplayNode(parameter_overrides=overrides), [])
     sys.exit(code)
 
 

@@ -30,7 +30,7 @@ class ExitCode(IntEnum):
     """By SIGINT, that is Ctrl-C; 128 plus the number of another signal: 129 SIGHUP, 143 SIGTERM."""
 
 
-_ROS = ("rclpy", "rosidl_parser", "ament_index_python")
+_ROS_MODULES = ("rclpy", "rosidl_parser", "ament_index_python")
 
 
 def fail(message: str = "") -> NoReturn:
@@ -76,7 +76,7 @@ def sentences() -> Iterator[None]:
         click.echo(str(error), err=True)
         sys.exit(ExitCode.NOT_REACHED if out_of_reach else ExitCode.BAD_INPUT)
     except ImportError as error:
-        if not error.name or error.name.split(".")[0] not in _ROS:
+        if not error.name or error.name.split(".")[0] not in _ROS_MODULES:
             raise
         click.echo(
             f"ROS 2 was not found ({error}); source its setup file, or install spacerobot_ros "

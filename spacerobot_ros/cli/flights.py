@@ -83,7 +83,7 @@ def run_command(
     the flight early: the bag and the summary cover it until then, and the exit code is 128 plus the
     number of the signal, 130 after Ctrl-C.
     """
-    chosen = _chosen(scenario, goal, method, settings, realtime)
+    chosen = _changed_scenario(scenario, goal, method, settings, realtime)
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.session.run import run_scenario
 
@@ -110,7 +110,7 @@ def run_command(
         fail(result.message)
 
 
-def _chosen(
+def _changed_scenario(
     name: str,
     goal: GoalOptions,
     method: str | None,
@@ -120,7 +120,7 @@ def _chosen(
     """Return the scenario with the changes of the command line."""
     from spacerobot_ros.scenario import scenario_or_robot
 
-    scenario = goal.of(scenario_or_robot(name))
+    scenario = goal.apply_to(scenario_or_robot(name))
     scenario.require_goal()
     if realtime is not None:
         scenario = scenario.in_real_time(realtime)
@@ -169,8 +169,8 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     for row in scenario.comparable if summary["state"] in ("reached", "failed") else ():
         measured = summary.get(row.quantity, summary["gait"].get(row.quantity))
         if isinstance(measured, list):
-            printed, found = (f"({numbers(values, 4)})" for values in (row.printed, measured))
-            lines.append(f"  {row.quantity:<26}{printed:<30}{found}")
+            printed, here = (f"({numbers(values, 4)})" for values in (row.printed, measured))
+            lines.append(f"  {row.quantity:<26}{printed:<30}{here}")
             if row.note:
                 lines.append(f"    {row.note}")
     return [f"  {'':<26}{'printed in the paper':<30}here", *lines] if lines else []
@@ -242,16 +242,16 @@ def goal_command(
         raise click.UsageError("The attitude is given twice, in radians and in degrees.")
     from spacerobot_ros.planning import Goal
 
-    wanted = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
+    goal = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
     if rotvec:
         note_large_angles(rotvec, "--goal-rpy-deg")
-        wanted = Goal.from_rotvec(pose[:3], rotvec)
+        goal = Goal.from_rotvec(pose[:3], rotvec)
     if rpy_deg:
-        wanted = Goal.from_rpy(pose[:3], rpy_deg)
+        goal = Goal.from_rpy(pose[:3], rpy_deg)
     from spacerobot_ros.measures import Outcome
     from spacerobot_ros.session.run import send_goal
 
-    outcome = send_goal(wanted, click.echo, namespace=namespace, timeout=timeout)
+    outcome = send_goal(goal, click.echo, namespace=namespace, timeout=timeout)
     end_if_requested()
     if outcome is not Outcome.REACHED:
         fail()

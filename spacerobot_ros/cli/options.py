@@ -104,7 +104,7 @@ def topic_option(help: str) -> Any:
     )
 
 
-def within_option(default: tuple[float, float], largest: str) -> Any:
+def within_option(default: tuple[float, float], help_prefix: str) -> Any:
     """Return the option ``--within``: bounds of random goals, m and deg."""
     return click.option(
         "--within",
@@ -113,7 +113,7 @@ def within_option(default: tuple[float, float], largest: str) -> Any:
         default=default,
         metavar="M DEG",
         show_default=True,
-        help=f"{largest} distance (m) and angle (deg) of the goals from the start.",
+        help=f"{help_prefix} distance (m) and angle (deg) of the goals from the start.",
     )
 
 
@@ -160,7 +160,7 @@ class GoalOptions:
     rotvec: tuple[float, ...] | None
     rpy_deg: tuple[float, ...] | None
 
-    def of(self, scenario: Scenario) -> Scenario:
+    def apply_to(self, scenario: Scenario) -> Scenario:
         """Return a scenario with this goal; a rotation that looks like degrees is reported."""
         if self.rotvec is not None:
             note_large_angles(self.rotvec, "--goal-rpy-deg")
@@ -177,13 +177,13 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
     return cast("Callable[..., None]", _pose_option(_attitude_options("goal-")(with_goal)))
 
 
-def note_large_angles(rotvec: Sequence[float], other: str) -> None:
+def note_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> None:
     """Report a rotation of more than a turn, which may have been meant in degrees."""
     angle = math.hypot(*rotvec)
     if 2 * math.pi < angle < math.inf:
         click.echo(
             f"The goal turns by {angle:.5g} rad, which is {angle / (2 * math.pi):.3g} turns: only "
-            f"the attitude at their end counts. For degrees there is {other}.",
+            f"the attitude at their end counts. For degrees there is {option_in_degrees}.",
             err=True,
         )
 

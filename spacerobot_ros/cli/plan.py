@@ -132,7 +132,7 @@ def problem_of(name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] 
         node, _, _ = parse_setting(text)
         if node not in ("plant", "planner"):
             raise ParameterError(f"'{text}' sets a parameter of {node}, which plans nothing.")
-    return goal.of(scenario_or_robot(name).with_settings(settings)).problem()
+    return goal.apply_to(scenario_or_robot(name).with_settings(settings)).problem()
 
 
 def json_of(problem: Problem, trial: PlanEvaluation) -> dict[str, Any]:

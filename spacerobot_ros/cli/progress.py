@@ -13,7 +13,7 @@ import click
 if TYPE_CHECKING:
     from spacerobot_ros.planning.core.progress import SearchProgress
 
-_SHARES = 1000
+_BAR_STEPS = 1000
 """Steps of the bar of a flight."""
 
 
@@ -42,7 +42,7 @@ class Display:
             if self._flies or not self._visible:
                 return
             if self._bar is None or progress.starts <= self._bar.pos:
-                self._begin(f"planning {self._label}", progress.most, "%(info)s")
+                self._begin(f"planning {self._label}", progress.most)
             self._bar.length = progress.most
             self._bar.update(progress.starts - self._bar.pos, progress.message)
 
@@ -53,23 +53,23 @@ class Display:
                 return
             if not self._flies:
                 self._flies = True
-                self._begin(f"flying {self._label}", _SHARES, "%(info)s")
-            share = max(0, round(_SHARES * min(now / end, 1.0)) - self._bar.pos)
-            self._bar.update(share, f"{now:.1f} of {end:.1f} s")
+                self._begin(f"flying {self._label}", _BAR_STEPS)
+            steps = max(0, round(_BAR_STEPS * min(now / end, 1.0)) - self._bar.pos)
+            self._bar.update(steps, f"{now:.1f} of {end:.1f} s")
 
-    def announce(self, sentence: str) -> None:
+    def show_line(self, message: str) -> None:
         """Show a line."""
         with self._lock:
             if self._visible:
                 self._finish()
-                click.echo(sentence, err=True)
+                click.echo(message, err=True)
 
     def close(self) -> None:
         """Complete the line of the bar."""
         with self._lock:
             self._finish()
 
-    def _begin(self, label: str, length: int, info: str) -> None:
+    def _begin(self, label: str, length: int) -> None:
         self._finish()
         self._bar = click.progressbar(
             length=length,
@@ -78,7 +78,7 @@ class Display:
             show_eta=False,
             show_percent=False,
             item_show_func=lambda item: item or "",
-            bar_template=f"%(label)s  [%(bar)s]  {info}",
+            bar_template="%(label)s  [%(bar)s]  %(info)s",
             width=24,
         )
         self._bar.__enter__()
@@ -99,7 +99,7 @@ def display(label: str) -> Iterator[Display]:
             return
         from spacerobot_ros.planning.core.progress import report_progress
 
-        with report_progress(shown.search, shown.announce):
+        with report_progress(shown.search, shown.show_line):
             yield shown
     finally:
         shown.close()

@@ -60,7 +60,7 @@ def test_what_is_shown_of_a_search_and_of_a_flight(monkeypatch: pytest.MonkeyPat
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
     shown = Display("arm", visible=True)
-    shown.announce("Compiling.")
+    shown.show_line("Compiling.")
     shown.search(SearchProgress(1, 8))
     shown.search(SearchProgress(8, 8, 12.34567))
     shown.fly(0.0, 0.0)
@@ -83,7 +83,7 @@ def test_nobody_is_shown_anything_where_nobody_looks(
 ) -> None:
     with display("arm") as shown:
         log_progress(_LOG, SearchProgress(1, 2), "start 1")
-        shown.announce("Compiling.")
+        shown.show_line("Compiling.")
         shown.search(SearchProgress(1, 2))
         shown.fly(1.0, 2.0)
     assert capsys.readouterr() == ("", "")
