@@ -51,15 +51,15 @@ from spacerobot_ros.version import __version__
 _CLOCK = "/clock"
 """Where no remap moves it; as every absolute name that a stack uses."""
 
-_SHARED = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
+_SHARED_TOPICS = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
 """Absolute names of what stacks in different namespaces may have in common, before remaps."""
 
-_DESCRIPTION = "robot_description"
+_DESCRIPTION_TOPIC = "robot_description"
 
-TEXT = "std_msgs/msg/String"
+_TEXT_TYPE = "std_msgs/msg/String"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
-_COMMON_NODES = {
+_PARAMETER_RECORDS = {
     "odom": "plant",
     "planner/status": "planner",
     "controller/status": "coordinated_control",
@@ -68,7 +68,7 @@ _COMMON_NODES = {
 
 A node that publishes them is configured: its parameters keep their values."""
 
-_QUEUE = 2000
+_QUEUE_DEPTH = 2000
 """Messages a subscription may be behind; the events executor wedges above 5000."""
 
 _CHUNK_SIZE = 262_144
@@ -99,8 +99,8 @@ class RecorderNode(FlightNode):
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
         self._taps = StreamTaps()
-        self._stamps = _Stamps()
-        self._asked: dict[str, RemoteParameters | None] = {}
+        self._stamps = _StampReader()
+        self._parameter_requests: dict[str, RemoteParameters | None] = {}
         """The records of parameters that are in the bag, or that a node is asked for."""
         super().__init__(name, **kwargs)
 
@@ -120,9 +120,9 @@ class RecorderNode(FlightNode):
         )
         self.recording = Recording(writer, config.clock_wait, self._on_failure)
         self._clock_topic = self.resolve_topic_name(_CLOCK)
-        self._wanted = {self.resolve_topic_name(topic) for topic in config.topics.split()}
-        self._shared = {self._clock_topic, *map(self.resolve_topic_name, _SHARED)}
-        self._asked = {}
+        self._chosen_topics = {self.resolve_topic_name(topic) for topic in config.topics.split()}
+        self._shared_topics = {self._clock_topic, *map(self.resolve_topic_name, _SHARED_TOPICS)}
+        self._parameter_requests = {}
         frames = tuple(map(self.resolve_topic_name, (TRANSFORMS, STATIC_TRANSFORMS)))
         self._listeners: dict[str, Take] = {}
         if config.tf_period and self._is_chosen(frames[0], TRANSFORM_TYPE):
@@ -131,14 +131,14 @@ class RecorderNode(FlightNode):
                 config.tf_period,
                 (frames[0], frames[1]),
                 lambda: frames[0] in self._recorded,
-            ).listeners(*map(self.resolve_topic_name, ("odom", "joint_states", _DESCRIPTION)))
+            ).listeners(*map(self.resolve_topic_name, ("odom", "joint_states", _DESCRIPTION_TOPIC)))
         self._recorded: set[str] = set()
-        self._unknown: set[str] = set()
+        self._unreadable_topics: set[str] = set()
         self._diagnostics: Publisher | None = None
         steady = RosClock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_SCAN_PERIOD, self.scan, clock=steady)
         self.create_timer(config.flush_period, self.flush, clock=steady)
-        self.create_timer(_CHECK_PERIOD, self._check, clock=steady)
+        self.create_timer(_CHECK_PERIOD, self._check_file, clock=steady)
         self._splits = 0
         asked = Path(config.bag).name
         if asked and not writer.path.name.startswith((f"{Path(asked).stem}_", asked)):
@@ -148,9 +148,9 @@ class RecorderNode(FlightNode):
         if config.diagnostics_period:
             self.create_timer(config.diagnostics_period, self._publish_state, clock=steady)
         self.describe("spacerobot", {"version": __version__})
-        for title, values in _descriptions(config.describe):
+        for title, values in _read_descriptions(config.describe):
             self.describe(title, values)
-        if self._wanted and self._clock_topic not in self._wanted:
+        if self._chosen_topics and self._clock_topic not in self._chosen_topics:
             self._follow_clock(self.recording)
         self.scan()
 
@@ -194,7 +194,7 @@ class RecorderNode(FlightNode):
             The disk refused the rest of the data.
         """
         self._taps.release()
-        for question in filter(None, self._asked.values()):
+        for question in filter(None, self._parameter_requests.values()):
             question.close()
         if self.recording is not None:
             self.recording.close()
@@ -218,7 +218,7 @@ class RecorderNode(FlightNode):
     @property
     def questions(self) -> list[str]:
         """The records that wait for the parameters of a node."""
-        return [name for name, question in self._asked.items() if question is not None]
+        return [name for name, question in self._parameter_requests.items() if question is not None]
 
     @property
     def messages_recorded(self) -> int:
@@ -233,7 +233,7 @@ class RecorderNode(FlightNode):
     def describe(self, name: str, values: dict[str, str]) -> None:
         """Put named values into the bag (parameters, seed, version)."""
         if self.recording is not None:
-            self._asked[name] = None
+            self._parameter_requests[name] = None
             self.recording.describe(name, values)
 
     def scan(self) -> None:
@@ -247,12 +247,12 @@ class RecorderNode(FlightNode):
             else:
                 self._follow_clock(recording)
         for topic, types in self.get_topic_names_and_types():
-            known = topic in self._recorded or topic in self._unknown
+            known = topic in self._recorded or topic in self._unreadable_topics
             if not known and self._is_chosen(topic, types[0]):
                 self._record(recording, topic, types[0])
-        for name, question in self._asked.items():
+        for name, question in self._parameter_requests.items():
             if question is not None and question.look():
-                self._asked[name] = None
+                self._parameter_requests[name] = None
                 if question.values is not None:
                     recording.describe(name, question.values)
 
@@ -278,9 +278,9 @@ class RecorderNode(FlightNode):
         A stack in a namespace has the topics in it and the shared ones. Only one clock
         gives the times of a bag; those of other stacks would say nothing in it.
         """
-        if self._wanted:
-            return topic in self._wanted
-        if topic in self._shared:
+        if self._chosen_topics:
+            return topic in self._chosen_topics
+        if topic in self._shared_topics:
             return True
         namespace = self.get_namespace().rstrip("/")
         ours = topic.startswith(f"{namespace}/") and not topic.endswith(NOT_RECORDED)
@@ -288,7 +288,7 @@ class RecorderNode(FlightNode):
 
     def _ask_for_parameters(self, topic: str, publishers: Sequence[Any]) -> None:
         """Have the parameters of a topic's publisher in the bag, unless they are there already."""
-        for name, title in _COMMON_NODES.items():
+        for name, title in _PARAMETER_RECORDS.items():
             if not topic.endswith(f"/{name}"):
                 continue
             record = f"parameters{topic.removesuffix(f'/{name}')}/{title}"
@@ -298,8 +298,8 @@ class RecorderNode(FlightNode):
             owner = publishers[0]
             full = f"{owner.node_namespace.rstrip('/')}/{owner.node_name}"
             watched = {node.get_fully_qualified_name() for node in self._taps.nodes}
-            if record not in self._asked and full not in watched:
-                self._asked[record] = RemoteParameters(self, full)
+            if record not in self._parameter_requests and full not in watched:
+                self._parameter_requests[record] = RemoteParameters(self, full)
 
     def _follow_clock(self, recording: Recording) -> None:
         """Know the time of a clock that is not recorded itself."""
@@ -309,7 +309,9 @@ class RecorderNode(FlightNode):
 
         topic = self._clock_topic
         if not self._taps.tap(topic, on_clock, self.count_publishers(topic)):
-            self.create_subscription(Clock, topic, on_clock, QoSProfile(depth=_QUEUE), raw=True)
+            self.create_subscription(
+                Clock, topic, on_clock, QoSProfile(depth=_QUEUE_DEPTH), raw=True
+            )
 
     def _record(self, recording: Recording, topic: str, type_name: str) -> None:
         publishers = self.get_publishers_info_by_topic(topic)
@@ -320,13 +322,15 @@ class RecorderNode(FlightNode):
             kind = message_class(type_name)
             channel = recording.writer.add_topic(topic, type_name, _recorded_qos(offered[0]))
         except SpaceRobotError as error:
-            self._unknown.add(topic)
+            self._unreadable_topics.add(topic)
             self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
             return
         self._recorded.add(topic)
         self._ask_for_parameters(topic, publishers)
-        record = _take(recording, self._stamps, topic, kind, channel, self._clock_topic)
-        take = _both(record, self._listeners.get(topic))
+        record = _recording_callback(
+            recording, self._stamps, topic, kind, channel, self._clock_topic
+        )
+        take = _record_and_listen(record, self._listeners.get(topic))
         qos = _subscribed_qos(offered)
         if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
             recording.latched[channel] = None
@@ -341,10 +345,10 @@ class RecorderNode(FlightNode):
         """Report why nothing is recorded any more; the other nodes go on."""
         message = f"Recording has ended: {error}"
         self.get_logger().error(message)
-        self._report(EventKind.RECORDING_FAILED, message, level=2)
+        self._report_bag_event(EventKind.RECORDING_FAILED, message, level=2)
         self._publish_state()
 
-    def _check(self) -> None:
+    def _check_file(self) -> None:
         """Check the file; a failure is published again for late subscribers."""
         recording = self.recording
         if recording is None or recording.state is RecordingState.CLOSED:
@@ -354,9 +358,11 @@ class RecorderNode(FlightNode):
             self._publish_state()
         elif recording.writer.splits != self._splits:
             self._splits = recording.writer.splits
-            self._report(EventKind.FILE_SPLIT, f"Recording goes on in {recording.writer.path}.")
+            self._report_bag_event(
+                EventKind.FILE_SPLIT, f"Recording goes on in {recording.writer.path}."
+            )
 
-    def _report(self, kind: EventKind, message: str, level: int = 0) -> None:
+    def _report_bag_event(self, kind: EventKind, message: str, level: int = 0) -> None:
         bag = str(self.recording.writer.path) if self.recording is not None else ""
         self.report_event(Event(kind, message, level, about={"bag": bag}))
 
@@ -366,14 +372,14 @@ class RecorderNode(FlightNode):
         message = f"{recording.lost.total()} messages were lost on their way to the recorder."
         self.get_logger().warning(message, throttle_duration_sec=_LOSS_LOG_PERIOD)
         counts = dict(sorted(recording.lost.items()))
-        self._publish("lost messages", DiagnosticStatus.WARN, message, counts)
+        self._publish_diagnostics("lost messages", DiagnosticStatus.WARN, message, counts)
 
     def _publish_state(self) -> None:
         recording = self.recording
         if recording is None or recording.state is RecordingState.CLOSED:
             return
         failure = recording.failure
-        self._publish(
+        self._publish_diagnostics(
             "bag",
             DiagnosticStatus.ERROR if failure else DiagnosticStatus.OK,
             str(failure) if failure else "recording" if recording.running else "paused",
@@ -386,7 +392,9 @@ class RecorderNode(FlightNode):
             },
         )
 
-    def _publish(self, what: str, level: bytes, message: str, values: Mapping[str, object]) -> None:
+    def _publish_diagnostics(
+        self, what: str, level: bytes, message: str, values: Mapping[str, object]
+    ) -> None:
         # A publisher without need would be one more thing to wait for and to record.
         if self._diagnostics is None:
             self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
@@ -402,18 +410,9 @@ class _RecordedTransforms:
     """Writes the frames of one robot by its recorded topics.
 
     A state is taken when its odom and its joint_states are there, whichever comes first; so the
-    transforms have the stamps of states.
-
-    Parameters
-    ----------
-    recording
-        Where they go.
-    period
-        Bag time between two of them, s.
-    topics
-        Names of /tf and /tf_static in the bag.
-    is_published
-        Returns whether a node publishes /tf: its messages are recorded, and none are written here.
+    transforms have the stamps of states, and at least ``period`` s of bag time between them.
+    ``topics`` are the names of /tf and /tf_static in the bag. While ``is_published``, a node
+    publishes /tf itself: its messages are recorded, and none are written here.
     """
 
     def __init__(
@@ -434,11 +433,8 @@ class _RecordedTransforms:
 
     def listeners(self, odom: str, joint_states: str, description: str) -> dict[str, Take]:
         """Return the callback of every message of these topics."""
-        return {
-            odom: self._on_odom,
-            joint_states: self._on_joint_states,
-            description: self._on_description,
-        }
+        callbacks = self._on_odom, self._on_joint_states, self._on_description
+        return dict(zip((odom, joint_states, description), callbacks, strict=True))
 
     def _on_odom(self, raw: bytes) -> None:
         self._odom = raw
@@ -452,7 +448,7 @@ class _RecordedTransforms:
 
     def _on_description(self, raw: bytes) -> None:
         try:
-            description = parse_robot(read_text(raw, TEXT, "data"))
+            description = parse_robot(read_text(raw, _TEXT_TYPE, "data"))
         except (RobotDescriptionError, CommandError):
             return  # Nothing is known of such a robot.
         self._description, self._frames = description, None
@@ -488,7 +484,7 @@ class _RecordedTransforms:
         recording.record(self._channel, message, time_ns)
 
 
-class _Stamps:
+class _StampReader:
     """Reads the times that messages begin with; those of one state begin with the same bytes."""
 
     def __init__(self) -> None:
@@ -503,8 +499,13 @@ class _Stamps:
         return self._time_ns
 
 
-def _take(
-    recording: Recording, stamps: _Stamps, topic: str, kind: Any, channel: int, clock: str = _CLOCK
+def _recording_callback(
+    recording: Recording,
+    stamps: _StampReader,
+    topic: str,
+    kind: Any,
+    channel: int,
+    clock: str = _CLOCK,
 ) -> Take:
     """Return the callback of a topic's messages: the clock sets the time of all others."""
     record, time_of = recording.record, stamps.time_ns
@@ -519,19 +520,19 @@ def _take(
 
     def on_description(raw: bytes) -> None:
         if urdf_name not in recording.attached:
-            urdf = read_text(raw, TEXT, "data").encode()
+            urdf = read_text(raw, _TEXT_TYPE, "data").encode()
             recording.attach_robot(urdf_name, urdf)
         record(channel, raw)
 
     if topic == clock:
         return on_clock
-    if topic.endswith(f"/{_DESCRIPTION}"):
+    if topic.endswith(f"/{_DESCRIPTION_TOPIC}"):
         return on_description
     header = next(iter(kind.get_fields_and_field_types().values()), "")
     return on_stamped if header == "std_msgs/Header" else lambda raw: record(channel, raw)
 
 
-def _both(record: Take, listener: Take | None) -> Take:
+def _record_and_listen(record: Take, listener: Take | None) -> Take:
     """Return a callback that records a message, then calls a listener."""
     if listener is None:
         return record
@@ -572,13 +573,13 @@ def _subscribed_qos(offered: Sequence[QoSProfile]) -> QoSProfile:
     reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
     latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
     return QoSProfile(
-        depth=_QUEUE,
+        depth=_QUEUE_DEPTH,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
 
 
-def _descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
+def _read_descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
     if not path:
         return []
     try:

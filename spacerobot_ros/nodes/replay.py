@@ -32,13 +32,13 @@ from spacerobot_ros.nodes.common.streams import raw_publish
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import LATEST_NS, SECOND, set_stamp
 
-_READER_CHECK = 0.05
+_READER_CHECK_PERIOD = 0.05
 """Wall s between two looks for readers."""
 
-_BURST = 500
+_MAX_MESSAGES_AT_ONCE = 500
 """Messages that are sent without a look at services and signals."""
 
-_ACKNOWLEDGED = Duration(seconds=2)
+_LONGEST_DELIVERY = Duration(seconds=2)
 """How long a reader may take for the last messages."""
 
 _LONGEST_WAIT_NS = 3600 * SECOND
@@ -53,9 +53,9 @@ _STATUS, _SEEK = "replay/status", "replay/seek"
 _STATUS_PERIOD = 0.2
 """Wall s between two statuses."""
 
-_TEXT, _DESCRIPTION = "std_msgs/msg/String", "/robot_description"
+_TEXT_TYPE, _DESCRIPTION_TOPIC = "std_msgs/msg/String", "/robot_description"
 
-_BAD_BAG = 2
+_BAD_BAG_EXIT_CODE = 2
 
 
 class ReplayNode(FlightNode):
@@ -117,12 +117,14 @@ class ReplayNode(FlightNode):
     def activate(self) -> None:
         """Wait for readers, then go on from where the replay is."""
         self._begun = False
-        self._wait = ReaderWait(_READER_CHECK, self.config.wait)
+        self._wait = ReaderWait(_READER_CHECK_PERIOD, self.config.wait)
         # One timer for the next message, always set anew: half the load of looking every
         # millisecond. Its first period is never waited for.
-        self._timer = self.create_timer(1.0, self._play, clock=self._steady)
+        self._timer = self.create_timer(1.0, self._send_due_messages, clock=self._steady)
         self._timer.cancel()
-        self._waiting = self.create_timer(_READER_CHECK, self._on_reader_check, clock=self._steady)
+        self._waiting = self.create_timer(
+            _READER_CHECK_PERIOD, self._on_reader_check, clock=self._steady
+        )
         reports = self.create_timer(_STATUS_PERIOD, self._publish_status, clock=self._steady)
         self._playing_timers = [self._timer, self._waiting, reports]
         rate = self.config.clock
@@ -174,7 +176,7 @@ class ReplayNode(FlightNode):
             name = new_names.get(topic.name, topic.name)
             try:
                 publisher = self.create_publisher(
-                    message_class(topic.type_name), name, _profile(topic.qos)
+                    message_class(topic.type_name), name, _publisher_qos(topic.qos)
                 )
             except InvalidTopicNameException:
                 raise ParameterError(
@@ -190,9 +192,9 @@ class ReplayNode(FlightNode):
                 continue
             self._outputs.append(publisher)
             send = raw_publish(publisher)
-            described = topic.type_name == _TEXT and topic.name.endswith(_DESCRIPTION)
+            described = topic.type_name == _TEXT_TYPE and topic.name.endswith(_DESCRIPTION_TOPIC)
             if described and self._meshes is not None:
-                send = _described(send, self._meshes)
+                send = _with_mesh_files(send, self._meshes)
             self._sends[topic.name] = send
         if not self._outputs and not own_clock:
             raise SpaceRobotError("None of the bag's message types is installed here.")
@@ -224,10 +226,10 @@ class ReplayNode(FlightNode):
         self._timer.timer_period_ns = min(max(due - self._now(), 1), _LONGEST_WAIT_NS)
         self._timer.reset()
 
-    def _play(self) -> None:
+    def _send_due_messages(self) -> None:
         """Send the messages that are due, and set the timer for the next one."""
         try:
-            for message in self._playback.take_due(self._now(), _BURST):
+            for message in self._playback.take_due(self._now(), _MAX_MESSAGES_AT_ONCE):
                 self._send(message)
         except RecordingError as error:
             self._end_with(error)
@@ -238,16 +240,10 @@ class ReplayNode(FlightNode):
     def _end_with(self, error: RecordingError) -> None:
         self._timer.cancel()
         self.get_logger().error(f"The replay has ended: {error}")
-        self.on_end(_BAD_BAG)
+        self.on_end(_BAD_BAG_EXIT_CODE)
 
     def _send(self, message: ReplayMessage) -> None:
-        """Publish one message.
-
-        Raises
-        ------
-        RecordingError
-            It is of a time that a clock cannot show.
-        """
+        """Publish one message; RecordingError: a clock cannot show its time."""
         if self.config.clock:
             if message.log_time_ns > LATEST_NS:
                 raise RecordingError(
@@ -283,7 +279,7 @@ class ReplayNode(FlightNode):
             self._publish_status()
             return
         for publisher in self._outputs:
-            publisher.wait_for_all_acked(_ACKNOWLEDGED)
+            publisher.wait_for_all_acked(_LONGEST_DELIVERY)
         self.get_logger().info(f"The replay has ended: {self.messages_replayed} messages.")
         self.on_end(0)
 
@@ -363,7 +359,7 @@ class ReplayNode(FlightNode):
         return response
 
 
-def _described(send: Callable[[bytes], None], meshes: MeshFolder) -> Callable[[bytes], None]:
+def _with_mesh_files(send: Callable[[bytes], None], meshes: MeshFolder) -> Callable[[bytes], None]:
     """Return a function that sends robot descriptions with files of the bag's meshes."""
 
     def send_with_files(data: bytes) -> None:
@@ -378,7 +374,7 @@ def _described(send: Callable[[bytes], None], meshes: MeshFolder) -> Callable[[b
     return send_with_files
 
 
-def _profile(qos: QosProfile) -> QoSProfile:
+def _publisher_qos(qos: QosProfile) -> QoSProfile:
     """Return the QoS of a publisher; a depth that a bag lacks is that of the stack."""
     latched = qos.durability == "transient_local"
     best_effort = qos.reliability == "best_effort"

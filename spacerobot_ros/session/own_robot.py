@@ -24,25 +24,25 @@ from spacerobot_ros.simulation.trials import Problem
 _FIRST_TURN = math.radians(5.0)
 """Largest turn of the base in the first scenario of a robot, rad."""
 
-_MOST_TURNS = 4 * math.pi
+_MAX_USUAL_LIMIT = 4 * math.pi
 """Joint limits above it may be in degrees, rad."""
 
-_EASY = 0.5
+_EASY_SHARE_OF_ROOM = 0.5
 """Part of the distance to its limits that a joint moves for a first rotation."""
 
-_ROOM = 1.0
+_LARGEST_ROOM = 1.0
 """Largest distance to a limit that counts, m or rad: the connection changes beyond it."""
 
 _LEAST_TURN = math.radians(0.2)
 """Smaller rotations are left to loops of the joints, rad."""
 
-_PARTS = 50.0
+_ROTATION_TO_TOLERANCE = 50.0
 """Ratio of a small rotation to its tolerance."""
 
-_LIGHT_BASE, _HEAVY_BASE = 0.2, 500.0
+_LEAST_BASE_MASS_RATIO, _LARGEST_BASE_MASS_RATIO = 0.2, 500.0
 """Usual ratios of the base's mass to the mass of all other bodies."""
 
-_SLOWEST, _FASTEST = 1e-3, 50.0
+_LEAST_USUAL_SPEED, _LARGEST_USUAL_SPEED = 1e-3, 50.0
 """Usual joint speeds, m/s or rad/s."""
 
 
@@ -53,13 +53,13 @@ def remarks(robot: RobotDescription) -> Iterator[str]:
     """
     carried = robot.total_mass - robot.bodies[0].inertia.mass
     base = robot.bodies[0].inertia
-    if carried > 0 and base.mass < _LIGHT_BASE * carried:
+    if carried > 0 and base.mass < _LEAST_BASE_MASS_RATIO * carried:
         yield (
             f"The base '{robot.base_link}' has {base.mass:.4g} kg and carries {carried:.4g} kg: it "
             "moves more than its load. If it stands for a mount, give it the mass and "
             "inertia of the spacecraft."
         )
-    if carried > 0 and base.mass > _HEAVY_BASE * carried:
+    if carried > 0 and base.mass > _LARGEST_BASE_MASS_RATIO * carried:
         yield (
             f"The base '{robot.base_link}' has {base.mass:.4g} kg, {base.mass / carried:.3g} times "
             "its load: the joints hardly move it."
@@ -76,13 +76,16 @@ def remarks(robot: RobotDescription) -> Iterator[str]:
                 f"The joint '{joint.name}' has the velocity limit 0, so that it cannot move: give "
                 f'<limit velocity="..."/> in {joint.unit}/s.'
             )
-        elif math.isfinite(limits.velocity) and not _SLOWEST <= limits.velocity <= _FASTEST:
+        elif (
+            math.isfinite(limits.velocity)
+            and not _LEAST_USUAL_SPEED <= limits.velocity <= _LARGEST_USUAL_SPEED
+        ):
             yield (
                 f"The joint '{joint.name}' moves at up to {limits.velocity:.4g} {joint.unit}/s: "
                 f"check the unit of its velocity limit."
             )
         reach = max(-limits.lower, limits.upper)
-        if joint.unit == "rad" and math.isfinite(reach) and reach > _MOST_TURNS:
+        if joint.unit == "rad" and math.isfinite(reach) and reach > _MAX_USUAL_LIMIT:
             yield (
                 f"The joint '{joint.name}' turns from {limits.lower:.4g} to {limits.upper:.4g} "
                 "rad: limits of a URDF are in rad, not in degrees."
@@ -96,10 +99,10 @@ def remarks(robot: RobotDescription) -> Iterator[str]:
         # Of a body as a whole it is refused.
         if flaw := flaw_of_inertia(link.inertia.about_com):
             yield f"The inertia of link '{link.name}' {flaw} The links welded to it make up for it."
-    yield from _about_looks(robot)
+    yield from _visual_remarks(robot)
 
 
-def _about_looks(robot: RobotDescription) -> Iterator[str]:
+def _visual_remarks(robot: RobotDescription) -> Iterator[str]:
     missing = [
         shape.resource
         for link in robot.links
@@ -156,7 +159,7 @@ def first_problem(name: str, robot: SpaceRobot, file: Path) -> Problem:
     angle = float(np.linalg.norm(turn))
     goal = Goal.checked([0.0, 0.0, 0.0], quaternion_from_rotvec(turn))
     config = PlannerConfig(robot=str(file))
-    tolerance = min(config.attitude_tolerance, float(f"{angle / _PARTS:.1g}"))
+    tolerance = min(config.attitude_tolerance, float(f"{angle / _ROTATION_TO_TOLERANCE:.1g}"))
     config = replace(config, attitude_tolerance=tolerance)
     return Problem(name, robot, InitialState(joint_positions=shape), goal, config)
 
@@ -169,14 +172,14 @@ def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
     turn it less, it is smaller, about the axis that they turn it most about.
     """
     room = np.minimum(robot.upper - shape, shape - robot.lower)
-    F = robot.connection(shape)[3:] * np.minimum(room, _ROOM)
+    F = robot.connection(shape)[3:] * np.minimum(room, _LARGEST_ROOM)
     usual = _FIRST_TURN * (axes if len(axes) == 1 else np.eye(3)[::-1])
     for turn in usual:
         ways = np.linalg.pinv(F, rcond=1e-6) @ turn
-        if np.allclose(F @ ways, turn, atol=1e-9) and np.abs(ways).max() <= _EASY:
+        if np.allclose(F @ ways, turn, atol=1e-9) and np.abs(ways).max() <= _EASY_SHARE_OF_ROOM:
             return np.asarray(turn)
     U, sizes, _ = np.linalg.svd(F, full_matrices=False)
-    angle = min(_FIRST_TURN, _EASY * float(sizes[0]))
+    angle = min(_FIRST_TURN, _EASY_SHARE_OF_ROOM * float(sizes[0]))
     if angle < _LEAST_TURN:
         return np.asarray(usual[0])
     axis = np.round(U[:, 0] * np.sign(U[np.argmax(np.abs(U[:, 0])), 0]), 3) + 0.0
@@ -194,33 +197,29 @@ def scenario_text(problem: Problem, method: str, robot_path: str) -> str:
     turn = rotvec_from_quaternion(problem.goal.quaternion)
     angle = math.degrees(float(np.linalg.norm(turn)))
     axis = ", ".join(f"{each:.3g}" for each in turn / np.linalg.norm(turn) + 0.0)
-    lines = [
-        f"# The first flight of {problem.robot.description.name}: its joints turn its base.",
-        "",
-        "scenario:",
-        "  ros__parameters:",
-        f"    description: The joints of {problem.robot.description.name} turn its base",
-        f"    # {angle:.3g} deg about ({axis})",
-        f"    goal_orientation: [{x!r}, {y!r}, {z!r}, {w!r}]   # x y z w; or goal_rotvec, rad",
-        "    # goal_position: [0.0, 0.0, 0.0]         # m",
-        f"    # goal_joint_positions: [{shape}]   # the shape to end in",
-        "",
-        "/**/plant:",
-        "  ros__parameters:",
-        f"    robot: {robot_path}",
-        f"    tick_rate: {rate!r}",
-    ]
-    if problem.robot.n:
-        lines.append(f"    initial_joint_positions: [{shape}]   # {joints}")
-    lines += [
-        "",
-        "/**/planner:",
-        "  ros__parameters:",
-        f"    robot: {robot_path}",
-        f"    tick_rate: {rate!r}",
-        f"    method: {method}",
-        f"    attitude_tolerance: {config.attitude_tolerance!r}   # rad",
-        f"    position_tolerance: {config.position_tolerance!r}   # m",
-        "",
-    ]
-    return "\n".join(lines)
+    name = problem.robot.description.name
+    start = f"    initial_joint_positions: [{shape}]   # {joints}\n" if problem.robot.n else ""
+    return f"""\
+# The first flight of {name}: its joints turn its base.
+
+scenario:
+  ros__parameters:
+    description: The joints of {name} turn its base
+    # {angle:.3g} deg about ({axis})
+    goal_orientation: [{x!r}, {y!r}, {z!r}, {w!r}]   # x y z w; or goal_rotvec, rad
+    # goal_position: [0.0, 0.0, 0.0]         # m
+    # goal_joint_positions: [{shape}]   # the shape to end in
+
+/**/plant:
+  ros__parameters:
+    robot: {robot_path}
+    tick_rate: {rate!r}
+{start}
+/**/planner:
+  ros__parameters:
+    robot: {robot_path}
+    tick_rate: {rate!r}
+    method: {method}
+    attitude_tolerance: {config.attitude_tolerance!r}   # rad
+    position_tolerance: {config.position_tolerance!r}   # m
+"""

@@ -34,19 +34,19 @@ from spacerobot_ros.session.stack import Stack, namespace_words
 from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.times import SECOND, stamp_to_ns
 
-_START = 60.0
+_LONGEST_START = 60.0
 """Longest wait for the start of all nodes, wall s."""
 
-_END = 10.0
+_LONGEST_END = 10.0
 """Wall time that a node has to end after a signal before it is killed, s."""
 
 _WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Fast DDS may go on writing into the shared memory of a killed node, not to its successor."""
 
-_PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+_FASTDDS_FILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 """Environment variables of Fast DDS: the file of its settings, by its new and its old name."""
 
-_PROMPT_WRITERS = """<?xml version="1.0" encoding="UTF-8"?>
+_FASTDDS_SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <profiles>
     <data_writer profile_name="prompt" is_default_profile="true">
@@ -62,7 +62,7 @@ _PROMPT_WRITERS = """<?xml version="1.0" encoding="UTF-8"?>
 
 The default is 3 s: by then the plant has published more than its publishers keep, or has waited."""
 
-_SETTLING = 1.0
+_LONGEST_RECORDING_DELAY = 1.0
 """Wall time for the recorder to receive the last messages of the plant, s."""
 
 
@@ -72,7 +72,7 @@ _SHORT_PATIENCE = 0.5
 _LOOK_PERIOD = 0.05
 """Wall time from one check of the connections to the next, s."""
 
-_CHILD = "spacerobot_ros.session.child"
+_CHILD_MODULE = "spacerobot_ros.session.child"
 """Module that runs a node until this process ends."""
 
 
@@ -132,7 +132,7 @@ class MultiProcessStack(Stack):
             for name in self.names:
                 self.launch(name, autostart=False)
             # All at once: models are built and compiled.
-            self._transit(Transition.TRANSITION_CONFIGURE, self.names)
+            self._change_states(Transition.TRANSITION_CONFIGURE, self.names)
             self._wait_for(self._connected, "the nodes to find each other")
         except BaseException:
             self.close()
@@ -161,10 +161,10 @@ class MultiProcessStack(Stack):
     def _environment(self) -> dict[str, str]:
         """Return the environment of a node; variables that the user has set stay."""
         environment = {**_WITHOUT_SHARED_MEMORY, **os.environ}
-        if not any(name in environment for name in _PROFILES):
+        if not any(name in environment for name in _FASTDDS_FILE_VARIABLES):
             file = Path(self._folder.name, "fastdds.xml")
-            file.write_text(_PROMPT_WRITERS, "utf-8")
-            environment |= dict.fromkeys(_PROFILES, str(file))
+            file.write_text(_FASTDDS_SETTINGS, "utf-8")
+            environment |= dict.fromkeys(_FASTDDS_FILE_VARIABLES, str(file))
         return environment
 
     def _log_of(self, name: str) -> Path:
@@ -190,11 +190,11 @@ class MultiProcessStack(Stack):
     def start(self, goal: Goal | None) -> None:
         """Activate everything and send the goal, if there is one; the plant begins last."""
         for name in reversed(self.names[1:]):
-            self._transit(Transition.TRANSITION_ACTIVATE, [name])
+            self._change_states(Transition.TRANSITION_ACTIVATE, [name])
         if goal is not None:
             self.client.send(goal, self.scenario.end_effector_goal)
             self.client.await_delivery()
-        self._transit(Transition.TRANSITION_ACTIVATE, ["plant"])
+        self._change_states(Transition.TRANSITION_ACTIVATE, ["plant"])
 
     def finish(self) -> None:
         """Stop time, then end every node, the recorder, whose bag is completed, last.
@@ -209,13 +209,13 @@ class MultiProcessStack(Stack):
         interrupted = self.client.outcome is Outcome.INTERRUPTED
         present = [name for name in self.names if name not in self._timeline.away]
         if "plant" in present and not (interrupted and not self.scenario.lockstep):
-            self._transit(Transition.TRANSITION_DEACTIVATE, ["plant"])
-        self._spin_for(0.0 if interrupted else _SETTLING)
+            self._change_states(Transition.TRANSITION_DEACTIVATE, ["plant"])
+        self._spin_for(0.0 if interrupted else _LONGEST_RECORDING_DELAY)
         if "planner" in present:
-            self._ask_statistics(_SHORT_PATIENCE if interrupted else _START)
+            self._ask_statistics(_SHORT_PATIENCE if interrupted else _LONGEST_START)
         ended: dict[str, int] = {}
         for group in ([name for name in present if name != "recorder"], ["recorder"]):
-            ended |= self._end([name for name in group if name in present])
+            ended |= self._end_nodes([name for name in group if name in present])
         for name, code in ended.items():
             if code != 0:
                 raise SpaceRobotError(
@@ -265,12 +265,12 @@ class MultiProcessStack(Stack):
             self.launch(name, **(again if name == "plant" else {}))
         self.require_alive()
 
-    def _end(self, names: Sequence[str]) -> dict[str, int]:
+    def _end_nodes(self, names: Sequence[str]) -> dict[str, int]:
         """End nodes together, and return their exit codes."""
         for name in names:
             self.processes[name].send_signal(signal.SIGINT)
         # The traceback that SIGABRT causes shows where a node hangs.
-        waits = {0: _END, signal.SIGABRT: 1.0}
+        waits = {0: _LONGEST_END, signal.SIGABRT: 1.0}
         return {name: end_child(self.processes[name], waits) for name in names}
 
     def _on_clock(self, message: Clock) -> None:
@@ -287,7 +287,7 @@ class MultiProcessStack(Stack):
         recorded = () if recorder is None else dict(recorder.subscriptions)
         return self._all_connected(nodes, recorded)
 
-    def _transit(self, transition: int, names: Sequence[str]) -> None:
+    def _change_states(self, transition: int, names: Sequence[str]) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
         answers = self._call_all(self._change_state, dict.fromkeys(names, request))
         for name, answer in answers.items():
@@ -299,14 +299,17 @@ class MultiProcessStack(Stack):
         request = {"planner": Trigger.Request()}
         try:
             answer = self._call_all({"planner": self._get_statistics}, request, patience)["planner"]
-        except _LateError:
-            if patience < _START:
+        except _AnswerLateError:
+            if patience < _LONGEST_START:
                 return
             raise
         self._statistics = PlannerStatistics.from_json(answer.message)
 
     def _call_all(
-        self, services: Mapping[str, Client], requests: Mapping[str, Any], patience: float = _START
+        self,
+        services: Mapping[str, Client],
+        requests: Mapping[str, Any],
+        patience: float = _LONGEST_START,
     ) -> dict[str, Any]:
         """Send requests, each as soon as its node is there, and return the answers."""
         names = ", ".join(requests)
@@ -329,12 +332,14 @@ class MultiProcessStack(Stack):
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.02)
 
-    def _wait_for(self, condition: Callable[[], bool], what: str, patience: float = _START) -> None:
+    def _wait_for(
+        self, condition: Callable[[], bool], what: str, patience: float = _LONGEST_START
+    ) -> None:
         deadline = time.monotonic() + patience
         while not condition():
             self.require_alive()
             if time.monotonic() > deadline:
-                raise _LateError(f"Waited {patience:g} s for {what} in vain.")
+                raise _AnswerLateError(f"Waited {patience:g} s for {what} in vain.")
             self.executor.spin_once(timeout_sec=0.02)
 
 
@@ -346,10 +351,10 @@ def node_words(
     own = f"{namespace}/{name}" if namespace else name
     file.write_text(yaml.safe_dump({own: {"ros__parameters": dict(parameters)}}), "utf-8")
     ros = ["--ros-args", "-r", f"__node:={name}", *namespace_words(namespace)]
-    return ["-m", _CHILD, module, *ros, "--params-file", str(file)]
+    return ["-m", _CHILD_MODULE, module, *ros, "--params-file", str(file)]
 
 
-class _LateError(SpaceRobotError):
+class _AnswerLateError(SpaceRobotError):
     """A node has not answered in time."""
 
 

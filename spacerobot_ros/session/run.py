@@ -170,10 +170,10 @@ def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
 
 # -- stacks that run until they are stopped, goals from outside ---------------------------------
 
-_DISCOVERY = 10.0
+_LONGEST_DISCOVERY = 10.0
 """Wall s to wait for a commander that takes goals."""
 
-_LATCHED = 1.0
+_LONGEST_STATUS_WAIT = 1.0
 """Wall s to wait for the status of earlier goals, so that it does not pass for an answer."""
 
 _LOOK_PERIOD = 0.1
@@ -270,7 +270,9 @@ def send_goal(
         try:
             for each in clients:
                 executor.add_node(each.node)
-            client = _with_decider(clients, executor, min(timeout or _DISCOVERY, _DISCOVERY))
+            client = _find_decider(
+                clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY)
+            )
             with ended_on_request() as stopped:
                 client.send(goal)
                 began, statuses = time.monotonic(), _StatusPrinter(client, show)
@@ -289,7 +291,7 @@ def send_goal(
             executor.shutdown()
 
 
-def _with_decider(
+def _find_decider(
     clients: list[MissionClient], executor: EventsExecutor, patience: float
 ) -> MissionClient:
     """Return the client that listens to the planner, or to the controller if there is none."""
@@ -298,7 +300,7 @@ def _with_decider(
         executor.spin_once(timeout_sec=0.05)
         for client in clients:
             if client.is_connected() and client.has_decider():
-                latest = time.monotonic() + _LATCHED
+                latest = time.monotonic() + _LONGEST_STATUS_WAIT
                 while client.status is None and time.monotonic() < latest:
                     executor.spin_once(timeout_sec=0.05)
                 # Its other readers may have been found in the meantime.

@@ -162,15 +162,7 @@ class Stack(ABC):
         """End what still runs; safe to call twice."""
 
     def _all_connected(self, nodes: Mapping[str, Connections], recorded: Iterable[str]) -> bool:
-        """Whether nodes and client are connected, and the recorder records all that is to be.
-
-        Parameters
-        ----------
-        nodes
-            The endpoints of the nodes, by their names.
-        recorded
-            Topics that the recorder takes.
-        """
+        """Whether nodes and client are connected, and ``recorded`` has all topics to record."""
         client = Connections.of(self.client.node)
         if unconnected([*nodes.values(), client]):
             return False

@@ -21,10 +21,10 @@ from spacerobot_ros.session.stack import checked_namespace
 from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.viewer.server import require_viser
 
-_START = 30.0
+_LONGEST_START = 30.0
 """Wall time within which the page must be served, s."""
 
-_END = 1.5
+_LONGEST_END = 1.5
 """Wall time after SIGINT at which the process is killed, s."""
 
 _NICENESS = 5
@@ -64,14 +64,14 @@ def viewing(
             )
         yield_to_flight(process.pid)
         try:
-            show(_announcement(process, log))
-            for line in _lines(log):
+            show(_read_announcement(process, log))
+            for line in _read_log_lines(log):
                 show(line)  # A warning about an address that others can reach.
             yield
             if process.poll() is not None:
-                show(f"The viewer ended early: {(_lines(log) or ['it was killed.'])[-1]}")
+                show(f"The viewer ended early: {(_read_log_lines(log) or ['it was killed.'])[-1]}")
         finally:
-            end_child(process, {signal.SIGINT: _END})
+            end_child(process, {signal.SIGINT: _LONGEST_END})
 
 
 def yield_to_flight(pid: int) -> None:
@@ -83,23 +83,25 @@ def yield_to_flight(pid: int) -> None:
         Path(f"/proc/{pid}/autogroup").write_text(str(_NICENESS), "ascii")
 
 
-def _lines(log: Path) -> list[str]:
+def _read_log_lines(log: Path) -> list[str]:
     """Return the lines that the viewer has written to standard error."""
     return log.read_text("utf-8", errors="replace").strip().splitlines()
 
 
-def _announcement(process: subprocess.Popen[bytes], log: Path) -> str:
+def _read_announcement(process: subprocess.Popen[bytes], log: Path) -> str:
     """Return the line that the viewer prints once its page is served."""
     assert process.stdout is not None
-    text, deadline = b"", time.monotonic() + _START
+    text, deadline = b"", time.monotonic() + _LONGEST_START
     while not text.endswith(b"\n"):
         ready, _, _ = select.select([process.stdout], [], [], 0.1)
         if ready:
             more = os.read(process.stdout.fileno(), 4096)
             if not more:
-                lines = _lines(log)
+                lines = _read_log_lines(log)
                 raise SpaceRobotError(lines[-1] if lines else "The viewer ended at its start.")
             text += more
         elif time.monotonic() > deadline:
-            raise SpaceRobotError(f"The viewer has not served its page within {_START:g} s.")
+            raise SpaceRobotError(
+                f"The viewer has not served its page within {_LONGEST_START:g} s."
+            )
     return text.decode(errors="replace").strip()

@@ -103,13 +103,13 @@ def test_messages_carry_the_clock_and_their_stamps(tmp_path: Path) -> None:
     writer = BagWriter(path)
     recording = Recording(writer, 2.0)
     recording.start()
-    stamps = recorder._Stamps()
+    stamps = recorder._StampReader()
 
     def take(topic: str, message: Any) -> Any:
         kind = type(message)
         package = kind.__module__.split(".")[0]
         channel = writer.add_topic(topic, f"{package}/msg/{kind.__name__}", QosProfile())
-        return recorder._take(recording, stamps, topic, kind, channel)
+        return recorder._recording_callback(recording, stamps, topic, kind, channel)
 
     clock, joints = take("/clock", Clock()), take("/joint_states", JointState())
     text, urdf = take("/talk", String()), take("/a/robot_description", String())
@@ -151,9 +151,9 @@ def test_losses_add_up(tmp_path: Path) -> None:
 def test_descriptions_are_texts(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text(json.dumps({"one": {"a": 1, "b": "x"}, "two": {}}))
-    assert recorder._descriptions(str(path)) == [("one", {"a": "1", "b": "x"}), ("two", {})]
-    assert recorder._descriptions("") == []
+    assert recorder._read_descriptions(str(path)) == [("one", {"a": "1", "b": "x"}), ("two", {})]
+    assert recorder._read_descriptions("") == []
     for text in ("[1]", "{", '{"one": 5}'):
         path.write_text(text)
         with pytest.raises(ParameterError, match="'describe'"):
-            recorder._descriptions(str(path))
+            recorder._read_descriptions(str(path))

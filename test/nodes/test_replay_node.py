@@ -31,7 +31,7 @@ from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.meshes import TriangleMesh, mesh_file, read_mesh, stl_of
 from spacerobot_ros.nodes import ReplayNode
-from spacerobot_ros.nodes.replay import _profile
+from spacerobot_ros.nodes.replay import _publisher_qos
 
 ROOT = Path(__file__).parents[2]
 STRING = "std_msgs/msg/String"
@@ -122,7 +122,7 @@ def test_publishers_offer_what_was_recorded(harness: Harness, bag: Path) -> None
     ],
 )
 def test_depths_that_are_not_in_a_bag(profile: QosProfile, depth: int) -> None:
-    assert _profile(profile).depth == depth
+    assert _publisher_qos(profile).depth == depth
 
 
 def test_a_bag_that_turns_out_damaged_is_exit_2(harness: Harness, tmp_path: Path) -> None:

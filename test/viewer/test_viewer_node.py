@@ -465,7 +465,7 @@ def test_the_log_has_the_warnings_of_its_own_stack(harness: Harness) -> None:
 def test_a_commander_that_is_busy_is_waited_for(harness: Harness) -> None:
     stack = Stack(harness)
     viewer, state = stack.viewer, StackState()
-    viewer._unanswered = "7.000000001", 100.0
+    viewer._unanswered_goal = "7.000000001", 100.0
     viewer._send_goals(replace(state, busy=True), 99.0)
     viewer._send_goals(replace(state, busy=True), 130.0)
     paused = PlantStatus(PlantState.PAUSED, "Time stands still.")

@@ -52,10 +52,10 @@ _LOOK_PERIOD = 0.1
 _COMPLAINT_PERIOD = 5.0
 """Least wall s between two lines about another publisher of plant/status."""
 
-_DIAGNOSED = 1.0
+_LONGEST_DIAGNOSTICS_PERIOD = 1.0
 """Longest wall s between two diagnostics, where a run need not be repeatable."""
 
-_STATUSES = QoSProfile(
+_STATUS_QOS = QoSProfile(
     depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 """Every status counts, not only the last: deeper than the history for latecomers."""
@@ -108,7 +108,11 @@ class CommanderNode(FlightNode):
         """A topic of the state with a publisher that this node cannot hear as it subscribes."""
         self._inputs: dict[str, Subscription] = {}
         self._subscribe_states()
-        self.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(
+            _LOOK_PERIOD,
+            self._look_at_waiting_messages,
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
         self.create_service(Trigger, "~/abort", self._on_abort)
         self._description = ""
         robot = robot_of(config)
@@ -174,7 +178,9 @@ class CommanderNode(FlightNode):
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
         """Return the messages that wait in the subscriptions of odom and joint_states."""
-        return self._drained("odom", Odometry), self._drained("joint_states", JointState)
+        return self._take_waiting_messages("odom", Odometry), self._take_waiting_messages(
+            "joint_states", JointState
+        )
 
     # -- inputs -------------------------------------------------------------------------------
 
@@ -244,7 +250,7 @@ class CommanderNode(FlightNode):
             DiagnosticStatus,
             "plant/status",
             with_information(lambda message, information: receive(message, information)),
-            _STATUSES,
+            _STATUS_QOS,
         )
 
     def _on_plant_status(self, message: DiagnosticStatus, information: Any) -> None:
@@ -331,7 +337,7 @@ class CommanderNode(FlightNode):
             self.destroy_subscription(self._inputs[topic])
         self._subscribe_states()
 
-    def _drained(self, topic: str, kind: type[Any]) -> list[Stamped]:
+    def _take_waiting_messages(self, topic: str, kind: type[Any]) -> list[Stamped]:
         """Return the serialised messages that wait in a subscription."""
         handle, found = self._inputs[topic].handle, []
         with handle:
@@ -339,7 +345,7 @@ class CommanderNode(FlightNode):
                 found.append(Stamped(first_time_ns(taken[0]), taken[0]))
         return found
 
-    def _look(self) -> None:
+    def _look_at_waiting_messages(self) -> None:
         """Take statuses that wait, and a state that was set aside once its time is accepted."""
         assert self._statuses is not None
         commander, handle = self.commander, self._statuses.handle
@@ -357,7 +363,7 @@ class CommanderNode(FlightNode):
             self.events_have_wall_time
             and self.config.diagnostics_period
             and self.is_active
-            and time.monotonic() - self._diagnosed >= _DIAGNOSED
+            and time.monotonic() - self._diagnosed >= _LONGEST_DIAGNOSTICS_PERIOD
         ):
             self._publish_diagnostics(ignored)
 

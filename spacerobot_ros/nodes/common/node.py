@@ -265,7 +265,9 @@ class FlightNode(LifecycleNode):
         if isinstance(error, SpaceRobotError):
             message = str(error)
         else:
-            message = f"Node '{self.get_name()}' has failed at {what}: {_described(error)}."
+            message = (
+                f"Node '{self.get_name()}' has failed at {what}: {_describe_exception(error)}."
+            )
         if message == self._failure:
             return  # It is known, and may come with every message.
         self._report_failure(message, error)
@@ -273,7 +275,9 @@ class FlightNode(LifecycleNode):
             if self.is_active:
                 self.trigger_deactivate()
         except Exception as second:  # There must be an end to it.
-            self.get_logger().error(f"Node '{self.get_name()}' cannot stop: {_described(second)}.")
+            self.get_logger().error(
+                f"Node '{self.get_name()}' cannot stop: {_describe_exception(second)}."
+            )
         self.fault = SpaceRobotError(message)
 
     def _report_failure(self, message: str, error: Exception) -> None:
@@ -282,7 +286,7 @@ class FlightNode(LifecycleNode):
         try:
             self.on_failure(message, error)
         except Exception as second:
-            self.get_logger().error(f"Node '{self.get_name()}': {_described(second)}.")
+            self.get_logger().error(f"Node '{self.get_name()}': {_describe_exception(second)}.")
         self.report_event(Event(EventKind.FAILED, message, level=2))
 
     @property
@@ -452,7 +456,7 @@ class FlightNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             # rclpy drops exceptions of transitions; a defect must at least be logged.
-            message = f"Node '{self.get_name()}' has failed: {_described(error)}."
+            message = f"Node '{self.get_name()}' has failed: {_describe_exception(error)}."
             self.fault = SpaceRobotError(message)
             self.get_logger().debug(traceback.format_exc())
             self._report_failure(message, error)
@@ -511,13 +515,7 @@ class FlightNode(LifecycleNode):
         fix(self, (each for each in declared if each.read_only), fixed=fixed)
 
     def _require_free(self, changes: list[RosParameter]) -> None:
-        """Refuse changes of parameters that keep their values now.
-
-        Raises
-        ------
-        ParameterError
-            There is one; the message says what to do.
-        """
+        """Raise ParameterError where a parameter that is to change keeps its value now."""
         for change in changes:
             if change.name == AUTOSTART.name:
                 raise ParameterError(
@@ -525,9 +523,8 @@ class FlightNode(LifecycleNode):
                     "the node instead."
                 )
             declaration = self._parameters_declared.get(change.name)
-            if declaration is None or not declaration.read_only:
-                continue
-            if self.lifecycle_state != State.PRIMARY_STATE_UNCONFIGURED:
+            configured_now = self.lifecycle_state != State.PRIMARY_STATE_UNCONFIGURED
+            if declaration is not None and declaration.read_only and configured_now:
                 name = self.get_fully_qualified_name()
                 raise ParameterError(
                     f"Parameter '{change.name}' keeps its value while the node is configured: "
@@ -554,7 +551,7 @@ def described_robot(robot: SpaceRobot | None) -> str:
     return f"'{robot.description.name}' ({robot.n} joint(s), {mass:.4g} kg)"
 
 
-def _described(error: BaseException) -> str:
+def _describe_exception(error: BaseException) -> str:
     """Return type, text and place of an exception that no one expected."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""

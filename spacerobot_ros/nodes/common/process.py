@@ -38,7 +38,7 @@ _TRANSPORT_CHOICES = (
 
 _SHARED_MEMORY = Path("/dev/shm")
 
-_ENOUGH_MEMORY = 2 * 2**20
+_REQUIRED_SHARED_MEMORY = 2 * 2**20
 """Free bytes of shared memory that a process starts with; the middleware takes about one MiB."""
 
 
@@ -62,7 +62,7 @@ def _use_sockets_without_shared_memory() -> None:
         free = 0
     else:
         free = facts.f_bavail * facts.f_frsize if os.access(_SHARED_MEMORY, os.W_OK) else 0
-    if free < _ENOUGH_MEMORY:
+    if free < _REQUIRED_SHARED_MEMORY:
         os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
         _LOG.warning(
             "%s has %d kB that can be used: messages go through sockets "
@@ -150,7 +150,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
             requested()
             node.drain(executor)
             node.finalize()
-            _deliver(node)
+            _await_delivery(node)
         return stop.result() or 0
     finally:
         if node is not None:
@@ -158,7 +158,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
         rclpy.try_shutdown()
 
 
-def _deliver(node: FlightNode) -> None:
+def _await_delivery(node: FlightNode) -> None:
     """Wait until readers have received all messages, which are lost when the process ends."""
     end = time.monotonic() + _LONGEST_DELIVERY
     for publisher in node.publishers:

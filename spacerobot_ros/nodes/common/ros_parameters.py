@@ -17,15 +17,15 @@ from rclpy.parameter import parameter_value_to_python
 
 from spacerobot_ros.parameters import Parameter, Value
 
-_MOST_LOOKS = 200
+_MAX_LOOKS_FOR_ANSWER = 200
 """Looks after which a node that does not answer has no such services."""
 
-_SETTLED = 3
+_LOOKS_UNTIL_CONNECTED = 3
 """Looks after which the node has met the client, too. Before that its answer would hold it up for a
 tenth of a second, and be lost.
 """
 
-_LOST_AFTER = 50
+_LOOKS_UNTIL_LOST = 50
 """Looks after which an answer is lost: the middleware drops it where it has not met the client."""
 
 
@@ -44,7 +44,7 @@ class RemoteParameters:
         self._node, self.name = node, name
         self.values: dict[str, str] | None = None
         """Every parameter that is set, as a JSON text by its full name; None before the answer."""
-        self._steps = self._ask()
+        self._steps = self._request_values()
 
     def look(self) -> bool:
         """Return whether nothing more is to come: the node has answered, or never will."""
@@ -54,7 +54,7 @@ class RemoteParameters:
         """Ask no more."""
         self._steps.close()
 
-    def _ask(self) -> Generator[bool, None, None]:
+    def _request_values(self) -> Generator[bool, None, None]:
         everything = ListParameters.Request(depth=ListParameters.Request.DEPTH_RECURSIVE)
         listed = yield from self._call(ListParameters, "list_parameters", everything)
         if listed is None:
@@ -64,19 +64,19 @@ class RemoteParameters:
         got = yield from self._call(GetParameters, "get_parameters", these)
         if got is not None and len(got.values) == len(names):
             values = zip(names, map(parameter_value_to_python, got.values), strict=True)
-            self.values = {name: json.dumps(_plain(value)) for name, value in values}
+            self.values = {name: json.dumps(_json_value(value)) for name, value in values}
 
     def _call(self, kind: Any, service: str, request: Any) -> Generator[bool, None, Any]:
         """Return the answer of a service; None if it is late."""
         client: Client = self._node.create_client(kind, f"{self.name}/{service}")
         try:
             future, asked_at, ready = None, 0, 0
-            for look in range(_MOST_LOOKS):
+            for look in range(_MAX_LOOKS_FOR_ANSWER):
                 if future is not None and future.done():
                     return future.result()
                 ready = ready + 1 if client.service_is_ready() else 0
-                lost = future is None or look - asked_at >= _LOST_AFTER
-                if lost and ready > _SETTLED:
+                lost = future is None or look - asked_at >= _LOOKS_UNTIL_LOST
+                if lost and ready > _LOOKS_UNTIL_CONNECTED:
                     future, asked_at = client.call_async(request), look
                 yield False
             return None
@@ -84,13 +84,13 @@ class RemoteParameters:
             self._node.destroy_client(client)
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     """Return a value as JSON can say it."""
     return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
 
 
 _LARGEST_FLOAT = sys.float_info.max
-_INTEGERS = -(2**63), 2**63 - 1
+_INTEGER_BOUNDS = -(2**63), 2**63 - 1
 """Bounds that descriptors can hold."""
 
 
@@ -112,7 +112,9 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
             FloatingPointRange(from_value=float(low), to_value=float(high))
         ]
     elif isinstance(parameter.default, int) and not isinstance(parameter.default, bool):
-        least, most = (int(min(max(b, _INTEGERS[0]), _INTEGERS[1])) for b in (low, high))
+        least, most = (
+            int(min(max(b, _INTEGER_BOUNDS[0]), _INTEGER_BOUNDS[1])) for b in (low, high)
+        )
         described.integer_range = [IntegerRange(from_value=least, to_value=most)]
     return described
 
@@ -130,7 +132,7 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
     values = {}
     for parameter in parameters:
         name = parameter.name
-        given = _given(node, name)
+        given = _given_value(node, name)
         value = parameter.default if given is None else parameter.checked(given)
         stored = _ros_parameter(parameter, value)
         if value == ():
@@ -144,7 +146,7 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
     return values
 
 
-def _given(node: Node, name: str) -> Any:
+def _given_value(node: Node, name: str) -> Any:
     """Return the value that was given for a parameter, of any type; None without."""
     overrides = getattr(node, "_parameter_overrides", None)
     if isinstance(overrides, dict):

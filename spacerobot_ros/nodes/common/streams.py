@@ -37,7 +37,7 @@ class Connections:
         """Return those of a node of this process."""
         readers = [(each.topic_name, each.get_subscription_count()) for each in node.publishers]
         writers = [(each.topic_name, each.get_publisher_count()) for each in node.subscriptions]
-        return cls(_own(readers), _own(writers))
+        return cls(_without_middleware(readers), _without_middleware(writers))
 
     def to_json(self) -> str:
         """Return them as a text."""
@@ -47,7 +47,7 @@ class Connections:
     def from_json(cls, text: str) -> Connections:
         """Return what :meth:`to_json` has made a text of."""
         publishers, subscriptions = json.loads(text)
-        return cls(_own(publishers), _own(subscriptions))
+        return cls(_without_middleware(publishers), _without_middleware(subscriptions))
 
 
 def unconnected(nodes: Iterable[Connections]) -> set[str]:
@@ -64,7 +64,7 @@ def unconnected(nodes: Iterable[Connections]) -> set[str]:
     }
 
 
-def _own(matches: Iterable[Iterable[object]]) -> Matches:
+def _without_middleware(matches: Iterable[Iterable[object]]) -> Matches:
     pairs = (tuple(pair) for pair in matches)
     return tuple((str(topic), int(str(met))) for topic, met in pairs if topic not in _MIDDLEWARE)
 

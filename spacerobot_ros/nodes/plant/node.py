@@ -46,11 +46,11 @@ from spacerobot_ros.topics import TOPICS
 _LOOK_PERIOD = 0.1
 """How often a plant looks for new subscribers and commanders, wall s."""
 
-_UNCONFIRMED = STREAM.depth // 2
+_MAX_UNCONFIRMED_TICKS = STREAM.depth // 2
 """Ticks that a lockstep plant takes at most before all readers confirm that they have their states:
 a reader that has fallen further behind than what publishers keep would lose some."""
 
-_STANDSTILL = 1e-3
+_REST_RATE = 1e-3
 """Joint rates of a robot at rest, m/s or rad/s."""
 
 _LONGEST_REST = 0.8
@@ -59,7 +59,7 @@ _LONGEST_REST = 0.8
 _REPORT_PERIOD_NS = 950_000_000
 """Wall time without diagnostics after which they are due: with the look's, one a second."""
 
-_VIEWED, _VIEWED_FRAMES = 0.5, 0.1
+_LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD = 0.5, 0.1
 """Longest wall s, in real time, from one look of the robot to the next: markers, and /tf."""
 
 # Looked up for every command: an enum takes its time to find a member.
@@ -130,7 +130,7 @@ class PlantNode(FlightNode):
                 "robot of this package, or 'robot_description' to a URDF text."
             )
         self._period_ns = config.period_ns
-        initial, self._tick = self._resumed(robot)
+        initial, self._tick = self._resumed_state(robot)
         self.plant = build_plant(robot, config, initial)
         self.plant.tick = self._tick
         self._reported = ReportedState(self.plant, config)
@@ -148,11 +148,11 @@ class PlantNode(FlightNode):
         self._transforms = TransformPublisher(self, robot, self._reported, config)
         self._markers = LinkMarkers(self, self.plant, config.world_frame)
         self._report = PlantReport(self, self.plant, self._commands, self._real_time)
-        self._pose_ticks = self._viewed_ticks(config.base_pose_period, _VIEWED) or 1
-        self._marker_ticks = self._viewed_ticks(config.marker_period, _VIEWED)
+        self._pose_ticks = self._viewed_ticks(config.base_pose_period, _LONGEST_MARKER_PERIOD) or 1
+        self._marker_ticks = self._viewed_ticks(config.marker_period, _LONGEST_MARKER_PERIOD)
         self._tf_ticks = 0
         if self._transforms.publishes:
-            self._tf_ticks = self._viewed_ticks(config.tf_period, _VIEWED_FRAMES)
+            self._tf_ticks = self._viewed_ticks(config.tf_period, _LONGEST_FRAME_PERIOD)
         self._report_ticks = self._ticks(config.diagnostics_period)
         for source in self._commands.sources:
             reader = CommandReader(source, robot, config.frame_prefix)
@@ -237,7 +237,7 @@ class PlantNode(FlightNode):
         end, began = time.monotonic() + _LONGEST_REST, self._tick
 
         def at_rest() -> bool:
-            return self._tick > began and bool(np.all(np.abs(self.plant.qdot) <= _STANDSTILL))
+            return self._tick > began and bool(np.all(np.abs(self.plant.qdot) <= _REST_RATE))
 
         while not at_rest() and time.monotonic() < end and self.is_active:
             executor.spin_once(timeout_sec=0.02)
@@ -270,16 +270,8 @@ class PlantNode(FlightNode):
         record = StatusRecord(name, status.level, status.message, status.to_values())
         self._status.take(record.encoded())
 
-    def _resumed(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:
-        """Return the state to start from (None: the configuration's) and its tick.
-
-        Raises
-        ------
-        ParameterError
-            The bag is of another robot.
-        RecordingError
-            It cannot be read, or holds no state.
-        """
+    def _resumed_state(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:
+        """Return the state to start from (None: the configuration's) and its tick."""
         path = self.config.resume_bag
         if not path:
             return None, 0
@@ -313,7 +305,7 @@ class PlantNode(FlightNode):
             self._report.limited()
         self._tick += 1
         self._publish()
-        if self._lockstep is not None and self._tick % _UNCONFIRMED == 0:
+        if self._lockstep is not None and self._tick % _MAX_UNCONFIRMED_TICKS == 0:
             self._publisher.await_readers()
         if self.plant.active is not self._faults_seen:
             self._look_at_status()

@@ -39,7 +39,7 @@ from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.viewer.state import Firing, Measured, Momenta, Part, StackState
 
-LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Keeps the last message only; no publisher waits for an acknowledgement."""
 
 _SILENT_AFTER = 1.5
@@ -51,10 +51,10 @@ _FORGOTTEN_AFTER = 60.0
 _JITTER_NS = 200_000
 """Jitter of the time between two messages published in one tick, wall ns."""
 
-_NO_EXPECTED_NS = SECOND
+_LONGEST_EXPECTED_DELAY_NS = SECOND
 """Wall time after which a plant counts as one that publishes no expected momenta, ns."""
 
-_MOST_POINTS = 1000
+_MAX_PATH_POINTS = 1000
 """Largest number of points of a planned path."""
 
 M = TypeVar("M")
@@ -76,7 +76,7 @@ class Latest(Generic[M]):
         self.sent_ns = 0
         """Publication time of the last message taken, wall ns."""
         self._subscription = node.create_subscription(
-            kind, topic, lambda raw: None, LATEST, raw=True
+            kind, topic, lambda raw: None, LATEST_QOS, raw=True
         )
 
     def take(self) -> M | None:
@@ -116,7 +116,7 @@ class Listener:
         self._frame, self._on_status = frame, on_status
         self._odom = Latest(streams, Odometry, "odom")
         self._joints = Latest(streams, JointState, "joint_states")
-        self._tool = Latest(streams, PoseStamped, "end_effector_pose")
+        self._end_effector = Latest(streams, PoseStamped, "end_effector_pose")
         self._momentum = Latest(streams, Float64MultiArray, "momentum")
         self._expected = Latest(streams, Float64MultiArray, "momentum_expected")
         self._thrusters = Latest(streams, JointState, "thrusters")
@@ -138,7 +138,7 @@ class Listener:
             ("replay/status", "replay", lambda values, _: ReplayStatus.from_values(values)),
         ):
             node.create_subscription(
-                DiagnosticStatus, topic, self._status_taker(key, read), LATCHED
+                DiagnosticStatus, topic, self._status_callback(key, read), LATCHED
             )
         node.create_subscription(Path, "planned_path", self._on_path, LATCHED)
         node.create_subscription(DiagnosticStatus, "heartbeat", self._on_heartbeat, STREAM)
@@ -156,8 +156,8 @@ class Listener:
         self._measured: Measured | None = None
         self._tool_pose: Array | None = None
         self._momenta: Momenta | None = None
-        self._expected_now: Array | None = None
-        self._least_apart_ns = _NO_EXPECTED_NS
+        self._expected_momenta: Array | None = None
+        self._least_apart_ns = _LONGEST_EXPECTED_DELAY_NS
         self._firing: Firing | None = None
 
     def use(self, robot: RobotDescription) -> None:
@@ -223,7 +223,7 @@ class Listener:
         if (odom is not None or joints is not None) and self._pose is not None and self._q:
             self._came_at = now
             self._measured = Measured(self._stamp_s, self._pose, *self._q)
-        tool = self._tool.take()
+        tool = self._end_effector.take()
         if tool is not None:
             self._tool_pose = pose_array(tool.pose.position, tool.pose.orientation)
         self._take_momenta()
@@ -242,25 +242,25 @@ class Listener:
         momentum = self._momentum.take()
         if momentum is None or len(momentum.data) < 7 or not np.all(np.isfinite(momentum.data)):
             return
-        if self._expected_now is not None and self._expected.sent_ns < self._momentum.sent_ns:
+        if self._expected_momenta is not None and self._expected.sent_ns < self._momentum.sent_ns:
             self._take_expected()
             late = self._momentum.sent_ns - self._expected.sent_ns
-            if late > _NO_EXPECTED_NS:
-                self._expected_now = None
+            if late > _LONGEST_EXPECTED_DELAY_NS:
+                self._expected_momenta = None
             elif late > 0:
                 return  # The next call has a pair.
-        if self._expected_now is not None:
+        if self._expected_momenta is not None:
             apart = self._expected.sent_ns - self._momentum.sent_ns
             self._least_apart_ns = min(self._least_apart_ns, apart)
             if apart > 3 * self._least_apart_ns + _JITTER_NS:
                 return
         numbers = np.array(momentum.data)
-        self._momenta = Momenta(numbers[:6], self._expected_now, float(numbers[6]))
+        self._momenta = Momenta(numbers[:6], self._expected_momenta, float(numbers[6]))
 
     def _take_expected(self) -> None:
         expected = self._expected.take()
         if expected is not None and len(expected.data) >= 6:
-            self._expected_now = np.array(expected.data[:6])
+            self._expected_momenta = np.array(expected.data[:6])
 
     def _take_joints(self, message: JointState) -> None:
         places = {name: i for i, name in enumerate(message.name)}
@@ -280,7 +280,7 @@ class Listener:
 
     # -- statuses, goals, heartbeats ------------------------------------------------------------
 
-    def _status_taker(
+    def _status_callback(
         self, key: str, read: Callable[[dict[str, str], str], Any]
     ) -> Callable[[DiagnosticStatus], None]:
         def take(received: DiagnosticStatus) -> None:
@@ -300,7 +300,7 @@ class Listener:
 
     def _on_path(self, message: Path) -> None:
         poses = message.poses
-        step = max(1, len(poses) // _MOST_POINTS)
+        step = max(1, len(poses) // _MAX_PATH_POINTS)
         kept = [*poses[:-1:step], *poses[-1:]]
         points = [(p.pose.position.x, p.pose.position.y, p.pose.position.z) for p in kept]
         path = np.array(points).reshape(-1, 3)

@@ -62,15 +62,15 @@ from spacerobot_ros.viewer.state import (
 ANNOUNCEMENT = "viewer      "
 """Text before the address of the page on standard output."""
 
-_ROSOUT = QoSProfile(
+_ROSOUT_QOS = QoSProfile(
     depth=100,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
 )
-_WARNING = 30
+_LEAST_LOG_LEVEL = 30
 """Least level of rcl_interfaces/Log that is shown."""
 
-_TOPICS: Mapping[Part, str] = {"base": "goal_pose", "end_effector": "end_effector/goal_pose"}
+_GOAL_TOPICS: Mapping[Part, str] = {"base": "goal_pose", "end_effector": "end_effector/goal_pose"}
 
 _SERVICES: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
     Request.ABORT: (("planner", "controller"), "abort", None),
@@ -84,7 +84,7 @@ _SERVICES: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
 }
 """Of each request the nodes, their service, and its data (None: it is a trigger)."""
 
-_PARAMETERS_OF = ("plant", "planner", "controller")
+_NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
 """Nodes whose parameters are read."""
 
 _LONGEST_MEETING = 4.0
@@ -94,7 +94,7 @@ _LONGEST_ANSWER = 5.0
 """Wall time within which a planner or controller answers a goal, s."""
 
 _MICROSECOND_NS = 1000
-_FLAG_NS = 1_000_000
+_MILLISECOND_NS = 1_000_000
 
 
 class ViewerNode(FlightNode):
@@ -134,11 +134,11 @@ class ViewerNode(FlightNode):
         self._clients_by_name: dict[tuple[str, type[Any]], Client] = {}
         self._remote_values: dict[str, dict[str, str]] = {}
         self._requests: dict[str, RemoteParameters] = {}
-        self._to_repeat: set[str] = set()
+        self._requests_to_repeat: set[str] = set()
         self._planner_state: PlannerState | None = None
         self._sent = 0
-        self._to_send: tuple[Mapping[Part, Goal], float] | None = None
-        self._unanswered: tuple[str, float] | None = None
+        self._goals_to_send: tuple[Mapping[Part, Goal], float] | None = None
+        self._unanswered_goal: tuple[str, float] | None = None
         # This node is not spun: its messages wait until the page is drawn.
         self._streams = rclpy.create_node(
             f"_{self.get_name()}_streams",
@@ -151,11 +151,13 @@ class ViewerNode(FlightNode):
         self._listener = Listener(self._streams, self, config.world_frame, self._on_status)
         self.create_subscription(String, "robot_description", self._on_description, LATCHED)
         self.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
-        self.create_subscription(RosoutLog, "/rosout", self._on_log, _ROSOUT)
-        self.create_subscription(ParameterEvent, "/parameter_events", self._on_change, STREAM)
+        self.create_subscription(RosoutLog, "/rosout", self._on_log, _ROSOUT_QOS)
+        self.create_subscription(
+            ParameterEvent, "/parameter_events", self._on_parameter_change, STREAM
+        )
         self._goal_topics = {
             part: self.create_publisher(PoseStamped, topic, STREAM)
-            for part, topic in _TOPICS.items()
+            for part, topic in _GOAL_TOPICS.items()
         }
         self._shape_topic = self.create_publisher(JointState, "goal_joint_states", STREAM)
         self._fault_topic = self.create_publisher(String, "fault_injection", STREAM)
@@ -241,7 +243,7 @@ class ViewerNode(FlightNode):
             return
         self._urdf = message.data
         self._checker.cancel()  # The question is about another robot.
-        self._to_send = None
+        self._goals_to_send = None
         try:
             self._robot = parse_robot(message.data)
         except SpaceRobotError as error:
@@ -263,7 +265,7 @@ class ViewerNode(FlightNode):
         for keys, service, data in _SERVICES.values():
             if key in keys:
                 self._client(Trigger if data is None else SetBool, f"{name}/{service}")
-        if key in _PARAMETERS_OF:
+        if key in _NODES_WITH_PARAMETERS:
             self._request_parameters(key)
 
     def _on_event(self, received: DiagnosticStatus) -> None:
@@ -275,7 +277,7 @@ class ViewerNode(FlightNode):
         self._page.note(Notice(event.message, event.level, event.time_s, message.name))
         if event.kind in (EventKind.ACTIVATED, EventKind.NODE_BACK):
             for key, name in self._full_names.items():
-                if name == message.name and key in _PARAMETERS_OF:
+                if name == message.name and key in _NODES_WITH_PARAMETERS:
                     self._request_parameters(key)
 
     def _on_log(self, message: RosoutLog) -> None:
@@ -283,12 +285,12 @@ class ViewerNode(FlightNode):
         own = self.get_namespace().strip("/").replace("/", ".")
         if own and not message.name.startswith(f"{own}."):
             return  # Of another stack.
-        if message.level >= _WARNING and message.name != self.get_logger().name:
-            level = 1 if message.level == _WARNING else 2
+        if message.level >= _LEAST_LOG_LEVEL and message.name != self.get_logger().name:
+            level = 1 if message.level == _LEAST_LOG_LEVEL else 2
             self._note(printable(message.msg), level, printable(message.name))
 
-    def _on_change(self, message: ParameterEvent) -> None:
-        for key in _PARAMETERS_OF:
+    def _on_parameter_change(self, message: ParameterEvent) -> None:
+        for key in _NODES_WITH_PARAMETERS:
             if self._full_names.get(key) == message.node and key in self._remote_values:
                 self._request_parameters(key)
 
@@ -297,7 +299,7 @@ class ViewerNode(FlightNode):
         name, before = self._full_names[key], self._requests.get(key)
         if before is not None and before.name == name:
             # The request before is still open: an answer that is never taken would block that node.
-            self._to_repeat.add(key)
+            self._requests_to_repeat.add(key)
             return
         if before is not None:
             before.close()
@@ -308,9 +310,9 @@ class ViewerNode(FlightNode):
             if not request.look():
                 continue
             del self._requests[key]
-            if request.values is None or key in self._to_repeat:
+            if request.values is None or key in self._requests_to_repeat:
                 # A node that has reported a status but does not answer is busy.
-                self._to_repeat.discard(key)
+                self._requests_to_repeat.discard(key)
                 self._request_parameters(key)
             if request.values is None:
                 continue
@@ -329,12 +331,12 @@ class ViewerNode(FlightNode):
             self._page.faults.offer(Targets())
             return
         effort = json.loads(values.get("actuation", '""')) == "effort"
-        table = self._table(json.loads(values.get("thrusters", '""')))
+        table = self._thruster_table(json.loads(values.get("thrusters", '""')))
         nozzles = () if table is None else table.names
         self._page.show_thrusters(table)
         self._page.faults.offer(Targets(self._robot.joint_names, effort, nozzles))
 
-    def _table(self, source: str) -> ThrusterTable | None:
+    def _thruster_table(self, source: str) -> ThrusterTable | None:
         if not source or self._robot is None:
             return None
         try:
@@ -351,19 +353,19 @@ class ViewerNode(FlightNode):
     def _carry_out(self, action: Action, state: StackState) -> None:
         match action:
             case Fly(goals):
-                self._to_send = goals, time.monotonic() + _LONGEST_MEETING
+                self._goals_to_send = goals, time.monotonic() + _LONGEST_MEETING
             case Inject(text):
                 self._fault_topic.publish(String(data=text))
                 self._note(f"Sent to the plant: {text}", source="page")
             case Seek(seconds):
                 self._seek_topic.publish(Float64(data=float(seconds)))
             case Request():
-                self._request(action)
+                self._call_service(action)
 
     def _send_goals(self, state: StackState, now: float) -> None:
         """Send pending goals once their subscribers are matched; report goals without an answer."""
-        if self._to_send is not None:
-            goals, until = self._to_send
+        if self._goals_to_send is not None:
+            goals, until = self._goals_to_send
             topics = [self._shape_topic, *(self._goal_topics[part] for part in goals)]
             # A node that has just started is discovered before its subscriptions are matched.
             met = all(
@@ -371,20 +373,20 @@ class ViewerNode(FlightNode):
                 for topic in topics
             )
             if met or now >= until:
-                self._to_send = None
+                self._goals_to_send = None
                 self._send(goals)
-        if self._unanswered is not None:
-            goal_id, until = self._unanswered
+        if self._unanswered_goal is not None:
+            goal_id, until = self._unanswered_goal
             statuses = (state.planner, state.controller)
             if any(status is not None and status.goal_id == goal_id for status in statuses):
-                self._unanswered = None
+                self._unanswered_goal = None
             elif state.busy or (
                 # Planner and controller answer with the next state.
                 state.plant is not None and state.plant.state is PlantState.PAUSED
             ):
-                self._unanswered = goal_id, now + _LONGEST_ANSWER
+                self._unanswered_goal = goal_id, now + _LONGEST_ANSWER
             elif now >= until:
-                self._unanswered = None
+                self._unanswered_goal = None
                 self._note(
                     "No planner or controller has answered the goal: send it again.", 2, "page"
                 )
@@ -392,7 +394,7 @@ class ViewerNode(FlightNode):
     def _send(self, goals: Mapping[Part, Goal]) -> None:
         # Statuses name a goal by its stamp, which is therefore unique among all viewers.
         self._sent += 1
-        flag = time.time_ns() // _MICROSECOND_NS * _MICROSECOND_NS % _FLAG_NS
+        flag = time.time_ns() // _MICROSECOND_NS * _MICROSECOND_NS % _MILLISECOND_NS
         time_ns = self._listener.time_ns() + flag + self._sent % 1000
         # Without it planners keep the joint positions of an earlier goal, perhaps of another tool.
         names = () if self._robot is None else self._robot.joint_names
@@ -408,12 +410,12 @@ class ViewerNode(FlightNode):
             self._note("Goal sent.", source="page")
             stamp = message.header.stamp
             goal_id = GoalIds().of(stamp.sec, stamp.nanosec)
-            self._unanswered = goal_id, time.monotonic() + _LONGEST_ANSWER
+            self._unanswered_goal = goal_id, time.monotonic() + _LONGEST_ANSWER
         editor = self._page.editor
         if self._checker.cancel() and not editor.moving:
             editor.show_check(Check(Verdict.UNCHECKED, "It was sent before it was checked."))
 
-    def _request(self, request: Request) -> None:
+    def _call_service(self, request: Request) -> None:
         """Call the service of a request on every node that has it."""
         keys, service, data = _SERVICES[request]
         called = False
