@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support import lost_values
 from support.warm_python import WarmPython
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ if not _WORKER:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     for name in ("ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY", "ROS_DOMAIN_ID"):
         os.environ.pop(name, None)
+
+lost_values.apply()
 
 _DOMAINS = 101
 """Higher domains take ports that Linux hands out to others."""
