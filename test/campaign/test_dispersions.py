@@ -164,6 +164,8 @@ KINDS: list[Any] = [
     ),
 ]  # fmt: skip
 
+FAULT_SLOWLY = pytest.param(*KINDS[-1].values, id="fault", marks=pytest.mark.slow)
+
 
 @pytest.mark.parametrize(("disperse", "settings", "check"), KINDS)
 def test_what_is_drawn_is_what_is_flown(
@@ -174,7 +176,7 @@ def test_what_is_drawn_is_what_is_flown(
     check(flight, drawn)
 
 
-@pytest.mark.parametrize(("disperse", "settings", "check"), KINDS)
+@pytest.mark.parametrize(("disperse", "settings", "check"), [*KINDS[:-1], FAULT_SLOWLY])
 def test_a_dispersion_that_is_not_applied_is_noticed(
     disperse: dict[str, Any], settings: dict[str, Any], check: Check
 ) -> None:

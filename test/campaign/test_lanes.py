@@ -109,6 +109,7 @@ def assert_same_flights(made: Campaign) -> tuple[dict[int, Row], dict[int, Row]]
     return lanes, one_by_one
 
 
+@pytest.mark.slow
 def test_coordinated_control_in_lanes_is_that_of_the_plant_and_the_controller() -> None:
     """Masses, noise, biases, goals, starts and gains differ; some come too late."""
     made = controlled(flights=9)

@@ -34,6 +34,9 @@ HARMFUL = {
     "number": "a: " + 5000 * "9",
     "long": "a: " + 1_000_001 * "x",
 }
+COMMANDS = ("plan", "run")
+"""They read scenarios as `campaign fly` reads its file, by one function."""
+
 REASONS = {
     "nested": "nested too deeply",
     "deep": "nested too deeply",
@@ -47,7 +50,9 @@ REASONS = {
 
 
 @pytest.mark.parametrize("name", HARMFUL)
-@pytest.mark.parametrize("words", [("plan",), ("run",), ("campaign", "fly")])
+@pytest.mark.parametrize(
+    "words", [("campaign", "fly"), *(pytest.param((w,), marks=pytest.mark.slow) for w in COMMANDS)]
+)
 def test_harmful_yaml_is_one_sentence(words: tuple[str, ...], name: str, tmp_path: Path) -> None:
     file = tmp_path / "harmful.yaml"
     file.write_text(HARMFUL[name], "utf-8")

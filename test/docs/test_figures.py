@@ -22,6 +22,7 @@ def test_every_number_is_known_and_used() -> None:
     assert set(re.findall(r"\{\{ value (\S+) \}\}", pages)) == set(WRITTEN)
 
 
+@pytest.mark.slow
 def test_the_file_is_what_make_figures_writes() -> None:
     found = figures()
     assert found.keys() == WRITTEN.keys()

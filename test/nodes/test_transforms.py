@@ -92,7 +92,9 @@ def record_states(harness: Harness, bag: Path, robot: str, **plant: Any) -> Bag:
     return read_bag(bag)
 
 
-@pytest.mark.parametrize("robot", ["servicer", "sliding_masses"])
+@pytest.mark.parametrize(
+    "robot", [pytest.param("servicer", marks=pytest.mark.slow), "sliding_masses"]
+)
 def test_a_bag_has_the_frames_of_odom_and_of_pinocchio(
     harness: Harness, tmp_path: Path, robot: str
 ) -> None:

@@ -303,7 +303,7 @@ def broken(loop: Loop) -> None:
     loop.measured.broken = False
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(
     st.booleans(),
     st.booleans(),

@@ -128,8 +128,8 @@ def content(schedule: GaitSchedule) -> dict[str, Any]:
     return values
 
 
-_LONG = "area_loop of six joints"
-_NAMES = [pytest.param(each, marks=pytest.mark.slow if each == _LONG else ()) for each in CASES]
+_LONG = {"area_loop of six joints", "optimal with sliders", "auto"}
+_NAMES = [pytest.param(each, marks=pytest.mark.slow if each in _LONG else ()) for each in CASES]
 
 
 @pytest.mark.parametrize("name", _NAMES)
