@@ -80,8 +80,15 @@ def started(*words: str | bytes, **variables: str) -> subprocess.CompletedProces
     )
 
 
-@pytest.mark.parametrize("domain", ["abc", "999", "-1", "1.5"])
-@pytest.mark.parametrize("words", [("run", "sliding_masses"), ("goal", "0", "0", "0")])
+@pytest.mark.parametrize(
+    ("words", "domain"),
+    [
+        (("run", "sliding_masses"), "abc"),
+        (("goal", "0", "0", "0"), "999"),
+        pytest.param(("run", "sliding_masses"), "-1", marks=pytest.mark.slow),
+        pytest.param(("goal", "0", "0", "0"), "1.5", marks=pytest.mark.slow),
+    ],
+)
 def test_a_domain_that_is_none_is_one_sentence(words: tuple[str, ...], domain: str) -> None:
     ended = started(*words, ROS_DOMAIN_ID=domain)
     assert ended.returncode == 2, ended.stderr

@@ -98,7 +98,7 @@ def wrench() -> Commanded:
     return Commanded("effort", 1)
 
 
-@fuzz("joint command", joint_commands(), fast=60, long=1200)
+@fuzz("joint command", joint_commands(), fast=30, long=1200)
 def test_joint_commands_are_taken_by_name_or_refused(message: JointState) -> None:
     given = joints()
     if given.accepts(bytes(serialize_message(message))):
@@ -107,7 +107,7 @@ def test_joint_commands_are_taken_by_name_or_refused(message: JointState) -> Non
     given.assert_good_passes(GOOD, [0.1, 0.2, -0.3])
 
 
-@fuzz("wrench", wrenches(), fast=60, long=800)
+@fuzz("wrench", wrenches(), fast=30, long=800)
 def test_wrenches_are_taken_in_their_frame_or_refused(message: WrenchStamped) -> None:
     given = wrench()
     taken = given.accepts(bytes(serialize_message(message)))
@@ -123,7 +123,7 @@ def test_wrenches_are_taken_in_their_frame_or_refused(message: WrenchStamped) ->
     "damaged command",
     damaged(bytes(serialize_message(GOOD))),
     st.booleans(),
-    fast=80,
+    fast=40,
     long=1500,
 )
 def test_damaged_joint_commands_mean_what_any_reader_takes_them_for(
@@ -143,7 +143,7 @@ def test_damaged_joint_commands_mean_what_any_reader_takes_them_for(
     "damaged wrench",
     damaged(bytes(serialize_message(GOOD_WRENCH))),
     st.booleans(),
-    fast=60,
+    fast=30,
     long=800,
 )
 def test_damaged_wrenches_mean_what_any_reader_takes_them_for(raw: bytes, learned: bool) -> None:
@@ -156,12 +156,12 @@ def test_damaged_wrenches_mean_what_any_reader_takes_them_for(raw: bytes, learne
     given.assert_good_passes(GOOD_WRENCH, [0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
 
 
-@fuzz("latched joint command", joint_commands(), st.booleans(), fast=80, long=1500)
+@fuzz("latched joint command", joint_commands(), st.booleans(), fast=40, long=1500)
 def test_malformed_joint_commands_latch_a_fault(message: JointState, refuse: bool) -> None:
     assert_latches_if_malformed(message, 0, "refuse" if refuse else "clip")
 
 
-@fuzz("latched wrench", wrenches(), fast=40, long=800)
+@fuzz("latched wrench", wrenches(), fast=20, long=800)
 def test_malformed_wrenches_latch_a_fault(message: WrenchStamped) -> None:
     assert_latches_if_malformed(message, 1, "clip")
 

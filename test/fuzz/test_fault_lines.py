@@ -57,7 +57,7 @@ LINES = st.one_of(
 )
 
 
-@fuzz("fault line", LINES, st.booleans(), fast=100, long=1500)
+@fuzz("fault line", LINES, st.booleans(), fast=50, long=1500)
 def test_a_line_is_refused_or_says_the_same_when_written_again(line: str, wrench: bool) -> None:
     targets = Targets(JOINTS, wrench, ("nozzle_1",) if wrench else ())
     fault = attempt("fault line", parse_fault, line, targets, 3.0)
@@ -68,7 +68,7 @@ def test_a_line_is_refused_or_says_the_same_when_written_again(line: str, wrench
 
 
 @fuzz(
-    "fault timeline", st.lists(LINES, max_size=4), st.lists(NUMBERS, max_size=4), fast=40, long=400
+    "fault timeline", st.lists(LINES, max_size=4), st.lists(NUMBERS, max_size=4), fast=20, long=400
 )
 def test_a_timeline_of_lines(lines: list[str], times: list[float]) -> None:
     timeline = attempt("fault timeline", FaultTimeline, lines, Targets(JOINTS, True))

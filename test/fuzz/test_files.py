@@ -88,7 +88,7 @@ def use(scenario: Scenario | None) -> None:
         attempt("scenario", scenario.config, node)
 
 
-@fuzz("scenario", st.sampled_from(FILES), CHANGES, fast=60, long=800)
+@fuzz("scenario", st.sampled_from(FILES), CHANGES, fast=30, long=800)
 def test_a_changed_scenario(tmp_path: Path, text: str, changes: Any) -> None:
     file = write(tmp_path / "s.yaml", with_changes(yaml.safe_load(text), changes))
     use(attempt("scenario", load_scenario, file))
@@ -97,7 +97,7 @@ def test_a_changed_scenario(tmp_path: Path, text: str, changes: Any) -> None:
 @fuzz(
     "damaged scenario",
     st.sampled_from(FILES).flatmap(lambda text: damaged(text.encode())),
-    fast=40,
+    fast=20,
     long=500,
 )
 def test_a_damaged_scenario(tmp_path: Path, raw: bytes) -> None:
@@ -106,7 +106,7 @@ def test_a_damaged_scenario(tmp_path: Path, raw: bytes) -> None:
     use(attempt("damaged scenario", load_scenario, str(path)))
 
 
-@fuzz("scenario name", TEXTS, fast=30, long=200)
+@fuzz("scenario name", TEXTS, fast=15, long=200)
 def test_a_scenario_of_any_name(name: str) -> None:
     attempt("scenario name", load_scenario, name)
 
@@ -123,7 +123,7 @@ def test_a_scenario_of_any_name(name: str) -> None:
         ),
         st.text(max_size=20).map(lambda text: f"plant.robot={text}"),
     ),
-    fast=80,
+    fast=40,
     long=1000,
 )
 def test_a_setting(text: str) -> None:
@@ -136,7 +136,7 @@ def robot() -> RobotDescription:
     return load_robot(robot_file("servicer"))
 
 
-@fuzz("thruster table", CHANGES, fast=80, long=800)
+@fuzz("thruster table", CHANGES, fast=40, long=800)
 def test_a_changed_table_of_thrusters(tmp_path: Path, changes: Any) -> None:
     file = write(tmp_path / "t.yaml", with_changes(TABLE, changes))
     table = attempt("thruster table", load_thrusters, file, robot())
@@ -146,7 +146,7 @@ def test_a_changed_table_of_thrusters(tmp_path: Path, changes: Any) -> None:
         table.missing()
 
 
-@fuzz("damaged thruster table", damaged(yaml.safe_dump(TABLE).encode()), fast=40, long=400)
+@fuzz("damaged thruster table", damaged(yaml.safe_dump(TABLE).encode()), fast=20, long=400)
 def test_a_damaged_table_of_thrusters(tmp_path: Path, raw: bytes) -> None:
     path = tmp_path / "t.yaml"
     path.write_bytes(raw)

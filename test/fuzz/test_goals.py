@@ -39,7 +39,7 @@ def assert_sound(goal: Goal | None) -> None:
         assert goal.joint_positions is None or np.all(np.isfinite(goal.joint_positions))
 
 
-@fuzz("goal message", VECTORS, QUATERNIONS, TEXTS, fast=60, long=800)
+@fuzz("goal message", VECTORS, QUATERNIONS, TEXTS, fast=30, long=800)
 def test_a_goal_pose_message(position: list[float], orientation: list[float], frame: str) -> None:
     pose = Pose(
         position=Point(**dict(zip("xyz", position, strict=True))),
@@ -50,7 +50,7 @@ def test_a_goal_pose_message(position: list[float], orientation: list[float], fr
     assert_sound(attempt("goal message", goal_of, message, "world"))
 
 
-@fuzz("goal shape", st.lists(TEXTS, max_size=4), st.lists(NUMBERS, max_size=4), fast=60, long=800)
+@fuzz("goal shape", st.lists(TEXTS, max_size=4), st.lists(NUMBERS, max_size=4), fast=30, long=800)
 def test_a_goal_shape_message(names: list[str], positions: list[float]) -> None:
     joints = robot("sliding_masses").joint_names
     message = JointState(name=[*joints, *names], position=positions)
@@ -58,12 +58,12 @@ def test_a_goal_shape_message(names: list[str], positions: list[float]) -> None:
     assert shape is None or (shape.shape == (3,) and np.all(np.isfinite(shape)))
 
 
-@fuzz("goal of a program", VALUES, VALUES, VALUES, fast=60, long=800)
+@fuzz("goal of a program", VALUES, VALUES, VALUES, fast=30, long=800)
 def test_a_goal_of_anything(position: object, quaternion: object, shape: object) -> None:
     assert_sound(attempt("goal of a program", Goal.checked, position, quaternion, shape))
 
 
-@fuzz("goal of a program", VECTORS, st.lists(NUMBERS, max_size=5), fast=60, long=400)
+@fuzz("goal of a program", VECTORS, st.lists(NUMBERS, max_size=5), fast=30, long=400)
 def test_a_goal_of_a_rotation_vector(position: list[float], rotvec: list[float]) -> None:
     assert_sound(attempt("goal of a program", Goal.from_rotvec, position, rotvec))
 

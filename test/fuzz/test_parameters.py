@@ -39,7 +39,7 @@ BASES: dict[str, dict[str, Any]] = {
 """With these alone a node configures."""
 
 
-@fuzz("parameter", st.sampled_from(SPECS), st.one_of(VALUES, ROS_VALUES), fast=200, long=3000)
+@fuzz("parameter", st.sampled_from(SPECS), st.one_of(VALUES, ROS_VALUES), fast=100, long=3000)
 def test_every_parameter_takes_a_value_or_names_itself(spec: Parameter, value: object) -> None:
     taken = attempt("parameter", spec.checked, value)
     if taken is None:

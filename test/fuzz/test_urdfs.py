@@ -60,7 +60,7 @@ MUTANTS = st.builds(
 )
 
 
-@fuzz("URDF", MUTANTS, fast=100, long=1800)
+@fuzz("URDF", MUTANTS, fast=50, long=1800)
 def test_a_changed_urdf(text: str) -> None:
     robot = attempt("URDF", parse_robot, text)
     if robot is None:
@@ -87,7 +87,7 @@ def test_a_model_of_a_changed_urdf(text: str) -> None:
 @fuzz(
     "damaged URDF",
     st.sampled_from(TEXTS).flatmap(lambda text: damaged(text.encode())),
-    fast=60,
+    fast=30,
     long=800,
 )
 def test_a_damaged_urdf(raw: bytes) -> None:

@@ -87,15 +87,19 @@ def sources() -> dict[str, Path]:
 
 
 @cache
+def tree_of(module: str) -> ast.Module:
+    return ast.parse(sources()[module].read_text(encoding="utf-8"))
+
+
+@cache
 def imports(module: str, *, types: bool = True) -> tuple[str, ...]:
     """Return the modules that a module imports anywhere in its text.
 
     ``types``: also those that are imported for type checkers alone.
     """
-    tree = ast.parse(sources()[module].read_text(encoding="utf-8"))
-    if not types:
-        tree.body = [node for node in tree.body if not _for_types(node)]
-    return tuple(each for node in ast.walk(tree) for each in _named(node))
+    body = tree_of(module).body
+    kept = body if types else [node for node in body if not _for_types(node)]
+    return tuple(each for part in kept for node in ast.walk(part) for each in _named(node))
 
 
 def _for_types(node: ast.stmt) -> bool:
@@ -195,10 +199,9 @@ MUTABLE = {
 """Dataclasses that change: records in the making. All others are values."""
 
 
-def dataclasses_of(path: Path) -> Iterator[tuple[str, bool]]:
+def dataclasses_of(module: str) -> Iterator[tuple[str, bool]]:
     """Yield every dataclass of a module, and whether it is frozen."""
-    module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for node in ast.walk(tree_of(module)):
         if not isinstance(node, ast.ClassDef):
             continue
         for decorator in node.decorator_list:
@@ -208,6 +211,6 @@ def dataclasses_of(path: Path) -> Iterator[tuple[str, bool]]:
 
 
 def test_values_are_frozen() -> None:
-    found = dict(each for path in (ROOT / PACKAGE).rglob("*.py") for each in dataclasses_of(path))
+    found = dict(each for module in sources() for each in dataclasses_of(module))
     assert len(found) > 50
     assert {name for name, frozen in found.items() if not frozen} == MUTABLE

@@ -28,6 +28,7 @@ _QUICK = ("hand", "square", "loops")
 
 _LONG = {
     "plant.actuation",
+    "plant.initial_orientation",
     "plant.integration_step",
     "planner.joint_tolerance",
     "planner.method",
