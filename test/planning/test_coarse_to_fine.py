@@ -81,7 +81,7 @@ def test_the_next_solution_is_refined_where_it_may_be_the_better_one(
     boundary = BoundaryConditions(np.zeros(2), goal, np.zeros(2))
     stages = Stages.of(chain, np.eye(3)[2:], False, constraints)
     curvature = chain.function("curvature", compile=False)
-    guess = next(InitialGuesses(stages.turn, curvature, 20).of(boundary, limits, np.zeros(2)))
+    guess = next(InitialGuesses(stages.turn, curvature, 20).generate(boundary, limits, np.zeros(2)))
     path = MultipleShooting(stages, 20).solve(
         boundary, limits, guess, StopRule(300), DurationBounds(0.1, 60.0)
     )

@@ -49,31 +49,31 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 
 _NO_ROTATION = 1e-9
 
-_SAMPLES = 12
+_SAMPLED_SHAPES = 12
 """Shapes in general position at which a robot is tested."""
 
-_NONE = 1e-7
+_SINGULAR_VALUE_TOLERANCE = 1e-7
 """Singular values below this share of the largest count as zero."""
 
-_STILL = 1e-12
+_MIN_BASE_TURN = 1e-12
 """Turn of the base a metre or radian of the joints that is none, rad."""
 
-_TRIES = 8
+_MAX_SHAPE_GUESSES = 8
 """Shapes from which one that puts the base somewhere is looked for."""
 
-_STEPS, _COARSE_INTEGRAL = 1000, 1e-5
+_INTEGRATION_STEPS, _INTEGRATION_ERROR = 1000, 1e-5
 """Steps in which the turn by one joint is integrated, and the error that this may make, rad."""
 
-_BEYOND = 1e-9
+_JOINT_LIMIT_ROUNDING = 1e-9
 """Rounding that a joint may be beyond its limits by, m or rad."""
 
-_NODES = 48
+_QUADRATURE_NODES = 48
 """Nodes of Gauss and Legendre along the way to a shape."""
 
-_LIKELY = 4.0
+_MAX_REPORTED_RANGE_FACTOR = 4.0
 """Times the range of the joints within which a shape beyond it is worth telling."""
 
-_ON_THE_SPOT = 1e-10
+_POSITION_TOLERANCE = 1e-10
 """Distance from where the base is to be that counts as there, m."""
 
 
@@ -173,13 +173,13 @@ class GoalSpecification:
         if shape is None and self.same_shape:
             shape = state.q
         if self.attitude:
-            self._require_turn(robot, turn, tolerance.attitude)
+            self._require_reachable_turn(robot, turn, tolerance.attitude)
             if robot.n == 1 and len(self.turning.axes):
                 _require_within_one_joint(
                     robot, limits, state.q, self.turning.axes[0], turn, tolerance.attitude
                 )
             if shape is not None and len(self.axes) and not self.turning.loops:
-                turn = self._turn_to(robot, turn, state.q, shape, tolerance.attitude)
+                turn = self._turn_on_way_to_shape(robot, turn, state.q, shape, tolerance.attitude)
                 # The only joint is in the shape of the goal where the attitude is that of the goal.
                 shape = shape if robot.n > 1 else None
         R_WB = matrix_from_quaternion(state.quaternion)
@@ -214,7 +214,7 @@ class GoalSpecification:
             return BoundaryConditions(state.q, turn, likely, likely, None, direction)
         return BoundaryConditions(state.q, turn, likely, None, center, direction)
 
-    def _require_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
+    def _require_reachable_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
         """Refuse attitudes that the joints cannot bring about."""
         axes, name = self.turning.axes, robot.description.name
         tilt = swing_angle(turn, axes)
@@ -227,7 +227,7 @@ class GoalSpecification:
                 )
             raise tilted_goal(robot, axes[0], tilt)
 
-    def _turn_to(
+    def _turn_on_way_to_shape(
         self, robot: SpaceRobot, turn: Array, start: Array, shape: Array, tolerance: float
     ) -> Array:
         """Return the turn (4,) on all ways to a shape (n,), where loops turn nothing.
@@ -238,7 +238,7 @@ class GoalSpecification:
             It is not the turn of the goal.
         """
         axis, way = self.turning.axes[0], shape - start
-        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+        nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
         rates = [-axis @ robot.connection(start + (1 + node) / 2 * way)[3:] @ way for node in nodes]
         angle = float(weights @ np.array(rates)) / 2
         wanted = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
@@ -278,13 +278,13 @@ class Turning:
         none = np.zeros((0, 3))
         if robot.n == 0:
             return cls(none, moves=False, loops=False)
-        shapes = sample_shapes(robot, _SAMPLES)
+        shapes = sample_shapes(robot, _SAMPLED_SHAPES)
         A = robot.function("connection", compile=False)(shapes.T).full()[3:]
         U, sizes, _ = np.linalg.svd(A, full_matrices=False)
-        if sizes[0] <= _STILL:
+        if sizes[0] <= _MIN_BASE_TURN:
             return cls(none, moves=False, loops=False)
-        loops = bool(np.abs(curvatures(robot, shapes)).max() > _NONE * sizes[0])
-        if np.sum(sizes > _NONE * sizes[0]) == 1:
+        loops = bool(np.abs(curvatures(robot, shapes)).max() > _SINGULAR_VALUE_TOLERANCE * sizes[0])
+        if np.sum(sizes > _SINGULAR_VALUE_TOLERANCE * sizes[0]) == 1:
             axis = U[:, 0] * np.sign(U[np.argmax(np.abs(U[:, 0])), 0])
             return cls(axis[np.newaxis], moves=True, loops=loops)
         return cls(np.eye(3) if loops else none, moves=True, loops=loops)
@@ -303,8 +303,8 @@ def _require_within_one_joint(
     connection = robot.function("connection", compile=False)
     angles = [0.0]
     for end in ends:
-        step = (end - q[0]) / _STEPS
-        middle = q[0] + step * (np.arange(_STEPS) + 0.5)
+        step = (end - q[0]) / _INTEGRATION_STEPS
+        middle = q[0] + step * (np.arange(_INTEGRATION_STEPS) + 0.5)
         rates = -axis @ connection(middle[np.newaxis]).full()[3:]
         angles.extend(np.cumsum(rates) * step)
     least, most = min(angles), max(angles)
@@ -314,7 +314,7 @@ def _require_within_one_joint(
     turns = np.arange(np.floor(least / whole) - 1, np.ceil(most / whole) + 2)
     nearest = wanted + whole * turns
     beyond = np.maximum(least - nearest, nearest - most)
-    if beyond.min() > max(tolerance, _COARSE_INTEGRAL):
+    if beyond.min() > max(tolerance, _INTEGRATION_ERROR):
         joint = robot.description.movable_joints[0]
         angle = (wanted + np.pi) % whole - np.pi
         raise UnreachableError(
@@ -364,7 +364,7 @@ def shape_for_center(
 
     rng = np.random.default_rng(0)
     best, miss = start, np.inf
-    for attempt in range(_TRIES):
+    for attempt in range(_MAX_SHAPE_GUESSES):
         guess = start if attempt == 0 else middle + half * rng.uniform(-0.9, 0.9, robot.n)
         found = least_squares(
             lambda q: robot.center_of_mass(q) - wanted,
@@ -384,23 +384,23 @@ def shape_for_center(
     found = nearest_for_center(robot, limits, best, wanted)
     if found is not None:
         return found
-    if _distance(robot, best, wanted) <= enough:
+    if _distance_to_center(robot, best, wanted) <= enough:
         return best
-    raise _no_shape(robot, limits, best, wanted)
+    raise _unreachable_center_error(robot, limits, best, wanted)
 
 
 def nearest_for_center(
     robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
 ) -> Array | None:
     """Return the shape (n,) next to ``near`` whose centre of mass is at ``wanted`` (3,) exactly."""
-    q = _free_shape(robot, near, wanted)
-    if np.maximum(limits.lower - q, q - limits.upper).max() > _BEYOND:
-        return near if _distance(robot, near, wanted) <= _ON_THE_SPOT else None
+    q = _shape_without_limits(robot, near, wanted)
+    if np.maximum(limits.lower - q, q - limits.upper).max() > _JOINT_LIMIT_ROUNDING:
+        return near if _distance_to_center(robot, near, wanted) <= _POSITION_TOLERANCE else None
     q = np.clip(q, limits.lower, limits.upper)
-    return q if _distance(robot, q, wanted) <= _ON_THE_SPOT else None
+    return q if _distance_to_center(robot, q, wanted) <= _POSITION_TOLERANCE else None
 
 
-def _free_shape(robot: SpaceRobot, near: Array, wanted: Array) -> Array:
+def _shape_without_limits(robot: SpaceRobot, near: Array, wanted: Array) -> Array:
     """Return a shape by Newton's method, whatever the limits."""
     q = near.copy()
     for _ in range(20):
@@ -411,26 +411,30 @@ def _free_shape(robot: SpaceRobot, near: Array, wanted: Array) -> Array:
     return q
 
 
-def _distance(robot: SpaceRobot, q: Array, wanted: Array) -> float:
+def _distance_to_center(robot: SpaceRobot, q: Array, wanted: Array) -> float:
     return float(np.linalg.norm(robot.center_of_mass(q) - wanted))
 
 
-def _no_shape(
+def _unreachable_center_error(
     robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
 ) -> UnreachableError | NotFoundError:
     """Return the reason why no shape puts the base at ``wanted``; ``near`` (n,) came nearest."""
-    name, distance = robot.description.name, _distance(robot, near, wanted)
+    name, distance = robot.description.name, _distance_to_center(robot, near, wanted)
     gap = CenterReach.of(robot, limits.lower, limits.upper).gap(wanted)
-    if gap <= _ON_THE_SPOT:
+    if gap <= _POSITION_TOLERANCE:
         return NotFoundError(
-            f"No shape of '{name}' that puts the base at the goal position was found from {_TRIES} "
-            f"starts: without thrust the centre of mass stays where it is, and the nearest shape "
-            f"that was found puts the base {distance:.3g} m from it. A nearer position may help, "
+            f"No shape of '{name}' that puts the base at the goal position was found from "
+            f"{_MAX_SHAPE_GUESSES} starts: without thrust the centre of mass stays where it is, "
+            "and the nearest shape that was found puts the base "
+            f"{distance:.3g} m from it. A nearer position may help, "
             "another attitude, or optimal.base_position 2, which ignores the position."
         )
-    free = _free_shape(robot, near, wanted)
+    free = _shape_without_limits(robot, near, wanted)
     # Three sliders have one shape for a centre of mass.
-    if len(sliders_of(robot)) == robot.n == 3 and _distance(robot, free, wanted) <= _ON_THE_SPOT:
+    if (
+        len(sliders_of(robot)) == robot.n == 3
+        and _distance_to_center(robot, free, wanted) <= _POSITION_TOLERANCE
+    ):
         worst = int(np.argmax(np.maximum(limits.lower - free, free - limits.upper)))
         joint = robot.description.movable_joints[worst]
         message = (
@@ -438,7 +442,9 @@ def _no_shape(
             f"{free[worst]:.4g} {joint.unit}, and optimal keeps it in [{limits.lower[worst]:.4g}, "
             f"{limits.upper[worst]:.4g}] {joint.unit}."
         )
-        if np.abs(free).max() < _LIKELY * (1 + np.abs(limits.span(near)[1]).max()):
+        if np.abs(free).max() < _MAX_REPORTED_RANGE_FACTOR * (
+            1 + np.abs(limits.span(near)[1]).max()
+        ):
             return UnreachableError(message, Proof.LIMITS)
     return UnreachableError(
         "The goal position is out of reach: without thrust the centre of mass stays where it is, "
@@ -447,7 +453,7 @@ def _no_shape(
     )
 
 
-_ROOM = 1e-12
+_MIN_SLIDER_RANGE = 1e-12
 """Bounds of a slider differ at least by this, m: the solver wants room between them."""
 
 
@@ -478,11 +484,11 @@ class CenterReach:
         """Return the set of a robot whose joints keep to ``lower`` and ``upper`` (n,)."""
         bodies = robot.description.bodies
         if robot.description.coupled:
-            lower, upper = _of_moving_joints(robot, lower, upper)
+            lower, upper = _moving_joint_ranges(robot, lower, upper)
         base = bodies[0].inertia
         origin, radius = base.mass * base.com, 0.0
         slots = np.zeros((3, len(lower)))
-        places = [_Place(np.zeros(3), np.eye(3), (), 0.0)]
+        places = [_FrameBounds(np.zeros(3), np.eye(3), (), 0.0)]
         for joint, body in enumerate(bodies[1:]):
             place = places[body.parent].next(joint, body, lower[joint], upper[joint])
             places.append(place)
@@ -507,12 +513,12 @@ class CenterReach:
         if self.slots.size:
             from scipy.optimize import lsq_linear  # Slow to import, and few goals need it.
 
-            bounds = self.lower - _ROOM, self.upper + _ROOM
+            bounds = self.lower - _MIN_SLIDER_RANGE, self.upper + _MIN_SLIDER_RANGE
             beside = beside - self.slots @ lsq_linear(self.slots, beside, bounds, method="bvls").x
         return max(0.0, float(np.linalg.norm(beside)) - self.radius)
 
 
-def _of_moving_joints(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Array, Array]:
+def _moving_joint_ranges(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Array, Array]:
     """Return ranges (m,) of all moving joints, each by itself: a larger set than that of (n,)."""
     G, offsets = robot.description.coupling
     leaders = np.argmax(np.abs(G), axis=1)
@@ -522,7 +528,7 @@ def _of_moving_joints(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Ar
 
 
 @dataclass(frozen=True)
-class _Place:
+class _FrameBounds:
     """Bounds on the frame of a body for all shapes.
 
     It is within ``around`` m of ``r`` (3,), displaced by the ``sliders``: pairs of an index and a
@@ -534,15 +540,15 @@ class _Place:
     sliders: tuple[tuple[int, Array], ...]
     around: float
 
-    def next(self, index: int, body: Body, lower: float, upper: float) -> _Place:
+    def next(self, index: int, body: Body, lower: float, upper: float) -> _FrameBounds:
         """Return the place of a body behind this one, which a joint with these limits carries."""
         assert body.joint is not None
         slides = body.joint.kind is JointKind.PRISMATIC
         if self.R is None:
             travel = max(abs(lower), abs(upper)) if slides else 0.0
             around = self.around + float(np.linalg.norm(body.origin.r)) + travel
-            return _Place(self.r, None, self.sliders, around)
+            return _FrameBounds(self.r, None, self.sliders, around)
         r, R = self.r + self.R @ body.origin.r, self.R @ body.origin.R
         if slides:
-            return _Place(r, R, (*self.sliders, (index, R @ body.joint.axis)), self.around)
-        return _Place(r, None, self.sliders, self.around)
+            return _FrameBounds(r, R, (*self.sliders, (index, R @ body.joint.axis)), self.around)
+        return _FrameBounds(r, None, self.sliders, self.around)

@@ -36,27 +36,27 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     Trajectory,
 )
 
-_WAVES = 6
+_WAVES_PER_JOINT = 6
 """Waves of a joint that are added to a path."""
 
-_REACHED = 1e-11
+_ATTITUDE_TOLERANCE = 1e-11
 """Attitude error that counts as zero, rad."""
 
-_MOST_STEPS = 25
-_MOST_STRETCHES = 40
-_LONGEST_STRETCH = 1.25
+_MAX_NEWTON_STEPS = 25
+_MAX_STRETCHES = 40
+_MAX_STRETCH_FACTOR = 1.25
 """A manoeuvre is not made longer than this to keep its limits: another start does better."""
 
-_COARSE = 20
+_MIN_SMOOTH_TICKS = 20
 """Manoeuvres of fewer ticks are polygons."""
 
-_ROUNDING = 0.02
+_TICK_ROUNDING = 0.02
 """Share of a tick by which the solver may have missed a whole number of them."""
 
-_WITHIN = 1e-9
+_LIMIT_ROUNDING = 1e-9
 """Rounding that a limit may be exceeded by, relative."""
 
-_END_ZONE = 0.02
+_FADING_ZONE = 0.02
 """Share of half a joint's range, off its ends, within which waves are smaller."""
 
 
@@ -128,19 +128,21 @@ class CommandHolder:
             final = nearest_for_center(self._robot, limits, final, boundary.center)
         if final is None:
             return None
-        ticks = max(1, math.ceil(trajectory.duration / self._period - _ROUNDING))
-        most = ticks if fixed else max(_COARSE, math.ceil(_LONGEST_STRETCH * ticks) + 4)
+        ticks = max(1, math.ceil(trajectory.duration / self._period - _TICK_ROUNDING))
+        most = (
+            ticks if fixed else max(_MIN_SMOOTH_TICKS, math.ceil(_MAX_STRETCH_FACTOR * ticks) + 4)
+        )
         free = boundary.final is None and boundary.center is None
-        for _ in range(_MOST_STRETCHES):
+        for _ in range(_MAX_STRETCHES):
             factor = math.inf
             for moves_end in (False, True)[: 1 + free]:
                 positions = trajectory.at_ticks(ticks)
-                held = self._adjusted(positions, boundary, final, limits, moves_end=moves_end)
+                held = self._adjust_to_goal(positions, boundary, final, limits, moves_end=moves_end)
                 if held is None:
                     continue
                 needed, overrun = limits.excess(held.positions, self._period, before)
-                if overrun > _WITHIN:
-                    held = self._adjusted(
+                if overrun > _LIMIT_ROUNDING:
+                    held = self._adjust_to_goal(
                         positions, boundary, final, limits, moves_end=moves_end, clipped=True
                     )
                     if held is None:
@@ -148,14 +150,14 @@ class CommandHolder:
                     needed, overrun = limits.excess(held.positions, self._period, before)
                 if self._efforts is not None:
                     needed = max(needed, self._efforts.excess(held.positions, before))
-                if overrun <= _WITHIN:
-                    if needed <= 1 + _WITHIN:
+                if overrun <= _LIMIT_ROUNDING:
+                    if needed <= 1 + _LIMIT_ROUNDING:
                         return held
                     factor = min(factor, needed)
-                if ticks >= _COARSE:
+                if ticks >= _MIN_SMOOTH_TICKS:
                     break
             if factor == math.inf:
-                if ticks >= _COARSE:
+                if ticks >= _MIN_SMOOTH_TICKS:
                     return None
                 # A polygon of more corners may do.
                 factor = 1.0
@@ -164,7 +166,7 @@ class CommandHolder:
                 return None
         return None
 
-    def _adjusted(
+    def _adjust_to_goal(
         self,
         positions: Array,
         boundary: BoundaryConditions,
@@ -184,16 +186,18 @@ class CommandHolder:
         positions = positions + s**3 * (10 - 15 * s + 6 * s**2) * (final - positions[-1])
         positions = np.clip(positions, limits.lower, limits.upper)
         positions[0], positions[-1] = boundary.start, final
-        waves, best = self._waves(positions, limits), math.inf
+        waves, best = self._build_waves(positions, limits), math.inf
         if moves_end:
-            waves = np.hstack([waves, self._ramps(s, limits)])
-        for _ in range(_MOST_STEPS):
+            waves = np.hstack([waves, self._build_ramps(s, limits)])
+        for _ in range(_MAX_NEWTON_STEPS):
             quaternions = self._prediction.attitudes(
                 positions, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
             )
             error = self._axes @ attitude_error(quaternions[-1], boundary.turn)
             miss = float(np.linalg.norm(error))
-            if miss <= _REACHED or (miss <= 1e3 * _REACHED and miss > best / 2):
+            if miss <= _ATTITUDE_TOLERANCE or (
+                miss <= 1e3 * _ATTITUDE_TOLERANCE and miss > best / 2
+            ):
                 return HeldCommands(positions, quaternions, miss)
             if miss > 2 * best:
                 return None
@@ -203,20 +207,20 @@ class CommandHolder:
             positions = positions + np.einsum("kin,i->kn", waves, amplitudes)
             if clipped:
                 positions = np.clip(positions, limits.lower, limits.upper)
-                waves = self._waves(positions, limits)
+                waves = self._build_waves(positions, limits)
                 if moves_end:
-                    waves = np.hstack([waves, self._ramps(s, limits)])
+                    waves = np.hstack([waves, self._build_ramps(s, limits)])
         return None
 
-    def _waves(self, positions: Array, limits: MotionLimits) -> Array:
+    def _build_waves(self, positions: Array, limits: MotionLimits) -> Array:
         """Return waves (N + 1, w, n) of one joint each, in proportion to its speed."""
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
-        order = np.arange(1, _WAVES + 1)
+        order = np.arange(1, _WAVES_PER_JOINT + 1)
         shape = np.sin(math.pi * s) * np.sin(math.pi * s * order) / order
-        speed, half = self._speed(positions[0], limits)
+        speed, half = self._speeds_and_half_ranges(positions[0], limits)
         room = np.minimum(positions - limits.lower, limits.upper - positions)
         with np.errstate(divide="ignore", invalid="ignore"):
-            fading = np.clip(np.nan_to_num(room / (_END_ZONE * half), nan=0.0), 0.0, 1.0)
+            fading = np.clip(np.nan_to_num(room / (_FADING_ZONE * half), nan=0.0), 0.0, 1.0)
         # Smooth where it begins, so that accelerations stay small.
         fading = fading**2 * (3 - 2 * fading)
         joints = np.eye(self._n) * speed
@@ -225,12 +229,12 @@ class CommandHolder:
         )
         return np.asarray(waves.reshape(len(positions), -1, self._n))
 
-    def _ramps(self, s: Array, limits: MotionLimits) -> Array:
+    def _build_ramps(self, s: Array, limits: MotionLimits) -> Array:
         """Return ramps (N + 1, n, n) that move the last shape."""
-        speed, _ = self._speed(np.zeros(self._n), limits)
+        speed, _ = self._speeds_and_half_ranges(np.zeros(self._n), limits)
         return np.asarray((s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self._n) * speed)
 
-    def _speed(self, q: Array, limits: MotionLimits) -> tuple[Array, Array]:
+    def _speeds_and_half_ranges(self, q: Array, limits: MotionLimits) -> tuple[Array, Array]:
         """Return a speed (n,) of every joint, and half of its range round q (n,)."""
         half = limits.span(q)[1]
         return np.where(np.isfinite(limits.velocity), limits.velocity, half), half

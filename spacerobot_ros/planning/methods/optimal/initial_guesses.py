@@ -11,10 +11,8 @@ are near to theirs.
 from __future__ import annotations
 
 import hashlib
-import io
 import itertools
 import math
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,19 +31,24 @@ from spacerobot_ros.model.rotations import (
     quaternions_from_rotvecs,
 )
 from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.planning.methods.optimal.archives import (
+    archive_name,
+    pack_arrays,
+    unpack_arrays,
+)
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
     Trajectory,
 )
 
-_CANDIDATES = 24
+_CANDIDATES_PER_GUESS = 24
 """Loops of one kind from which the one that ends nearest to the goal is taken."""
 
-_WIDEST = 0.85
+_MAX_RANGE_SHARE = 0.85
 """Share of half the joints' ranges that a guess uses at most."""
 
-_COMES_BACK = 4.0
+_BRAKING_TIME_FACTOR = 4.0
 """A joint that moves at the start is back on the way of its guess after this many times the time
 that it takes to brake."""
 
@@ -68,48 +71,50 @@ class InitialGuesses:
         self._turn, self._curvature = turn, curvature
         self._instants = np.linspace(0.0, 1.0, intervals + 1)
 
-    def of(
+    def generate(
         self, boundary: BoundaryConditions, limits: MotionLimits, final: Array
     ) -> Iterator[Trajectory]:
         """Yield guesses that end in the shape ``final`` (n,)."""
         rng = np.random.default_rng(1)
         half = limits.span(boundary.start)[1]
-        (direct,) = self._candidates(self._direct(boundary.start, final)[np.newaxis], limits)
+        (direct,) = self._build_trajectories(
+            self._direct_path(boundary.start, final)[np.newaxis], limits
+        )
         missing = attitude_error(direct.quaternions[-1], boundary.turn)
-        size = min(1.0, self._size(final, half, float(np.linalg.norm(missing))))
+        size = min(1.0, self._loop_size(final, half, float(np.linalg.norm(missing))))
         for number in itertools.count():
             loop = _LOOPS[number % len(_LOOPS)]
             rounds = [
                 size * rng.uniform(0.3, 1.5) * loop(rng, self._instants, len(half))
-                for _ in range(_CANDIDATES)
+                for _ in range(_CANDIDATES_PER_GUESS)
             ]
-            shapes = self._paths(np.array(rounds), boundary.start, final, limits)
-            candidates = self._candidates(shapes, limits)
+            shapes = self._add_loops(np.array(rounds), boundary.start, final, limits)
+            candidates = self._build_trajectories(shapes, limits)
             # The cosine of half the angle that is left.
             near = np.abs([each.quaternions[-1] @ boundary.turn for each in candidates])
             yield candidates[int(near.argmax())]
 
-    def _direct(self, start: Array, final: Array) -> Array:
+    def _direct_path(self, start: Array, final: Array) -> Array:
         s = self._instants
         return start + np.outer(s**3 * (10 - 15 * s + 6 * s**2), final - start)
 
-    def _paths(self, rounds: Array, start: Array, final: Array, limits: MotionLimits) -> Array:
+    def _add_loops(self, rounds: Array, start: Array, final: Array, limits: MotionLimits) -> Array:
         """Return shapes (K, N + 1, n) of loops, in half ranges, on the direct way."""
-        direct = self._direct(start, final)
+        direct = self._direct_path(start, final)
         middle, half = limits.span(start)
         # Within most of the joint limits, or as far out as the direct way is.
-        room = np.maximum(_WIDEST * half, np.abs(direct - middle))
+        room = np.maximum(_MAX_RANGE_SHARE * half, np.abs(direct - middle))
         shapes = np.clip(direct + half * rounds, middle - room, middle + room)
         return np.clip(shapes, limits.lower, limits.upper)
 
-    def _size(self, q: Array, half: Array, angle: float) -> float:
+    def _loop_size(self, q: Array, half: Array, angle: float) -> float:
         """Return the size, in half ranges, of a loop that turns the base by ``angle``."""
         n = len(q)
         K = np.abs(self._curvature(q).full()[3:]).sum(axis=0).reshape(n, n)
         largest = float((K * np.outer(half, half)).max())
         return math.sqrt(angle / (math.pi * largest)) if largest > 0 else 1.0
 
-    def _candidates(self, shapes: Array, limits: MotionLimits) -> list[Trajectory]:
+    def _build_trajectories(self, shapes: Array, limits: MotionLimits) -> list[Trajectory]:
         """Return shapes (K, N + 1, n) as trajectories, as fast as the limits allow."""
         u = np.gradient(shapes, axis=1)
         u[:, 0] = u[:, -1] = 0.0
@@ -118,10 +123,12 @@ class InitialGuesses:
         steps = np.maximum(np.maximum(speed, np.sqrt(change)), 1e-6)
         return [
             Trajectory(float(h), q, step / h, X)
-            for h, q, step, X in zip(steps, shapes, u, self._attitudes(shapes, u), strict=True)
+            for h, q, step, X in zip(
+                steps, shapes, u, self._integrate_attitudes(shapes, u), strict=True
+            )
         ]
 
-    def _attitudes(self, shapes: Array, steps: Array) -> Array:
+    def _integrate_attitudes(self, shapes: Array, steps: Array) -> Array:
         """Return the attitudes (..., N + 1, 4) that shapes and steps (..., N + 1, n) lead to."""
         parts = shapes[..., :-1, :], steps[..., :-1, :], steps[..., 1:, :]
         Omega = self._turn(*(x.reshape(-1, x.shape[-1]).T for x in parts)).full().T
@@ -134,51 +141,59 @@ class InitialGuesses:
             )
         return quaternions
 
-    def refined(self, solution: Trajectory) -> Trajectory:
+    def resample(self, solution: Trajectory) -> Trajectory:
         """Return a solution on another grid."""
         intervals = len(self._instants) - 1
         coarse = np.linspace(0.0, 1.0, len(solution.shapes))
         shapes = solution.at_ticks(intervals)
-        velocities = np.column_stack(
-            [np.interp(self._instants, coarse, column) for column in solution.velocities.T]
-        )
+        velocities = _interpolate(self._instants, coarse, solution.velocities)
         step = solution.duration / intervals
-        return Trajectory(step, shapes, velocities, self._attitudes(shapes, step * velocities))
+        return Trajectory(
+            step, shapes, velocities, self._integrate_attitudes(shapes, step * velocities)
+        )
 
-    def through(self, shapes: Array, limits: MotionLimits) -> Trajectory:
+    def from_shapes(self, shapes: Array, limits: MotionLimits) -> Trajectory:
         """Return a guess through shapes (M, n) at equal intervals, as fast as the limits allow."""
         at = np.linspace(0.0, 1.0, len(shapes))
-        columns = [np.interp(self._instants, at, column) for column in shapes.T]
-        (trajectory,) = self._candidates(np.column_stack(columns)[np.newaxis], limits)
+        path = _interpolate(self._instants, at, shapes)
+        (trajectory,) = self._build_trajectories(path[np.newaxis], limits)
         return trajectory
 
-    def along(self, positions: Array, velocity: Array, period: float) -> Trajectory:
+    def from_ticks(self, positions: Array, velocity: Array, period: float) -> Trajectory:
         """Return shapes (M + 1, n) at ticks that begin with a velocity (n,) and end at rest."""
         ticks = np.linspace(0.0, 1.0, len(positions))
         step = period * (len(positions) - 1) / (len(self._instants) - 1)
         rates = np.gradient(positions, period, axis=0)
         rates[0], rates[-1] = velocity, 0.0
         shapes, velocities = (
-            np.column_stack([np.interp(self._instants, ticks, column) for column in values.T])
-            for values in (positions, rates)
+            _interpolate(self._instants, ticks, values) for values in (positions, rates)
         )
-        return Trajectory(step, shapes, velocities, self._attitudes(shapes, step * velocities))
+        return Trajectory(
+            step, shapes, velocities, self._integrate_attitudes(shapes, step * velocities)
+        )
 
-    def moving(self, guess: Trajectory, velocity: Array, limits: MotionLimits) -> Trajectory:
+    def with_initial_velocity(
+        self, guess: Trajectory, velocity: Array, limits: MotionLimits
+    ) -> Trajectory:
         """Return a guess from rest, changed so that it begins with a velocity (n,)."""
         brakes = float((np.abs(velocity) / limits.acceleration).max(initial=0.0))
-        back = min(guess.duration, _COMES_BACK * brakes)
+        back = min(guess.duration, _BRAKING_TIME_FACTOR * brakes)
         if back == 0:
             return guess
         x = np.clip(self._instants * guess.duration / back, 0.0, 1.0)[:, np.newaxis]
         shapes = guess.shapes + back * x * (1 - x) ** 2 * velocity
         velocities = guess.velocities + (1 - x) * (1 - 3 * x) * velocity
         shapes = np.clip(shapes, limits.lower, limits.upper)
-        quaternions = self._attitudes(shapes, guess.step * velocities)
+        quaternions = self._integrate_attitudes(shapes, guess.step * velocities)
         return Trajectory(guess.step, shapes, velocities, quaternions)
 
 
-def _trigonometric(rng: np.random.Generator, s: Array, n: int) -> Array:
+def _interpolate(instants: Array, known: Array, values: Array) -> Array:
+    """Return values (N, n) at the instants (N,), linear between those (M, n) at ``known`` (M,)."""
+    return np.column_stack([np.interp(instants, known, column) for column in values.T])
+
+
+def _trigonometric_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
     """Random harmonics under an envelope that is zero at both ends."""
     rounds = rng.integers(1, 4)
     path = np.zeros((len(s), n))
@@ -189,7 +204,7 @@ def _trigonometric(rng: np.random.Generator, s: Array, n: int) -> Array:
     return np.asarray(path * np.sin(math.pi * s)[:, np.newaxis] ** 2)
 
 
-def _three_frequencies(rng: np.random.Generator, s: Array, n: int) -> Array:
+def _three_frequency_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
     """A cycle of step 3 of paper 1, among any three joints (two, if there are no three)."""
     phi = 2 * math.pi * s
     b11, b12, b21, a22, a31 = rng.normal(size=5)
@@ -204,7 +219,7 @@ def _three_frequencies(rng: np.random.Generator, s: Array, n: int) -> Array:
     return path
 
 
-def _squares(rng: np.random.Generator, s: Array, n: int) -> Array:
+def _square_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
     """Out to squares in the plane of two joints, round once or twice, and back (paper 3)."""
     path = np.zeros((len(s), n))
     pair = rng.permutation(n)[:2]
@@ -219,13 +234,18 @@ def _squares(rng: np.random.Generator, s: Array, n: int) -> Array:
     return path
 
 
-_LOOPS: tuple[Loop, ...] = (_trigonometric, _three_frequencies, _trigonometric, _squares)
+_LOOPS: tuple[Loop, ...] = (
+    _trigonometric_loop,
+    _three_frequency_loop,
+    _trigonometric_loop,
+    _square_loop,
+)
 
 
-_NEAREST = 2
+_NEAREST_MANOEUVRES = 2
 """Manoeuvres of a library that a search begins with."""
 
-_KNOTS = 41
+_SHAPES_PER_MANOEUVRE = 41
 """Shapes that are kept of a manoeuvre."""
 
 
@@ -248,13 +268,15 @@ class SolutionLibrary:
     shapes: Array
 
     @classmethod
-    def of(cls, key: str, schedules: Sequence[GaitSchedule], turns: Array) -> SolutionLibrary:
+    def from_schedules(
+        cls, key: str, schedules: Sequence[GaitSchedule], turns: Array
+    ) -> SolutionLibrary:
         """Take schedules and the turns (K, 4) that they bring about."""
-        shapes = []
-        for schedule in schedules:
-            ticks, instants = np.linspace(0, 1, schedule.ticks + 1), np.linspace(0, 1, _KNOTS)
-            columns = schedule.positions.T
-            shapes.append(np.column_stack([np.interp(instants, ticks, x) for x in columns]))
+        instants = np.linspace(0, 1, _SHAPES_PER_MANOEUVRE)
+        shapes = [
+            _interpolate(instants, np.linspace(0, 1, schedule.ticks + 1), schedule.positions)
+            for schedule in schedules
+        ]
         return cls(key, turns, np.array(shapes))
 
     @property
@@ -273,7 +295,7 @@ class SolutionLibrary:
         if boundary.final is not None:
             ends = (self.shapes[:, -1] - boundary.final) / half
             distance = distance + np.linalg.norm(ends, axis=1)
-        for index in np.argsort(distance, kind="stable")[:_NEAREST]:
+        for index in np.argsort(distance, kind="stable")[:_NEAREST_MANOEUVRES]:
             shapes = self.shapes[index]
             s = np.linspace(0.0, 1.0, len(shapes))[:, np.newaxis]
             late = s**3 * (10 - 15 * s + 6 * s**2)
@@ -285,10 +307,7 @@ class SolutionLibrary:
 
     def to_bytes(self) -> bytes:
         """Return it as an archive of numpy."""
-        file = io.BytesIO()
-        key = np.array(self.key)
-        np.savez(file, key=key, turns=self.turns, shapes=self.shapes)
-        return file.getvalue()
+        return pack_arrays(key=self.key, turns=self.turns, shapes=self.shapes)
 
     @classmethod
     def from_bytes(cls, content: bytes) -> SolutionLibrary:
@@ -299,19 +318,13 @@ class SolutionLibrary:
         ValueError
             That holds something else.
         """
-        try:
-            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-                found = cls(str(arrays["key"]), arrays["turns"], arrays["shapes"])
-        except (OSError, EOFError, KeyError, MemoryError, ValueError, zipfile.BadZipFile):
-            # The message of numpy recommends to trust the file.
-            raise ValueError("it holds no library") from None
-        turns, shapes = found.turns, found.shapes
+        key, turns, shapes = unpack_arrays(content, "library", "key", "turns", "shapes")
         fits = turns.shape[1:] == (4,) and shapes.ndim == 3 and len(shapes) == len(turns) > 0
         if not fits or shapes.shape[1] < 2 or not turns.dtype == shapes.dtype == np.float64:
             raise ValueError("it holds something else than a library")
         if not (np.all(np.isfinite(turns)) and np.all(np.isfinite(shapes))):
             raise ValueError("it is not finite")
-        return found
+        return cls(str(key), turns, shapes)
 
 
 def library_key(robot: SpaceRobot, limits: MotionLimits, axes: Array, *, position: bool) -> str:
@@ -325,7 +338,7 @@ def library_key(robot: SpaceRobot, limits: MotionLimits, axes: Array, *, positio
 
 def library_file(key: str) -> tuple[Cache, str]:
     """Return the cache of libraries, and the name of one in it."""
-    return Cache(cache_directory() / "libraries"), f"{key[:32]}.npz"
+    return Cache(cache_directory() / "libraries"), archive_name(key)
 
 
 def load_library(path: str, key: str) -> SolutionLibrary | None:

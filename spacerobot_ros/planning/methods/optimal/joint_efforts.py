@@ -33,10 +33,10 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
 
-_ROOM = 0.98
+_PLANNED_EFFORT_SHARE = 0.98
 """Share of the limits that a solution uses: changes of its path take the rest."""
 
-_AT_LIMITS, _WITHIN = 0.9, 0.1
+_AT_LIMITS_FROM, _AT_LIMITS_BEYOND = 0.9, 0.1
 """Shares of the limits at which guesses count as made for them, below and beyond one."""
 
 
@@ -92,7 +92,7 @@ class JointEfforts:
         rates = np.diff(positions, axis=0) / self._period
         before = np.vstack([np.broadcast_to(velocity, (1, rates.shape[1])), rates])
         after = np.vstack([rates, np.zeros((1, rates.shape[1]))])
-        return self._shares(positions, (before + after) / 2, (after - before) / self._period)
+        return self._effort_shares(positions, (before + after) / 2, (after - before) / self._period)
 
     def excess(self, positions: Array, velocity: Array | float = 0.0) -> float:
         """Return the factor by which held commands must be slower; at most 1: they need not be.
@@ -105,8 +105,10 @@ class JointEfforts:
         """Return the largest ratio of efforts on a trajectory to those that solutions may use."""
         q, v = trajectory.shapes, trajectory.velocities
         a = np.diff(v, axis=0) / trajectory.step
-        ends = np.vstack([self._shares(q[:-1], v[:-1], a), self._shares(q[1:], v[1:], a)])
-        return float(np.abs(ends).max()) / _ROOM
+        ends = np.vstack(
+            [self._effort_shares(q[:-1], v[:-1], a), self._effort_shares(q[1:], v[1:], a)]
+        )
+        return float(np.abs(ends).max()) / _PLANNED_EFFORT_SHARE
 
     def slowed(self, trajectory: Trajectory) -> Trajectory:
         """Return the same path, slowed until its efforts keep the limits."""
@@ -120,11 +122,11 @@ class JointEfforts:
         q, qdot, qddot = (ca.SX.sym(name, n) for name in ("q", "qdot", "qddot"))
         limited = np.flatnonzero(np.isfinite(self.limit))
         tau = self._function(q, qdot, qddot)[limited.tolist()]
-        share = tau / (_ROOM * self.limit[limited])
+        share = tau / (_PLANNED_EFFORT_SHARE * self.limit[limited])
         function = ca.Function("efforts", [q, qdot, qddot], [ca.vertcat(1 - share, 1 + share)])
         return PathInequality(function)
 
-    def _shares(self, q: Array, qdot: Array, qddot: Array) -> Array:
+    def _effort_shares(self, q: Array, qdot: Array, qddot: Array) -> Array:
         tau = self._function(q.T, qdot.T, qddot.T).full().T
         return np.asarray(tau / self.limit)
 
@@ -168,7 +170,7 @@ class EffortLimitedShooting(MultipleShooting):
     ) -> Trajectory | None:
         """Solve as :class:`MultipleShooting` does, within the limits of the efforts."""
         # A guess that uses the efforts just up to their limits was made for them.
-        if not _AT_LIMITS <= self._efforts.peak(guess) <= 1 + _WITHIN:
+        if not _AT_LIMITS_FROM <= self._efforts.peak(guess) <= 1 + _AT_LIMITS_BEYOND:
             solution = super().solve(boundary, limits, guess, stop, duration)
             if solution is None or self._efforts.peak(solution) <= 1:
                 return solution

@@ -8,10 +8,8 @@ at guesses with loops (:mod:`.initial_guesses`), made into held commands that en
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
-import zipfile
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -36,6 +34,11 @@ from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
+from spacerobot_ros.planning.methods.optimal.archives import (
+    archive_name,
+    pack_arrays,
+    unpack_arrays,
+)
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
 from spacerobot_ros.planning.methods.optimal.initial_guesses import (
@@ -59,24 +62,24 @@ from spacerobot_ros.planning.methods.optimal.search import (
 )
 from spacerobot_ros.version import __version__
 
-_CORRECTION_INTERVALS = 40
+_MAX_CORRECTION_INTERVALS = 40
 
-_STARTS_IN_MOTION = 12
+_MAX_STARTS_IN_MOTION = 12
 """Guesses that are tried for a manoeuvre from moving joints: the robot flies on meanwhile."""
 
-_NOTHING_LEFT = 1e-10
+_ZERO_ERROR = 1e-10
 """Errors up to this are zero: the robot is at the goal; rad, m and joint coordinates."""
 
-_EQUAL = 1e-7
+_MAX_CACHED_END_ERROR = 1e-7
 """Largest error at the ends of a cached manoeuvre, rad, m and joint coordinates."""
 
-_NEAR_LIMIT = 0.95
+_ACTIVE_LIMIT_SHARE = 0.95
 """Share of a limit beyond which a manoeuvre counts as limited by it."""
 
-_LONGER, _MORE_TICKS = 1.25, 20
+_LONGEST_FACTOR, _LONGEST_ADDITIONAL_TICKS = 1.25, 20
 """Longest duration of held commands: a factor of optimal.longest, and additional ticks."""
 
-_ROUNDING = 1e-8
+_LIMIT_ROUNDING = 1e-8
 """Largest excess of a cached manoeuvre over a limit, relative or in joint coordinates."""
 
 
@@ -134,7 +137,7 @@ class OptimalGait(GaitMethod):
                 turns.append(quaternion_multiply(begins, request.goal.quaternion))
         if not schedules:
             return None
-        return SolutionLibrary.of(self._library_key, schedules, np.array(turns))
+        return SolutionLibrary.from_schedules(self._library_key, schedules, np.array(turns))
 
     def store_library(self, library: SolutionLibrary) -> Path | None:
         """Put a library where plans find it; return where, None if that is not possible."""
@@ -173,7 +176,7 @@ class OptimalGait(GaitMethod):
         if request.motion is not None:
             return self._plan_in_motion(request, request.motion, boundary, limits, cancellation)
         if self._is_reached(state, goal):
-            return self._schedule(state, goal, q[np.newaxis], {"starts": 0.0})
+            return self._build_schedule(state, goal, q[np.newaxis], {"starts": 0.0})
         attitude = state.quaternion[np.newaxis]
         try:
             self._constraints.check(q[np.newaxis], attitude, self.control_period)
@@ -181,14 +184,14 @@ class OptimalGait(GaitMethod):
             raise PlanningError(f"The start violates a path constraint: {reason}.") from None
         key = None
         if self._cache is not None and not correction:
-            key = self._key(request)
-            if kept := self._loaded(self._cache, key, request, boundary, limits):
+            key = self._request_key(request)
+            if kept := self._load_cached_plan(self._cache, key, request, boundary, limits):
                 return kept
         found = self._search.search(
             boundary,
             limits,
             state.quaternion,
-            self._intervals(correction),
+            self._count_intervals(correction),
             replace(self.options, duration=0.0, answers=1) if correction else self.options,
             cancellation,
             library=None if correction else self._library,
@@ -204,11 +207,11 @@ class OptimalGait(GaitMethod):
                 f"The search used up optimal.time_budget, {self.options.time_budget:g} s, after "
                 f"{found.starts} start(s); a longer one may find a faster manoeuvre."
             )
-        schedule = self._schedule(state, goal, found.held.positions, notes)
+        schedule = self._build_schedule(state, goal, found.held.positions, notes)
         # The result of a busy machine is not to be flown on a quiet one.
         if self._cache is not None and key is not None and not found.cut_short:
             kept_plan = _CachedPlan(schedule.positions, notes)
-            self._cache.store(_file(key), key, kept_plan.to_bytes())
+            self._cache.store(archive_name(key), key, kept_plan.to_bytes())
         return schedule
 
     def _plan_in_motion(
@@ -220,7 +223,7 @@ class OptimalGait(GaitMethod):
         cancellation: Cancellation,
     ) -> GaitSchedule:
         """Plan from moving joints; the rest of the motion so far is the first guess."""
-        too_fast = np.abs(motion.velocity) > limits.velocity * (1 + _ROUNDING)
+        too_fast = np.abs(motion.velocity) > limits.velocity * (1 + _LIMIT_ROUNDING)
         if too_fast.any():
             names = ", ".join(np.array(self.robot.joint_names)[too_fast])
             raise PlanningError(f"Joints move faster than optimal may: {names}.")
@@ -232,33 +235,33 @@ class OptimalGait(GaitMethod):
         budget = replace(
             chosen,
             duration=duration,
-            starts=1 if again else min(chosen.starts, _STARTS_IN_MOTION),
+            starts=1 if again else min(chosen.starts, _MAX_STARTS_IN_MOTION),
             answers=1 if again else chosen.answers,
         )
         found = self._motion_search.search(
             boundary,
             limits,
             request.state.quaternion,
-            self._intervals(False),
+            self._count_intervals(False),
             budget,
             motion,
             cancellation,
         )
         notes: Notes = {"starts": float(found.starts), "durations": list(found.solutions)}
-        return self._schedule(
+        return self._build_schedule(
             request.state, request.goal, found.held.positions, notes, motion.velocity
         )
 
-    def _intervals(self, correction: bool) -> int:
+    def _count_intervals(self, correction: bool) -> int:
         intervals = self.options.intervals
-        return min(intervals, _CORRECTION_INTERVALS) if correction else intervals
+        return min(intervals, _MAX_CORRECTION_INTERVALS) if correction else intervals
 
     def _is_reached(self, state: RobotState, goal: Goal) -> bool:
         error = PoseError.between(state.position, state.quaternion, goal, state.q)
-        nothing = Tolerance(_NOTHING_LEFT, _NOTHING_LEFT, _NOTHING_LEFT)
+        nothing = Tolerance(_ZERO_ERROR, _ZERO_ERROR, _ZERO_ERROR)
         return nothing.admits(error, self.controls)
 
-    def _schedule(
+    def _build_schedule(
         self,
         state: RobotState,
         goal: Goal,
@@ -274,11 +277,11 @@ class OptimalGait(GaitMethod):
             "final_position": path.position[-1].tolist(),
             "predicted_attitude_error": left.angle,
             "predicted_position_error": left.distance,
-            "limited_by": self._limited_by(positions, velocity),
+            "limited_by": self._list_active_limits(positions, velocity),
         }
         return self._schedule_of(goal, positions, path, notes)
 
-    def _limited_by(self, positions: Array, velocity: Array | float) -> str:
+    def _list_active_limits(self, positions: Array, velocity: Array | float) -> str:
         """Return the limits that held commands come near to, with their joints."""
         if len(positions) < 2:
             return "nothing"
@@ -288,13 +291,13 @@ class OptimalGait(GaitMethod):
             shares["effort"] = np.abs(self._efforts.shares(positions, velocity))
         names = np.array(self.robot.joint_names)
         active = {
-            limit: names[share.max(axis=0) > _NEAR_LIMIT].tolist()
+            limit: names[share.max(axis=0) > _ACTIVE_LIMIT_SHARE].tolist()
             for limit, share in shares.items()
         }
         parts = (f"{limit} of {' '.join(joints)}" for limit, joints in active.items() if joints)
         return ", ".join(parts) or "nothing"
 
-    def _key(self, request: PlanRequest) -> str:
+    def _request_key(self, request: PlanRequest) -> str:
         state, goal, tolerance = request.state, request.goal, request.tolerance
         shape = goal.joint_positions
         numbers = {
@@ -312,7 +315,7 @@ class OptimalGait(GaitMethod):
             numbers["library"] = np.frombuffer(digest, np.uint8).astype(float)
         return plan_key(self.robot, numbers, values_of(self.options))
 
-    def _loaded(
+    def _load_cached_plan(
         self,
         cache: Cache,
         key: str,
@@ -321,19 +324,19 @@ class OptimalGait(GaitMethod):
         limits: MotionLimits,
     ) -> GaitSchedule | None:
         """Return the cached plan of a key, if it still reaches its goal within the limits."""
-        kept = cache.load(_file(key), key)
+        kept = cache.load(archive_name(key), key)
         if kept is None:
             return None
         try:
             plan = _CachedPlan.from_bytes(kept[1])
-            self._require_manoeuvre(plan.positions, request, boundary, limits)
+            self._require_valid_manoeuvre(plan.positions, request, boundary, limits)
         except (ValueError, CandidateError) as reason:
-            cache.discard(_file(key), str(reason))
+            cache.discard(archive_name(key), str(reason))
             return None
         notes: Notes = {**plan.notes, "from_cache": 1.0}
-        return self._schedule(request.state, request.goal, plan.positions, notes)
+        return self._build_schedule(request.state, request.goal, plan.positions, notes)
 
-    def _require_manoeuvre(
+    def _require_valid_manoeuvre(
         self,
         positions: Array,
         request: PlanRequest,
@@ -355,31 +358,30 @@ class OptimalGait(GaitMethod):
         wanted, duration = self.options.duration, (len(positions) - 1) * period
         if wanted > 0 and abs(duration - wanted) > period:
             raise CandidateError(f"it takes {duration:g} s, not {wanted:g} s")
-        if duration > _LONGER * self.options.longest + _MORE_TICKS * period:
+        if duration > _LONGEST_FACTOR * self.options.longest + _LONGEST_ADDITIONAL_TICKS * period:
             raise CandidateError(f"it takes {duration:g} s")
         first, last = positions[0], positions[-1]
-        if np.abs(first - boundary.start).max() > _EQUAL:
+        if np.abs(first - boundary.start).max() > _MAX_CACHED_END_ERROR:
             raise CandidateError("it begins in another shape")
-        if boundary.final is not None and np.abs(last - boundary.final).max() > _EQUAL:
+        if (
+            boundary.final is not None
+            and np.abs(last - boundary.final).max() > _MAX_CACHED_END_ERROR
+        ):
             raise CandidateError("it ends in another shape")
         if boundary.center is not None:
             beside = robot.center_of_mass(last) - boundary.center
-            if np.linalg.norm(beside) > _EQUAL:
+            if np.linalg.norm(beside) > _MAX_CACHED_END_ERROR:
                 raise CandidateError("it ends in another position")
         factor, overrun = limits.excess(positions, period)
         if self._efforts is not None:
             factor = max(factor, self._efforts.excess(positions))
-        if factor > 1 + _ROUNDING or overrun > _ROUNDING:
+        if factor > 1 + _LIMIT_ROUNDING or overrun > _LIMIT_ROUNDING:
             raise CandidateError("it exceeds a limit of the joints")
         attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
         error = attitude_error(attitudes[-1], request.goal.quaternion)
-        if np.linalg.norm(self._specification.axes @ error) > _EQUAL:
+        if np.linalg.norm(self._specification.axes @ error) > _MAX_CACHED_END_ERROR:
             raise CandidateError("it ends in another attitude")
         self._constraints.check(positions, attitudes, period)
-
-
-def _file(key: str) -> str:
-    return f"{key[:32]}.npz"
 
 
 @dataclass(frozen=True)
@@ -391,10 +393,7 @@ class _CachedPlan:
 
     def to_bytes(self) -> bytes:
         """Return it as an archive of numpy."""
-        file = io.BytesIO()
-        noted = np.array(json.dumps(self.notes))
-        np.savez(file, positions=self.positions, notes=noted)
-        return file.getvalue()
+        return pack_arrays(positions=self.positions, notes=json.dumps(self.notes))
 
     @classmethod
     def from_bytes(cls, content: bytes) -> _CachedPlan:
@@ -405,19 +404,16 @@ class _CachedPlan:
         ValueError
             That holds something else.
         """
-        try:
-            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-                positions, notes = arrays["positions"], json.loads(str(arrays["notes"]))
-        except (OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile) as error:
-            raise ValueError(f"it holds no plan ({error})") from None
+        positions, text = unpack_arrays(content, "plan", "positions", "notes")
+        notes = json.loads(str(text))
         if positions.dtype != np.float64 or not isinstance(notes, dict):
             raise ValueError("it holds something else than a plan")
-        if not all(_is_note(value) for value in notes.values()):
+        if not all(_is_numeric_note(value) for value in notes.values()):
             raise ValueError("its notes are not numbers")
         return cls(positions, notes)
 
 
-def _is_note(value: object) -> bool:
+def _is_numeric_note(value: object) -> bool:
     values = value if isinstance(value, list) else [value]
     return all(isinstance(each, float) and math.isfinite(each) for each in values)
 

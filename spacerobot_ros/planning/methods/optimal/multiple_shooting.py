@@ -19,13 +19,13 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 from spacerobot_ros.planning.methods.optimal.transcription import Layout, Stages, program
 
-_FEASIBLE = 1e-4
+_FEASIBILITY_TOLERANCE = 1e-4
 """Violation of the constraints below which an iterate counts as a trajectory, SI units."""
 
 TOLERANCE = 1e-5
 """Durations within a thousandth of a control period, for manoeuvres of some seconds."""
 
-_OPTIONS = {
+_IPOPT_OPTIONS = {
     "print_time": False,
     # Compiled functions have no derivatives beyond those that they are.
     "no_nlp_grad": True,
@@ -98,17 +98,19 @@ class MultipleShooting:
         self._program = program(stages, intervals)
         # The solver's matrices are small: threads of its linear algebra would wait for each other.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        self._watch = _Watch(self._program.problem, self._program.lower, self._program.upper)
+        self._monitor = _SolverMonitor(
+            self._program.problem, self._program.lower, self._program.upper
+        )
         self._solver = ca.nlpsol(
             "manoeuvre",
             "ipopt",
             self._program.problem,
             {
-                **_OPTIONS,
+                **_IPOPT_OPTIONS,
                 "ipopt.tol": tolerance,
                 "jac_g": self._program.jac_g,
                 "hess_lag": self._program.hess_lag,
-                "iteration_callback": self._watch,
+                "iteration_callback": self._monitor,
             },
         )
 
@@ -145,39 +147,43 @@ class MultipleShooting:
         accelerations = np.multiply.outer([-1.0, 1.0], np.tile(limits.acceleration, (N, 1)))
         steps = duration.shortest / N, duration.longest / N
         least, most = (
-            _packed(layout, steps[i], attitudes[i], vertices[i], velocities[i], accelerations[i])
+            _pack_knots(
+                layout, steps[i], attitudes[i], vertices[i], velocities[i], accelerations[i]
+            )
             for i in (0, 1)
         )
-        self._watch.begin(stop)
+        self._monitor.begin(stop)
         result = self._solver(
-            x0=self._start(guess),
+            x0=self._initial_variables(guess),
             lbx=least,
             ubx=most,
             lbg=self._program.lower,
             ubg=self._program.upper,
-            p=_parameters(boundary, limits, guess if duration.fixed else None),
+            p=_pack_parameters(boundary, limits, guess if duration.fixed else None),
         )
         stats = self._solver.stats()
         self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
         x = result["x"].full().ravel()
         if not self.converged:
-            if self._watch.best is None:
+            if self._monitor.best is None:
                 return None
-            x = self._watch.best
-        return self._trajectory(x)
+            x = self._monitor.best
+        return self._unpack_trajectory(x)
 
-    def _start(self, guess: Trajectory) -> Array:
+    def _initial_variables(self, guess: Trajectory) -> Array:
         """Return the variables of a guess."""
         h, v = guess.step, guess.velocities
         a = np.diff(v, axis=0) / h
-        return _packed(self._program.layout, h, guess.quaternions, guess.shapes + h * v / 2, v, a)
+        return _pack_knots(
+            self._program.layout, h, guess.quaternions, guess.shapes + h * v / 2, v, a
+        )
 
-    def _trajectory(self, x: Array) -> Trajectory:
+    def _unpack_trajectory(self, x: Array) -> Trajectory:
         h, (X, s, v, _) = float(x[0]), (x[each] for each in self._program.layout.knots())
         return Trajectory(h, s - h * v / 2, v, X)
 
 
-def _parameters(
+def _pack_parameters(
     boundary: BoundaryConditions, limits: MotionLimits, gentle: Trajectory | None
 ) -> Array:
     typical = np.where(np.isfinite(limits.velocity), limits.velocity, limits.acceleration)
@@ -192,7 +198,7 @@ def _parameters(
     )
 
 
-def _packed(layout: Layout, step: float, *knots: Array) -> Array:
+def _pack_knots(layout: Layout, step: float, *knots: Array) -> Array:
     """Return the variables of a step and of X, s, v and a at their knots."""
     x = np.empty(layout.size)
     x[0] = step
@@ -201,7 +207,7 @@ def _packed(layout: Layout, step: float, *knots: Array) -> Array:
     return x
 
 
-class _Watch(ca.Callback):
+class _SolverMonitor(ca.Callback):
     """Receives every iterate: keeps the best feasible one, and stops the solver."""
 
     def __init__(self, problem: dict[str, ca.MX], lower: Array, upper: Array) -> None:
@@ -239,7 +245,7 @@ class _Watch(ca.Callback):
         x, f, g = (np.frombuffer(each) for each in arguments[:3])
         if f[0] < self._least:
             worst = max((self._lower - g).max(), (g - self._upper).max())
-            if worst <= _FEASIBLE:
+            if worst <= _FEASIBILITY_TOLERANCE:
                 self.best, self._least = x.copy(), float(f[0])
         self._iterates += 1
         stops = (

@@ -142,16 +142,16 @@ class OptimalOptions:
     cache: int = parameter(1, "1: manoeuvres are kept on disk", minimum=0, maximum=1)
 
 
-_FREE_SPAN = np.pi
+_UNLIMITED_HALF_RANGE = np.pi
 """Half of the range that a guess uses of a joint without limits, rad or m."""
 
-_SHARPNESS = 8
+_SMOOTH_BODY_EXPONENT = 8
 """Exponent of the smooth bodies that stand for boxes of shapes."""
 
-_FREE = 1e6
+_UNBOUNDED_FROM = 1e6
 """Bounds of a box beyond this, m or rad, are none where a joint has no limits."""
 
-_ROOM = 0.02
+_CONSTRAINT_RESERVE = 0.02
 """Distance of a solution from its path constraints, relative: they are imposed at steps alone."""
 
 
@@ -248,10 +248,10 @@ class MotionLimits:
 
     def span(self, q: Array) -> tuple[Array, Array]:
         """Return middle and half width (n,) of the range, finite round ``q`` (n,)."""
-        lower = np.maximum(self.lower, q - 2 * _FREE_SPAN)
-        upper = np.minimum(self.upper, q + 2 * _FREE_SPAN)
+        lower = np.maximum(self.lower, q - 2 * _UNLIMITED_HALF_RANGE)
+        upper = np.minimum(self.upper, q + 2 * _UNLIMITED_HALF_RANGE)
         middle = np.where(np.isfinite(self.lower) & np.isfinite(self.upper), (lower + upper) / 2, q)
-        return middle, np.minimum((upper - lower) / 2, _FREE_SPAN)
+        return middle, np.minimum((upper - lower) / 2, _UNLIMITED_HALF_RANGE)
 
     def excess(
         self, positions: Array, period: float, velocity: Array | float = 0.0
@@ -322,7 +322,7 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
-class _Body:
+class _SmoothBody:
     """A smooth body of shapes round a box, through its corners.
 
     ``middle`` and ``half`` are the box's, of the ``joints`` that it bounds.
@@ -333,11 +333,12 @@ class _Body:
     half: Array
 
     @classmethod
-    def of(cls, robot: SpaceRobot, lower: Array, upper: Array) -> _Body:
+    def of(cls, robot: SpaceRobot, lower: Array, upper: Array) -> _SmoothBody:
         bounded = [
             i
             for i in range(robot.n)
-            if lower[i] > max(robot.lower[i], -_FREE) or upper[i] < min(robot.upper[i], _FREE)
+            if lower[i] > max(robot.lower[i], -_UNBOUNDED_FROM)
+            or upper[i] < min(robot.upper[i], _UNBOUNDED_FROM)
         ]
         if not bounded:
             raise ParameterError("A box of optimal.keep_out holds all shapes of the robot.")
@@ -345,7 +346,7 @@ class _Body:
         width = robot.upper - robot.lower
         lower = np.maximum(lower, robot.lower - width)[bounded]
         upper = np.minimum(upper, robot.upper + width)[bounded]
-        return cls(bounded, (upper + lower) / 2, (upper - lower) / 2 * (1 + _ROOM))
+        return cls(bounded, (upper + lower) / 2, (upper - lower) / 2 * (1 + _CONSTRAINT_RESERVE))
 
 
 @dataclass(frozen=True)
@@ -370,7 +371,7 @@ class PathConstraints:
     direction_W: Array | None = None
     cone: float = 0.0
     boxes: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
-    bodies: tuple[_Body, ...] = ()
+    bodies: tuple[_SmoothBody, ...] = ()
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> PathConstraints:
@@ -381,8 +382,8 @@ class PathConstraints:
         ParameterError
             A list has the wrong length, a direction is zero, or a box is empty.
         """
-        axis = _direction("axis", options.keep_axis)
-        direction = _direction("direction", options.keep_direction)
+        axis = _unit_direction("axis", options.keep_axis)
+        direction = _unit_direction("direction", options.keep_direction)
         if len({axis is None, direction is None, options.keep_angle == 0}) > 1:
             raise ParameterError(
                 "A direction that is kept away takes all of optimal.keep_axis, "
@@ -399,7 +400,7 @@ class PathConstraints:
             raise ParameterError(
                 "optimal.keep_out has a box whose lower bound is not below its upper."
             )
-        bodies = tuple(_Body.of(robot, *box) for box in corners)
+        bodies = tuple(_SmoothBody.of(robot, *box) for box in corners)
         return cls(options.max_base_rate, axis, direction, options.keep_angle, corners, bodies)
 
     @property
@@ -415,11 +416,11 @@ class PathConstraints:
         rows = [ca.SX(0, 1)]
         for body in self.bodies:
             x = (q[body.joints] - body.middle) / body.half
-            rows.append(ca.log(ca.sum1(x**_SHARPNESS) / len(body.joints) + 1e-3))
+            rows.append(ca.log(ca.sum1(x**_SMOOTH_BODY_EXPONENT) / len(body.joints) + 1e-3))
         if self.axis_B is not None:
             R_WB = symbolic_rotations.matrix_from_quaternion(quaternion)
             seen = ca.dot(R_WB @ ca.DM(self.axis_B), direction)
-            rows.append(np.cos(min(self.cone * (1 + _ROOM), np.pi)) - seen)
+            rows.append(np.cos(min(self.cone * (1 + _CONSTRAINT_RESERVE), np.pi)) - seen)
         return ca.vertcat(*rows)
 
     def check(self, positions: Array, quaternions: Array, period: float) -> None:
@@ -445,24 +446,24 @@ class PathConstraints:
             if angle < self.cone - 1e-9:
                 raise CandidateError(f"the axis comes within {angle:.4g} rad of keep_direction")
         if self.base_rate > 0:
-            rate = _fastest_turn(quaternions, period)
+            rate = _largest_base_rate(quaternions, period)
             if rate > self.base_rate * (1 + 1e-6):
                 raise CandidateError(f"the base turns at {rate:.4g} rad/s")
 
     @property
     def imposed_base_rate(self) -> float:
         """The bound on the base rate that a solution is held to at its steps, rad/s."""
-        return self.base_rate * (1 - _ROOM)
+        return self.base_rate * (1 - _CONSTRAINT_RESERVE)
 
     def slowed(self, guess: Trajectory) -> Trajectory:
         """Return a guess that turns the base no faster than it may."""
         if self.base_rate == 0:
             return guess
-        fastest = _fastest_turn(guess.quaternions, guess.step)
+        fastest = _largest_base_rate(guess.quaternions, guess.step)
         return guess.retimed(max(1.0, fastest / self.imposed_base_rate))
 
 
-def _direction(name: str, values: Sequence[float]) -> Array | None:
+def _unit_direction(name: str, values: Sequence[float]) -> Array | None:
     if not values:
         return None
     vector = np.asarray(values, dtype=float)
@@ -474,7 +475,7 @@ def _direction(name: str, values: Sequence[float]) -> Array | None:
     return np.asarray(vector / length)
 
 
-def _fastest_turn(quaternions: Array, period: float) -> float:
+def _largest_base_rate(quaternions: Array, period: float) -> float:
     """Return the largest mean rate (rad/s) between attitudes (N + 1, 4) that are so far apart."""
     # |a - b| is twice the sine of a quarter of the angle.
     apart = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)

@@ -52,78 +52,78 @@ from spacerobot_ros.planning.methods.optimal.transcription import PathInequality
 
 _LOG = logging.getLogger(__name__)
 
-_NOTHING = "the solver found no path within the limits"
-_NOT_HELD = "held commands could not be brought to the goal within the limits"
+_NO_PATH_FOUND = "the solver found no path within the limits"
+_NO_HELD_COMMANDS = "held commands could not be brought to the goal within the limits"
 
-_FEWEST_TICKS = 2
+_MIN_TICKS = 2
 """A manoeuvre has at least as many: one begins to move, another one stops."""
 
 _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
 """A gentle manoeuvre has as many ticks or takes as long, s, whichever is less: it corrects a
 small error, and haste would leave a larger one."""
 
-_LAST_CALL = 5.0
+_BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
 """Factor of the time budget after which a search without any solution ends."""
 
-_UNHURRIED = 4.0
+_GENTLE_DURATION_FACTOR = 4.0
 """A gentle manoeuvre is the path of least effort in this many times the time of its guess, then as
 fast as the limits allow."""
 
-_COARSER = 5
+_COARSE_GRID_RATIO = 5
 """Ratio of the intervals of the full grid to those of the coarse grid."""
 
 _COARSE_TOLERANCE = 1e-4
 """Tolerance of the solver on the coarse grid, whose own error is larger."""
 
-_FEWEST_INTERVALS = 8
+_MIN_COARSE_INTERVALS = 8
 """Fewest intervals of a coarse grid; with fewer there is none."""
 
-_REFINED = 2
+_MAX_REFINED_SOLUTIONS = 2
 """Largest number of coarse solutions that are refined."""
 
-_FAR_BEHIND = 1.1
+_MAX_REFINED_COST_RATIO = 1.1
 """Largest ratio of the cost of a coarse solution to the best one at which it is refined, too: the
 coarse grid underestimates some costs by more than others."""
 
-_SAME = 1e-3
+_SAME_COST_TOLERANCE = 1e-3
 """Relative difference of costs below which two solutions count as the same."""
 
-_AGREEING = 3e-3
+_AGREEING_COST_TOLERANCE = 3e-3
 """Solutions whose costs are this near, relative, agree: the coarse grid and the tolerance of the
 solver leave as much between them."""
 
-_AGREEING_WITH_LIBRARY = 2
+_AGREEING_SOLUTIONS_WITH_LIBRARY = 2
 """Solutions that are the best one and enough, where a library has the first guesses."""
 
-_FULL_STARTS = 3
+_MAX_FULL_GRID_STARTS = 3
 """Guesses that are tried on the full grid where nothing came of the coarse one."""
 
-_ROOM_IN_GIVEN_TIME = 0.99
+_LIMIT_SHARE_IN_GIVEN_TIME = 0.99
 """Share of velocities and accelerations that is planned with where the time cannot stretch."""
 
 
-_ROOMS = (0.98, 1.0)
+_ACCELERATION_SHARES_IN_MOTION = (0.98, 1.0)
 """In motion: shares of accelerations that are planned with, one after the other: changes of a path
 take the rest, but a joint near its limit may need all to come to rest in time."""
 
-_SLOWER = 0.02
+_VELOCITY_RESERVE_IN_MOTION = 0.02
 """In motion: share of velocities that is left for the same reason, at most: a joint at full speed
 is slowed down to the rest in a quarter of a control period."""
 
-_COARSER_IN_MOTION, _FEWEST_INTERVALS_IN_MOTION = 4, 10
-"""As ``_COARSER``, ``_FEWEST_INTERVALS``, in motion."""
+_COARSE_GRID_RATIO_IN_MOTION, _MIN_COARSE_INTERVALS_IN_MOTION = 4, 10
+"""As ``_COARSE_GRID_RATIO``, ``_MIN_COARSE_INTERVALS``, in motion."""
 
-_REFINED_IN_MOTION = 3
+_MAX_REFINED_SOLUTIONS_IN_MOTION = 3
 """In motion: largest number of solutions that are made into commands, fastest first, until one
 keeps all limits."""
 
-_AGREED_IN_MOTION = 3
+_AGREEING_SOLUTIONS_IN_MOTION = 3
 """In motion: solutions of the same duration that end the search."""
 
-_FEWEST_TICKS_IN_MOTION = 4
+_MIN_TICKS_IN_MOTION = 4
 """Control periods that a manoeuvre in motion takes at least."""
 
-_MORE_TICKS = (0, 1, 3, 7)
+_ADDITIONAL_TICKS = (0, 1, 3, 7)
 """Control periods by which it is made longer where its commands exceed a limit."""
 
 
@@ -186,7 +186,8 @@ class _Progress:
         deadline = last_call = math.inf
         if self.options.time_budget > 0:
             deadline, last_call = (
-                self._began + x * self.options.time_budget for x in (1.0, _LAST_CALL)
+                self._began + x * self.options.time_budget
+                for x in (1.0, _BUDGET_FACTOR_WITHOUT_SOLUTION)
             )
         last = deadline if found else last_call
         return StopRule(self.options.iterations, self.cancellation, deadline, last)
@@ -212,8 +213,8 @@ class _Progress:
         agreeing = self.options.agreeing
         if self.library is not None:
             # Solutions for goals nearby have agreed before.
-            agreeing = min(agreeing, _AGREEING_WITH_LIBRARY)
-        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING)))
+            agreeing = min(agreeing, _AGREEING_SOLUTIONS_WITH_LIBRARY)
+        same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING_COST_TOLERANCE)))
         return 0 < agreeing <= same
 
     def cost(self, trajectory: Trajectory) -> float:
@@ -270,23 +271,25 @@ class ManoeuvreSearch:
         PlanningCancelled
             The search was cancelled.
         """
-        if options.longest < _FEWEST_TICKS * self._period:
+        if options.longest < _MIN_TICKS * self._period:
             raise PlanningError(
-                f"Manoeuvres take at least {_FEWEST_TICKS} control periods of {self._period:g} s, "
+                f"Manoeuvres take at least {_MIN_TICKS} control periods of {self._period:g} s, "
                 f"more than optimal.longest = {options.longest:g} s."
             )
         progress = _Progress(boundary, limits, quaternion, options, cancellation, library, gentle)
         full = self.solver(intervals, boundary.center is not None)
-        coarser = intervals // _COARSER
+        coarser = intervals // _COARSE_GRID_RATIO
         found: list[Manoeuvre] = []
         # A single answer is had at less cost without a detour.
-        if options.answers > 1 and coarser >= _FEWEST_INTERVALS:
+        if options.answers > 1 and coarser >= _MIN_COARSE_INTERVALS:
             coarse = self.solver(coarser, boundary.center is not None, _COARSE_TOLERANCE)
-            found = self._manoeuvres(progress, coarse, full, options.starts)
+            found = self._search_from_guesses(progress, coarse, full, options.starts)
             if not found and not progress.cut_short(found=False):
-                found = self._manoeuvres(progress, full, full, min(options.starts, _FULL_STARTS))
+                found = self._search_from_guesses(
+                    progress, full, full, min(options.starts, _MAX_FULL_GRID_STARTS)
+                )
         else:
-            found = self._manoeuvres(progress, full, full, options.starts)
+            found = self._search_from_guesses(progress, full, full, options.starts)
         cut_short = progress.cut_short(found=bool(found))
         if not found:
             within = f" within optimal.time_budget {options.time_budget:g} s" if cut_short else ""
@@ -301,29 +304,31 @@ class ManoeuvreSearch:
         durations = [one.duration for one in found]
         return replace(best, starts=progress.starts, solutions=durations, cut_short=cut_short)
 
-    def _manoeuvres(
+    def _search_from_guesses(
         self, progress: _Progress, grid: MultipleShooting, full: MultipleShooting, starts: int
     ) -> list[Manoeuvre]:
         """Return manoeuvres from at most ``starts`` guesses on a grid; none where none is found."""
-        guesses = self._guesses(full, grid.intervals)
+        guesses = _build_guesses(self._robot, grid)
         boundary, limits = progress.boundary, progress.limits
-        of_boundary = guesses.of(boundary, limits, boundary.likely)
+        of_boundary = guesses.generate(boundary, limits, boundary.likely)
         if progress.library is not None:
             near = progress.library.nearest(boundary, limits)
-            of_boundary = itertools.chain((guesses.through(x, limits) for x in near), of_boundary)
+            of_boundary = itertools.chain(
+                (guesses.from_shapes(x, limits) for x in near), of_boundary
+            )
         solutions: list[Trajectory] = []
         enough = progress.options.answers
         for number, guess in enumerate(itertools.islice(of_boundary, starts), 1):
             stop = progress.stop_rule(found=bool(solutions))
-            solution = self._solution(progress, grid, guess, stop)
+            solution = self._solve_from_guess(progress, grid, guess, stop)
             progress.cancellation.raise_if_requested()
             progress.starts += 1
-            result = _NOTHING if solution is None else f"{solution.duration:.6g} s"
+            result = _NO_PATH_FOUND if solution is None else f"{solution.duration:.6g} s"
             if solution is not None:
                 progress.shortest = min(progress.shortest, solution.duration)
             progress.report(f"start {progress.starts}", result, grid.iterations)
             if solution is None:
-                progress.rejection = _NOTHING
+                progress.rejection = _NO_PATH_FOUND
             else:
                 solutions.append(solution)
             # A search that is cut short within its last start is cut short, too.
@@ -331,14 +336,14 @@ class ManoeuvreSearch:
             going_on = len(solutions) < enough and not progress.agreed(solutions)
             if going_on and number < starts and not cut_short:
                 continue
-            found = self._refined(progress, solutions, grid, full)
+            found = self._refine_solutions(progress, solutions, grid, full)
             if found or cut_short:
                 return found
             # These are none; the next ones count one by one.
             solutions, enough = [], 1
         return []
 
-    def _refined(
+    def _refine_solutions(
         self,
         progress: _Progress,
         solutions: list[Trajectory],
@@ -355,21 +360,23 @@ class ManoeuvreSearch:
         agreed = progress.agreed(solutions)
         for solution in sorted(solutions, key=progress.cost):
             cost = progress.cost(solution)
-            if found and (len(found) == _REFINED or cost > _FAR_BEHIND * costs[0]):
+            if found and (
+                len(found) == _MAX_REFINED_SOLUTIONS or cost > _MAX_REFINED_COST_RATIO * costs[0]
+            ):
                 break
             least = min((one.solution_time for one in found), default=math.inf)
-            if agreed and solution.duration > (1 - _SAME) * least:
+            if agreed and solution.duration > (1 - _SAME_COST_TOLERANCE) * least:
                 break
-            if any(abs(cost - other) <= _SAME * other for other in costs):
+            if any(abs(cost - other) <= _SAME_COST_TOLERANCE * other for other in costs):
                 continue
             try:
                 refined: Trajectory | None = solution
                 if grid is not full:
-                    guess = self._guesses(full, full.intervals).refined(solution)
+                    guess = _build_guesses(self._robot, full).resample(solution)
                     stop = progress.stop_rule(found=bool(found))
-                    refined = self._solution(progress, full, guess, stop)
+                    refined = self._solve_from_guess(progress, full, guess, stop)
                     progress.cancellation.raise_if_requested()
-                manoeuvre = self._commanded(progress, refined)
+                manoeuvre = self._make_held_commands(progress, refined)
                 found.append(manoeuvre)
                 costs.append(cost)
                 result = f"{manoeuvre.duration:.6g} s"
@@ -378,16 +385,13 @@ class ManoeuvreSearch:
             progress.report("manoeuvre", result, full.iterations)
         return found
 
-    def _guesses(self, solver: MultipleShooting, intervals: int) -> InitialGuesses:
-        return _initial_guesses(self._robot, solver, intervals)
-
     def solver(
         self, intervals: int, position: bool, tolerance: float = TOLERANCE
     ) -> MultipleShooting:
         """Return the solver with a number of intervals, with or without a position."""
         key = intervals, position, tolerance
         if key not in self._solvers:
-            of = partial(self._stages_of, position)
+            of = partial(self._get_stages, position)
             self._solvers[key] = (
                 MultipleShooting(of(), intervals, tolerance)
                 if self._efforts is None
@@ -395,7 +399,7 @@ class ManoeuvreSearch:
             )
         return self._solvers[key]
 
-    def _stages_of(self, position: bool, inequalities: Sequence[PathInequality] = ()) -> Stages:
+    def _get_stages(self, position: bool, inequalities: Sequence[PathInequality] = ()) -> Stages:
         key = position, bool(inequalities)
         if key not in self._stages:
             self._stages[key] = Stages.of(
@@ -408,7 +412,7 @@ class ManoeuvreSearch:
             )
         return self._stages[key]
 
-    def _solution(
+    def _solve_from_guess(
         self,
         progress: _Progress,
         solver: MultipleShooting,
@@ -417,38 +421,38 @@ class ManoeuvreSearch:
     ) -> Trajectory | None:
         """Return the solution from a guess, None if there is none."""
         boundary, limits, options = progress.boundary, progress.limits, progress.options
-        shortest = _FEWEST_TICKS * self._period
+        shortest = _MIN_TICKS * self._period
         if progress.gentle:
             shortest = max(shortest, min(_GENTLE_TICKS * self._period, _GENTLE_TIME))
         guess = self._constraints.slowed(guess)
         if options.duration > 0:
             limits = replace(
                 limits,
-                velocity=_ROOM_IN_GIVEN_TIME * limits.velocity,
-                acceleration=_ROOM_IN_GIVEN_TIME * limits.acceleration,
+                velocity=_LIMIT_SHARE_IN_GIVEN_TIME * limits.velocity,
+                acceleration=_LIMIT_SHARE_IN_GIVEN_TIME * limits.acceleration,
             )
             T = max(round(options.duration / self._period), 1) * self._period
         elif progress.gentle:
-            guess = self._slowed(guess)
-            T = max(_UNHURRIED * guess.duration, shortest)
+            guess = self._slow_to_effort_limits(guess)
+            T = max(_GENTLE_DURATION_FACTOR * guess.duration, shortest)
         else:
             duration = DurationBounds(shortest, options.longest)
             solution = solver.solve(boundary, limits, guess, stop, duration)
             if solution is None or solver.converged or self._constraints.base_rate > 0:
                 return solution
             # A solution that has not converged has time to spare.
-            return self._slowed(solution.at_full_speed(limits, shortest))
+            return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest))
         guess = guess.retimed(T / guess.duration)
         solution = solver.solve(boundary, limits, guess, stop, DurationBounds(T, T))
         if solution is None or not progress.gentle:
             return solution
-        return self._slowed(solution.at_full_speed(limits, shortest))
+        return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest))
 
-    def _slowed(self, trajectory: Trajectory) -> Trajectory:
+    def _slow_to_effort_limits(self, trajectory: Trajectory) -> Trajectory:
         """Return the same path, slow enough for the efforts of the joints."""
         return trajectory if self._efforts is None else self._efforts.slowed(trajectory)
 
-    def _commanded(self, progress: _Progress, trajectory: Trajectory | None) -> Manoeuvre:
+    def _make_held_commands(self, progress: _Progress, trajectory: Trajectory | None) -> Manoeuvre:
         """Return a solution as held commands.
 
         Raises
@@ -457,11 +461,11 @@ class ManoeuvreSearch:
             There is no solution, or none that commands reach within the constraints.
         """
         if trajectory is None:
-            raise CandidateError(_NOTHING)
+            raise CandidateError(_NO_PATH_FOUND)
         fixed = progress.options.duration > 0
         held = self._holder.hold(trajectory, progress.boundary, progress.limits, fixed=fixed)
         if held is None:
-            raise CandidateError(_NOT_HELD)
+            raise CandidateError(_NO_HELD_COMMANDS)
         attitudes = quaternion_multiply(progress.quaternion, held.quaternions)
         self._constraints.check(held.positions, attitudes, self._period)
         duration = (len(held.positions) - 1) * self._period
@@ -508,30 +512,36 @@ class MotionSearch:
         PlanningCancelled
             The search was cancelled.
         """
-        boundary = replace(boundary, velocity=self._velocity(motion, limits))
+        boundary = replace(boundary, velocity=self._initial_velocity(motion, limits))
         full = self._solver(intervals, boundary.center is not None)
         coarse = full
-        if intervals >= _COARSER_IN_MOTION * _FEWEST_INTERVALS_IN_MOTION:
-            coarse = self._solver(intervals // _COARSER_IN_MOTION, boundary.center is not None)
+        if intervals >= _COARSE_GRID_RATIO_IN_MOTION * _MIN_COARSE_INTERVALS_IN_MOTION:
+            coarse = self._solver(
+                intervals // _COARSE_GRID_RATIO_IN_MOTION, boundary.center is not None
+            )
         stop = StopRule(options.iterations, cancellation)
         candidates: list[Trajectory] = []
-        starts, rejection = 0, _NOTHING
+        starts, rejection = 0, _NO_PATH_FOUND
         guesses = self._guesses(boundary, limits, coarse, motion.remaining)
         for guess in itertools.islice(guesses, options.starts):
             starts += 1
             if options.duration > 0:
                 candidates.append(guess)
             else:
-                solution = self._fastest(coarse, boundary, limits, guess, stop, options)
+                solution = self._find_fastest(coarse, boundary, limits, guess, stop, options)
                 candidates += [] if solution is None else [solution]
             cancellation.raise_if_requested()
-            if len(candidates) >= options.answers or _agreed(candidates):
+            if len(candidates) >= options.answers or _durations_agree(candidates):
                 break
         # The rest of a motion is short: the coarse grid is fine enough for it.
         fine = coarse if options.answers == 1 else full
-        for candidate in sorted(candidates, key=lambda each: each.duration)[:_REFINED_IN_MOTION]:
+        for candidate in sorted(candidates, key=lambda each: each.duration)[
+            :_MAX_REFINED_SOLUTIONS_IN_MOTION
+        ]:
             try:
-                held = self._commanded(fine, boundary, limits, candidate, motion, options, stop)
+                held = self._make_held_commands(
+                    fine, boundary, limits, candidate, motion, options, stop
+                )
                 attitudes = quaternion_multiply(quaternion, held.quaternions)
                 self._constraints.check(held.positions, attitudes, self._period)
             except CandidateError as reason:
@@ -547,21 +557,23 @@ class MotionSearch:
             f"{rejection}."
         )
 
-    def _speed(self, limits: MotionLimits) -> Array:
+    def _planned_speed_limit(self, limits: MotionLimits) -> Array:
         """Return the velocities (n,) that are planned with at most."""
-        given_up = np.minimum(_SLOWER * limits.velocity, limits.acceleration * self._period / 4)
+        given_up = np.minimum(
+            _VELOCITY_RESERVE_IN_MOTION * limits.velocity, limits.acceleration * self._period / 4
+        )
         return np.where(np.isfinite(limits.velocity), limits.velocity - given_up, limits.velocity)
 
-    def _velocity(self, motion: InitialMotion, limits: MotionLimits) -> Array:
+    def _initial_velocity(self, motion: InitialMotion, limits: MotionLimits) -> Array:
         """Return the velocities (n,) at the start: between those that are held before and after."""
         between = motion.velocity
         if len(motion.remaining) > 1:
             after = (motion.remaining[1] - motion.remaining[0]) / self._period
             between = (motion.velocity + after) / 2
-        speed = self._speed(limits)
+        speed = self._planned_speed_limit(limits)
         return np.clip(between, -speed, speed)
 
-    def _fastest(
+    def _find_fastest(
         self,
         solver: MultipleShooting,
         boundary: BoundaryConditions,
@@ -571,20 +583,20 @@ class MotionSearch:
         options: OptimalOptions,
     ) -> Trajectory | None:
         """Return the fastest trajectory near a guess, None if there is none."""
-        shortest = min(_FEWEST_TICKS_IN_MOTION * self._period, options.longest)
+        shortest = min(_MIN_TICKS_IN_MOTION * self._period, options.longest)
         duration = DurationBounds(shortest, options.longest)
-        for room in _ROOMS:
-            narrowed = self._narrowed(limits, room)
+        for room in _ACCELERATION_SHARES_IN_MOTION:
+            narrowed = self._narrow_limits(limits, room)
             solution = solver.solve(boundary, narrowed, guess, stop, duration)
             if solution is not None or stop.cancellation.requested:
                 return solution
         return None
 
-    def _narrowed(self, limits: MotionLimits, room: float) -> MotionLimits:
-        velocity = self._speed(limits)
+    def _narrow_limits(self, limits: MotionLimits, room: float) -> MotionLimits:
+        velocity = self._planned_speed_limit(limits)
         return replace(limits, velocity=velocity, acceleration=room * limits.acceleration)
 
-    def _commanded(
+    def _make_held_commands(
         self,
         solver: MultipleShooting,
         boundary: BoundaryConditions,
@@ -601,19 +613,21 @@ class MotionSearch:
         CandidateError
             There are none that reach the goal within the limits.
         """
-        guesses = _initial_guesses(self._robot, solver, solver.intervals)
-        guess, duration = guesses.refined(candidate), options.duration
-        most = 1 if duration > 0 else len(_MORE_TICKS)
+        guesses = _build_guesses(self._robot, solver)
+        guess, duration = guesses.resample(candidate), options.duration
+        most = 1 if duration > 0 else len(_ADDITIONAL_TICKS)
         if duration == 0:
-            finer = self._fastest(solver, boundary, limits, guess, stop, options)
+            finer = self._find_fastest(solver, boundary, limits, guess, stop, options)
             guess = guess if finer is None else finer
             duration = guess.duration
         ticks = max(1, math.ceil(duration / self._period - 1e-6))
-        for more, room in itertools.product(_MORE_TICKS[:most], _ROOMS):
+        for more, room in itertools.product(
+            _ADDITIONAL_TICKS[:most], _ACCELERATION_SHARES_IN_MOTION
+        ):
             T = (ticks + more) * self._period
             solution = solver.solve(
                 boundary,
-                self._narrowed(limits, room),
+                self._narrow_limits(limits, room),
                 replace(guess, step=T / solver.intervals),
                 stop,
                 DurationBounds(T, T),
@@ -627,7 +641,7 @@ class MotionSearch:
                 )
             if held is not None:
                 return held
-        raise CandidateError(_NOT_HELD)
+        raise CandidateError(_NO_HELD_COMMANDS)
 
     def _guesses(
         self,
@@ -638,20 +652,22 @@ class MotionSearch:
     ) -> Iterator[Trajectory]:
         """Yield the rest of the motion so far, then guesses with loops, from its velocity."""
         velocity = np.broadcast_to(boundary.velocity, boundary.start.shape)
-        guesses = _initial_guesses(self._robot, solver, solver.intervals)
+        guesses = _build_guesses(self._robot, solver)
         if len(remaining) > 1:
-            yield guesses.along(remaining, velocity, self._period)
-        for guess in guesses.of(boundary, limits, boundary.likely):
-            yield guesses.moving(guess, velocity, limits)
+            yield guesses.from_ticks(remaining, velocity, self._period)
+        for guess in guesses.generate(boundary, limits, boundary.likely):
+            yield guesses.with_initial_velocity(guess, velocity, limits)
 
 
-def _initial_guesses(robot: SpaceRobot, solver: MultipleShooting, intervals: int) -> InitialGuesses:
-    return InitialGuesses(solver.turn, robot.function("curvature", compile=False), intervals)
+def _build_guesses(robot: SpaceRobot, solver: MultipleShooting) -> InitialGuesses:
+    curvature = robot.function("curvature", compile=False)
+    return InitialGuesses(solver.turn, curvature, solver.intervals)
 
 
-def _agreed(found: list[Trajectory]) -> bool:
+def _durations_agree(found: list[Trajectory]) -> bool:
     """Whether the fastest trajectory was found often enough."""
     durations = np.array([each.duration for each in found])
     return (
-        int(np.sum(durations <= durations.min(initial=math.inf) * (1 + _SAME))) >= _AGREED_IN_MOTION
+        int(np.sum(durations <= durations.min(initial=math.inf) * (1 + _SAME_COST_TOLERANCE)))
+        >= _AGREEING_SOLUTIONS_IN_MOTION
     )
