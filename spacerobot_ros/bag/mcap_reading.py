@@ -190,15 +190,15 @@ def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int, int]]:
         position = end
 
 
-def read_record(file: BinaryIO, place: int, wanted: Opcode) -> bytes:
+def read_record(file: BinaryIO, place: int, expected: Opcode) -> bytes:
     """Return the body of the record of a kind that begins at a byte of a file."""
     end = file_size(file)
     if place + RECORD_HEADER.size > end:
         raise ValueError(f"its index names byte {place}, and it has {end} bytes")
     file.seek(place)
     opcode, length = _read_record_header(file, place, end)
-    if opcode != wanted:
-        raise ValueError(f"there is no {wanted.name.lower()} at byte {place}")
+    if opcode != expected:
+        raise ValueError(f"there is no {expected.name.lower()} at byte {place}")
     return file.read(length)
 
 
@@ -396,11 +396,11 @@ def _check_chunks(summary: Summary, end: int) -> None:
 
 
 def indexed_records(
-    file: BinaryIO, indexes: Sequence[AttachmentIndex | MetadataIndex], wanted: Opcode
+    file: BinaryIO, indexes: Sequence[AttachmentIndex | MetadataIndex], opcode: Opcode
 ) -> Iterator[tuple[int, bytes]]:
     """Iterate over the records that an index of a summary names, each once: its place and body."""
     for place in dict.fromkeys(index.offset for index in indexes):
-        yield place, read_record(file, place, wanted)
+        yield place, read_record(file, place, opcode)
 
 
 # -- messages ---------------------------------------------------------------------------------
@@ -442,20 +442,13 @@ def messages_in_time_order(
     Parameters
     ----------
     path
-        The MCAP file.
+        The MCAP file; errors are those of :func:`open_bag`.
     channel_ids
-        The channels wanted.
-    start_ns
-        Earliest log time wanted, in nanoseconds.
-    end_ns
-        Latest log time wanted, in nanoseconds.
+        The channels to read.
+    start_ns, end_ns
+        Earliest and latest log time to read, in nanoseconds.
     summary
-        Of the bag, where that was read before.
-
-    Raises
-    ------
-    RecordingError
-        There is no such bag, it is not MCAP, was cut short or is damaged.
+        Summary of the bag, where that was read before.
     """
     # The largest time that the columns of this package hold: the year 2262.
     start_ns, end_ns = min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS)
@@ -478,8 +471,8 @@ def messages_in_time_order(
 def _overlapping_chunks(
     summary: Summary, channel_ids: set[int], start_ns: int, end_ns: int
 ) -> Iterator[list[ChunkIndex]]:
-    """Group the chunks with something wanted in them: those of a group overlap in time."""
-    wanted = [
+    """Group the chunks that hold these messages: those of a group overlap in time."""
+    selected = [
         index
         for index in summary.chunk_indexes
         if not channel_ids.isdisjoint(index.message_index_offsets)
@@ -488,7 +481,7 @@ def _overlapping_chunks(
     ]
     cluster: list[ChunkIndex] = []
     latest = farthest = 0
-    for index in sorted(wanted, key=lambda i: (i.message_start_time, i.chunk_start_offset)):
+    for index in sorted(selected, key=lambda i: (i.message_start_time, i.chunk_start_offset)):
         start = index.message_start_time, index.chunk_start_offset
         # Of equal times the messages of chunks that were written before come first.
         if cluster and start >= (latest, farthest):

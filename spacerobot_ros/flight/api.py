@@ -132,10 +132,11 @@ def plan(
             goal, position, rotvec = _changed_goal(start, goal, position, rotvec), None, None
             if (shape := options.pop("joint_positions", None)) is not None:
                 goal = Goal.checked(goal.position, goal.quaternion, shape)
-        position = None if position is None else _float_list(position, "position")
-        rotvec = None if rotvec is None else _float_list(rotvec, "rotvec")
-        given = {"position": position, "rotvec": rotvec}
-        chosen = {name: value for name, value in given.items() if value is not None}
+        chosen = {
+            name: _float_list(value, name)
+            for name, value in (("position", position), ("rotvec", rotvec))
+            if value is not None
+        }
         if method is None:
             # The options of a method that is not named are those of `optimal`.
             of_method = options.keys() - signature(planning.plan).parameters.keys()

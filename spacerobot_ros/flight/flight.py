@@ -457,7 +457,7 @@ def _turns_end_effector(status: Status | None) -> bool:
     )
 
 
-def goal_of(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
+def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
     """Return the goal of a status, as it was sent; None where the status names none."""
     for sent in reversed(goals):
         if status.goal_id and status.goal_id == sent.goal_id:
@@ -480,7 +480,7 @@ def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal |
     """Return the goal that was flown to last, or else the one that was sent last."""
     for status in reversed(list(statuses)):
         if status.state.value in _FLOWN_STATES:
-            goal = goal_of(status, goals)
+            goal = reported_goal(status, goals)
             if goal is not None:
                 return goal
     return goals[-1].goal if goals else None

@@ -237,16 +237,11 @@ def _plant_config(recorded: RecordedRobot) -> PlantConfig:
             "the plant's parameters."
         )
     try:
-        values = {name: json.loads(text) for name, text in texts.items()}
-    except (ValueError, RecursionError) as error:
+        config = configured(PlantConfig, {name: json.loads(text) for name, text in texts.items()})
+    except (ValueError, RecursionError, ParameterError) as error:
+        reason = str(error).removesuffix(".")
         raise RecordingError(
-            f"The plant's parameters in the bag {bag.path} cannot be read: {error}."
-        ) from error
-    try:
-        config = configured(PlantConfig, values)
-    except ParameterError as error:
-        raise RecordingError(
-            f"The plant's parameters in the bag {bag.path} cannot be used: {error}"
+            f"The plant's parameters in the bag {bag.path} cannot be used: {reason}."
         ) from error
     if config.time_mode != "lockstep":
         raise RecordingError(

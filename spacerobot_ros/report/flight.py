@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.control.status import CommandReport, ControllerStatus
-from spacerobot_ros.flight.flight import Flight, SentGoal, Signal, goal_of, pose_error
+from spacerobot_ros.flight.flight import Flight, SentGoal, Signal, pose_error, reported_goal
 from spacerobot_ros.flight.reading import (
     WRENCH_COLUMNS,
     FlightBag,
@@ -316,7 +316,7 @@ class FlightReport:
         found = [
             (status.time, goal)
             for status in self.executing
-            if status.report is not None and (goal := goal_of(status.report, sent))
+            if status.report is not None and (goal := reported_goal(status.report, sent))
         ]
         return self._each_until_the_next(found or self._sent(sent))
 

@@ -203,7 +203,7 @@ def test_a_flight_under_efforts_that_begins_in_mid_flight_has_its_joint_rates(
     [
         ({"time_mode": '"realtime"'}, "in real time"),
         ({"actuation": '"magic"'}, "'magic'"),
-        ({"tick_rate": "not a number"}, "cannot be read"),
+        ({"tick_rate": "not a number"}, "cannot be used: Expecting value"),
         ({"initial_position": '"here"'}, "cannot be used"),
         ({"tick_rate": "30.01"}, "between the ticks"),
     ],
