@@ -222,7 +222,7 @@ class RecorderNode(FlightNode):
 
     @property
     def messages_recorded(self) -> int:
-        """How many messages were written."""
+        """Number of messages written."""
         return self.recording.messages if self.recording is not None else 0
 
     @property
@@ -438,13 +438,11 @@ class _RecordedTransforms:
 
     def _on_odom(self, raw: bytes) -> None:
         self._odom = raw
-        if raw[HEADER_STAMP] == self._joint_states[HEADER_STAMP]:
-            self._take_state(first_time_ns(raw))
+        self._write_whole_state()
 
     def _on_joint_states(self, raw: bytes) -> None:
         self._joint_states = raw
-        if raw[HEADER_STAMP] == self._odom[HEADER_STAMP]:
-            self._take_state(first_time_ns(raw))
+        self._write_whole_state()
 
     def _on_description(self, raw: bytes) -> None:
         try:
@@ -454,9 +452,11 @@ class _RecordedTransforms:
         self._description, self._frames = description, None
         self._state = StateFrames(description)
 
-    def _take_state(self, time_ns: int) -> None:
+    def _write_whole_state(self) -> None:
         """Write the transforms if the period is over, or time has gone back."""
-        state = self._state
+        if self._odom[HEADER_STAMP] != self._joint_states[HEADER_STAMP]:
+            return
+        state, time_ns = self._state, first_time_ns(self._odom)
         if self._last_ns <= time_ns < self._next_ns or state is None:
             return
         if not self._recording.running or self._is_published():
@@ -558,7 +558,7 @@ def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:
 
 
 def _recorded_qos(offered: QoSProfile) -> QosProfile:
-    """Return a publisher's quality of service as a bag says it."""
+    """Return a publisher's quality of service in the words of a bag."""
     return QosProfile(
         history=offered.history.name.lower(),
         depth=offered.depth,

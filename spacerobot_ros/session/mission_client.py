@@ -53,7 +53,7 @@ class MissionClient:
     on_end
         Called, within the callback, when the goal is decided or no longer followed.
     name, namespace, context
-        Of the node.
+        Name, namespace and rclpy context of the node.
     """
 
     def __init__(

@@ -29,7 +29,6 @@ from spacerobot_ros.nodes.common.streams import Connections
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import COMMANDERS, Kill, Scenario
-from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.stack import Stack, namespace_words
 from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.times import SECOND, stamp_to_ns
@@ -108,14 +107,7 @@ class MultiProcessStack(Stack):
             names = robot.joint_names if robot is not None else ()
             if robot is not None:
                 scenario.require_shape_of(robot)
-        self.client = MissionClient(
-            scenario.commanders[0],
-            scenario.config(scenario.commanders[0]).world_frame,
-            lambda: self._time_ns,
-            joint_names=None if names is None else lambda: names,
-            end_effector=scenario.end_effector_goal is not None,
-            namespace=self.namespace,
-        )
+        self._make_client(None if names is None else lambda: names)
         node = self.client.node
         node.create_subscription(Clock, f"{self.namespace}/clock", self._on_clock, 10)
         self._change_state = {

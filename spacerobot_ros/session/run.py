@@ -234,7 +234,7 @@ def keep_up(
 def send_goal(
     goal: Goal, show: Callable[[str], None], *, namespace: str, timeout: float
 ) -> Outcome:
-    """Send one goal pose, show what becomes of it, and return how it ended.
+    """Send one goal pose, show its statuses, and return its outcome.
 
     ``timeout`` is wall time in s, 0: for ever. A commander is looked for no longer than that, and
     for ten seconds at most.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import rclpy
 from rclpy.clock import Clock, ClockType
@@ -68,7 +68,7 @@ class Stack(ABC):
     Parameters
     ----------
     scenario
-        What to run.
+        The scenario to run.
     bag
         File to record into; None records nothing.
     namespace
@@ -102,6 +102,20 @@ class Stack(ABC):
         """The nodes, in the order of their start."""
         for name in self.names:
             scenario.config(name)  # Refused here, before anything runs.
+
+    def _make_client(self, joint_names: Callable[[], Sequence[str]] | None, **options: Any) -> None:
+        """Make the client of the mission; ``options`` are those of :class:`MissionClient`."""
+        # The planner decides; a controller alone decides for itself.
+        decider = self.scenario.commanders[0]
+        self.client = MissionClient(
+            decider,
+            self.scenario.config(decider).world_frame,
+            lambda: self.time_ns,
+            joint_names=joint_names,
+            end_effector=self.scenario.end_effector_goal is not None,
+            namespace=self.namespace,
+            **options,
+        )
 
     @property
     @abstractmethod
@@ -218,16 +232,10 @@ class InProcessStack(Stack):
                 # Their warnings are in their status, which is shown anyway.
                 node.get_logger().set_level(LoggingSeverity.ERROR)
             shaped = scenario.goal.joint_positions is not None
-            self.client = MissionClient(
-                # The planner decides; a controller alone decides for itself.
-                scenario.commanders[0],
-                scenario.config(scenario.commanders[0]).world_frame,
-                lambda: self.plant.time_ns,
-                joint_names=(lambda: self.plant.plant.robot.joint_names) if shaped else None,
-                end_effector=scenario.end_effector_goal is not None,
+            self._make_client(
+                (lambda: self.plant.plant.robot.joint_names) if shaped else None,
                 # In lockstep here and now: a run ends at the same tick every time.
                 on_end=self.plant.trigger_deactivate if scenario.lockstep else lambda: None,
-                namespace=self.namespace,
                 context=context,
             )
             self._nodes.append(self.client.node)

@@ -242,7 +242,7 @@ class KnownFrames:
     Parameters
     ----------
     node
-        Whose they are.
+        The node that subscribes to /tf.
     """
 
     def __init__(self, node: Any) -> None:

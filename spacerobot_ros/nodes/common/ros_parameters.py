@@ -30,12 +30,12 @@ _LOOKS_UNTIL_LOST = 50
 
 
 class RemoteParameters:
-    """All parameters of one node, once it has answered; look again and again.
+    """All parameters of another node; :meth:`look` is called until it has answered.
 
     Parameters
     ----------
     node
-        Who asks.
+        The node that asks.
     name
         Full name of the node that is asked.
     """
@@ -51,7 +51,7 @@ class RemoteParameters:
         return next(self._steps, True)
 
     def close(self) -> None:
-        """Ask no more."""
+        """Stop asking."""
         self._steps.close()
 
     def _request_values(self) -> Generator[bool, None, None]:
@@ -95,7 +95,7 @@ _INTEGER_BOUNDS = -(2**63), 2**63 - 1
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return what ``ros2 param describe`` shows."""
+    """Return the descriptor that ``ros2 param describe`` shows."""
     unit = f" [{parameter.unit}]" if parameter.unit else ""
     choices = ", ".join(parameter.choices)
     described = ParameterDescriptor(

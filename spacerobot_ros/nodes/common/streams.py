@@ -26,7 +26,7 @@ class Connections:
     Attributes
     ----------
     publishers, subscriptions
-        With the number of their partners.
+        The topic of each, and the number of endpoints that it has met.
     """
 
     publishers: Matches
@@ -34,18 +34,18 @@ class Connections:
 
     @classmethod
     def of(cls, node: Node) -> Connections:
-        """Return those of a node of this process."""
+        """Return the endpoints of a node of this process."""
         readers = [(each.topic_name, each.get_subscription_count()) for each in node.publishers]
         writers = [(each.topic_name, each.get_publisher_count()) for each in node.subscriptions]
         return cls(_without_middleware(readers), _without_middleware(writers))
 
     def to_json(self) -> str:
-        """Return them as a text."""
+        """Return the endpoints as a JSON text."""
         return json.dumps([self.publishers, self.subscriptions])
 
     @classmethod
     def from_json(cls, text: str) -> Connections:
-        """Return what :meth:`to_json` has made a text of."""
+        """Return the endpoints of a text from :meth:`to_json`."""
         publishers, subscriptions = json.loads(text)
         return cls(_without_middleware(publishers), _without_middleware(subscriptions))
 
@@ -136,9 +136,9 @@ class RawOutput(RawStream):
     Parameters
     ----------
     publisher
-        Where messages go.
+        The publisher of the messages.
     latched
-        Whether its topic is.
+        Whether its topic keeps the last message for late subscribers.
     """
 
     def __init__(self, publisher: Publisher, *, latched: bool = False) -> None:

@@ -101,12 +101,12 @@ class PlantNode(FlightNode):
 
     @property
     def simulated_time_s(self) -> float:
-        """The same, s."""
+        """Simulated time of the tick whose state was published last, s."""
         return self.time_ns / SECOND
 
     @property
     def state(self) -> PlantState:
-        """Treatment of time and commands."""
+        """Whether the plant's time runs, and whether it obeys commands."""
         return self.status.state
 
     @property

@@ -63,11 +63,11 @@ class PlantReport:
     Parameters
     ----------
     node
-        Whose they are.
+        The plant's node.
     plant, commands
         Sources of the report.
     real_time
-        How well it keeps to the clock; None in lockstep.
+        The plant's time against the wall clock; None in lockstep.
     """
 
     def __init__(
@@ -293,11 +293,11 @@ class StatePublisher:
     node
         The node that owns the publishers.
     robot
-        Whose state it is.
+        The robot whose state is published.
     state
         The reported quantities.
     config
-        Names of the frames.
+        Configuration of the plant: the names of the frames.
     """
 
     def __init__(
