@@ -34,7 +34,7 @@ _STEPS = 1000
 
 _ROUNDS = 21
 
-_LEAST_INERTIA = 1e-12
+_MIN_INERTIA = 1e-12
 """MuJoCo has no point masses, kg m^2."""
 
 
@@ -143,7 +143,7 @@ def mujoco_model(mujoco: Any, description: RobotDescription, step: float) -> Any
     """
     spec = mujoco.MjSpec.from_string(description.urdf)
     spec.worldbody.first_body().add_freejoint()
-    spec.compiler.boundinertia = _LEAST_INERTIA
+    spec.compiler.boundinertia = _MIN_INERTIA
     model = spec.compile()
     for name in ("CONSTRAINT", "GRAVITY", "SENSOR", "SPRING", "DAMPER", "ISLAND", "AUTORESET"):
         model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
@@ -179,10 +179,10 @@ _LANE_ROUNDS = 5
 _MANY = 10_000
 """Flights of which the whole time is measured."""
 
-_SPREAD = 0.05
+_MASS_SPREAD = 0.05
 """Largest relative change of masses and inertias."""
 
-_AGREED = 50
+_COMPARED_FLIGHTS = 50
 """Number of flights that the plant flies as well, for comparison."""
 
 
@@ -215,7 +215,7 @@ class _Case:
         """Return flights with random masses, inertias and starts."""
         rng, robot = np.random.default_rng(seed), self.robot
         bodies = len(robot.description.bodies)
-        low, high = 1 - _SPREAD, 1 + _SPREAD
+        low, high = 1 - _MASS_SPREAD, 1 + _MASS_SPREAD
         inertial = robot.inertial.scaled(
             rng.uniform(low, high, (count, bodies)), rng.uniform(low, high, (count, bodies))
         )
@@ -260,10 +260,10 @@ def lanes_benchmark(show: Callable[[str], None]) -> dict[str, float | str]:
         _Case("sliders effort", sliders, "effort", 0.01, 50, efforts[:, :3]),
     )
     for case in cases:
-        found = _measured(case)
+        found = _measure_case(case)
         figures["engine"] = found.pop("engine")
         figures |= {f"{case.name}: {name}": value for name, value in found.items()}
-        show(_line(case.name, found))
+        show(_case_text(case.name, found))
     began = time.process_time()
     cases[0].campaign(_MANY, 1)
     figures["sliders velocity: cpu_s_of_10000_flights_of_39_s"] = time.process_time() - began
@@ -275,8 +275,8 @@ def lanes_benchmark(show: Callable[[str], None]) -> dict[str, float | str]:
     return figures
 
 
-def _measured(case: _Case) -> dict[str, float | str]:
-    few = case.flights(_AGREED, 2)
+def _measure_case(case: _Case) -> dict[str, float | str]:
+    few = case.flights(_COMPARED_FLIGHTS, 2)
     result, plant = fly_lanes(few), fly_one_by_one(few)
     largest = max(
         float(np.abs(getattr(result, name) - getattr(plant, name)).max()) for name in ("pose", "q")
@@ -297,7 +297,7 @@ def _measured(case: _Case) -> dict[str, float | str]:
     return found
 
 
-def _line(name: str, found: Mapping[str, Any]) -> str:
+def _case_text(name: str, found: Mapping[str, Any]) -> str:
     text = (
         f"{name}: {found['lanes_us']:.3f} us a tick of {found['steps_a_tick']} step(s) in lanes, "
         f"{found['plant_us']:.3f} us by the plant ({found['ratio_to_plant']:.1f} times)"

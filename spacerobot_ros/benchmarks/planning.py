@@ -17,13 +17,13 @@ from spacerobot_ros.resources import robot_file
 
 _SEED = 7
 
-_LONGER = (1.01, 1.02, 1.03)
+_DURATION_RATIOS = (1.01, 1.02, 1.03)
 """Ratios of durations below which goals are counted."""
 
 _LARGE_ROBOTS = ("seven_joint_arm", "quadruped", "dual_arm")
 """Robots of 7, 12 and 14 joints."""
 
-_NEXT = 3
+_NEXT_PROCESSES = 3
 """Number of processes with the cache of the first one, of which medians are taken."""
 
 Plans = Mapping[str, list[float]]
@@ -62,43 +62,43 @@ def planning_benchmark(
     ours, theirs = Checkout.pair(other)
     figures: dict[str, Any] = {}
     for name in CASES:
-
-        def planned(checkout: Checkout, name: str = name, **more: Any) -> Plans:
-            urdf = str(robot_file(name))
-            arguments = {"options": {}, **more}
-            result: Plans = checkout.measure(
-                "plans", urdf=urdf, case=name, count=goals, seed=_SEED, **arguments
-            )
-            return result
-
-        plans = planned(ours)
-        found: dict[str, Any] = {"median_cpu_s": statistics.median(plans["cpu_s"]), **plans}
-        show(f"{name}: {found['median_cpu_s']:.3f} s of CPU time in the median of {goals} goals")
-        plain = found["median_cpu_s"]
+        plans = _measured_plans(ours, name, goals)
+        here = statistics.median(plans["cpu_s"])
+        robot = figures[name] = {"median_cpu_s": here, **plans}
+        show(f"{name}: {here:.3f} s of CPU time in the median of {goals} goals")
+        without_library = here
         if theirs is not None:
-            before = planned(theirs)
-            median = statistics.median(before["cpu_s"])
-            found |= {"there": before, "times_faster": median / found["median_cpu_s"]}
-            show(f"... there {median:.3f} s: {found['times_faster']:.2f} times faster here")
-            plain = median
-            found["durations_to_there"] = _compared(plans, before, "there", show)
+            robot["there"] = _measured_plans(theirs, name, goals)
+            there = without_library = statistics.median(robot["there"]["cpu_s"])
+            robot["times_faster"] = there / here
+            show(f"... there {there:.3f} s: {there / here:.2f} times faster here")
+            robot["durations_to_there"] = _compare_durations(plans, robot["there"], "there", show)
         if library is not None:
-            helped = planned(ours, library=library)
-            median = statistics.median(helped["cpu_s"])
-            found |= {"with_library": helped, "library_times_faster": plain / median}
-            show(f"... with a library {median:.3f} s: {plain / median:.2f} times faster")
-            _compared(helped, plans, "without it", show)
+            with_library = _measured_plans(ours, name, goals, library=library)
+            median = statistics.median(with_library["cpu_s"])
+            ratio = without_library / median
+            robot |= {"with_library": with_library, "library_times_faster": ratio}
+            show(f"... with a library {median:.3f} s: {ratio:.2f} times faster")
+            _compare_durations(with_library, plans, "without it", show)
         if starts is not None:
             options = {"starts": starts, "answers": starts, "agreeing": 0}
-            long = planned(ours, options=options)
-            found |= {"long_search": long}
-            words = f"by a search from {starts} guesses"
-            found["durations_to_long_search"] = _compared(plans, long, words, show)
-        figures[name] = found
+            robot["long_search"] = _measured_plans(ours, name, goals, options=options)
+            robot["durations_to_long_search"] = _compare_durations(
+                plans, robot["long_search"], f"by a search from {starts} guesses", show
+            )
     return figures
 
 
-def _compared(
+def _measured_plans(checkout: Checkout, robot: str, goals: int, **arguments: Any) -> Plans:
+    """Return the plans of a number of goals; ``arguments`` are further ones of ``plans``."""
+    arguments = {"options": {}, **arguments}
+    plans: Plans = checkout.measure(
+        "plans", urdf=str(robot_file(robot)), case=robot, count=goals, seed=_SEED, **arguments
+    )
+    return plans
+
+
+def _compare_durations(
     plans: Plans, others: Plans, whose: str, show: Callable[[str], None]
 ) -> dict[str, float]:
     """Return figures of the durations beside those of others, and show them."""
@@ -106,7 +106,7 @@ def _compared(
     figures = duration_figures(here, there)
     shares = ", ".join(
         f"{100 * figures[f'share_below_{limit:g}']:.0f} % at most {100 * (limit - 1):.0f} %"
-        for limit in _LONGER
+        for limit in _DURATION_RATIOS
     )
     show(f"... durations beside those {whose}: {shares} longer; at most {figures['worst']:.3f}")
     return figures
@@ -119,7 +119,9 @@ def duration_figures(here: Array, there: Array) -> dict[str, float]:
     """
     ratio = np.where(np.isnan(there), np.where(np.isnan(here), 1.0, 0.0), here / there)
     ratio = np.where(np.isnan(ratio), np.inf, ratio)
-    shares = {f"share_below_{limit:g}": float(np.mean(ratio <= limit)) for limit in _LONGER}
+    shares = {
+        f"share_below_{limit:g}": float(np.mean(ratio <= limit)) for limit in _DURATION_RATIOS
+    }
     return {**shares, "worst": float(ratio.max()), "best": float(ratio.min())}
 
 
@@ -150,11 +152,11 @@ def first_plan_benchmark(other: Path | None, show: Callable[[str], None]) -> dic
     ours, theirs = Checkout.pair(other)
     figures: dict[str, Any] = {}
     for name in _LARGE_ROBOTS:
-        found = figures[name] = _first_plans(ours, name)
-        show(f"{name}, {found['joints']} joints: {_line(found)}")
+        robot = figures[name] = _first_plans(ours, name)
+        show(f"{name}, {robot['joints']} joints: {_first_plan_text(robot)}")
         if theirs is not None:
-            found["there"] = _first_plans(theirs, name)
-            show(f"... there {_line(found['there'])}")
+            robot["there"] = _first_plans(theirs, name)
+            show(f"... there {_first_plan_text(robot['there'])}")
     return figures
 
 
@@ -162,7 +164,7 @@ def _first_plans(checkout: Checkout, name: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="spacerobot_") as cache:
         first, *others = (
             checkout.measure("first_plan", cache=cache, urdf=str(robot_file(name)))
-            for _ in range(1 + _NEXT)
+            for _ in range(1 + _NEXT_PROCESSES)
         )
     return {
         "joints": first["joints"],
@@ -172,7 +174,7 @@ def _first_plans(checkout: Checkout, name: str) -> dict[str, Any]:
     }
 
 
-def _line(figures: dict[str, Any]) -> str:
+def _first_plan_text(figures: dict[str, Any]) -> str:
     first, following, more = (figures[f"{name}_cpu_s"] for name in ("first", "next", "more"))
     return (
         f"{first:.1f} s of CPU time from an empty cache to the first plan, {following:.2f} s in "

@@ -10,11 +10,10 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
@@ -46,7 +45,7 @@ from spacerobot_ros.simulation.trials import state_of
 from spacerobot_ros.times import SECOND
 
 _ROUNDS = 5
-_TOPICS: tuple[tuple[str, type[Any], int, int], ...] = (
+_EXCHANGED_TOPICS: tuple[tuple[str, type[Any], int, int], ...] = (
     ("/clock", Clock, 0, 1),
     ("base_pose", PoseStamped, 0, 20),
     ("momentum", Float64MultiArray, 7, 1),
@@ -55,22 +54,22 @@ _TOPICS: tuple[tuple[str, type[Any], int, int], ...] = (
 )
 """The plant's topics: name, type, length of its lists, and how many ticks from one to the next."""
 
-_GAITS = (
+_SCENARIOS_AND_METHODS = (
     ("sliding_masses", "lie_bracket"),
     ("arm_attitude", "area_loop"),
     ("planar_chain", "square_path"),
 )
 """Scenarios of the papers with their methods."""
 
-_PLANS = 5
+_PLANS_PER_MEDIAN = 5
 _PLANT_TICKS = 5_000
 
-_PERIOD = 0.01
-_MESSAGES = 500
-_PATIENCE = 2.0
+_REPLAY_PERIOD = 0.01
+_REPLAYED_MESSAGES = 500
+_REPLAY_TIMEOUT = 2.0
 """Wall time for the messages that are still under way when the replay has ended, s."""
 
-_REPLAYED = "/bench/joint_states"
+_REPLAYED_TOPIC = "/bench/joint_states"
 
 
 def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float | str]:
@@ -83,18 +82,20 @@ def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float 
     with ros(private=True), tempfile.TemporaryDirectory() as folder:
         bag = Path(folder, "bench.mcap")
         for _ in range(_ROUNDS):
-            flights["minimal"].append(_minimal_exchange(ticks, bag))
+            flights["minimal"].append(_exchange_speed(ticks, bag))
             bag.unlink()
-            flights["recorded"].append(_stack(ticks, bag))
+            flights["recorded"].append(_stack_speed(ticks, bag))
             bag.unlink()
-            flights["unrecorded"].append(_stack(ticks, None))
+            flights["unrecorded"].append(_stack_speed(ticks, None))
             show(
                 f"round: {flights['recorded'][-1].cpu_us:.1f} us of CPU time a tick with plant, "
                 f"planner and recorder, {flights['minimal'][-1].cpu_us:.1f} us minimal exchange"
             )
         spacing, worst_spacing = _replay_spacing(Path(folder))
-    stack, unrecorded, minimal = (_median(flights[name]) for name in flights)
-    cost = 1 - unrecorded.cpu_us / stack.cpu_us
+    stack, unrecorded, minimal = (
+        _Speed(*np.median(speeds, axis=0).tolist()) for speeds in flights.values()
+    )
+    recorder_share = 1 - unrecorded.cpu_us / stack.cpu_us
     tick = _plant_tick()
     figures: dict[str, float | str] = {
         "ticks_per_s": stack.ticks_per_s,
@@ -102,7 +103,7 @@ def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float 
         "unrecorded_ticks_per_s": unrecorded.ticks_per_s,
         "tick_cpu_us": stack.cpu_us,
         "bare_tick_cpu_us": minimal.cpu_us,
-        "recorder_cost": cost,
+        "recorder_cost": recorder_share,
         "ratio_to_bare": minimal.cpu_us / stack.cpu_us,
         "replay_spacing_error_s": spacing,
         "plant_tick_us": tick,
@@ -117,7 +118,7 @@ def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float 
         f"ticks/s, {minimal.cpu_us:.1f} us of CPU time a tick"
     )
     show(f"ratio of the CPU times: {minimal.cpu_us / stack.cpu_us:.2f}")
-    show(f"the recorder takes {100 * cost:.0f} % of the CPU time")
+    show(f"the recorder takes {100 * recorder_share:.0f} % of the CPU time")
     show(
         f"replay at rate 1, 100 messages a second: spacing off by {1e3 * spacing:.2f} ms (median), "
         f"{1e3 * worst_spacing:.1f} ms at most"
@@ -148,60 +149,56 @@ def _dynamics_lines(figures: dict[str, float | str]) -> Iterator[str]:
     yield f"... without a compiler: {without:.2f}"
 
 
-@dataclass(frozen=True)
-class _Speed:
+class _Speed(NamedTuple):
     """Ticks a second of wall time, and the CPU time of a tick, us."""
 
     ticks_per_s: float
     cpu_us: float
 
-    @classmethod
-    def of(cls, ticks: int, wall: float, cpu: float) -> _Speed:
-        """Return the speed of a number of ticks that took these times, s."""
-        return cls(ticks / wall, 1e6 * cpu / ticks)
+
+def _speed_of(ticks: int, wall: float, cpu: float) -> _Speed:
+    """Return the speed of a number of ticks that took these times, s."""
+    return _Speed(ticks / wall, 1e6 * cpu / ticks)
 
 
-def _median(speeds: Sequence[_Speed]) -> _Speed:
-    return _Speed(
-        statistics.median(each.ticks_per_s for each in speeds),
-        statistics.median(each.cpu_us for each in speeds),
-    )
-
-
-def _stack(ticks: int, bag: Path | None) -> _Speed:
-    """Fly the first ``ticks`` of sliding_masses; planning does not count."""
+def _stack_speed(ticks: int, bag: Path | None) -> _Speed:
+    """Return the speed of the first ``ticks`` of sliding_masses, without planning."""
     scenario = load_scenario("sliding_masses").with_overrides("planner", {"method": "lie_bracket"})
     stack = InProcessStack(scenario, bag)
     try:
         stack.start(stack.scenario.goal)
-        first, began, used = 0, 0.0, 0.0
+        first_tick, wall, cpu = 0, 0.0, 0.0
 
-        def look() -> bool:
-            nonlocal first, began, used
-            if not first:
-                first, began, used = stack.plant.tick, time.perf_counter(), time.process_time()
-            return stack.plant.tick >= first + ticks
+        def has_flown() -> bool:
+            nonlocal first_tick, wall, cpu
+            if not first_tick:
+                first_tick, wall, cpu = stack.plant.tick, time.perf_counter(), time.process_time()
+            return stack.plant.tick >= first_tick + ticks
 
-        stack.spin(look)
-        wall, cpu = time.perf_counter() - began, time.process_time() - used
-        speed = _Speed.of(stack.plant.tick - first, wall, cpu)
+        stack.spin(has_flown)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        speed = _speed_of(stack.plant.tick - first_tick, wall, cpu)
         stack.finish()
     finally:
         stack.close()
     return speed
 
 
-def _minimal_exchange(ticks: int, path: Path) -> _Speed:
-    """Exchange as many messages as the stack does, and record them."""
+def _exchange_speed(ticks: int, path: Path) -> _Speed:
+    """Return the speed of an exchange of as many messages as the stack's, which is recorded."""
     qos = QoSProfile(depth=1000)
     a, b, recorder = (rclpy.create_node(name) for name in ("ping", "pong", "raw_recorder"))
     executor = EventsExecutor()
     done = rclpy.task.Future()
     count = 0
-    command = serialize_message(_filled(JointState, 3))
+    command = serialize_message(_message_with_lists(JointState, 3))
     publishers = [
-        (a.create_publisher(kind, topic, qos), serialize_message(_filled(kind, n)), period)
-        for topic, kind, n, period in _TOPICS
+        (
+            a.create_publisher(kind, topic, qos),
+            serialize_message(_message_with_lists(kind, n)),
+            period,
+        )
+        for topic, kind, n, period in _EXCHANGED_TOPICS
     ]
     reply = b.create_publisher(JointState, "joint_commands", qos)
 
@@ -222,9 +219,11 @@ def _minimal_exchange(ticks: int, path: Path) -> _Speed:
         writer = Writer(stream, chunk_size=65536, compression=CompressionType.ZSTD)
         writer.start()
         schema = writer.register_schema("bench", "ros2msg", b"")
-        for topic, kind, _, _ in (*_TOPICS, ("joint_commands", JointState, 3, 1)):
+        for topic, kind, _, _ in (*_EXCHANGED_TOPICS, ("joint_commands", JointState, 3, 1)):
             channel = writer.register_channel(topic, "cdr", schema)
-            recorder.create_subscription(kind, topic, _writing(writer, channel), qos, raw=True)
+            recorder.create_subscription(
+                kind, topic, _recording_callback(writer, channel), qos, raw=True
+            )
         a.create_subscription(JointState, "joint_commands", on_command, qos, raw=True)
         b.create_subscription(
             JointState, "joint_states", lambda _: reply.publish(command), qos, raw=True
@@ -236,7 +235,7 @@ def _minimal_exchange(ticks: int, path: Path) -> _Speed:
         began, used = time.perf_counter(), time.process_time()
         ping()
         executor.spin_until_future_complete(done, timeout_sec=1e6)
-        speed = _Speed.of(ticks, time.perf_counter() - began, time.process_time() - used)
+        speed = _speed_of(ticks, time.perf_counter() - began, time.process_time() - used)
         writer.finish()
     executor.shutdown()
     for node in (a, b, recorder):
@@ -244,11 +243,11 @@ def _minimal_exchange(ticks: int, path: Path) -> _Speed:
     return speed
 
 
-def _writing(writer: Writer, channel: int) -> Callable[[bytes], None]:
+def _recording_callback(writer: Writer, channel: int) -> Callable[[bytes], None]:
     return lambda raw: writer.add_message(channel, 0, raw, 0)
 
 
-def _filled(kind: type[Any], n: int) -> Any:
+def _message_with_lists(kind: type[Any], n: int) -> Any:
     """Return a message with its lists as long as the stack's are."""
     message = kind()
     if kind is JointState:
@@ -277,12 +276,12 @@ def _planning_times() -> Iterator[tuple[str, float, float]]:
 
     ``area_loop`` plans one cycle at a time.
     """
-    for scenario, name in _GAITS:
+    for scenario, name in _SCENARIOS_AND_METHODS:
         problem = load_scenario(scenario).problem()
         method = problem.method(name)
         request = PlanRequest(state_of(problem.plant()), problem.goal, problem.config.tolerance)
         times = []
-        for _ in range(1 + _PLANS):
+        for _ in range(1 + _PLANS_PER_MEDIAN):
             began = time.perf_counter()
             method.plan(request)
             times.append(time.perf_counter() - began)
@@ -296,16 +295,20 @@ def _replay_spacing(folder: Path) -> tuple[float, float]:
     """
     bag = folder / "spacing.mcap"
     with BagWriter(bag) as writer:
-        channel = writer.add_topic(_REPLAYED, "sensor_msgs/msg/JointState")
+        channel = writer.add_topic(_REPLAYED_TOPIC, "sensor_msgs/msg/JointState")
         raw = serialize_message(JointState(name=["a", "b", "c"], position=[0.0] * 3))
-        for k in range(_MESSAGES):
-            stamp = round(k * _PERIOD * SECOND)
+        for k in range(_REPLAYED_MESSAGES):
+            stamp = round(k * _REPLAY_PERIOD * SECOND)
             writer.write(channel, raw, stamp, stamp)
     arrivals: list[float] = []
     executor = EventsExecutor()
     listener = rclpy.create_node("listener")
     listener.create_subscription(
-        JointState, _REPLAYED, lambda _: arrivals.append(time.perf_counter()), STREAM, raw=True
+        JointState,
+        _REPLAYED_TOPIC,
+        lambda _: arrivals.append(time.perf_counter()),
+        STREAM,
+        raw=True,
     )
     replay = ReplayNode("replay", parameter_overrides=[Parameter("bag", value=str(bag))])
     done = rclpy.task.Future()
@@ -314,12 +317,12 @@ def _replay_spacing(folder: Path) -> tuple[float, float]:
         for node in (listener, replay):
             executor.add_node(node)
         spin_until(executor, done)
-        patience = time.perf_counter() + _PATIENCE
-        while len(arrivals) < _MESSAGES and time.perf_counter() < patience:
+        deadline = time.perf_counter() + _REPLAY_TIMEOUT
+        while len(arrivals) < _REPLAYED_MESSAGES and time.perf_counter() < deadline:
             executor.spin_once(timeout_sec=0.1)
     finally:
         for node in (listener, replay):
             node.destroy_node()
         executor.shutdown()
-    errors = [abs(later - earlier - _PERIOD) for earlier, later in pairwise(arrivals)]
+    errors = [abs(later - earlier - _REPLAY_PERIOD) for earlier, later in pairwise(arrivals)]
     return statistics.median(errors), max(errors)

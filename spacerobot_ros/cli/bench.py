@@ -75,9 +75,11 @@ def ticks(ticks: int, against: Path | None, rounds: int, json_file: Path | None)
     if against is None:
         from spacerobot_ros.benchmarks.ticks import ticks_benchmark
 
-        _write(json_file, ticks_benchmark(ticks, click.echo))
+        _write_figures(json_file, ticks_benchmark(ticks, click.echo))
     else:
-        _compare(against, lambda there: there.measure("tick_times", ticks=ticks), rounds, json_file)
+        _compare_checkouts(
+            against, lambda there: there.measure("tick_times", ticks=ticks), rounds, json_file
+        )
 
 
 @bench_command.command("real-time")
@@ -109,11 +111,11 @@ def real_time(
     if against is None:
         from spacerobot_ros.benchmarks.real_time import real_time_benchmark
 
-        _write(json_file, real_time_benchmark(seconds, rates, click.echo))
+        _write_figures(json_file, real_time_benchmark(seconds, rates, click.echo))
     else:
         words = ["-m", "spacerobot_ros", "bench", "real-time", str(seconds)]
         words += [f"--rate={rate}" for rate in rates]
-        _compare(against, lambda there: there.run([*words, "--json"]), rounds, json_file)
+        _compare_checkouts(against, lambda there: there.run([*words, "--json"]), rounds, json_file)
 
 
 @bench_command.command("soak")
@@ -129,7 +131,7 @@ def soak(seconds: float, json_file: Path | None) -> None:
 
     picture = None if json_file is None else json_file.with_suffix(".png")
     figures = soak_benchmark(seconds, click.echo, picture)
-    _write(json_file, figures, indent=None)
+    _write_figures(json_file, figures, indent=None)
     if not figures["flat"]:
         fail()
 
@@ -150,7 +152,7 @@ def viewer(seconds: float, no_priorities: bool, json_file: Path | None) -> None:
     """
     from spacerobot_ros.benchmarks.real_time import viewer_benchmark
 
-    _write(json_file, viewer_benchmark(seconds, click.echo, priorities=not no_priorities))
+    _write_figures(json_file, viewer_benchmark(seconds, click.echo, priorities=not no_priorities))
 
 
 @bench_command.command("planning")
@@ -183,7 +185,7 @@ def planning(
     """
     from spacerobot_ros.benchmarks.planning import planning_benchmark
 
-    _write(json_file, planning_benchmark(goals, against, starts, library, click.echo))
+    _write_figures(json_file, planning_benchmark(goals, against, starts, library, click.echo))
 
 
 @bench_command.command("first-plans")
@@ -197,7 +199,7 @@ def first_plans(against: Path | None, json_file: Path | None) -> None:
     """
     from spacerobot_ros.benchmarks.planning import first_plan_benchmark
 
-    _write(json_file, first_plan_benchmark(against, click.echo))
+    _write_figures(json_file, first_plan_benchmark(against, click.echo))
 
 
 @bench_command.command("campaign")
@@ -209,17 +211,17 @@ def campaign(json_file: Path | None) -> None:
     """
     from spacerobot_ros.benchmarks.engines import lanes_benchmark
 
-    _write(json_file, lanes_benchmark(click.echo))
+    _write_figures(json_file, lanes_benchmark(click.echo))
 
 
-def _compare(
+def _compare_checkouts(
     other: Path, measure: Callable[[Checkout], Any], rounds: int, json_file: Path | None
 ) -> None:
     from spacerobot_ros.benchmarks.checkouts import compare
 
-    _write(json_file, compare(other, measure, click.echo, rounds))
+    _write_figures(json_file, compare(other, measure, click.echo, rounds))
 
 
-def _write(json_file: Path | None, figures: Any, indent: int | None = 2) -> None:
+def _write_figures(json_file: Path | None, figures: Any, indent: int | None = 2) -> None:
     if json_file is not None:
         write_json(json_file, figures, indent)
