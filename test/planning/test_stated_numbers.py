@@ -128,8 +128,8 @@ def test_the_cycles_that_are_left_are_those_of_a_count(k: float) -> None:
             while left > enough:
                 left -= k * min(left, missing * share)
                 cycles += 1
-            assert abs(method._cycles_left(missing, share, enough) - cycles) <= 1.1
-        assert math.isinf(method._cycles_left(missing, share, 0.0))
+            assert abs(method._count_cycles_left(missing, share, enough) - cycles) <= 1.1
+        assert math.isinf(method._count_cycles_left(missing, share, 0.0))
 
 
 def test_the_last_cycle_that_a_goal_may_take_is_flown() -> None:

@@ -33,13 +33,13 @@ from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes, straight_motion
 from spacerobot_ros.planning.methods.nominal_shape import PLANES, NominalChoice, NominalShape
 
-_TRIALS = 6
+_MAX_CYCLE_TRIALS = 6
 """A cycle that would not bring the base nearer is tried this often, each time half as large."""
 
-_ALL = 1.0 - 1e-9
+_MAX_CYCLE_SHARE = 1.0 - 1e-9
 """A share k of the missing turn above this leaves nothing for the next cycle, but rounding."""
 
-_NEGLIGIBLE = 1e-3
+_NEGLIGIBLE_AREA_SHARE = 1e-3
 """An area below this share of the largest counts as zero: a later cycle makes up for it."""
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
@@ -130,20 +130,20 @@ class AreaLoopGait(GaitMethod):
         state, goal, tolerance = request.state, request.goal, request.tolerance
         self._require_rest(state)
         final = self._goal_shape(goal)
-        gait = _Gait(state.q[np.newaxis], state.quaternion[np.newaxis])
+        gait = _PlannedMotion(state.q[np.newaxis], state.quaternion[np.newaxis])
         notes: Notes = {"cycles": 0.0}
         progress = None if request.previous is None else request.previous.progress
         if not isinstance(progress, AreaLoopProgress):
             progress = None
         error = PoseError.between(state.position, state.quaternion, goal, state.q)
         if tolerance.admits(error, self.controls):
-            return self._schedule(gait, request, notes, progress)
+            return self._build_schedule(gait, request, notes, progress)
         chosen = self._nominal.at(state.q, None if progress is None else progress.nominal)
         nominal = self._nominal.nearest_turn(chosen, state.q)
         flown = 0 if progress is None else progress.cycles
-        gait = self._moved(gait, [(nominal.shape, self.options.edge_time)])
+        gait = self._add_legs(gait, [(nominal.shape, self.options.edge_time)])
         # The way from the nominal to the final shape turns the base too.
-        aside = self._turn(nominal, final)
+        aside = self._turn_to_final_shape(nominal, final)
         target = quaternion_multiply(goal.quaternion, quaternion_inverse(aside))
         remaining = 0.0
         for planned in range(self.options.cycles_per_plan + 1):
@@ -151,11 +151,11 @@ class AreaLoopGait(GaitMethod):
             left = attitude_error(gait.attitudes[-1], target)
             if np.linalg.norm(left) <= tolerance.attitude:
                 if final is not None:
-                    gait = self._moved(gait, [(final, self.options.edge_time)])
+                    gait = self._add_legs(gait, [(final, self.options.edge_time)])
                 break
             if planned < self.options.cycles_per_plan:
                 before = len(gait.positions)
-                gait, cycle_notes, cycles = self._cycle(
+                gait, cycle_notes, cycles = self._add_cycle(
                     gait, target, left, nominal, tolerance.attitude, flown
                 )
                 flown += 1
@@ -163,17 +163,17 @@ class AreaLoopGait(GaitMethod):
                 cycle = (len(gait.positions) - before) * self.control_period
                 remaining = max(0.0, cycles - flown) * cycle
         progress = AreaLoopProgress(chosen, flown)
-        return self._schedule(gait, request, notes, progress, remaining)
+        return self._build_schedule(gait, request, notes, progress, remaining)
 
-    def _cycle(
+    def _add_cycle(
         self,
-        gait: _Gait,
+        gait: _PlannedMotion,
         target: Array,
         left: Array,
         nominal: NominalShape,
         enough: float,
         flown: int,
-    ) -> tuple[_Gait, Notes, float]:
+    ) -> tuple[_PlannedMotion, Notes, float]:
         """Add one cycle for the turn ``left`` (3,), rad.
 
         Also returned are the paper's symbols and the expected number of cycles for the goal.
@@ -184,22 +184,22 @@ class AreaLoopGait(GaitMethod):
         # Edges go as the root of areas.
         share = min(1.0, edge_path(S, nominal.longest).excess ** -2)
         missing = float(np.linalg.norm(left))
-        cycles = flown + self._cycles_left(missing, share, enough)
+        cycles = flown + self._count_cycles_left(missing, share, enough)
         most = self.options.most_cycles
         if cycles > most:
             raise PlanningError(
                 f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
                 f"{flown} are flown."
             )
-        for _ in range(_TRIALS):
+        for _ in range(_MAX_CYCLE_TRIALS):
             path = edge_path(share * S, nominal.longest)
-            after = self._moved(gait, self._ends(path, nominal))
+            after = self._add_legs(gait, self._edge_ends(path, nominal))
             if np.linalg.norm(attitude_error(after.attitudes[-1], target)) < missing:
                 break
             share /= 2
         else:
             raise PlanningError(
-                f"None of {_TRIALS} cycles of area_loop round the nominal shape "
+                f"None of {_MAX_CYCLE_TRIALS} cycles of area_loop round the nominal shape "
                 f"{np.round(nominal.shape, 4).tolist()}, each half as large as the one before, "
                 f"brings the base nearer to its goal than {missing:.3g} rad."
             )
@@ -223,7 +223,7 @@ class AreaLoopGait(GaitMethod):
             cycles,
         )
 
-    def _cycles_left(self, missing: float, share: float, enough: float) -> float:
+    def _count_cycles_left(self, missing: float, share: float, enough: float) -> float:
         """Return the number of cycles for a turn (rad) to first order, the first by a share of k.
 
         While edges are as long as they may be, every cycle turns the base as far; then the
@@ -235,10 +235,10 @@ class AreaLoopGait(GaitMethod):
             return max(1.0, (missing - enough) / (self.options.k * unbounded))
         if enough <= 0.0:
             return math.inf
-        factor = -math.log1p(-min(self.options.k, _ALL))
+        factor = -math.log1p(-min(self.options.k, _MAX_CYCLE_SHARE))
         return many + max(1.0, math.log(unbounded / enough) / factor)
 
-    def _ends(self, path: EdgePath, nominal: NominalShape) -> Ends:
+    def _edge_ends(self, path: EdgePath, nominal: NominalShape) -> Ends:
         """Return where the edges of a path end, from the nominal shape and back to it."""
         chosen = list(nominal.joints)
         lower, upper = self.robot.lower[chosen], self.robot.upper[chosen]
@@ -255,26 +255,26 @@ class AreaLoopGait(GaitMethod):
             ends.append((nominal.shape, self.options.edge_time / 2))
         return ends
 
-    def _turn(self, nominal: NominalShape, final: Array | None) -> Array:
+    def _turn_to_final_shape(self, nominal: NominalShape, final: Array | None) -> Array:
         """Return the turn (4,) of the base on the straight way from nominal to final shape."""
-        start = _Gait(nominal.shape[np.newaxis], _IDENTITY[np.newaxis])
+        start = _PlannedMotion(nominal.shape[np.newaxis], _IDENTITY[np.newaxis])
         ends = [] if final is None else [(final, self.options.edge_time)]
-        return self._moved(start, ends).attitudes[-1]
+        return self._add_legs(start, ends).attitudes[-1]
 
-    def _moved(self, gait: _Gait, ends: Ends) -> _Gait:
+    def _add_legs(self, gait: _PlannedMotion, ends: Ends) -> _PlannedMotion:
         """Return the gait with straight legs added."""
         shapes = straight_motion(
             self.robot, gait.positions[-1], ends, self.control_period, self.options.longest
         )
         # At rest there is no momentum: the attitudes depend on the shapes alone.
         attitudes = self._prediction.attitudes(shapes, gait.attitudes[-1], np.zeros(3))
-        return _Gait(
+        return _PlannedMotion(
             np.vstack([gait.positions, shapes[1:]]), np.vstack([gait.attitudes, attitudes[1:]])
         )
 
-    def _schedule(
+    def _build_schedule(
         self,
-        gait: _Gait,
+        gait: _PlannedMotion,
         request: PlanRequest,
         notes: Notes,
         progress: AreaLoopProgress | None,
@@ -297,7 +297,7 @@ class AreaLoopGait(GaitMethod):
 
 
 @dataclass(frozen=True)
-class _Gait:
+class _PlannedMotion:
     """Shapes (N + 1, n) at the ticks so far, and the attitudes (N + 1, 4) of the base."""
 
     positions: Array
@@ -335,10 +335,10 @@ def edge_path(areas: Array, longest: Array) -> EdgePath:
     rectangles. Areas that are too large give a path with ``excess`` over 1: edges go as the root
     of the areas.
     """
-    areas = np.where(np.abs(areas) > _NEGLIGIBLE * np.abs(areas).max(), areas, 0.0)
-    rectangles = _rectangles(areas, longest)
+    areas = np.where(np.abs(areas) > _NEGLIGIBLE_AREA_SHARE * np.abs(areas).max(), areas, 0.0)
+    rectangles = _rectangle_path(areas, longest)
     if np.all(areas != 0.0):
-        cube = _cube(areas, longest)
+        cube = _cube_path(areas, longest)
         if cube.excess <= max(1.0, rectangles.excess):
             return cube
     return rectangles
@@ -359,7 +359,7 @@ def cube_edges(areas: Array) -> tuple[Array, bool]:
     return np.array([d1, d2, sense * S23 / d2]), backwards
 
 
-def _cube(areas: Array, longest: Array) -> EdgePath:
+def _cube_path(areas: Array, longest: Array) -> EdgePath:
     d, backwards = cube_edges(areas)
     corners = np.vstack([np.zeros(3), np.cumsum(np.vstack([np.diag(d), -np.diag(d)]), axis=0)])
     corners[-1] = 0.0
@@ -368,7 +368,7 @@ def _cube(areas: Array, longest: Array) -> EdgePath:
     return EdgePath((loop[::-1] if backwards else loop,), excess)
 
 
-def _rectangles(areas: Array, longest: Array) -> EdgePath:
+def _rectangle_path(areas: Array, longest: Array) -> EdgePath:
     loops, excess = [], 0.0
     for area, (i, j) in zip(areas, PLANES, strict=True):
         if area == 0.0:

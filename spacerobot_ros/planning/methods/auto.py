@@ -62,7 +62,7 @@ class AutoGait(GaitMethod):
                 candidate.method.require_suitable(robot)
             except PlanningError as refusal:
                 self._unsuitable[name] = refusal
-        self._built: dict[str, GaitMethod] = {}
+        self._built_methods: dict[str, GaitMethod] = {}
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan by the methods that suit, and compare; see :meth:`GaitMethod.plan`.
@@ -77,7 +77,7 @@ class AutoGait(GaitMethod):
             one of them proves it, and else a `NotFoundError` where one of them searched.
         """
         refusals = dict(self._unsuitable)
-        names = self._comparable(refusals)
+        names = self._list_comparable(refusals)
         if request.motion is not None:
             for name in names:
                 if not self._candidates[name].method.starts_in_motion:
@@ -86,26 +86,26 @@ class AutoGait(GaitMethod):
         flying = "" if request.previous is None else request.previous.method
         if flying in names:
             names.remove(flying)
-            kept = self._planned(flying, request, refusals, cancellation)
+            kept = self._plan_by_method(flying, request, refusals, cancellation)
             if kept is not None:
                 result = {flying: _Result.of(kept, request)}
-                return _noted(kept, flying, f"{flying} planned this goal before.", result, {})
+                return _add_notes(kept, flying, f"{flying} planned this goal before.", result, {})
         results: dict[str, _Result] = {}
         for name in names:
-            schedule = self._planned(name, request, refusals, cancellation)
+            schedule = self._plan_by_method(name, request, refusals, cancellation)
             if schedule is not None:
                 results[name] = _Result.of(schedule, request)
         if not results:
-            raise self._refusal(refusals)
+            raise self._refuse_goal(refusals)
         chosen = min(results, key=lambda name: results[name].rank(results.values()))
         because = f"{chosen} suits robot '{self.robot.description.name}' and " + (
             f"plans the shortest of {len(results)} manoeuvres to this goal."
             if len(results) > 1
             else "is the only one that plans this goal."
         )
-        return _noted(results[chosen].schedule, chosen, because, results, refusals)
+        return _add_notes(results[chosen].schedule, chosen, because, results, refusals)
 
-    def _refusal(self, refusals: Mapping[str, SpaceRobotError]) -> PlanningError:
+    def _refuse_goal(self, refusals: Mapping[str, SpaceRobotError]) -> PlanningError:
         """Return the refusal of a goal that no method plans: the proof of one, or all reasons."""
         # Refusals of the robot say nothing about the goal.
         of_goal = [refusals[name] for name in self._candidates if name not in self._unsuitable]
@@ -116,7 +116,7 @@ class AutoGait(GaitMethod):
         message = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
         return refusal_of_all(message, of_goal)
 
-    def _comparable(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
+    def _list_comparable(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
         """Return the methods to compare; add the refusals of the others.
 
         The others do not control a part of the pose that one of the methods controls.
@@ -126,7 +126,7 @@ class AutoGait(GaitMethod):
             if name in refusals:
                 continue
             try:
-                pose[name] = self._method(name).controls & POSE
+                pose[name] = self._get_method(name).controls & POSE
             except ParameterError as refusal:
                 refusals[name] = refusal
         for name, parts in pose.items():
@@ -138,7 +138,7 @@ class AutoGait(GaitMethod):
                 )
         return [name for name in pose if name not in refusals]
 
-    def _planned(
+    def _plan_by_method(
         self,
         name: str,
         request: PlanRequest,
@@ -147,17 +147,17 @@ class AutoGait(GaitMethod):
     ) -> GaitSchedule | None:
         """Return the schedule of one method, None if it refuses; the refusal is kept."""
         try:
-            return self._method(name).plan(request, cancellation)
+            return self._get_method(name).plan(request, cancellation)
         except PlanningCancelled:
             raise
         except (ParameterError, PlanningError) as refusal:
             refusals[name] = refusal
             return None
 
-    def _method(self, name: str) -> GaitMethod:
-        if name not in self._built:
-            self._built[name] = self._candidates[name].build()
-        return self._built[name]
+    def _get_method(self, name: str) -> GaitMethod:
+        if name not in self._built_methods:
+            self._built_methods[name] = self._candidates[name].build()
+        return self._built_methods[name]
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ class _Result:
         return f"{about}{self.schedule.expected_duration:.6g} s{off}"
 
 
-def _noted(
+def _add_notes(
     schedule: GaitSchedule,
     chosen: str,
     because: str,

@@ -25,39 +25,39 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.planning.core.controllability import NO_TURN, Controllability, shape_box
 
-_OUT_OF_PLANE = 1e-5
+_MAX_AXIS_TILT = 1e-5
 """Largest tilt of an axis, and turn about other axes a radian of a joint, that counts as planar:
 as much as angles written with six digits leave."""
 
-_SAMPLES = 8
+_SAMPLED_SHAPES = 8
 """Shapes at which it is tested whether a robot stays in its plane."""
 
-_PANEL = 0.5
+_MAX_PANEL_ANGLE = 0.5
 """Longest piece of a leg that one Gauss rule integrates, rad."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
-_ANGLES: Array = 2 * math.pi / 3 * np.arange(3.0)
+_FITTED_ANGLES: Array = 2 * math.pi / 3 * np.arange(3.0)
 """Three angles determine a trigonometric polynomial of degree one."""
 
-_SLOPE = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""``h @ _SLOPE`` is the derivative of ``h = [1, cos, sin]``."""
+_HARMONIC_DERIVATIVE = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""``h @ _HARMONIC_DERIVATIVE`` is the derivative of ``h = [1, cos, sin]``."""
 
-_CORNERS = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+_UNIT_SQUARE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 """Corners of the unit square, counter-clockwise."""
 
 _GRID_STEP = math.radians(15.0)
-_REFINEMENTS = 8
-_MOST_PEAKS = 4
+_GRID_REFINEMENTS = 8
+_MAX_PEAKS = 4
 
-_EQUAL = 1e-4
+_EQUAL_PEAK_TOLERANCE = 1e-4
 """Peaks of the curvature that differ by less than this share are equally good, ..."""
 
-_EQUALLY_NEAR = 1e-2
+_EQUAL_DISTANCE = 1e-2
 """Distances that differ by less than this count as equal, rad."""
 
-_AROUND = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -1.0, 1.0)])
+_NEIGHBOUR_OFFSETS = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -1.0, 1.0)])
 """A point and its eight neighbours; the point itself comes first and wins a tie."""
 
 
@@ -89,7 +89,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
         # Turns about parallel axes do not move the axes: one shape tells.
         rotations.append(rotations[body.parent] @ body.origin.R)
         axes.append(rotations[-1] @ joint.axis)
-        if np.linalg.norm(np.cross(axes[0], axes[-1])) > _OUT_OF_PLANE:
+        if np.linalg.norm(np.cross(axes[0], axes[-1])) > _MAX_AXIS_TILT:
             raise PlanningError(
                 f"Robot '{name}' is not planar: the axis of joint '{joint.name}' is not parallel "
                 f"to that of joint '{robot.joint_names[0]}'."
@@ -103,11 +103,11 @@ def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
     """Refuse masses off the plane and products of inertia that tilt the base."""
     # The tilt is a ratio of trigonometric polynomials of the shape: it is zero everywhere or
     # almost nowhere, and a few shapes in general position tell which.
-    shapes = np.outer(np.arange(1, _SAMPLES + 1), np.sqrt(np.arange(2, robot.n + 2)))
+    shapes = np.outer(np.arange(1, _SAMPLED_SHAPES + 1), np.sqrt(np.arange(2, robot.n + 2)))
     A = robot.function("connection", compile=False)(shapes.T).full()[3:]
-    tilts = np.linalg.norm(A - np.outer(axis, axis @ A), axis=0).reshape(_SAMPLES, robot.n)
+    tilts = np.linalg.norm(A - np.outer(axis, axis @ A), axis=0).reshape(_SAMPLED_SHAPES, robot.n)
     worst = np.unravel_index(np.argmax(tilts), tilts.shape)
-    if tilts[worst] > _OUT_OF_PLANE:
+    if tilts[worst] > _MAX_AXIS_TILT:
         raise PlanningError(
             f"Robot '{robot.description.name}' is not planar: joint "
             f"'{robot.joint_names[worst[1]]}' also turns the base about other axes than its own, "
@@ -168,14 +168,14 @@ class PlanarPhase:
 
     def legs(self, starts: Array, ends: Array) -> Array:
         """Return the turns (L,) along straight legs of the shape, starts and ends (L, n)."""
-        return _along(self._s, starts, ends)
+        return _integrate_legs(self._s, starts, ends)
 
     def plane(self, psi: Array, i: int, j: int) -> PhasePlane:
         """Return the phase in the plane of joints i and j, the others at rest in ``psi`` (n,)."""
         shapes = np.tile(psi, (9, 1))
-        shapes[:, i], shapes[:, j] = np.repeat(_ANGLES, 3), np.tile(_ANGLES, 3)
+        shapes[:, i], shapes[:, j] = np.repeat(_FITTED_ANGLES, 3), np.tile(_FITTED_ANGLES, 3)
         samples = self._N_D(shapes.T).full()[[i, j, -1]].reshape(3, 3, 3)
-        fit: Array = np.linalg.inv(_harmonics(_ANGLES)).astype(float)
+        fit: Array = np.linalg.inv(_harmonics(_FITTED_ANGLES)).astype(float)
         return PhasePlane(fit @ samples @ fit.T)
 
     def _s(self, shapes: Array) -> Array:
@@ -208,15 +208,15 @@ class PhasePlane:
         """
         left, right = _harmonics(points[..., 0]), _harmonics(points[..., 1])
         N_i, N_j, D = self._polynomials(left, right)
-        _, N_j_i, D_i = self._polynomials(left @ _SLOPE, right)
-        N_i_j, _, D_j = self._polynomials(left, right @ _SLOPE)
+        _, N_j_i, D_i = self._polynomials(left @ _HARMONIC_DERIVATIVE, right)
+        N_i_j, _, D_j = self._polynomials(left, right @ _HARMONIC_DERIVATIVE)
         return np.asarray((N_i_j * D - N_i * D_j - N_j_i * D + N_j * D_i) / D**2)
 
     def squares(self, centres: Array, sides: Array) -> Array:
         """Return the turns (R,) by squares gone round counter-clockwise, centres (R, 2)."""
         corners = square_corners(centres, sides)
         ends = np.roll(corners, -1, axis=1)
-        legs = _along(self._s, corners.reshape(-1, 2), ends.reshape(-1, 2))
+        legs = _integrate_legs(self._s, corners.reshape(-1, 2), ends.reshape(-1, 2))
         return legs.reshape(-1, 4).sum(axis=1)
 
     def _s(self, points: Array) -> Array:
@@ -232,7 +232,7 @@ class PhasePlane:
 
 def square_corners(centres: Array, sides: Array) -> Array:
     """Return the corners (R, 4, 2) of squares, counter-clockwise; centres (R, 2), sides (R,)."""
-    return centres[:, np.newaxis] + np.multiply.outer(sides, _CORNERS)
+    return centres[:, np.newaxis] + np.multiply.outer(sides, _UNIT_SQUARE)
 
 
 def _harmonics(angles: Array) -> Array:
@@ -240,13 +240,13 @@ def _harmonics(angles: Array) -> Array:
     return np.stack([np.ones_like(angles), np.cos(angles), np.sin(angles)], axis=-1)
 
 
-def _along(s: Callable[[Array], Array], starts: Array, ends: Array) -> Array:
+def _integrate_legs(s: Callable[[Array], Array], starts: Array, ends: Array) -> Array:
     """Return the integrals (L,) of ``-s' dpsi`` along straight legs from (L, n) to (L, n).
 
     Gauss-Legendre quadrature in pieces of at most half a radian.
     """
     moves = ends - starts
-    count = max(1, math.ceil(np.abs(moves).max(initial=0.0) / _PANEL))
+    count = max(1, math.ceil(np.abs(moves).max(initial=0.0) / _MAX_PANEL_ANGLE))
     along = ((np.arange(count)[:, np.newaxis] + _NODES) / count).ravel()
     weights = np.tile(_WEIGHTS, count) / count
     shapes = starts[:, np.newaxis] + along[:, np.newaxis] * moves[:, np.newaxis]
@@ -272,14 +272,14 @@ def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
     # Joints without limits have the same box for squares of all sizes.
     flat, row = np.unique(boxes.reshape(-1, 4), axis=0, return_inverse=True)
     boxes = flat.reshape(-1, 2, 2)
-    tops = [_tops(plane, box) for box in boxes]
+    tops = [_find_grid_maxima(plane, box) for box in boxes]
     points = np.vstack(tops)
     owner = np.repeat(np.arange(len(boxes)), [len(found) for found in tops])
     lower, upper = boxes[owner, :1], boxes[owner, 1:]
     step = _GRID_STEP
-    for _ in range(_REFINEMENTS):
+    for _ in range(_GRID_REFINEMENTS):
         step /= 2
-        near = np.clip(points[:, np.newaxis] + step * _AROUND, lower, upper)
+        near = np.clip(points[:, np.newaxis] + step * _NEIGHBOUR_OFFSETS, lower, upper)
         around = np.abs(plane.curvature(near))
         points = near[np.arange(len(points)), np.argmax(around, axis=1)]
     heights = around.max(axis=1)
@@ -287,14 +287,14 @@ def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
     chosen = []
     for k in range(len(boxes)):
         mine = np.flatnonzero(owner == k)
-        good = mine[heights[mine] >= (1 - _EQUAL) * heights[mine].max()]
-        nearest = good[distances[good] <= distances[good].min() + _EQUALLY_NEAR]
+        good = mine[heights[mine] >= (1 - _EQUAL_PEAK_TOLERANCE) * heights[mine].max()]
+        nearest = good[distances[good] <= distances[good].min() + _EQUAL_DISTANCE]
         # The last one in order, so that rounding does not choose between mirror images.
         chosen.append(max(points[nearest].tolist()))
     return np.array(chosen)[row.ravel()]
 
 
-def _tops(plane: PhasePlane, box: Array) -> Array:
+def _find_grid_maxima(plane: PhasePlane, box: Array) -> Array:
     """Return the highest local maxima (P, 2) of |curvature| on a grid over a box."""
     axes = [np.linspace(low, high, 1 + math.ceil((high - low) / _GRID_STEP)) for low, high in box.T]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -302,4 +302,4 @@ def _tops(plane: PhasePlane, box: Array) -> Array:
     around = np.lib.stride_tricks.sliding_window_view(np.pad(heights, 1, mode="edge"), (3, 3))
     tops = np.flatnonzero(heights == around.max(axis=(2, 3)))
     order = np.argsort(-heights.ravel()[tops], kind="stable")
-    return grid.reshape(-1, 2)[tops[order[:_MOST_PEAKS]]]
+    return grid.reshape(-1, 2)[tops[order[:_MAX_PEAKS]]]

@@ -40,9 +40,9 @@ from spacerobot_ros.planning.core.goal import POSITION_SLACK, Goal, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
-_FEWEST_TICKS_A_CYCLE = 12
-_MOST_REFINEMENTS = 20
-_KNOTS = 100
+_MIN_CYCLE_TICKS = 12
+_MAX_REFINEMENTS = 20
+_PATH_POINTS = 100
 """Poses of the predicted path in each step, up to twice as many."""
 
 _NO_ROTATION = 1e-9
@@ -94,7 +94,7 @@ class LieBracketGait(GaitMethod):
         robot = self.robot
         # Whole ticks a cycle: every cycle is then the same commands and the same rotation.
         self.ticks_a_cycle = max(
-            round(self.options.cycle_period / self.control_period), _FEWEST_TICKS_A_CYCLE
+            round(self.options.cycle_period / self.control_period), _MIN_CYCLE_TICKS
         )
         self.sliders = sliders_of(robot)
 
@@ -109,12 +109,12 @@ class LieBracketGait(GaitMethod):
         state, goal = request.state, request.goal
         self._require_rest(state)
         z_f = self.final_shape(state, goal, POSITION_SLACK * request.tolerance.position)
-        slide = self._slide(state.q, z_f)
+        slide = self._slide_shapes(state.q, z_f)
         t1 = (len(slide) - 1) * self.control_period or self.options.t1
         attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)
-        cycle, n, notes = self._turn(attitudes[-1], z_f, request)
+        cycle, n, notes = self._plan_turn(attitudes[-1], z_f, request)
         turn = np.tile(cycle[1:], (n, 1)) if n else np.empty((0, self.robot.n))
-        path = self._path(state, slide, attitudes, cycle, n)
+        path = self._predict_path(state, slide, attitudes, cycle, n)
         symbols: Notes = {
             "zf": [float(z_f[i]) for i in self.sliders],
             "c": [2 * float((z_f - state.q)[i]) / t1 for i in self.sliders],
@@ -143,12 +143,12 @@ class LieBracketGait(GaitMethod):
         z0, lower, upper = (x[self.sliders] for x in (state.q, robot.lower, robot.upper))
         dz: Array = np.linalg.lstsq(P, shift, rcond=None)[0].astype(float)
         if np.any(z0 + dz < lower) or np.any(z0 + dz > upper):
-            dz = self._within_strokes(P, shift, z0, dz, lower, upper, enough)
+            dz = self._keep_to_strokes(P, shift, z0, dz, lower, upper, enough)
         z_f = state.q.copy()
         z_f[self.sliders] = np.clip(z0 + dz, lower, upper)
         return z_f
 
-    def _within_strokes(
+    def _keep_to_strokes(
         self,
         P: Array,
         shift: Array,
@@ -185,7 +185,7 @@ class LieBracketGait(GaitMethod):
             raise PlanningError(message)
         raise UnreachableError(message, Proof.LIMITS)
 
-    def _slide(self, z0: Array, z_f: Array) -> Array:
+    def _slide_shapes(self, z0: Array, z_f: Array) -> Array:
         """Step 2: shapes (N + 1, n) under ``v_i = c_i sin^2(2 pi n1 t / t1)``, eq. (10)."""
         displacement = z_f - z0
         if np.abs(displacement).max() <= _NO_MOTION:
@@ -214,7 +214,7 @@ class LieBracketGait(GaitMethod):
                 slowest = max(slowest, 2 * distance / rate)
         return float(slowest)
 
-    def _turn(
+    def _plan_turn(
         self, quaternion: Array, z_f: Array, request: PlanRequest
     ) -> tuple[Array, int, Notes]:
         """Step 3: one cycle of shapes (m + 1, n), the number of cycles, and the paper's symbols."""
@@ -224,13 +224,13 @@ class LieBracketGait(GaitMethod):
             return z_f[np.newaxis].copy(), 0, {"cycles": 0.0}
         triple, brackets = self._best_triple(z_f)
         least = 0 if request.correction else self.options.cycles
-        best = self._refine(wanted, brackets, triple, z_f, least, enough)
+        best = self._refine_turn(wanted, brackets, triple, z_f, least, enough)
         while (
             best.miss > enough
             and 2 * best.cycles * self.ticks_a_cycle * self.control_period <= self.options.longest
         ):
             # The error of the first order goes as 1/sqrt(n).
-            best = self._refine(wanted, brackets, triple, z_f, 2 * best.cycles, enough)
+            best = self._refine_turn(wanted, brackets, triple, z_f, 2 * best.cycles, enough)
         names = [self.robot.joint_names[i] for i in triple]
         return (
             best.shapes,
@@ -245,7 +245,7 @@ class LieBracketGait(GaitMethod):
             },
         )
 
-    def _refine(
+    def _refine_turn(
         self,
         wanted: Array,
         brackets: Array,
@@ -260,11 +260,11 @@ class LieBracketGait(GaitMethod):
         """
         omega_d, best = wanted, None
         target = quaternion_from_rotvec(wanted)
-        for _ in range(_MOST_REFINEMENTS):
+        for _ in range(_MAX_REFINEMENTS):
             alpha = np.linalg.solve(brackets, omega_d).astype(float)
-            turn = self._fit(alpha, triple, z_f, least)
+            turn = self._fit_to_limits(alpha, triple, z_f, least)
             least = turn.cycles
-            reached = turn.cycles * self._rotation(turn.shapes)
+            reached = turn.cycles * self._cycle_rotation(turn.shapes)
             miss = attitude_error(quaternion_from_rotvec(reached), target)
             turn = replace(turn, miss=float(np.linalg.norm(miss)))
             if best is None or turn.miss < best.miss:
@@ -289,12 +289,14 @@ class LieBracketGait(GaitMethod):
             )
         return triple, brackets
 
-    def _fit(self, alpha: Array, triple: tuple[int, int, int], z_f: Array, least: int) -> _Turn:
+    def _fit_to_limits(
+        self, alpha: Array, triple: tuple[int, int, int], z_f: Array, least: int
+    ) -> _Turn:
         """Choose n, from ``least`` up, so that the cycle keeps rates and strokes; more cycles are
         smaller ones. With ``least`` 0 it follows from ``loop_area``.
         """
         n = least or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.options.loop_area))
-        amplitudes = self._amplitudes(alpha)
+        amplitudes = self._cycle_amplitudes(alpha)
         robot, longest = self.robot, self.options.longest
         room = np.minimum(z_f - robot.lower, robot.upper - z_f)
         while True:
@@ -304,7 +306,7 @@ class LieBracketGait(GaitMethod):
                     f"rates of the sliders at the final shape {np.round(z_f, 4).tolist()}; "
                     "a goal that leaves the sliders more room takes less."
                 )
-            shapes = self._cycle(amplitudes, n, triple, z_f)
+            shapes = self._cycle_shapes(amplitudes, n, triple, z_f)
             swing = np.abs(shapes - z_f).max(axis=0)
             rate = np.abs(np.diff(shapes, axis=0)).max(axis=0) / self.control_period
             active = swing > 0
@@ -318,7 +320,7 @@ class LieBracketGait(GaitMethod):
             # Amplitudes go as 1/sqrt(n).
             n = math.ceil(min(n * min(excess, 1e6) ** 2 * 1.001, 1e12)) + 1
 
-    def _amplitudes(self, alpha: Array) -> Array:
+    def _cycle_amplitudes(self, alpha: Array) -> Array:
         """Return (b11, b12, b21, a22, a31): ``a22 b12 = 2 alpha1/pi``, ``a31 b21 = alpha2/pi``,
         ``a31 b11 = alpha3/pi``, each product raised by the loss of polygons.
         """
@@ -331,7 +333,9 @@ class LieBracketGait(GaitMethod):
         b21, b11 = (p23 / (first * a31), p13 / (first * a31)) if a31 else (0.0, 0.0)
         return np.array([b11, b12, b21, a22, a31])
 
-    def _cycle(self, amplitudes: Array, n: int, triple: tuple[int, int, int], z_f: Array) -> Array:
+    def _cycle_shapes(
+        self, amplitudes: Array, n: int, triple: tuple[int, int, int], z_f: Array
+    ) -> Array:
         """One cycle at its ticks: the integrals of v1, v2, v3 of step 3, from ``zf`` back to it."""
         b11, b12, b21, a22, a31 = amplitudes / math.sqrt(n)
         phi = np.linspace(0.0, 2 * np.pi, self.ticks_a_cycle + 1)
@@ -344,21 +348,21 @@ class LieBracketGait(GaitMethod):
         shapes[-1] = z_f
         return shapes
 
-    def _rotation(self, cycle: Array) -> Array:
+    def _cycle_rotation(self, cycle: Array) -> Array:
         """Rotation vector (3,) of the base over one cycle."""
         identity = np.array([0.0, 0.0, 0.0, 1.0])
         return rotvec_from_quaternion(self._prediction.attitudes(cycle, identity, np.zeros(3))[-1])
 
-    def _path(
+    def _predict_path(
         self, state: RobotState, slide: Array, attitudes: Array, cycle: Array, n: int
     ) -> BasePath:
         """Base path: step 2 as it goes, step 3 at the ends of some cycles."""
-        stride = max(1, len(slide) // _KNOTS)
+        stride = max(1, len(slide) // _PATH_POINTS)
         chosen = np.unique(np.append(np.arange(0, len(slide), stride), len(slide) - 1))
         time, shapes, quaternions = chosen * self.control_period, slide[chosen], attitudes[chosen]
         if n:
-            done = np.unique(np.append(np.arange(0, n, max(1, n // _KNOTS))[1:], n))
-            rotation = self._rotation(cycle)
+            done = np.unique(np.append(np.arange(0, n, max(1, n // _PATH_POINTS))[1:], n))
+            rotation = self._cycle_rotation(cycle)
             turned = [
                 quaternion_multiply(attitudes[-1], quaternion_from_rotvec(k * rotation))
                 for k in done

@@ -29,23 +29,23 @@ from spacerobot_ros.planning.core.controllability import (
 PLANES = ((0, 1), (1, 2), (2, 0))
 """The planes of three joints in which loops enclose areas."""
 
-_GRID = {1: 11, 2: 7}
+_GRID_POINTS = {1: 11, 2: 7}
 """Points a joint of the first grid, by the number of triples; 5 with more."""
 
-_MOST_TRIPLES, _SAMPLES = 8, 48
+_MAX_TRIPLES, _SAMPLED_SHAPES = 8, 48
 """Of more triples of joints the best of these are examined closely, at so many shapes."""
 
-_REFINEMENTS = 10
-_EQUAL = 1e-6
+_GRID_REFINEMENTS = 10
+_EQUAL_MEASURES = 1e-6
 """Shapes whose measures differ by less than this share are equally good; the middle one wins."""
 
-_NO_ROOM = 1e-4
+_MIN_EDGE = 1e-4
 """Edges shorter than this, m or rad, are none."""
 
-_SAME_SHAPE = 1e-3
+_HELD_JOINT_TOLERANCE = 1e-3
 """Held joints may have moved by this much, m or rad."""
 
-_AROUND = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)))
+_NEIGHBOUR_OFFSETS = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)))
 
 
 @dataclass(frozen=True)
@@ -105,9 +105,11 @@ class NominalChoice:
     ) -> None:
         self._robot = robot
         self._largest_edge = largest_edge
-        self._triples = _triples(robot, joints.split())
-        self._given = _checked(robot, np.array(nominal, dtype=float)) if len(nominal) else None
-        self._only: NominalShape | None = None
+        self._triples = _list_triples(robot, joints.split())
+        self._given_shape = (
+            _require_shape(robot, np.array(nominal, dtype=float)) if len(nominal) else None
+        )
+        self._only_choice: NominalShape | None = None
         kinds = [joint.kind for joint in robot.description.movable_joints]
         turning = np.array([kind is not JointKind.PRISMATIC for kind in kinds], dtype=bool)
         self._repeating = turning & np.isinf(robot.lower) & np.isinf(robot.upper)
@@ -116,7 +118,7 @@ class NominalChoice:
         """Choose beforehand where the choice depends on no shape: for robots with three joints."""
         if self._robot.n == 3:
             with suppress(PlanningError):
-                self._only = self._choose(np.zeros(3))
+                self._only_choice = self._choose_nominal(np.zeros(3))
 
     def at(self, q: Array, kept: NominalShape | None = None) -> NominalShape:
         """Return the nominal shape to use from shape ``q`` (n,).
@@ -128,33 +130,35 @@ class NominalChoice:
         PlanningError
             Limits leave no room for loops, or loops there do not turn the base about all axes.
         """
-        if self._only is not None:
-            return self._only
-        return kept if kept is not None and self._holds(kept, q) else self._choose(q)
+        if self._only_choice is not None:
+            return self._only_choice
+        return (
+            kept if kept is not None and self._still_applies(kept, q) else self._choose_nominal(q)
+        )
 
     def nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
         """Return the nominal shape with joints without limits at their turn nearest to ``q``."""
         turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
         return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
 
-    def _holds(self, chosen: NominalShape, q: Array) -> bool:
+    def _still_applies(self, chosen: NominalShape, q: Array) -> bool:
         moved = np.abs(np.delete(q - chosen.shape, chosen.joints)).max(initial=0.0)
-        return self._given is not None or bool(moved <= _SAME_SHAPE)
+        return self._given_shape is not None or bool(moved <= _HELD_JOINT_TOLERANCE)
 
-    def _choose(self, q: Array) -> NominalShape:
+    def _choose_nominal(self, q: Array) -> NominalShape:
         robot = self._robot
         if not self._triples:
             raise PlanningError(
                 f"area_loop needs three joints that move; robot '{robot.description.name}' has "
                 f"{int(np.sum(robot.velocity_limit > 0))} with a velocity limit above zero."
             )
-        if self._given is not None:
-            chosen = given_nominal(robot, self._given, self._triples, self._largest_edge)
+        if self._given_shape is not None:
+            chosen = given_nominal(robot, self._given_shape, self._triples, self._largest_edge)
         else:
             chosen = best_nominal(robot, q, self._triples, self._largest_edge)
         names = [robot.joint_names[i] for i in chosen.joints]
         least = int(np.argmin(chosen.longest))
-        if chosen.longest[least] < _NO_ROOM:
+        if chosen.longest[least] < _MIN_EDGE:
             joint = chosen.joints[least]
             raise PlanningError(
                 f"The joint limits [{robot.lower[joint]:.4g}, {robot.upper[joint]:.4g}] leave "
@@ -183,7 +187,7 @@ def given_nominal(
     for triple in triples:
         longest = np.minimum(largest_edge, (upper - lower)[list(triple)])
         candidates.append(NominalShape(shape, triple, curvature_matrices(K, triple), longest))
-    return max(candidates, key=lambda nominal: float(_measure(nominal.M, nominal.longest)))
+    return max(candidates, key=lambda nominal: float(_worst_axis_turn(nominal.M, nominal.longest)))
 
 
 def best_nominal(
@@ -193,31 +197,31 @@ def best_nominal(
 
     Boxes of the longest edges fit round it into the limits.
     """
-    triples = _promising(robot, triples, largest_edge)
-    points = _GRID.get(len(triples), 5)
+    triples = _select_best_triples(robot, triples, largest_edge)
+    points = _GRID_POINTS.get(len(triples), 5)
     return max(
-        (_best_of(robot, held, triple, largest_edge, points) for triple in triples),
-        key=lambda nominal: float(_measure(nominal.M, nominal.longest)),
+        (_best_of_triple(robot, held, triple, largest_edge, points) for triple in triples),
+        key=lambda nominal: float(_worst_axis_turn(nominal.M, nominal.longest)),
     )
 
 
-def _promising(
+def _select_best_triples(
     robot: SpaceRobot, triples: Sequence[tuple[int, int, int]], largest_edge: float
 ) -> Sequence[tuple[int, int, int]]:
     """Return the triples of joints that are best somewhere in the shape space."""
-    if len(triples) <= _MOST_TRIPLES:
+    if len(triples) <= _MAX_TRIPLES:
         return triples
-    shapes = sample_shapes(robot, _SAMPLES)
+    shapes = sample_shapes(robot, _SAMPLED_SHAPES)
     K = curvatures(robot, shapes)
 
     def best(triple: tuple[int, int, int]) -> float:
         longest = _centred_edges(robot, list(triple), shapes[:, list(triple)], largest_edge)
-        return float(_measure(curvature_matrices(K, triple), longest).max())
+        return float(_worst_axis_turn(curvature_matrices(K, triple), longest).max())
 
-    return sorted(triples, key=best, reverse=True)[:_MOST_TRIPLES]
+    return sorted(triples, key=best, reverse=True)[:_MAX_TRIPLES]
 
 
-def _best_of(
+def _best_of_triple(
     robot: SpaceRobot, held: Array, triple: tuple[int, int, int], largest_edge: float, points: int
 ) -> NominalShape:
     chosen = list(triple)
@@ -225,18 +229,18 @@ def _best_of(
     step = (upper - lower) / (points - 1)
     axes = [np.linspace(low, high, points) for low, high in zip(lower, upper, strict=True)]
     at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    for _ in range(_REFINEMENTS):
-        matrices, longest = _at(robot, held, chosen, at, largest_edge)
-        best = _most_central(at, _measure(matrices, longest), (lower + upper) / 2)
+    for _ in range(_GRID_REFINEMENTS):
+        matrices, longest = _matrices_and_edges(robot, held, chosen, at, largest_edge)
+        best = _most_central(at, _worst_axis_turn(matrices, longest), (lower + upper) / 2)
         step = step / 2
-        at = np.clip(at[best] + step * _AROUND, lower, upper)
+        at = np.clip(at[best] + step * _NEIGHBOUR_OFFSETS, lower, upper)
     # The centre of the last neighbourhood is the best point.
     shape = held.copy()
     shape[chosen] = at[0]
     return NominalShape(shape, triple, matrices[best], longest[best])
 
 
-def _at(
+def _matrices_and_edges(
     robot: SpaceRobot, held: Array, chosen: list[int], at: Array, largest_edge: float
 ) -> tuple[Array, Array]:
     """Return M (N, 3, 3) and the longest centred edges (N, 3) with three joints at (N, 3)."""
@@ -252,18 +256,18 @@ def _centred_edges(robot: SpaceRobot, chosen: list[int], at: Array, largest_edge
     return np.clip(2 * room, 0.0, largest_edge)
 
 
-def _measure(M: Array, longest: Array) -> Array:
+def _worst_axis_turn(M: Array, longest: Array) -> Array:
     """Return the turn (...) about the worst axis by the largest loops, rad."""
     areas = np.stack([longest[..., i] * longest[..., j] for i, j in PLANES], axis=-1)
     return np.asarray(np.linalg.svd(M * areas[..., np.newaxis, :], compute_uv=False)[..., 2])
 
 
 def _most_central(at: Array, measures: Array, middle: Array) -> int:
-    good = np.flatnonzero(measures >= (1 - _EQUAL) * measures.max())
+    good = np.flatnonzero(measures >= (1 - _EQUAL_MEASURES) * measures.max())
     return int(good[np.argmin(np.linalg.norm(at[good] - middle, axis=1))])
 
 
-def _triples(robot: SpaceRobot, names: Sequence[str]) -> list[tuple[int, int, int]]:
+def _list_triples(robot: SpaceRobot, names: Sequence[str]) -> list[tuple[int, int, int]]:
     """Return the triples of joints to choose from; joints without speed are no choice."""
     if not names:
         movable = np.flatnonzero(robot.velocity_limit > 0).tolist()
@@ -277,7 +281,7 @@ def _triples(robot: SpaceRobot, names: Sequence[str]) -> list[tuple[int, int, in
     return [(i, j, k)]
 
 
-def _checked(robot: SpaceRobot, shape: Array) -> Array:
+def _require_shape(robot: SpaceRobot, shape: Array) -> Array:
     if len(shape) != robot.n:
         raise ParameterError(
             f"area_loop.nominal has {len(shape)} number(s); robot '{robot.description.name}' has "

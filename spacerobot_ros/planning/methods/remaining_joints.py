@@ -75,7 +75,7 @@ class RemainingJointsGait(GaitMethod):
         self._names = list(dict.fromkeys((method, "auto")))
         self._required = required
         self._options = {
-            name: _options_without(chosen, self._is_stuck, robot.joint_names)
+            name: _options_of_remaining(chosen, self._is_stuck, robot.joint_names)
             for name, chosen in options.items()
         }
         self._remaining: SpaceRobot | None = None
@@ -88,7 +88,7 @@ class RemainingJointsGait(GaitMethod):
         except PlanningCancelled:
             raise
         except PlanningError as refusal:
-            raise refusal_of_all(f"{self._where()}; {refusal}", [refusal]) from None
+            raise refusal_of_all(f"{self._describe_stuck_joints()}; {refusal}", [refusal]) from None
 
     def _plan(self, request: PlanRequest, cancellation: Cancellation) -> GaitSchedule:
         moving, state, shape = ~self._is_stuck, request.state, request.goal.joint_positions
@@ -96,7 +96,7 @@ class RemainingJointsGait(GaitMethod):
             raise PlanningError(
                 "no joint follows; /diagnostics says whether the plant refuses the commands."
             )
-        names, previous = self._going_on(request.previous)
+        names, previous = self._methods_to_try(request.previous)
         inner = replace(
             request,
             state=replace(state, q=state.q[moving]),
@@ -106,7 +106,7 @@ class RemainingJointsGait(GaitMethod):
         reasons: list[SpaceRobotError] = []
         for name in names:
             try:
-                schedule = self._method(name).plan(inner, cancellation)
+                schedule = self._get_method(name).plan(inner, cancellation)
             except PlanningCancelled:
                 raise
             except (PlanningError, ParameterError, RobotDescriptionError) as refusal:
@@ -118,7 +118,7 @@ class RemainingJointsGait(GaitMethod):
                 reasons.append(PlanningError(left))
                 continue
             if "shape" in schedule.controls and shape is not None:
-                self._require_shape(state, shape, request.tolerance.shape)
+                self._require_stuck_at(state, shape, request.tolerance.shape)
             positions = np.tile(state.q, (len(schedule.positions), 1))
             positions[:, moving] = schedule.positions
             return replace(
@@ -131,7 +131,9 @@ class RemainingJointsGait(GaitMethod):
         sentences = " ".join(dict.fromkeys(map(str, reasons)))
         raise refusal_of_all(f"with the remaining joints: {sentences}", reasons)
 
-    def _going_on(self, previous: GaitSchedule | None) -> tuple[list[str], GaitSchedule | None]:
+    def _methods_to_try(
+        self, previous: GaitSchedule | None
+    ) -> tuple[list[str], GaitSchedule | None]:
         """Return the methods to try, and the previous schedule as theirs.
 
         Progress with other joints does not count.
@@ -143,7 +145,7 @@ class RemainingJointsGait(GaitMethod):
             return self._names, None
         return [progress.planner], replace(previous, progress=progress.inner)
 
-    def _method(self, name: str) -> GaitMethod:
+    def _get_method(self, name: str) -> GaitMethod:
         if self._remaining is None:
             self._remaining = SpaceRobot(self.robot.description.with_locked(self._stuck))
         if name not in self._methods:
@@ -152,7 +154,7 @@ class RemainingJointsGait(GaitMethod):
             )
         return self._methods[name]
 
-    def _require_shape(self, state: RobotState, shape: Array, tolerance: float) -> None:
+    def _require_stuck_at(self, state: RobotState, shape: Array, tolerance: float) -> None:
         far = np.abs(shape - state.q) * self._is_stuck
         worst = int(np.argmax(far))
         if far[worst] > tolerance:
@@ -161,7 +163,7 @@ class RemainingJointsGait(GaitMethod):
                 Proof.LIMITS,
             )
 
-    def _where(self) -> str:
+    def _describe_stuck_joints(self) -> str:
         places = []
         for joint in self.robot.description.movable_joints:
             if joint.name in self._stuck:
@@ -170,7 +172,7 @@ class RemainingJointsGait(GaitMethod):
         return " and ".join(places)
 
 
-def _options_without(options: Any, stuck: npt.NDArray[np.bool_], names: Sequence[str]) -> Any:
+def _options_of_remaining(options: Any, stuck: npt.NDArray[np.bool_], names: Sequence[str]) -> Any:
     """Return options for the remaining joints: lists with a number a joint lose those of the stuck
     ones, and names of joints are left to the method if one of them is stuck.
     """

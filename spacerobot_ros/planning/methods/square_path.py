@@ -43,7 +43,7 @@ from spacerobot_ros.planning.methods.geometric_phase import (
     square_corners,
 )
 
-_WORTHWHILE = 0.1
+_MIN_CORRECTED_SHARE = 0.1
 """A missing turn below this share of the tolerance is not corrected."""
 
 _NO_ROTATION = 1e-9
@@ -52,10 +52,10 @@ _LARGEST_SIDE = math.pi
 """rad. Over a whole turn of both joints the curvature has mean zero: beyond about half a turn a
 larger square adds curvature of the other sign."""
 
-_SIDES = 8
+_TRIED_SIDES = 8
 """Sides that are tried between zero and the largest that fits."""
 
-_LARGEST_WITHIN = 1.0 - 1e-9
+_USED_ROOM = 1.0 - 1e-9
 """Share of the room that the largest square takes: rounding must not put a corner beyond it."""
 
 
@@ -134,7 +134,7 @@ class SquarePathGait(GaitMethod):
         cancellation.raise_if_requested()
         state, goal, tolerance = request.state, request.goal, request.tolerance
         self._require_rest(state)
-        turn = self._turn(request)
+        turn = self._requested_turn(request)
         psi_e = self._goal_shape(goal)
         if psi_e is None:
             psi_e = np.clip(state.q, self.robot.lower, self.robot.upper)
@@ -142,12 +142,12 @@ class SquarePathGait(GaitMethod):
         # Whole turns are no matter: the smaller of the two ways round.
         wanted = math.remainder(turn - step_1, 2 * math.pi)
         loop = None
-        if abs(wanted) > max(_NO_ROTATION, _WORTHWHILE * tolerance.attitude):
+        if abs(wanted) > max(_NO_ROTATION, _MIN_CORRECTED_SHARE * tolerance.attitude):
             loop = self._search.loop(psi_e, wanted)
         positions = straight_motion(
             self.robot,
             state.q,
-            self._legs(psi_e, loop),
+            self._straight_legs(psi_e, loop),
             self.control_period,
             self.options.longest,
         )
@@ -169,7 +169,7 @@ class SquarePathGait(GaitMethod):
         }
         return self._schedule_of(goal, positions, path, notes)
 
-    def _turn(self, request: PlanRequest) -> float:
+    def _requested_turn(self, request: PlanRequest) -> float:
         """Return the angle in [-pi, pi] about the robot's axis from the present attitude."""
         start, wanted = request.state.quaternion, request.goal.quaternion
         axis = self._phase.axis
@@ -180,7 +180,7 @@ class SquarePathGait(GaitMethod):
         twist = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
         return math.remainder(twist, 2 * math.pi)
 
-    def _legs(self, psi_e: Array, loop: SquareLoop | None) -> list[tuple[Array, float]]:
+    def _straight_legs(self, psi_e: Array, loop: SquareLoop | None) -> list[tuple[Array, float]]:
         """Return the ends (n,) of the straight legs, and the duration of each, s."""
         step_1, step_2, step_3, step_4 = self._durations
         legs = [(psi_e, step_1)]
@@ -233,7 +233,7 @@ class SquareLoop:
 
 
 @dataclass(frozen=True)
-class _Candidates:
+class _GrowingSquares:
     """Growing squares of one pair: centres (R, 2), sides (R,), phases (R,) counter-clockwise."""
 
     pair: tuple[int, int]
@@ -288,14 +288,14 @@ class SquareSearch:
             No square within the joint limits turns the base far enough.
         """
         pairs = itertools.combinations(self._movable, 2)
-        found = [candidates for pair in pairs if (candidates := self._candidates(psi_e, pair))]
+        found = [candidates for pair in pairs if (candidates := self._growing_squares(psi_e, pair))]
         largest = max(found, key=lambda candidates: candidates.largest, default=None)
         if largest is None or largest.largest * self._most_loops < abs(wanted):
-            raise PlanningError(self._why_not(wanted, largest))
+            raise PlanningError(self._describe_refusal(wanted, largest))
         loops = math.ceil(abs(wanted) / largest.largest)
         target = abs(wanted) / loops
         solved = [
-            (candidates, *self._solve(candidates, target))
+            (candidates, *self._solve_for_side(candidates, target))
             for candidates in found
             if candidates is largest or candidates.largest >= target
         ]
@@ -314,7 +314,7 @@ class SquareSearch:
             np.roll(corners, -nearest, axis=0),
         )
 
-    def _why_not(self, wanted: float, largest: _Candidates | None) -> str:
+    def _describe_refusal(self, wanted: float, largest: _GrowingSquares | None) -> str:
         """Return why no loop will do; ``largest`` is the best there is."""
         if len(self._movable) < 2:
             return (
@@ -332,7 +332,7 @@ class SquareSearch:
             f"square loops of joints '{names[i]}' and '{names[j]}'{given} turn it by at most about "
             f"{largest.largest:.3g} rad each"
         )
-        if largest.sides[-1] < _LARGEST_SIDE * _LARGEST_WITHIN:
+        if largest.sides[-1] < _LARGEST_SIDE * _USED_ROOM:
             most += f", with sides of up to {largest.sides[-1]:.3g} rad within the joint limits"
         if largest.largest < _NO_ROTATION:
             return f"The base cannot be turned by {wanted:.4g} rad by square loops: {most}."
@@ -342,7 +342,7 @@ class SquareSearch:
             f"{self._most_loops}: {most}."
         )
 
-    def _candidates(self, psi_e: Array, pair: tuple[int, int]) -> _Candidates | None:
+    def _growing_squares(self, psi_e: Array, pair: tuple[int, int]) -> _GrowingSquares | None:
         """Return squares of growing side within the limits; None if there is no room."""
         at, lower, upper = (x[list(pair)] for x in (psi_e, self._robot.lower, self._robot.upper))
         room = float(np.min(upper - lower))
@@ -351,15 +351,15 @@ class SquareSearch:
         if room <= 0:
             return None
         plane = self._phase.plane(psi_e, *pair)
-        sides = np.linspace(0.0, min(room, _LARGEST_SIDE) * _LARGEST_WITHIN, _SIDES + 1)[1:]
+        sides = np.linspace(0.0, min(room, _LARGEST_SIDE) * _USED_ROOM, _TRIED_SIDES + 1)[1:]
         if self._centre is not None:
-            centres = np.tile(self._centre, (_SIDES, 1))
+            centres = np.tile(self._centre, (_TRIED_SIDES, 1))
         else:
             boxes = [centre_box(at, lower + side / 2, upper - side / 2) for side in sides]
             centres = curvature_peaks(plane, at, np.array(boxes))
-        return _Candidates(pair, plane, centres, sides, plane.squares(centres, sides))
+        return _GrowingSquares(pair, plane, centres, sides, plane.squares(centres, sides))
 
-    def _solve(self, candidates: _Candidates, wanted: float) -> tuple[int, float]:
+    def _solve_for_side(self, candidates: _GrowingSquares, wanted: float) -> tuple[int, float]:
         """Return the row of the smallest candidate that turns far enough, and its ``z*``.
 
         ``wanted`` is the turn of one loop in either sense, rad, at most the largest there is.
