@@ -44,7 +44,7 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.status import PlannerStatus, remaining_error
+from spacerobot_ros.planning.execution.status import PlannerStatus, describe_remaining_error
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
@@ -287,7 +287,7 @@ class _ScheduledLanes:
         if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
             return "had a joint that did not follow its schedule"
         error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
-        remaining = remaining_error(error, schedule.controls)
+        remaining = describe_remaining_error(error, schedule.controls)
         outcome, message = Outcome.REACHED, f"The goal is reached: {remaining}."
         if not scenario.planner.tolerance.admits(error, schedule.controls):
             if scenario.planner.max_corrections:

@@ -42,8 +42,8 @@ class Display:
             if self._flies or not self._visible:
                 return
             if self._bar is None or progress.starts <= self._bar.pos:
-                self._begin(f"planning {self._label}", progress.most)
-            self._bar.length = progress.most
+                self._begin(f"planning {self._label}", progress.max_starts)
+            self._bar.length = progress.max_starts
             self._bar.update(progress.starts - self._bar.pos, progress.message)
 
     def fly(self, now: float, end: float) -> None:

@@ -15,12 +15,12 @@ from typing import Any, Literal, Protocol
 
 from spacerobot_ros.commanding.goal_follower import Status, decision_event
 from spacerobot_ros.commanding.plant_state import (
-    Change,
+    PlantChange,
     PlantListener,
+    PlantStopped,
     Stamped,
     StampFilter,
     StateSynchroniser,
-    Stopped,
 )
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.executive import ControlExecutive
@@ -35,13 +35,13 @@ from spacerobot_ros.planning.execution.goal_file import GoalFile, GoalIds, Ident
 from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.simulation.status import PlantStatus
 
-_STANDSTILL = 0.005
+_STANDSTILL_TIME = 0.005
 """Wall s without an answer after which only the last of the states that wait is answered."""
 
 _REPORT_PERIOD = 1.0
 """Least wall s between two warnings about ignored states."""
 
-_COMPLAINT_PERIOD = 5.0
+_FAULT_LOG_PERIOD = 5.0
 """Least wall s between two lines about the same fault of messages."""
 
 LogLevel = Literal["debug", "info", "warning", "error"]
@@ -185,11 +185,11 @@ class Commander(ABC):
         self._decoder: StateDecoder | None = None
         self._goal_file = GoalFile(config.resume_file, goal_keys)
         self._goal_ids = GoalIds()
-        self._waiting: dict[str, IdentifiedGoal] = {}
+        self._waiting_goals: dict[str, IdentifiedGoal] = {}
         """Goals that have come before the robot."""
-        self._answered = clock()
+        self._answer_time = clock()
         self._ignored_reported, self._next_report = 0, 0.0
-        self._complained: dict[str, float] = {}
+        self._fault_log_times: dict[str, float] = {}
         """By kind of fault the wall time of the last line about it, s."""
 
     # -- life ---------------------------------------------------------------------------------
@@ -199,7 +199,7 @@ class Commander(ABC):
         """Whether states are answered and goals accepted."""
         return self.activity is Activity.ACTIVE
 
-    def use(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
+    def use_robot(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         """Command this robot from now on, and accept the goals that wait for it.
 
         Raises
@@ -207,18 +207,18 @@ class Commander(ABC):
         SpaceRobotError
             The configuration does not go with the robot.
         """
-        self._build(robot, decoder)
+        self._build_executive(robot, decoder)
         self.robot, self._decoder = robot, decoder
-        self._follow_plant()
-        waiting, self._waiting = self._waiting, {}
+        self._tell_plant_state()
+        waiting, self._waiting_goals = self._waiting_goals, {}
         for key, goal in waiting.items():
-            self._submit(key, goal)
+            self._submit_goal(key, goal)
 
     def leave_robot(self, why: str) -> None:
         """Give up the goals and the robot; goals wait for another one."""
         if self.executive is not None:
-            self._give_up(Stopped(why))
-            self._release()
+            self._give_up_goals(PlantStopped(why))
+            self._stop_executive()
         self.robot = self.executive = self._decoder = None
 
     def activate(self) -> None:
@@ -229,7 +229,7 @@ class Commander(ABC):
         ParameterError
             The file of goals is refused.
         """
-        self._resume(self._goal_file.load())
+        self._resume_goals(self._goal_file.load())
         self.activity = Activity.ACTIVE
         # A lockstep plant may have been waiting for an answer since before.
         self.answer()
@@ -237,8 +237,8 @@ class Commander(ABC):
     def deactivate(self) -> None:
         """Give up the goals and command nothing any more; the file of goals stays."""
         if self.activity is not Activity.INACTIVE and self.executive is not None:
-            self._release()
-        self.activity, self._waiting = Activity.INACTIVE, {}
+            self._stop_executive()
+        self.activity, self._waiting_goals = Activity.INACTIVE, {}
 
     # -- goals --------------------------------------------------------------------------------
 
@@ -269,15 +269,15 @@ class Commander(ABC):
             if self.plant.blocked:
                 raise PlanningError(self.plant.blocked)
         except PlanningError as error:
-            self._refuse(str(error), goal_id)
+            self._refuse_goal(str(error), goal_id)
             return None
         accepted = IdentifiedGoal(goal, goal_id)
-        self._accept(key, accepted)
+        self._accept_goal(key, accepted)
         return accepted
 
     def abort(self) -> str | None:
         """Give up all goals; return the message of the answer, None where there was no goal."""
-        if self._waiting:
+        if self._waiting_goals:
             message = "Aborted on request, before the robot was known."
             self._abort_waiting(message)
             return message
@@ -285,31 +285,31 @@ class Commander(ABC):
         self._goal_file.delete()
         return answer
 
-    def _accept(self, key: str, goal: IdentifiedGoal) -> None:
+    def _accept_goal(self, key: str, goal: IdentifiedGoal) -> None:
         if self.executive is None:
-            self._waiting[key] = goal
+            self._waiting_goals[key] = goal
             self._report_waiting(goal, "The goal waits for a robot on robot_description.")
         else:
-            self._submit(key, goal)
+            self._submit_goal(key, goal)
 
-    def _refuse(self, message: str, goal_id: str) -> None:
-        self._publish_decision(self._status("refused", message, goal_id))
+    def _refuse_goal(self, message: str, goal_id: str) -> None:
+        self._publish_decision(self._make_status("refused", message, goal_id))
 
     def _abort_waiting(self, message: str) -> None:
         """Give up the goals that wait for the robot."""
-        *_, goal = self._waiting.values()
-        self._waiting = {}
+        *_, goal = self._waiting_goals.values()
+        self._waiting_goals = {}
         self._goal_file.delete()
-        self._publish_decision(self._status("aborted", message, goal.goal_id))
+        self._publish_decision(self._make_status("aborted", message, goal.goal_id))
 
     def _publish_decision(self, status: Status) -> None:
         """Publish a status, and the event where it decides a goal."""
-        self._publish(status)
+        self._publish_status(status)
         event = decision_event(status)
         if event is not None:
             self.host.report_event(event)
 
-    def _publish(self, status: Status) -> None:
+    def _publish_status(self, status: Status) -> None:
         self.host.publish_status(status)
         if status.state.decided and self.config.stop_when_decided and self.active:
             self.activity = Activity.DECIDED
@@ -323,16 +323,16 @@ class Commander(ABC):
 
     def receive_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take joints as they come: those of another time are set aside, and late ones skipped."""
-        if self._clock() - self._answered > _STANDSTILL:
-            self._take_last(Stamped(stamp_ns, joints))
-        elif self._of_the_robot(joints) and self.stamps.admits(stamp_ns, joints):
+        if self._clock() - self._answer_time > _STANDSTILL_TIME:
+            self._answer_last_state(Stamped(stamp_ns, joints))
+        elif self._is_of_robot(joints) and self.stamps.admits(stamp_ns, joints):
             self.take_joints(stamp_ns, joints)
-        self._answered = self._clock()
+        self._answer_time = self._clock()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
         """Take an odom of the present time, and answer the state that it completes."""
         if self.states.put_odom(stamp_ns, odom):
-            self._complain(
+            self._log_fault(
                 "contradiction",
                 "odom: two messages of one time differ; more than one node publishes it, and such "
                 "poses are not used.",
@@ -345,7 +345,7 @@ class Commander(ABC):
         self.states.put_joints(stamp_ns, joints)
         self.answer()
 
-    def look(self) -> str:
+    def take_accepted_jump(self) -> str:
         """Take a state that was set aside once its time is accepted; to be called ten times a s.
 
         Returns
@@ -368,7 +368,7 @@ class Commander(ABC):
             return stamps.last_ignored
         return ""
 
-    def _take_last(self, joints: Stamped) -> None:
+    def _answer_last_state(self, joints: Stamped) -> None:
         """Answer only the last of the states that wait after this process stood still.
 
         An answer to one before it comes too late, and the motion of the joints before the first
@@ -381,34 +381,34 @@ class Commander(ABC):
             if (
                 ahead > 0
                 and self.stamps.would_admit(newer.stamp_ns)
-                and self._of_the_robot(newer.message)
+                and self._is_of_robot(newer.message)
             ):
                 joints = newer
             else:
                 skipped.append(newer)
         for each in (joints, *skipped):
-            if self._of_the_robot(each.message) and self.stamps.admits(*each):
+            if self._is_of_robot(each.message) and self.stamps.admits(*each):
                 for odom in odoms:
                     if odom.stamp_ns >= self.stamps.now_ns:
                         self.receive_odom(*odom)
                 odoms = []
                 self.take_joints(*each)
 
-    def _of_the_robot(self, joints: Any) -> bool:
+    def _is_of_robot(self, joints: Any) -> bool:
         # Those of another robot neither tell the time nor take the place of this one's.
         try:
             if self._decoder is not None:
                 self._decoder.require(joints)
         except CommandError as error:
-            self._complain("joints", f"joint_states: {error}.")
+            self._log_fault("joints", f"joint_states: {error}.")
             return False
         return True
 
-    def _complain(self, kind: str, message: str) -> None:
+    def _log_fault(self, kind: str, message: str) -> None:
         """Log a fault of messages, which may come with each of them."""
         now = self._clock()
-        if now - self._complained.get(kind, -_COMPLAINT_PERIOD) >= _COMPLAINT_PERIOD:
-            self._complained[kind] = now
+        if now - self._fault_log_times.get(kind, -_FAULT_LOG_PERIOD) >= _FAULT_LOG_PERIOD:
+            self._fault_log_times[kind] = now
             self.host.log("error", message)
 
     # -- the plant ----------------------------------------------------------------------------
@@ -416,48 +416,48 @@ class Commander(ABC):
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status of the plant of this name."""
         for change in self.plant.take(status, name):
-            if isinstance(change, Stopped):
-                self._give_up(change)
+            if isinstance(change, PlantStopped):
+                self._give_up_goals(change)
                 continue
-            if change is Change.RESET:
+            if change is PlantChange.RESET:
                 self.states.forget_pose()
             if self.executive is not None:
-                self._plant_changed(change)
-        self._follow_plant()
+                self._react_to_change(change)
+        self._tell_plant_state()
 
     def plant_silent(self, message: str) -> None:
         """Give up the goals: nothing comes from the plant any more."""
-        self._give_up(Stopped(message))
+        self._give_up_goals(PlantStopped(message))
 
-    def _give_up(self, stopped: Stopped) -> None:
+    def _give_up_goals(self, stopped: PlantStopped) -> None:
         if self.executive is not None:
             self.executive.plant_stopped(
                 stopped.why, stopped.commanded_until_ns, stopped.rests_since_ns
             )
-            self._hand_out()
-        elif self._waiting and stopped.commanded_until_ns is None:
+            self._pass_on_outputs()
+        elif self._waiting_goals and stopped.commanded_until_ns is None:
             self._abort_waiting(f"Aborted by the plant: {stopped.why}")
 
     # -- differences --------------------------------------------------------------------------
 
     @abstractmethod
-    def _status(self, state: str, message: str, goal_id: str) -> Status:
+    def _make_status(self, state: str, message: str, goal_id: str) -> Status:
         """Return the status of a goal that the executive does not know."""
 
     @abstractmethod
-    def _build(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
+    def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         """Build the executive."""
 
     @abstractmethod
-    def _release(self) -> None:
+    def _stop_executive(self) -> None:
         """Give up everything that the executive does."""
 
     @abstractmethod
-    def _resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
+    def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         """Accept the goals of an earlier commander."""
 
     @abstractmethod
-    def _submit(self, key: str, goal: IdentifiedGoal) -> None:
+    def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         """Give a goal to the executive."""
 
     @abstractmethod
@@ -469,11 +469,11 @@ class Commander(ABC):
         """Answer the state that is ready, if one is and the commander is active."""
 
     @abstractmethod
-    def _plant_changed(self, change: Change) -> None:
+    def _react_to_change(self, change: PlantChange) -> None:
         """Have the executive react to a change."""
 
     @abstractmethod
-    def _follow_plant(self) -> None:
+    def _tell_plant_state(self) -> None:
         """Have the executive know whether the plant obeys."""
 
     def _awaits_odom(self) -> bool:
@@ -483,5 +483,5 @@ class Commander(ABC):
     def _report_waiting(self, goal: IdentifiedGoal, message: str) -> None:  # noqa: B027
         """Report a goal that nothing is done for yet."""
 
-    def _hand_out(self) -> None:  # noqa: B027
+    def _pass_on_outputs(self) -> None:  # noqa: B027
         """Pass on the outputs that the executive has collected."""

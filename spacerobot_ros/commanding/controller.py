@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
-from spacerobot_ros.commanding.plant_state import Change, Pairing
+from spacerobot_ros.commanding.plant_state import Pairing, PlantChange
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
@@ -47,10 +47,10 @@ class ControllerCommander(Commander):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
-        self._posed = self._odom_met = False
+        self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
 
-    def _status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
+    def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
 
     def reconfigure(self, config: ControllerConfig) -> None:
@@ -77,14 +77,14 @@ class ControllerCommander(Commander):
             overdue = self.states.overdue()
         if overdue is not None:
             # An answer to a lost pose would come a tick late; the estimate goes on from that state.
-            self._answer_as(overdue, send=overdue is _WHOLE)
+            self._answer_state(overdue, send=overdue is _WHOLE)
         super().take_joints(stamp_ns, joints)
 
-    def _build(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
+    def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         self.executive = ControlExecutive(
             build_controller(robot, self.config),
             self.config,
-            self._publish,
+            self._publish_status,
             self._goal_file,
             lambda message: self.host.log("error", message),
             self.host.report_event,
@@ -92,28 +92,28 @@ class ControllerCommander(Commander):
         self.effort = np.zeros(robot.n)
         self._held_velocities = HeldVelocityReference(self.config.control_period)
 
-    def _release(self) -> None:
+    def _stop_executive(self) -> None:
         assert self.executive is not None
         self.executive.reset()
 
-    def _resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
+    def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         if self.executive is None:
-            self._waiting = dict(saved)
+            self._waiting_goals = dict(saved)
         else:
             self.executive.resume(saved)
         if saved:
             self.host.log("info", "Going on to an earlier goal.")
 
-    def _submit(self, key: str, goal: IdentifiedGoal) -> None:
+    def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None
         try:
             self.executive.submit(key, goal)
         except PlanningError as error:
-            self._refuse(str(error), goal.goal_id)
+            self._refuse_goal(str(error), goal.goal_id)
 
-    def _refuse(self, message: str, goal_id: str) -> None:
+    def _refuse_goal(self, message: str, goal_id: str) -> None:
         if self.executive is None:
-            super()._refuse(message, goal_id)
+            super()._refuse_goal(message, goal_id)
         else:
             self.executive.refuse(message, goal_id)
 
@@ -123,22 +123,22 @@ class ControllerCommander(Commander):
         self.executive.abort()
         return "The robot holds where it is."
 
-    def _plant_changed(self, change: Change) -> None:
+    def _react_to_change(self, change: PlantChange) -> None:
         assert self.executive is not None
-        if change is Change.RESET:
+        if change is PlantChange.RESET:
             self.executive.plant_reset()
         else:
             self.executive.plant_obeys_again()
 
-    def _follow_plant(self) -> None:
+    def _tell_plant_state(self) -> None:
         if self.executive is not None:
             self.executive.plant_blocked = bool(self.plant.blocked)
 
     def _waits_for_first_pose(self) -> bool:
         """Whether the state before came when odom was not connected yet: its pose is not lost."""
-        if self._posed:
+        if self._pose_has_come:
             return False
-        before, self._odom_met = self._odom_met, self.host.has_publisher("odom")
+        before, self._odom_was_connected = self._odom_was_connected, self.host.has_publisher("odom")
         return not before
 
     def answer(self) -> None:
@@ -146,19 +146,19 @@ class ControllerCommander(Commander):
         if self.executive is not None and self.activity is _ACTIVE:
             pairing = self.states.ready()
             if pairing is not None:
-                self._answer_as(pairing)
+                self._answer_state(pairing)
 
-    def _answer_as(self, pairing: Pairing, *, send: bool = True) -> None:
+    def _answer_state(self, pairing: Pairing, *, send: bool = True) -> None:
         """Answer one state with one command of the same stamp."""
         executive, decoder, states = self.executive, self._decoder, self.states
         assert executive is not None
         assert decoder is not None
-        self._posed = self._posed or pairing is _WHOLE
+        self._pose_has_come = self._pose_has_come or pairing is _WHOLE
         try:
             stamp = decoder.accept(states.joints)
         except CommandError as error:
             self.stamps.withdraw()
-            self._complain("state", f"The state is refused: {error}")
+            self._log_fault("state", f"The state is refused: {error}")
             return
         try:
             q, qdot, measured = decoder.q, decoder.qdot, None
@@ -168,7 +168,7 @@ class ControllerCommander(Commander):
             now = stamp / SECOND
             result = executive.command(now, measured, q, qdot, self._reference(decoder))
         except (CommandError, NotFiniteError) as error:
-            self._complain("state", f"The state is refused: {error}")
+            self._log_fault("state", f"The state is refused: {error}")
             return
         self.effort[:], self.wrench[:] = result.realised.tau, result.realised.wrench_B
         if send:

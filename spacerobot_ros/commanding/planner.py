@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
-from spacerobot_ros.commanding.plant_state import Change, Pairing
+from spacerobot_ros.commanding.plant_state import Pairing, PlantChange
 from spacerobot_ros.errors import CommandError
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
@@ -86,7 +86,7 @@ class PlannerCommander(Commander):
         super().__init__(config, host, (BASE,), pose_required=False, clock=clock)
         self._method, self._long_work = method, long_work
 
-    def _status(self, state: str, message: str, goal_id: str) -> PlannerStatus:
+    def _make_status(self, state: str, message: str, goal_id: str) -> PlannerStatus:
         return PlannerStatus(PlannerState(state), message, goal_id)
 
     @property
@@ -111,48 +111,48 @@ class PlannerCommander(Commander):
         if self.executive is not None:
             self.executive.cancel_plan()
 
-    def _build(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
+    def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         worker = PlanningWorker(robot, self.config, self._method, self._long_work)
         self.executive = Executive(robot, self.config, worker, self._goal_file)
         self._measured = _MeasuredState(decoder)
 
-    def _release(self) -> None:
+    def _stop_executive(self) -> None:
         assert self.executive is not None
         commands = self.statistics.commands_published
         self.host.log("info", f"{commands} commands were published.")
         self.executive.stop()
-        self._hand_out()
+        self._pass_on_outputs()
 
-    def _resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
+    def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         goal = saved.get(BASE)
         if goal is None:
-            self._publish(PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose."))
+            self._publish_status(PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose."))
             return
-        self._accept(BASE, goal)
+        self._accept_goal(BASE, goal)
         self._report_waiting(goal, "Resuming an earlier goal.")
 
-    def _submit(self, key: str, goal: IdentifiedGoal) -> None:
+    def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None
         self.executive.propose(goal)
 
     def _report_waiting(self, goal: IdentifiedGoal, message: str) -> None:
         values = goal_values(goal.goal)
-        self._publish(PlannerStatus(PlannerState.PLANNING, message, goal.goal_id, values))
+        self._publish_status(PlannerStatus(PlannerState.PLANNING, message, goal.goal_id, values))
 
     def _abort_goal(self) -> str | None:
         if self.executive is None:
             return None
         message = self.executive.abort()
-        self._hand_out()
+        self._pass_on_outputs()
         return message
 
-    def _plant_changed(self, change: Change) -> None:
+    def _react_to_change(self, change: PlantChange) -> None:
         assert self.executive is not None
-        if change is Change.RESET:
+        if change is PlantChange.RESET:
             self.executive.plant_reset()
-            self._hand_out()
+            self._pass_on_outputs()
 
-    def _follow_plant(self) -> None:
+    def _tell_plant_state(self) -> None:
         if self.executive is not None:
             self.executive.plant_rests = self.plant.rests
 
@@ -175,7 +175,7 @@ class PlannerCommander(Commander):
             measured.stamp_ns = measured.decoder.accept(states.joints)
         except CommandError as error:
             self.stamps.withdraw()
-            self._complain("state", f"joint_states: {error}.")
+            self._log_fault("state", f"joint_states: {error}.")
             return
         if pairing is _LATE_POSE:
             # The state was answered without it, and is planned from when the next joints come.
@@ -183,15 +183,15 @@ class PlannerCommander(Commander):
         else:
             executive.update(measured)
             if executive.outputs:
-                self._hand_out()
+                self._pass_on_outputs()
                 if self.activity is not _ACTIVE:
                     return
             self.host.send_command(measured.stamp_ns)
         if measured.base_error is not None:
-            self._complain("odom", f"odom: {measured.base_error}.")
+            self._log_fault("odom", f"odom: {measured.base_error}.")
             measured.base_error = None
 
-    def _hand_out(self) -> None:
+    def _pass_on_outputs(self) -> None:
         assert self.executive is not None
         outputs, host = self.executive.outputs, self.host
         while outputs:

@@ -26,12 +26,12 @@ class Stamped(NamedTuple):
     message: Any
 
 
-_NOTHING = Stamped(_NO_STAMP, None)
+_NO_MESSAGE = Stamped(_NO_STAMP, None)
 
 
 # -- states of the present time ---------------------------------------------------------------
 
-SHORTEST_DOUBT = 0.2
+_MIN_JUMP_DOUBT = 0.2
 """Least wall s without a state of the old time before a time jump is accepted."""
 
 _STEP_SLACK = 1.5
@@ -40,10 +40,10 @@ _STEP_SLACK = 1.5
 _PACE_SLACK = 2.0
 """Largest ratio of the time that lost states took to the time that its pace so far explains."""
 
-_LOOKS = 2
+_MIN_CHECKS = 2
 """Looks without a state of the old time before a time jump is accepted."""
 
-_LONGEST_STEP = 100
+_MAX_STEP_PERIODS = 100
 """Largest step of a plant with another rate, in control periods."""
 
 
@@ -54,7 +54,7 @@ class _PendingJump:
     since: float
     """Wall time at which the first state of that time came, s."""
     joints: Stamped
-    looks: int = 0
+    checks: int = 0
     """Calls of :meth:`StampFilter.accepted_jump` since then."""
 
 
@@ -82,16 +82,16 @@ class StampFilter:
 
     def __init__(self, control_period: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._period = round(control_period * SECOND)
-        self._step = self._period
+        self._period_ns = round(control_period * SECOND)
+        self._step_ns = self._period_ns
         """Time between two states as far as is known, ns."""
-        self._longest = -1
+        self._max_step_ns = -1
         """Largest plausible step without a loss, ns; negative before the first state."""
-        self._before_ns, self._wall = _NO_STAMP, 0.0
+        self._previous_ns, self._admission_wall = _NO_STAMP, 0.0
         self._origin_ns, self._origin_wall = 0, 0.0
         """The first state of this time, from which its pace is measured."""
-        self._jump: _PendingJump | None = None
-        self._jump_odom = _NOTHING
+        self._pending_jump: _PendingJump | None = None
+        self._jump_odom = _NO_MESSAGE
         self._last_jump_ns = 0
         """Size of the jump that was accepted last, ns."""
         self.now_ns = 0
@@ -103,102 +103,104 @@ class StampFilter:
 
     def admits(self, stamp_ns: int, joints: Any) -> bool:
         """Return whether joints are of the present time; others are set aside."""
-        if not 0 <= stamp_ns - self.now_ns <= self._longest and not self._explained(stamp_ns):
+        if not 0 <= stamp_ns - self.now_ns <= self._max_step_ns and not self._loss_explains(
+            stamp_ns
+        ):
             self._set_aside(Stamped(stamp_ns, joints))
             return False
-        self._before_ns, self.now_ns = self.now_ns, stamp_ns
-        self._wall = self._clock()
-        if self._jump is not None or self._jump_odom.message is not None:
+        self._previous_ns, self.now_ns = self.now_ns, stamp_ns
+        self._admission_wall = self._clock()
+        if self._pending_jump is not None or self._jump_odom.message is not None:
             self._ignore_jump()
         return True
 
     def would_admit(self, stamp_ns: int) -> bool:
         """Return whether joints with this stamp would be admitted, and change nothing."""
         ahead = stamp_ns - self.now_ns
-        return 0 <= ahead <= max(self._longest, self._loss(self._clock()))
+        return 0 <= ahead <= max(self._max_step_ns, self._max_loss_ns(self._clock()))
 
     def admits_odom(self, stamp_ns: int, odom: Any) -> bool:
         """Return whether a pose is of the present time; others are set aside.
 
         It comes before the joints of its stamp, or after them.
         """
-        ahead, longest = stamp_ns - self.now_ns, self._longest
+        ahead, longest = stamp_ns - self.now_ns, self._max_step_ns
         if -longest <= ahead <= longest or longest < 0:
             return True
-        if 0 <= ahead <= self._loss(self._clock()):
+        if 0 <= ahead <= self._max_loss_ns(self._clock()):
             return True
         self._jump_odom = Stamped(stamp_ns, odom)
         return False
 
     def withdraw(self) -> None:
         """Undo the last admission: the state is not one of the robot."""
-        if self._before_ns == _NO_STAMP:
-            self._longest, self.now_ns = -1, 0
+        if self._previous_ns == _NO_STAMP:
+            self._max_step_ns, self.now_ns = -1, 0
         else:
-            self.now_ns = self._origin_ns = self._before_ns
-            self._origin_wall = self._wall
+            self.now_ns = self._origin_ns = self._previous_ns
+            self._origin_wall = self._admission_wall
 
     def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:
         """Return odom (if it came) and joints that were set aside and whose time is now accepted.
 
         To be called several times a second; None: no jump is accepted.
         """
-        jump = self._jump
+        jump = self._pending_jump
         if jump is None:
             return None
         # While this process itself stood still, states of the old time may have come unseen.
-        jump.looks += 1
-        if jump.looks < _LOOKS or self._clock() - jump.since < self._patience:
+        jump.checks += 1
+        if jump.checks < _MIN_CHECKS or self._clock() - jump.since < self._jump_doubt:
             return None
         stamp, now = jump.joints.stamp_ns, self._clock()
         size = stamp - self.now_ns
-        if size == self._last_jump_ns and 0 < size <= _LONGEST_STEP * self._period:
+        if size == self._last_jump_ns and 0 < size <= _MAX_STEP_PERIODS * self._period_ns:
             # The plant's rate is another one than this commander's.
-            self._step = size
-            self._longest = round(_STEP_SLACK * size)
+            self._step_ns = size
+            self._max_step_ns = round(_STEP_SLACK * size)
         self._last_jump_ns = size
-        self._before_ns, self.now_ns, self._wall = self.now_ns, stamp, now
+        self._previous_ns, self.now_ns, self._admission_wall = self.now_ns, stamp, now
         self._origin_ns, self._origin_wall = stamp, now
-        odom, self._jump, self._jump_odom = self._jump_odom, None, _NOTHING
+        odom, self._pending_jump, self._jump_odom = self._jump_odom, None, _NO_MESSAGE
         return (odom if odom.stamp_ns == stamp else None), jump.joints
 
-    def _explained(self, stamp_ns: int) -> bool:
+    def _loss_explains(self, stamp_ns: int) -> bool:
         """Whether a stamp is that of a first state, or lost messages explain it."""
         now = self._clock()
-        if self._longest < 0:
-            self._longest = round(_STEP_SLACK * self._step)
+        if self._max_step_ns < 0:
+            self._max_step_ns = round(_STEP_SLACK * self._step_ns)
             self._origin_ns, self._origin_wall = stamp_ns, now
             self.now_ns = _NO_STAMP
             return True
-        return 0 <= stamp_ns - self.now_ns <= self._loss(now)
+        return 0 <= stamp_ns - self.now_ns <= self._max_loss_ns(now)
 
-    def _loss(self, now: float) -> float:
+    def _max_loss_ns(self, now: float) -> float:
         """Return the largest plausible step at a wall time where messages were lost, ns."""
-        return self._longest + _PACE_SLACK * self._pace * (now - self._wall)
+        return self._max_step_ns + _PACE_SLACK * self._pace * (now - self._admission_wall)
 
     @property
     def _pace(self) -> float:
         """Simulated ns per wall s of this time so far."""
-        elapsed = self._wall - self._origin_wall
+        elapsed = self._admission_wall - self._origin_wall
         return (self.now_ns - self._origin_ns) / elapsed if elapsed > 0 else 0.0
 
     @property
-    def _patience(self) -> float:
+    def _jump_doubt(self) -> float:
         """Wall s without a state of the old time after which a jump is accepted."""
         pace = self._pace
-        return max(SHORTEST_DOUBT, 4 * self._step / pace if pace > 0 else 0.0)
+        return max(_MIN_JUMP_DOUBT, 4 * self._step_ns / pace if pace > 0 else 0.0)
 
     def _set_aside(self, joints: Stamped) -> None:
         """Keep a state of another time; it replaces the one before."""
-        jump = self._jump
-        if jump is not None and 0 <= joints.stamp_ns - jump.joints.stamp_ns <= self._longest:
+        jump = self._pending_jump
+        if jump is not None and 0 <= joints.stamp_ns - jump.joints.stamp_ns <= self._max_step_ns:
             jump.joints = joints
         else:
-            self._jump = _PendingJump(self._clock(), joints)
+            self._pending_jump = _PendingJump(self._clock(), joints)
 
     def _ignore_jump(self) -> None:
         """Count the messages that were set aside as ignored: the old time goes on."""
-        joints = _NOTHING if self._jump is None else self._jump.joints
+        joints = _NO_MESSAGE if self._pending_jump is None else self._pending_jump.joints
         for name, given in (("joint_states", joints), ("odom", self._jump_odom)):
             if given.message is None or given.stamp_ns == self.now_ns:
                 continue
@@ -208,7 +210,7 @@ class StampFilter:
                 f"A message on '{name}' is ignored: its stamp is {abs(ahead):.4g} s "
                 f"{'ahead of' if ahead > 0 else 'behind'} the time of the states."
             )
-        self._jump, self._jump_odom = None, _NOTHING
+        self._pending_jump, self._jump_odom = None, _NO_MESSAGE
 
 
 # -- whole states -----------------------------------------------------------------------------
@@ -268,7 +270,7 @@ class StateSynchroniser:
         if not required:
             self._required.pop(topic, None)
         else:
-            self._required.setdefault(topic, _NOTHING)
+            self._required.setdefault(topic, _NO_MESSAGE)
 
     def put_odom(self, stamp_ns: int, odom: Any) -> bool:
         """Accept an odom; poses are measured (again).
@@ -301,7 +303,7 @@ class StateSynchroniser:
 
     def latest(self, topic: str) -> Any:
         """Return the latest message of a required topic; None if there is none."""
-        return self._required.get(topic, _NOTHING).message
+        return self._required.get(topic, _NO_MESSAGE).message
 
     def ready(self) -> Pairing | None:
         """Hand over the state that is ready; None if there is none, or it was handed over."""
@@ -340,7 +342,7 @@ class StateSynchroniser:
 
 
 @dataclass(frozen=True)
-class Stopped:
+class PlantStopped:
     """The plant does not obey commands.
 
     Attributes
@@ -358,7 +360,7 @@ class Stopped:
     rests_since_ns: int = 0
 
 
-class Change(Enum):
+class PlantChange(Enum):
     """Other changes that a plant reports."""
 
     OBEYS = "obeys"
@@ -397,36 +399,36 @@ class PlantListener:
         """Whether the plant's time stands still."""
         return self._status is not None and self._status.state is PlantState.PAUSED
 
-    def take(self, status: PlantStatus, name: str = "plant") -> list[Stopped | Change]:
+    def take(self, status: PlantStatus, name: str = "plant") -> list[PlantStopped | PlantChange]:
         """Take the next status of the plant of this name; return the changes to react to.
 
         Statuses may be missed: the counters of a plant tell the changes in between.
         """
         before, was_blocked = self._status, bool(self.blocked)
         self._status, self._name = status, name
-        changes: list[Stopped | Change] = []
+        changes: list[PlantStopped | PlantChange] = []
         if self.blocked:
             if before is None or not was_blocked or status.latched_fault != before.latched_fault:
-                changes.append(Stopped(status.message))
+                changes.append(PlantStopped(status.message))
             return changes
         if before is None:
             return changes
         if status.rearms > before.rearms and not was_blocked:
-            changes.append(Stopped("Commands pass again after a fault was latched."))
+            changes.append(PlantStopped("Commands pass again after a fault was latched."))
         if status.timeouts > before.timeouts or (
             status.reason == "timeout" and before.reason != "timeout"
         ):
-            rested = _rested(status)
+            rested = _timeout_rest(status)
             if rested is not None:
                 changes.append(rested)
         if status.resets > before.resets:
-            changes.append(Change.RESET)
+            changes.append(PlantChange.RESET)
         if was_blocked or status.rearms > before.rearms:
-            changes.append(Change.OBEYS)
+            changes.append(PlantChange.OBEYS)
         return changes
 
 
-def _rested(status: PlantStatus) -> Stopped | None:
+def _timeout_rest(status: PlantStatus) -> PlantStopped | None:
     """Return since when a plant rests, or has rested; None if its times are not finite."""
     last, since = status.last_command_s, status.time_s
     last = since if last is None else last
@@ -435,4 +437,4 @@ def _rested(status: PlantStatus) -> Stopped | None:
         since, why = last, "The joints were brought to rest: no command came in time."
     if not (math.isfinite(last) and math.isfinite(since)):
         return None
-    return Stopped(why, round(last * SECOND), round(since * SECOND))
+    return PlantStopped(why, round(last * SECOND), round(since * SECOND))

@@ -227,12 +227,12 @@ class _LockstepFlight:
             commanders["planner"] = self._planner = PlannerCommander(
                 scenario.planner, _Host(self, send), method=robots.method
             )
-            self._planner.use(robots.planner, ArrayDecoder())
+            self._planner.use_robot(robots.planner, ArrayDecoder())
         if "coordinated_control" in scenario.commanders:
             commanders["coordinated_control"] = self._controller = ControllerCommander(
                 scenario.controller, _Host(self, self._send_actuation)
             )
-            self._controller.use(robots.controller, ArrayDecoder())
+            self._controller.use_robot(robots.controller, ArrayDecoder())
         self._commanders = [commanders[name] for name in scenario.commanders]
 
     # -- the flight ---------------------------------------------------------------------------

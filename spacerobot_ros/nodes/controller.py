@@ -83,7 +83,7 @@ class CoordinatedControlNode(CommanderNode):
     def use(self, robot: SpaceRobot) -> None:
         """Control this robot from now on."""
         commander = self.commander
-        commander.use(robot, MessageDecoder(robot.joint_names))
+        commander.use_robot(robot, MessageDecoder(robot.joint_names))
         self._joint_message = joint_template(robot.joint_names)
         if robot.n:
             self._joint_message.feed("effort", commander.effort)

@@ -30,7 +30,7 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatus,
     ScheduleStart,
 )
-from spacerobot_ros.planning.execution.worker import LONGEST_END
+from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
 from spacerobot_ros.times import stamp_bytes
 
 
@@ -91,7 +91,7 @@ class PlannerNode(CommanderNode):
         """Give up the present goal and command nothing any more; the goal file stays."""
         super().deactivate()
         if self._announcement is not None:
-            self._announcement.join(LONGEST_END)
+            self._announcement.join(MAX_THREAD_END_TIME)
 
     def interrupt(self) -> None:
         """Cancel the plan that is being made."""
@@ -104,7 +104,7 @@ class PlannerNode(CommanderNode):
     def use(self, robot: SpaceRobot) -> None:
         """Plan for this robot from now on."""
         self._shape = None
-        self.commander.use(robot, MessageDecoder(robot.joint_names))
+        self.commander.use_robot(robot, MessageDecoder(robot.joint_names))
         setpoint = self.commander.setpoint
         self._message = joint_template(robot.joint_names)
         if robot.n:
@@ -150,7 +150,7 @@ class PlannerNode(CommanderNode):
             self._publish_schedule(start)
             return
         if self._announcement is not None:
-            self._announcement.join(LONGEST_END)
+            self._announcement.join(MAX_THREAD_END_TIME)
         # Serialising a long schedule takes longer than a tick, and nothing waits for it.
         self._announcement = Thread(target=self._publish_schedule, args=(start,), daemon=True)
         self._announcement.start()

@@ -26,10 +26,10 @@ from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nom
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
-_SHAPES = 300
+_CONDITION_SHAPES = 300
 """Shapes over which conditioning is summed up."""
 
-_EDGE = 1.0
+_LOOP_EDGE = 1.0
 """Edges of the loops for which the nominal shape is the best, m or rad: those of area_loop."""
 
 
@@ -81,16 +81,16 @@ def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis
     ParameterError
         The shape is none of this robot.
     """
-    given = None if shape is None else _checked(robot, shape)
+    given = None if shape is None else _check_shape(robot, shape)
     anywhere = brackets_anywhere(robot)
     nominal = None
     if robot.n >= 3 and anywhere.controllable:
         triples = list(itertools.combinations(range(robot.n), 3))
         if given is None:
             middle = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
-            nominal = best_nominal(robot, middle, triples, _EDGE)
+            nominal = best_nominal(robot, middle, triples, _LOOP_EDGE)
         else:
-            nominal = given_nominal(robot, given, triples, _EDGE)
+            nominal = given_nominal(robot, given, triples, _LOOP_EDGE)
     planar = planar_chain(robot)
     if given is None:
         best = planar if planar.controllable else anywhere
@@ -101,18 +101,18 @@ def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis
         nominal,
         brackets_at(robot, given),
         anywhere,
-        _conditions(robot),
+        _condition_numbers(robot),
         planar,
         sliding_masses(robot),
         {
-            name: _objection(method, robot)
+            name: _find_objection(method, robot)
             for name, method in METHODS.items()
             if method is not AutoGait
         },
     )
 
 
-def _objection(method: type[GaitMethod], robot: SpaceRobot) -> str | None:
+def _find_objection(method: type[GaitMethod], robot: SpaceRobot) -> str | None:
     """Return the reason why a method plans no goal of a robot; None if it plans some."""
     try:
         method.require_suitable(robot)
@@ -121,7 +121,7 @@ def _objection(method: type[GaitMethod], robot: SpaceRobot) -> str | None:
     return None
 
 
-def _checked(robot: SpaceRobot, shape: Sequence[float]) -> Array:
+def _check_shape(robot: SpaceRobot, shape: Sequence[float]) -> Array:
     values = np.asarray(shape, dtype=float)
     if values.shape != (robot.n,) or not np.all(np.isfinite(values)):
         raise ParameterError(
@@ -131,11 +131,11 @@ def _checked(robot: SpaceRobot, shape: Sequence[float]) -> Array:
     return values
 
 
-def _conditions(robot: SpaceRobot) -> Array:
+def _condition_numbers(robot: SpaceRobot) -> Array:
     if robot.n < 3:
-        return np.full(_SHAPES, np.inf)
+        return np.full(_CONDITION_SHAPES, np.inf)
     # The matrices of all triples at once: the best one at each shape.
-    K = curvatures(robot, sample_shapes(robot, _SHAPES))
+    K = curvatures(robot, sample_shapes(robot, _CONDITION_SHAPES))
     i, j, k = np.array(list(itertools.combinations(range(robot.n), 3))).T
     M = np.stack([K[:, :, i, j], K[:, :, j, k], K[:, :, k, i]], axis=-1).transpose(0, 2, 1, 3)
     values = np.linalg.svd(M, compute_uv=False)

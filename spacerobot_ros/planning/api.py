@@ -18,7 +18,7 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.methods.registry import build_method, method_options
 from spacerobot_ros.resources import robot_file
 
-_TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
+_DEFAULT_TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
 
 
 def plan(
@@ -31,7 +31,7 @@ def plan(
     start: RobotState | npt.ArrayLike | None = None,
     method: str = "optimal",
     control_period: float = 0.05,
-    tolerance: Tolerance = _TOLERANCE,
+    tolerance: Tolerance = _DEFAULT_TOLERANCE,
     integration_step: float = DEFAULT_INTEGRATION_STEP,
     **options: Any,
 ) -> GaitSchedule:
@@ -66,10 +66,10 @@ def plan(
         goal = Goal.checked(position, quaternion_from_rotvec(rotvec), joint_positions)
     options_of_method = {method: method_options(method, options)}
     planner = build_method(method, robot, control_period, integration_step, options_of_method)
-    return planner.plan(PlanRequest(_state(robot, start), goal, tolerance))
+    return planner.plan(PlanRequest(_start_state(robot, start), goal, tolerance))
 
 
-def _state(robot: SpaceRobot, start: RobotState | npt.ArrayLike | None) -> RobotState:
+def _start_state(robot: SpaceRobot, start: RobotState | npt.ArrayLike | None) -> RobotState:
     if isinstance(start, RobotState):
         return start
     q = np.clip(np.zeros(robot.n), robot.lower, robot.upper)

@@ -132,7 +132,7 @@ class Rig:
         return self.commander.receive_goal(BASE, sec, 0, lambda: goal)
 
     def use(self, robot: SpaceRobot) -> None:
-        self.commander.use(robot, OneRobotDecoder(self.n))
+        self.commander.use_robot(robot, OneRobotDecoder(self.n))
 
 
 METHOD = {"method": "lie_bracket", "lie_bracket.t1": 2.0, "lie_bracket.n1": 1}
@@ -210,7 +210,7 @@ def test_a_jump_is_answered_with_its_pose_once_its_time_is_accepted(controller: 
     assert controller.host.commands == [1, 2, 3]
     for _ in range(4):
         controller.wall += 0.1
-        controller.commander.look()
+        controller.commander.take_accepted_jump()
     assert controller.host.commands == [1, 2, 3, 5000]
     assert controller.commander.executive.state.value == "holding"
 
@@ -221,7 +221,7 @@ def test_while_the_plant_is_paused_no_jump_is_accepted(planner: Rig) -> None:
     planner.state(5000)
     for _ in range(10):
         planner.wall += 0.1
-        planner.commander.look()
+        planner.commander.take_accepted_jump()
     assert planner.host.commands == [1]
 
 
@@ -232,7 +232,7 @@ def test_ignored_states_are_reported_once_a_second(planner: Rig) -> None:
         planner.wall += 0.05
         planner.joints(tick + 3000)
         planner.state(tick)
-        warned += [text for text in [planner.commander.look()] if text]
+        warned += [text for text in [planner.commander.take_accepted_jump()] if text]
     assert 1 <= len(warned) <= 2
     assert "ahead of" in warned[0]
     assert ("warning", warned[0]) in planner.host.lines

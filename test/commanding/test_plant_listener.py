@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.commanding.plant_state import Change, PlantListener, Stopped
+from spacerobot_ros.commanding.plant_state import PlantChange, PlantListener, PlantStopped
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 RUNNING = PlantStatus(PlantState.RUNNING, "A command is in force.")
@@ -29,7 +29,7 @@ def listener(*statuses: PlantStatus) -> PlantListener:
 def test_a_latched_plant_stops_commanders_once_and_goals_are_refused() -> None:
     one = listener(RUNNING)
     assert (one.blocked, one.rests) == ("", False)
-    assert one.take(LATCHED, "/robot/plant") == [Stopped("Nothing moves: a fuse.")]
+    assert one.take(LATCHED, "/robot/plant") == [PlantStopped("Nothing moves: a fuse.")]
     assert one.take(replace(LATCHED, faults=("joint_stuck a",)), "/robot/plant") == []
     assert_one_sentence(one.blocked, "a fuse is blown", "/robot/plant/rearm")
     # Paused or inactive it is latched as well.
@@ -37,45 +37,45 @@ def test_a_latched_plant_stops_commanders_once_and_goals_are_refused() -> None:
         assert one.take(replace(LATCHED, state=state), "/robot/plant") == []
         assert one.blocked
         assert one.rests, "no command is in force"
-    assert one.take(AGAIN) == [Change.OBEYS]
+    assert one.take(AGAIN) == [PlantChange.OBEYS]
     assert (one.blocked, one.rests) == ("", False)
 
 
 def test_a_commander_that_comes_later_learns_that_the_plant_is_latched() -> None:
-    assert listener().take(LATCHED) == [Stopped("Nothing moves: a fuse.")]
+    assert listener().take(LATCHED) == [PlantStopped("Nothing moves: a fuse.")]
     assert listener().take(RUNNING) == []
     assert listener().take(RESTING) == []
 
 
 def test_a_latch_that_was_missed_is_noticed_by_the_rearming() -> None:
     (stopped, change) = listener(RUNNING).take(AGAIN)
-    assert isinstance(stopped, Stopped)
+    assert isinstance(stopped, PlantStopped)
     assert_one_sentence(stopped.why, "latched")
-    assert change is Change.OBEYS
+    assert change is PlantChange.OBEYS
     assert listener(RUNNING, LATCHED).take(replace(LATCHED, rearms=1)) == []
 
 
 def test_a_plant_that_fails_stops_commanders() -> None:
     one = listener(RUNNING)
     failed = PlantStatus(PlantState.FAILED, "Its model has no inertia.", "model")
-    assert one.take(failed) == [Stopped("Its model has no inertia.")]
+    assert one.take(failed) == [PlantStopped("Its model has no inertia.")]
     assert_one_sentence(one.blocked, "failed", "Its model has no inertia.")
-    assert one.take(RUNNING) == [Change.OBEYS]
+    assert one.take(RUNNING) == [PlantChange.OBEYS]
 
 
 def test_a_plant_that_rests_stops_what_was_commanded_before() -> None:
     assert listener(RUNNING).take(RESTING) == [
-        Stopped("It is too old.", 1_500_000_000, 2_000_000_000)
+        PlantStopped("It is too old.", 1_500_000_000, 2_000_000_000)
     ]
     assert listener(RUNNING, RESTING).take(replace(RUNNING, timeouts=1)) == []
     # Missed: it runs again.
     (stopped,) = listener(RUNNING).take(replace(RUNNING, timeouts=1, last_command_s=1.5))
-    assert isinstance(stopped, Stopped)
+    assert isinstance(stopped, PlantStopped)
     assert stopped.commanded_until_ns == 1_500_000_000
     assert_one_sentence(stopped.why, "rest")
     # A plant without counters says when it came to rest.
     plain = PlantStatus(PlantState.RESTING, "It rests.", "timeout", time_s=2.0)
-    assert listener(RUNNING).take(plain) == [Stopped("It rests.", 2 * 10**9, 2 * 10**9)]
+    assert listener(RUNNING).take(plain) == [PlantStopped("It rests.", 2 * 10**9, 2 * 10**9)]
     assert listener(RUNNING).take(replace(plain, reason="no_command")) == []
     assert listener(RUNNING).take(replace(plain, time_s=float("nan"))) == []
 
@@ -92,5 +92,5 @@ def test_pauses_and_restarts_stop_nothing() -> None:
 
 def test_a_reset_is_reported_once() -> None:
     one = listener(RUNNING)
-    assert one.take(replace(RUNNING, resets=1)) == [Change.RESET]
+    assert one.take(replace(RUNNING, resets=1)) == [PlantChange.RESET]
     assert one.take(replace(RUNNING, resets=1, time_s=9.0)) == []

@@ -240,7 +240,7 @@ def test_every_other_transition_raises() -> None:
             continue
         executive.phase = source
         with pytest.raises(IllegalTransitionError, match=source.name):
-            executive._go(event, target)
+            executive._change_phase(event, target)
         assert executive.phase is source
     assert not executive.outputs
 

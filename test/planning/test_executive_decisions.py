@@ -41,7 +41,7 @@ from spacerobot_ros.simulation import InitialState, VelocityPlant
 def reasons(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> list[PlanReason]:
     """Record why the executive of a loop requests plans from now on."""
     requested: list[PlanReason] = []
-    request = loop.executive._request
+    request = loop.executive._request_plan
 
     def recorded(job: PlanJob, state: RobotState) -> None:
         requested.append(job.reason)
@@ -183,8 +183,8 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
     start: Callable[[], Loop], tmp_path: Path
 ) -> None:
     loop = start()
-    loop.executive._file = GoalFile(str(tmp_path / "goal.json"))
-    loop.executive._file.save({BASE: IdentifiedGoal(goal_at(NEAR), "goal-1")})
+    loop.executive._goal_file = GoalFile(str(tmp_path / "goal.json"))
+    loop.executive._goal_file.save({BASE: IdentifiedGoal(goal_at(NEAR), "goal-1")})
     assert loop.executive.plant_stopped("The plant is latched: a fuse is blown.")
     loop.tick()
     status = loop.statuses[-1]

@@ -26,7 +26,7 @@ def test_a_goal_is_judged_by_what_is_controlled() -> None:
     error = PoseError.between(*here, goal, np.array([0.5, -0.4]))
     assert error.distance == 1.0
     assert error.angle == pytest.approx(0.2)
-    assert error.farthest_joint == pytest.approx(0.1)
+    assert error.max_joint_error == pytest.approx(0.1)
     for parts in itertools.chain.from_iterable(
         itertools.combinations(("position", "attitude", "shape"), k) for k in range(4)
     ):
@@ -36,9 +36,9 @@ def test_a_goal_is_judged_by_what_is_controlled() -> None:
         for part in parts:
             assert not Tolerance(**{**loose, part: 0.05}).admits(error, controls)
     # Without a shape in the goal, or measured, no joint is wrong.
-    assert PoseError.between(*here, goal).farthest_joint == 0.0
+    assert PoseError.between(*here, goal).max_joint_error == 0.0
     unshaped = replace(goal, joint_positions=None)
-    assert PoseError.between(*here, unshaped, np.ones(2)).farthest_joint == 0.0
+    assert PoseError.between(*here, unshaped, np.ones(2)).max_joint_error == 0.0
     assert not Tolerance(0.5, 0.21).admits(error)
 
 

@@ -114,14 +114,22 @@ def test_what_was_learnt_on_one_path_counts_on_the_next() -> None:
     assert (true_end.inv() * end).magnitude() < 0.1 * (true_end.inv() * unknown).magnitude()
 
 
-def test_an_offset_of_all_poses_tells_nothing_of_masses() -> None:
-    robot = robot_of("servicer")
+@pytest.mark.parametrize("size", [1e-4, 1e-2, 1.0], ids="{:g}".format)
+@pytest.mark.parametrize("name", ROBOTS)
+def test_an_offset_of_all_poses_tells_nothing_of_masses(name: str, size: float) -> None:
+    robot = robot_of(name)
     sensitivity = PathSensitivity(robot)
     schedule = schedule_of(robot, shapes_of(robot, 60))
-    masses = MassEstimate(sensitivity.count)
-    for derivative in sensitivity.along(schedule):
-        masses.add(derivative, np.array([0.01, -0.02, 0.03, 0.02, 0.01, -0.01]))
-    np.testing.assert_allclose(masses.errors, 0.0, atol=1e-9)
+    derivatives = sensitivity.along(schedule)
+    true = 0.02 * np.random.default_rng(5).normal(size=sensitivity.count)
+    offset = size * np.array([0.01, -0.02, 0.03, 0.02, 0.01, -0.01])
+    plain, shifted = MassEstimate(sensitivity.count), MassEstimate(sensitivity.count)
+    for derivative in derivatives:
+        plain.add(derivative, derivative @ true)
+        shifted.add(derivative, derivative @ true + offset)
+    # Not an implausible estimate, which is zero whatever the poses were.
+    assert np.abs(plain.errors).max() > 1e-3
+    np.testing.assert_allclose(shifted.errors, plain.errors, atol=1e-8)
 
 
 @pytest.mark.parametrize(

@@ -169,7 +169,7 @@ def test_the_aim_of_a_plan_leaves_a_share_of_each_tolerance(
     position: float, angle: float, late: bool, left: tuple[float, float] | None
 ) -> None:
     check, goal = check_off(position, angle)
-    aim = check.aim(goal, WITHIN, frozenset({"position", "attitude"}), late=late)
+    aim = check.shift_goal(goal, WITHIN, frozenset({"position", "attitude"}), late=late)
     if left is None:
         assert aim is None
         return

@@ -19,8 +19,8 @@ from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatistics,
     PlannerStatus,
+    describe_remaining_error,
     goal_values,
-    remaining_error,
 )
 
 GOAL = Goal(np.array([0.1, -2.0, 3.5]), np.array([0.0, 0.6, 0.0, 0.8]), np.array([0.25, -0.5]))
@@ -231,10 +231,13 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
         ({"position", "attitude"}, "0.05 m and 0.2 rad from the goal"),
         ({"attitude", "shape"}, "0.2 rad and 0.75 at the joints from the goal"),
     ):
-        assert remaining_error(error, frozenset(controls)) == words  # type: ignore[arg-type]
+        assert describe_remaining_error(error, frozenset(controls)) == words  # type: ignore[arg-type]
     unshaped = PoseError(error.position, error.rotvec)
-    assert remaining_error(unshaped, frozenset({"attitude", "shape"})) == "0.2 rad from the goal"
-    assert PoseError(error.position, error.rotvec, np.zeros(0)).farthest_joint == 0.0
+    assert (
+        describe_remaining_error(unshaped, frozenset({"attitude", "shape"}))
+        == "0.2 rad from the goal"
+    )
+    assert PoseError(error.position, error.rotvec, np.zeros(0)).max_joint_error == 0.0
 
 
 def test_numbers_and_texts_of_notes_are_read_as_what_they_were() -> None:

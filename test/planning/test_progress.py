@@ -33,7 +33,7 @@ def test_a_search_reports_every_start_and_the_best_so_far() -> None:
     starts = [each.starts for each in seen]
     assert starts[:3] == [1, 2, 3]
     assert starts == sorted(starts)
-    assert all(each.most >= each.starts for each in seen)
+    assert all(each.max_starts >= each.starts for each in seen)
     best = [each.best_s for each in seen]
     assert best == sorted(best, reverse=True), "it is the best so far"
     # Held commands take a whole number of periods, and bring the gait to the goal exactly.

@@ -51,7 +51,7 @@ def watched(
         error = wanted - measured
         error -= np.clip(error, -band / 2, band / 2)
         velocity = (gait(time + TICK) - wanted) / TICK + GAIN * error
-        for joint in watch.look(measured, wanted, velocity):
+        for joint in watch.find_stuck(measured, wanted, velocity):
             found.setdefault(joint, time)
         q += np.asarray(follows(time)) * velocity * TICK
     return found
@@ -110,7 +110,7 @@ def found_at(goes: Callable[[int], float], ticks: int = 10 * NEEDED) -> int | No
     for tick in range(-15, ticks):
         q = np.array([goes(max(tick, 0)), tick, 0.0]) * 1e-3
         wanted = np.array([tick + 30.0, tick + 1e-3, 0.0]) * 1e-3
-        stuck = watch.look(q, wanted, velocity)
+        stuck = watch.find_stuck(q, wanted, velocity)
         assert stuck in ([], [0])
         if stuck:
             return tick + 1
@@ -162,4 +162,4 @@ def test_a_plant_that_is_restarted_and_gets_no_commands_yet_has_no_stuck_joint(j
     for tick in range(7 * NEEDED):
         if tick == NEEDED:
             q = np.array([0.0, -jump, 0.0])
-        assert watch.look(q, velocity * (tick + 1) * TICK, velocity) == [], tick
+        assert watch.find_stuck(q, velocity * (tick + 1) * TICK, velocity) == [], tick

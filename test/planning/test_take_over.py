@@ -222,10 +222,10 @@ def test_a_plan_for_an_earlier_goal_is_cancelled_at_once() -> None:
 
 def test_the_present_goal_once_more_goes_on_under_its_new_id(tmp_path: Path) -> None:
     loop = flying()
-    loop.executive._file = GoalFile(str(tmp_path / "goal.json"))
+    loop.executive._goal_file = GoalFile(str(tmp_path / "goal.json"))
     loop.propose(NEAR)
     loop.tick()
-    assert loop.executive._file.load()[BASE].goal_id == "goal-2"
+    assert loop.executive._goal_file.load()[BASE].goal_id == "goal-2"
     assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
     assert len(loop.starts) == 1
     assert [(s.state.value, s.goal_id) for s in loop.statuses] == [
@@ -239,7 +239,7 @@ def test_the_present_goal_once_more_goes_on_under_its_new_id(tmp_path: Path) -> 
 def test_what_is_planned_for_another_goal_is_aborted_with_all_goals(tmp_path: Path) -> None:
     for ticks in (1, 4):
         loop = flying(held=True)
-        loop.executive._file = GoalFile(str(tmp_path / "goal.json"))
+        loop.executive._goal_file = GoalFile(str(tmp_path / "goal.json"))
         loop.propose(OTHER)
         loop.tick()
         if ticks > 1:
@@ -395,11 +395,11 @@ def test_a_base_that_is_off_as_its_joints_lag_is_on_its_way_to_the_end() -> None
     k = round((loop.measured.stamp_ns - loop.starts[0].stamp_ns) / TICK_NS)
     lag = np.array([-0.04, 0.02, 0.03])
     pose = schedule.path.position[k] - lag / 8, schedule.path.quaternion[k]
-    averaged = check.averaged(RobotState(*pose, schedule.positions[k] + lag))
+    averaged = check.average_pose(RobotState(*pose, schedule.positions[k] + lag))
     np.testing.assert_allclose(averaged.position, pose[0], atol=1e-9)
     for position, _ in (check.end, check.expected_end):
         np.testing.assert_allclose(position, schedule.path.position[-1], atol=5e-5)
-    off = check.averaged(RobotState(*pose, schedule.positions[k]))
+    off = check.average_pose(RobotState(*pose, schedule.positions[k]))
     np.testing.assert_allclose(off.position, pose[0], atol=1e-9)
     np.testing.assert_allclose(check.end[0], schedule.path.position[-1] - lag / 8, atol=1e-6)
 

@@ -139,4 +139,4 @@ def long_flight() -> Loop:
 
 def quick_without_joints(loop: Loop) -> None:
     """Have the stub plan without stuck joints too: models without them take seconds to build."""
-    loop.held._method_for = lambda task: stub_of(loop)  # type: ignore[method-assign]
+    loop.held._choose_method = lambda task: stub_of(loop)  # type: ignore[method-assign]

@@ -357,7 +357,7 @@ class CommanderNode(FlightNode):
             self._subscribe_plant_status()
         if self._unheard:
             self._resubscribe_best_effort()
-        ignored = commander.look()
+        ignored = commander.take_accepted_jump()
         if ignored or (
             # In a run that is to be repeatable only simulated time counts.
             self.events_have_wall_time

@@ -19,16 +19,16 @@ from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 
-WORST_CONDITION = 1e6
+MAX_CONDITION = 1e6
 """Condition number from which on brackets do not span: rounding decides on their directions."""
 
 NO_TURN = 1e-12
 """Singular values of brackets below this, rad per unit area, are rounding."""
 
-_SAMPLES = 24
+_EXAMINED_SHAPES = 24
 """Shapes at which a robot is examined; brackets that span anywhere span at almost all of them."""
 
-_UNLIMITED = {JointKind.PRISMATIC: 1.0}
+_UNLIMITED_HALF_RANGE = {JointKind.PRISMATIC: 1.0}
 """Half the range that is examined of a joint without limits, m; pi for joints that turn."""
 
 
@@ -83,7 +83,7 @@ class Controllability:
 def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
     """Return finite bounds (n,), (n,) of the shape space: one turn for joints without limits."""
     joints = robot.description.movable_joints
-    half = np.array([_UNLIMITED.get(joint.kind, np.pi) for joint in joints])
+    half = np.array([_UNLIMITED_HALF_RANGE.get(joint.kind, np.pi) for joint in joints])
     lower = np.where(
         np.isfinite(robot.lower), robot.lower, np.minimum(robot.upper, half) - 2 * half
     )
@@ -95,7 +95,7 @@ def sample_shapes(robot: SpaceRobot, count: int) -> Array:
     """Return shapes (count, n) all over the shape space, always the same ones."""
     lower, upper = shape_box(robot)
     # Multiples of independent irrational numbers are evenly spread.
-    fractions = np.outer(np.arange(1, count + 1), np.sqrt(_primes(robot.n))) % 1.0
+    fractions = np.outer(np.arange(1, count + 1), np.sqrt(_first_primes(robot.n))) % 1.0
     return np.asarray(lower + fractions * (upper - lower))
 
 
@@ -130,12 +130,12 @@ def brackets_at(
     robot: SpaceRobot, shape: Array, among: Sequence[int] | None = None
 ) -> Controllability:
     """Return the span of the first-order brackets of joints (indices) at a shape (n,)."""
-    return _brackets(robot, shape[np.newaxis], among)
+    return _span_of_brackets(robot, shape[np.newaxis], among)
 
 
 def brackets_anywhere(robot: SpaceRobot, among: Sequence[int] | None = None) -> Controllability:
     """Return the span of the first-order brackets at the best of shapes all over the space."""
-    return _brackets(robot, sample_shapes(robot, _SAMPLES), among)
+    return _span_of_brackets(robot, sample_shapes(robot, _EXAMINED_SHAPES), among)
 
 
 def sliders_of(robot: SpaceRobot) -> list[int]:
@@ -192,7 +192,9 @@ def sliding_masses(robot: SpaceRobot) -> Controllability:
     return brackets_anywhere(robot, sliders)
 
 
-def _brackets(robot: SpaceRobot, shapes: Array, among: Sequence[int] | None) -> Controllability:
+def _span_of_brackets(
+    robot: SpaceRobot, shapes: Array, among: Sequence[int] | None
+) -> Controllability:
     """Return the span of the brackets at that of the shapes (N, n) where three are best."""
     joints = list(range(robot.n)) if among is None else list(among)
     name = robot.description.name
@@ -202,7 +204,7 @@ def _brackets(robot: SpaceRobot, shapes: Array, among: Sequence[int] | None) -> 
     K = curvatures(robot, shapes)
     pairs = np.array(list(itertools.combinations(joints, 2)))
     values = np.linalg.svd(K[:, :, pairs[:, 0], pairs[:, 1]], compute_uv=False)
-    rank = int(max(_rank(row) for row in values))
+    rank = int(max(_numerical_rank(row) for row in values))
     where, names = f"at the best of {len(shapes)} shapes", robot.joint_names
     if len(joints) < 3:
         message = f"Loops of two joints of robot '{name}' turn its base about one axis at a time."
@@ -214,7 +216,7 @@ def _brackets(robot: SpaceRobot, shapes: Array, among: Sequence[int] | None) -> 
     singular = np.linalg.svd(np.array([M for _, M in found]), compute_uv=False)
     best = int(np.argmax(singular[:, 2] / np.maximum(singular[:, 0], NO_TURN)))
     triple = tuple(names[i] for i in found[best][0])
-    rank = min(rank, _rank(singular[best]))
+    rank = min(rank, _numerical_rank(singular[best]))
     if len(shapes) == 1:
         where = f"at the shape {np.round(shapes[0], 4).tolist()}"
     if rank == 3:
@@ -231,12 +233,12 @@ def _brackets(robot: SpaceRobot, shapes: Array, among: Sequence[int] | None) -> 
     return Controllability(rank, 3, singular[best], triple, shapes[best], message)
 
 
-def _rank(values: Array) -> int:
+def _numerical_rank(values: Array) -> int:
     """Return the number of descending singular values that are not rounding."""
-    return int(np.sum(values > max(NO_TURN, float(values[0]) / WORST_CONDITION)))
+    return int(np.sum(values > max(NO_TURN, float(values[0]) / MAX_CONDITION)))
 
 
-def _primes(count: int) -> Array:
+def _first_primes(count: int) -> Array:
     found: list[int] = []
     candidate = 2
     while len(found) < count:

@@ -28,10 +28,10 @@ POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
 POSITION_SLACK = 0.5
 """Share of its tolerance by which a plan may miss a position that is out of reach."""
 
-_FARTHEST = 1e12
+_MAX_COORDINATE = 1e12
 """Beyond it a float64 does not resolve a millimetre, m or rad."""
 
-_LARGEST_ANGLE = 2e6 * np.pi
+_MAX_ANGLE = 2e6 * np.pi
 """A million turns, rad: beyond them an angle does not resolve its attitude."""
 
 
@@ -68,23 +68,27 @@ class Goal:
             A list has the wrong length, or numbers that are not finite or too large, or the
             quaternion is zero.
         """
-        r = _numbers(position, "position")
-        q = _numbers(quaternion, "orientation")
+        r = _convert_numbers(position, "position")
+        q = _convert_numbers(quaternion, "orientation")
         if r.shape != (3,) or q.shape != (4,):
             raise GoalError("A goal has three numbers of position and four of orientation.")
         if not np.all(np.isfinite(r)):
             raise GoalError(f"The goal position {r.tolist()} is not finite.")
-        if np.abs(r).max() > _FARTHEST:
-            raise GoalError(f"The goal position {r.tolist()} is farther than {_FARTHEST:g} m away.")
+        if np.abs(r).max() > _MAX_COORDINATE:
+            raise GoalError(
+                f"The goal position {r.tolist()} is farther than {_MAX_COORDINATE:g} m away."
+            )
         if not np.all(np.isfinite(q)):
             raise GoalError(f"The goal orientation {q.tolist()} is not finite.")
-        shape = None if joint_positions is None else _numbers(joint_positions, "shape")
+        shape = None if joint_positions is None else _convert_numbers(joint_positions, "shape")
         if shape is not None and not (
-            shape.ndim == 1 and np.all(np.isfinite(shape)) and np.all(np.abs(shape) <= _FARTHEST)
+            shape.ndim == 1
+            and np.all(np.isfinite(shape))
+            and np.all(np.abs(shape) <= _MAX_COORDINATE)
         ):
             raise GoalError(
                 f"The goal shape {shape.tolist()} is not a list of finite joint positions "
-                f"of at most {_FARTHEST:g} m or rad."
+                f"of at most {_MAX_COORDINATE:g} m or rad."
             )
         try:
             return cls(r, unit_quaternion(q), shape)
@@ -103,11 +107,11 @@ class Goal:
         GoalError
             It is no goal, or the rotation vector is not three numbers of at most a million turns.
         """
-        vector = _numbers(rotvec, "rotation vector")
-        if vector.shape != (3,) or not np.all(np.abs(vector) <= _LARGEST_ANGLE):
+        vector = _convert_numbers(rotvec, "rotation vector")
+        if vector.shape != (3,) or not np.all(np.abs(vector) <= _MAX_ANGLE):
             raise GoalError(
                 f"The rotation vector {rotvec!r} is not three finite numbers of at most "
-                f"{_LARGEST_ANGLE:.2g} rad."
+                f"{_MAX_ANGLE:.2g} rad."
             )
         return cls.checked(position, quaternion_from_rotvec(vector))
 
@@ -120,8 +124,8 @@ class Goal:
         GoalError
             It is no goal, or the angles are not three finite numbers.
         """
-        angles = _numbers(rpy_deg, "roll, pitch and yaw")
-        if angles.shape != (3,) or not np.all(np.abs(angles) <= np.degrees(_LARGEST_ANGLE)):
+        angles = _convert_numbers(rpy_deg, "roll, pitch and yaw")
+        if angles.shape != (3,) or not np.all(np.abs(angles) <= np.degrees(_MAX_ANGLE)):
             raise GoalError(f"The angles {rpy_deg!r} are not three finite numbers of degrees.")
         return cls.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
@@ -138,7 +142,7 @@ class Goal:
         )
 
 
-def _numbers(given: npt.ArrayLike, name: str) -> Array:
+def _convert_numbers(given: npt.ArrayLike, name: str) -> Array:
     try:
         return np.asarray(given, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -205,7 +209,7 @@ class PoseError:
         return float(np.linalg.norm(self.rotvec))
 
     @property
-    def farthest_joint(self) -> float:
+    def max_joint_error(self) -> float:
         """Largest joint error, m or rad; zero where the goal has none."""
         return float(np.abs(self.shape).max(initial=0.0))
 
@@ -223,5 +227,5 @@ class Tolerance:
         return (
             ("position" not in controls or error.distance <= self.position)
             and ("attitude" not in controls or error.angle <= self.attitude)
-            and ("shape" not in controls or error.farthest_joint <= self.shape)
+            and ("shape" not in controls or error.max_joint_error <= self.shape)
         )

@@ -18,10 +18,10 @@ from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
-_AT_REST = 1e-9
+_REST_MOMENTUM = 1e-9
 """Momenta below this times the mass count as zero, m/s and m^2/s."""
 
-_BEYOND = 1e-9
+_LIMIT_SLACK = 1e-9
 """Rounding by which a goal shape may exceed a limit, m or rad."""
 
 
@@ -217,7 +217,7 @@ class GaitMethod(ABC):
             )
         beyond = np.maximum(robot.lower - wanted, wanted - robot.upper)
         worst = int(np.argmax(beyond))
-        if beyond[worst] > _BEYOND:
+        if beyond[worst] > _LIMIT_SLACK:
             joint = robot.description.movable_joints[worst]
             raise UnreachableError(
                 f"The goal shape is beyond limits: joint '{joint.name}' at "
@@ -232,7 +232,7 @@ class GaitMethod(ABC):
         if self._setup_refusal is not None:
             raise PlanningError(str(self._setup_refusal))
         p, L = np.linalg.norm(state.linear_momentum), np.linalg.norm(state.angular_momentum)
-        if max(p, L) > _AT_REST * self.robot.total_mass:
+        if max(p, L) > _REST_MOMENTUM * self.robot.total_mass:
             raise PlanningError(
                 "The robot drifts: its total momentum is not zero "
                 f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), and {self.name} plans for zero momentum; "

@@ -11,7 +11,7 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import BasePath
 
-_KNOTS = 200
+_MIN_PATH_POSES = 200
 """A predicted path has this many poses of the base, or up to twice as many."""
 
 
@@ -77,7 +77,7 @@ class BasePrediction:
         if attitudes is None:
             attitudes = self.attitudes(positions, state.quaternion, state.angular_momentum)
         last = len(positions) - 1
-        chosen = np.unique(np.append(np.arange(0, last, max(1, last // _KNOTS)), last))
+        chosen = np.unique(np.append(np.arange(0, last, max(1, last // _MIN_PATH_POSES)), last))
         time, quaternions = chosen * self._control_period, attitudes[chosen]
         positions_W = self.positions(state, time, positions[chosen], quaternions)
         return BasePath(time, positions_W, quaternions)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from spacerobot_ros.model.compilation import ANNOUNCEMENT
 
-_KEY = "search_progress"
+_RECORD_ATTRIBUTE = "search_progress"
 """The attribute of a log record that has it."""
 
 _PACKAGE = "spacerobot_ros"
@@ -26,7 +26,7 @@ class SearchProgress:
 
     Attributes
     ----------
-    starts, most
+    starts, max_starts
         Initial guesses that were tried, and those that are tried at most: a search ends sooner
         where enough solutions agree.
     best_s
@@ -34,19 +34,19 @@ class SearchProgress:
     """
 
     starts: int
-    most: int
+    max_starts: int
     best_s: float = math.inf
 
     @property
     def message(self) -> str:
         """The text for the user, without a full stop."""
         best = f"best {self.best_s:.4g} s" if math.isfinite(self.best_s) else "none found yet"
-        return f"start {self.starts} of at most {self.most}, {best}"
+        return f"start {self.starts} of at most {self.max_starts}, {best}"
 
 
 def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) -> None:
     """Log a line about a search, with its progress."""
-    logger.info(line, extra={_KEY: progress})
+    logger.info(line, extra={_RECORD_ATTRIBUTE: progress})
 
 
 @contextmanager
@@ -62,7 +62,7 @@ def report_progress(
     announce
         Called with a message when other long work begins.
     """
-    handler, logger = _Handler(show, announce), logging.getLogger(_PACKAGE)
+    handler, logger = _ProgressHandler(show, announce), logging.getLogger(_PACKAGE)
     before = logger.level
     logger.addHandler(handler)
     # Other handlers report as before: they have levels of their own.
@@ -74,7 +74,7 @@ def report_progress(
         logger.removeHandler(handler)
 
 
-class _Handler(logging.Handler):
+class _ProgressHandler(logging.Handler):
     def __init__(
         self, show: Callable[[SearchProgress], None], announce: Callable[[str], None]
     ) -> None:
@@ -82,7 +82,7 @@ class _Handler(logging.Handler):
         self._show, self._announce = show, announce
 
     def emit(self, record: logging.LogRecord) -> None:
-        progress = getattr(record, _KEY, None)
+        progress = getattr(record, _RECORD_ATTRIBUTE, None)
         if isinstance(progress, SearchProgress):
             self._show(progress)
         elif getattr(record, ANNOUNCEMENT, False):

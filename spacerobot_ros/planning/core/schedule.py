@@ -100,7 +100,7 @@ class GaitSchedule:
         return np.diff(self.positions, axis=0) / self.control_period
 
 
-_NO_MOTION = 1e-9
+_MIN_JOINT_MOTION = 1e-9
 """A joint that is to move less than this, m or rad, rests."""
 
 
@@ -126,7 +126,7 @@ def straight_motion(
     """
     starts = [start, *(end for end, _ in ends)]
     legs = [
-        (before, end, _duration(robot, end - before, wanted))
+        (before, end, _leg_duration(robot, end - before, wanted))
         for before, (end, wanted) in zip(starts, ends, strict=False)
     ]
     total = sum(duration for _, _, duration in legs)
@@ -147,9 +147,9 @@ def straight_motion(
     return np.vstack(pieces)
 
 
-def _duration(robot: SpaceRobot, move: Array, wanted: float) -> float:
+def _leg_duration(robot: SpaceRobot, move: Array, wanted: float) -> float:
     """Return the duration of a leg, s: infinity if a joint without speed is to move."""
-    active = np.abs(move) > _NO_MOTION
+    active = np.abs(move) > _MIN_JOINT_MOTION
     if not active.any():
         return 0.0
     with np.errstate(divide="ignore"):

@@ -12,7 +12,7 @@ from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
-_REPLAN_PERIOD = 2.0
+_BACKGROUND_REPLAN_PERIOD = 2.0
 """Default of ``replan_period`` where plans are made in the background, s."""
 
 
@@ -97,7 +97,7 @@ class PlannerConfig(CommanderConfig):
         """Time after which the remaining motion is planned again, s; 0: never."""
         if self.replan_period >= 0:
             return self.replan_period
-        return _REPLAN_PERIOD if self.plan_in_background else 0.0
+        return _BACKGROUND_REPLAN_PERIOD if self.plan_in_background else 0.0
 
     @property
     def method_options(self) -> Mapping[str, Any]:

@@ -35,8 +35,8 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatus,
     ScheduleStart,
     Severity,
+    describe_remaining_error,
     goal_values,
-    remaining_error,
 )
 from spacerobot_ros.planning.execution.tracker import Setpoint, TakeOver, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import (
@@ -52,13 +52,13 @@ from spacerobot_ros.planning.execution.worker import (
     TakeOverJob,
 )
 
-_GAP, _GAP_PERIODS = 1.0, 10
+_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
 """A longer time between two states, or a negative one, is a jump of time: s, control periods."""
 
-_MOST_ATTEMPTS = 2
+_MAX_IN_MOTION_ATTEMPTS = 2
 """Plans in motion that are tried for a goal: each takes over twice as late as the one before."""
 
-_LATE = 1 / 3
+_LATE_TIME_SHARE = 1 / 3
 """A motion is late when this share of it is left, or less."""
 
 
@@ -108,14 +108,14 @@ class Transition(NamedTuple):
     target: Phase
 
 
-_AT_REST = (Phase.MEASURING, Phase.EVALUATING)
-_IN_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.BRAKING)
-_RULES: tuple[tuple[Iterable[Phase], Event, Iterable[Phase]], ...] = (
-    ((Phase.IDLE, *_AT_REST), Event.NEW_GOAL, [Phase.MEASURING]),
-    ((*_AT_REST, Phase.EXECUTING, Phase.BRAKING), Event.PLAN_REQUESTED, [Phase.PLANNING]),
+_REST_PHASES = (Phase.MEASURING, Phase.EVALUATING)
+_MOTION_PHASES = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.BRAKING)
+_TRANSITION_RULES: tuple[tuple[Iterable[Phase], Event, Iterable[Phase]], ...] = (
+    ((Phase.IDLE, *_REST_PHASES), Event.NEW_GOAL, [Phase.MEASURING]),
+    ((*_REST_PHASES, Phase.EXECUTING, Phase.BRAKING), Event.PLAN_REQUESTED, [Phase.PLANNING]),
     ([Phase.PLANNING], Event.PLANNED, [Phase.EXECUTING]),
-    ([Phase.PLANNING], Event.REFUSED, [Phase.IDLE, *_AT_REST, Phase.EXECUTING, Phase.BRAKING]),
-    ((Phase.EXECUTING, Phase.REPLANNING), Event.SCHEDULE_ENDED, _AT_REST),
+    ([Phase.PLANNING], Event.REFUSED, [Phase.IDLE, *_REST_PHASES, Phase.EXECUTING, Phase.BRAKING]),
+    ((Phase.EXECUTING, Phase.REPLANNING), Event.SCHEDULE_ENDED, _REST_PHASES),
     ([Phase.EVALUATING], Event.REACHED, [Phase.IDLE]),
     ([Phase.EVALUATING], Event.FAILED, [Phase.IDLE]),
     # Plans that take over in motion.
@@ -128,21 +128,21 @@ _RULES: tuple[tuple[Iterable[Phase], Event, Iterable[Phase]], ...] = (
     # Braking, to plan from rest.
     ([Phase.EXECUTING], Event.NEW_GOAL, [Phase.BRAKING]),
     ([Phase.EXECUTING], Event.TRACKING_ERROR, [Phase.BRAKING]),
-    ([Phase.BRAKING], Event.AT_REST, [Phase.IDLE, *_AT_REST]),
+    ([Phase.BRAKING], Event.AT_REST, [Phase.IDLE, *_REST_PHASES]),
     # Interruptions.
-    (_IN_MOTION, Event.JOINTS_STUCK, _AT_REST),
-    (_IN_MOTION, Event.TIME_JUMPED, _AT_REST),
+    (_MOTION_PHASES, Event.JOINTS_STUCK, _REST_PHASES),
+    (_MOTION_PHASES, Event.TIME_JUMPED, _REST_PHASES),
     ([Phase.BRAKING], Event.TIME_JUMPED, [Phase.IDLE]),
-    ((Phase.PLANNING, *_IN_MOTION), Event.PLANT_RESET, _AT_REST),
+    ((Phase.PLANNING, *_MOTION_PHASES), Event.PLANT_RESET, _REST_PHASES),
     ([Phase.BRAKING], Event.PLANT_RESET, [Phase.IDLE]),
-    (_IN_MOTION, Event.ABORTED, [Phase.BRAKING]),
-    ((*_AT_REST, Phase.PLANNING), Event.ABORTED, [Phase.IDLE]),
+    (_MOTION_PHASES, Event.ABORTED, [Phase.BRAKING]),
+    ((*_REST_PHASES, Phase.PLANNING), Event.ABORTED, [Phase.IDLE]),
     (set(Phase) - {Phase.IDLE}, Event.PLANT_STOPPED, [Phase.IDLE]),
     (Phase, Event.DEACTIVATED, [Phase.IDLE]),
 )
 TRANSITIONS = frozenset(
     Transition(source, event, target)
-    for sources, event, targets in _RULES
+    for sources, event, targets in _TRANSITION_RULES
     for source in sources
     for target in targets
 )
@@ -219,31 +219,33 @@ class Executive:
     ) -> None:
         self._robot, self.config = robot, config
         self._worker = worker or PlanningWorker(robot, config)
-        self._file = goal_file or GoalFile("")
+        self._goal_file = goal_file or GoalFile("")
         self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
         self._tracker = TrajectoryTracker(robot, config)
-        self._longest_gap = round(max(_GAP, _GAP_PERIODS * config.control_period) * 1e9)
+        self._max_state_gap_ns = round(
+            max(_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS * config.control_period) * 1e9
+        )
         self.phase = Phase.IDLE
-        """The present phase; :meth:`_go` alone changes it."""
+        """The present phase; :meth:`_change_phase` alone changes it."""
         self.outputs: deque[Output] = deque()
         """Outputs to publish and log, in order; the owner takes them out."""
         self.plant_rests = False
         """Whether the plant reports that no command is in force; the owner sets it."""
         self._stamp_ns = 0
         """Stamp of the state that is answered, ns."""
-        self._waiting: IdentifiedGoal | None = None
+        self._waiting_goal: IdentifiedGoal | None = None
         """A new goal that waits to be planned for."""
-        self._attempts = 0
+        self._in_motion_attempts = 0
         """Plans in motion for it that were late or refused."""
-        self._plan: PlanJob | ReadyPlan | None = None
+        self._pending_plan: PlanJob | ReadyPlan | None = None
         """The plan that is being made, or waits for its tick (``TAKING_OVER``)."""
-        self._active: ActiveGoal | None = None
+        self._active_goal: ActiveGoal | None = None
         """The goal that is executed or evaluated."""
         self._replan_ns = 0
         """Stamp from which on the remaining motion is planned again, ns."""
         self._commanded_from_ns = 0
         """Stamp of the first state that the present schedule or plan answers, ns."""
-        self._plan_time, self._plans, self._commands = 0.0, 0, 0
+        self._total_plan_time, self._plan_count, self._command_count = 0.0, 0, 0
 
     @property
     def setpoint(self) -> Setpoint:
@@ -253,47 +255,47 @@ class Executive:
     @property
     def measuring(self) -> bool:
         """Whether the next measured base will be planned from, or evaluated."""
-        return self._waiting is not None or self.phase is _EVALUATING
+        return self._waiting_goal is not None or self.phase is _EVALUATING
 
     @property
     def statistics(self) -> PlannerStatistics:
         """Time and number of plans for the latest goal, and the number of commands."""
-        return PlannerStatistics(self._plan_time, self._plans, self._commands)
+        return PlannerStatistics(self._total_plan_time, self._plan_count, self._command_count)
 
     # -- requests of the owner ----------------------------------------------------------------
 
     def propose(self, identified: IdentifiedGoal) -> None:
         """Plan for a goal from the states that are measured next; it replaces any other."""
-        self._waiting, self._attempts = identified, 0
+        self._waiting_goal, self._in_motion_attempts = identified, 0
         self._average.restart()
         match self.phase:
             case Phase.IDLE | Phase.MEASURING | Phase.EVALUATING:
-                self._go(Event.NEW_GOAL, Phase.MEASURING)
+                self._change_phase(Event.NEW_GOAL, Phase.MEASURING)
             case Phase.REPLANNING | Phase.TAKING_OVER:
                 self._drop_plan()
-                self._go(Event.NEW_GOAL, Phase.EXECUTING)
+                self._change_phase(Event.NEW_GOAL, Phase.EXECUTING)
 
     def abort(self) -> str | None:
         """Give up all goals and come to rest.
 
         Returns a message about the joints; None where nothing was done for any goal.
         """
-        goal_id, message = self._latest_id(), "The joints rest."
-        self._file.delete()
+        goal_id, message = self._latest_goal_id(), "The joints rest."
+        self._goal_file.delete()
         match self.phase:
             case Phase.IDLE:
                 return None
-            case Phase.MEASURING if self._active is None:
-                self._waiting = None
-                self._go(Event.ABORTED, Phase.IDLE)
+            case Phase.MEASURING if self._active_goal is None:
+                self._waiting_goal = None
+                self._change_phase(Event.ABORTED, Phase.IDLE)
                 return None
             case Phase.MEASURING | Phase.PLANNING | Phase.EVALUATING:
-                self._go(Event.ABORTED, Phase.IDLE)
+                self._change_phase(Event.ABORTED, Phase.IDLE)
             case Phase.EXECUTING | Phase.REPLANNING | Phase.TAKING_OVER | Phase.BRAKING:
                 self._tracker.brake(self._stamp_ns)
                 duration = self.config.abort_time
                 message = f"The joints brake along the planned path within {duration:g} s."
-                self._go(Event.ABORTED, Phase.BRAKING)
+                self._change_phase(Event.ABORTED, Phase.BRAKING)
         self._forget_goals()
         self.outputs.append(
             PlannerStatus(PlannerState.ABORTED, f"Aborted on request. {message}", goal_id=goal_id)
@@ -323,26 +325,26 @@ class Executive:
         bool
             Whether a goal was given up.
         """
-        if commanded_until_ns is not None and not self._was_obeyed(
+        if commanded_until_ns is not None and not self._plant_has_obeyed(
             commanded_until_ns, rests_since_ns
         ):
             return False
-        self._file.delete()
+        self._goal_file.delete()
         if self.phase is Phase.IDLE:
             return False
-        has_goal, goal_id = self._latest() is not None, self._latest_id()
+        has_goal, goal_id = self._latest_goal() is not None, self._latest_goal_id()
         self._tracker.stop()
         self._average.restart()
         self._forget_goals()
-        self._go(Event.PLANT_STOPPED, Phase.IDLE)
+        self._change_phase(Event.PLANT_STOPPED, Phase.IDLE)
         if has_goal:
             message = f"Aborted by the plant: {why}"
             self.outputs.append(PlannerStatus(PlannerState.ABORTED, message, goal_id=goal_id))
         return has_goal
 
-    def _was_obeyed(self, commanded_until_ns: int, rests_since_ns: int) -> bool:
+    def _plant_has_obeyed(self, commanded_until_ns: int, rests_since_ns: int) -> bool:
         """Whether a plant has obeyed the active goal before it came to rest."""
-        active, since = self._active, self._commanded_from_ns
+        active, since = self._active_goal, self._commanded_from_ns
         if active is None or commanded_until_ns < active.begins_ns:
             return False
         return commanded_until_ns >= since or rests_since_ns <= since
@@ -352,13 +354,13 @@ class Executive:
         self._average.forget()
         # The shape that is held is one of before, like the schedule.
         self._tracker.stop()
-        if self._active is not None:
-            self._active.next_plan = PlanReason.REPLAN
+        if self._active_goal is not None:
+            self._active_goal.next_plan = PlanReason.REPLAN
         if self.phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
             return
         self._drop_plan()
-        self._go(Event.PLANT_RESET, self._phase_at_rest())
-        self._notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
+        self._change_phase(Event.PLANT_RESET, self._phase_at_rest())
+        self._add_notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
 
     def cancel_plan(self) -> None:
         """Have a plan that is being made end without a result; may be called in any thread."""
@@ -369,7 +371,7 @@ class Executive:
         self._tracker.stop()
         self._forget_goals()
         self._worker.close()
-        self._go(Event.DEACTIVATED, Phase.IDLE)
+        self._change_phase(Event.DEACTIVATED, Phase.IDLE)
 
     # -- measured states ----------------------------------------------------------------------
 
@@ -379,44 +381,48 @@ class Executive:
             if self._tracker.active:
                 # Of a robot that moves only the last state counts.
                 self._average.restart()
-            self._add(measured)
+            self._add_to_average(measured)
 
     def update(self, measured: MeasuredState) -> Setpoint:
         """Return the setpoint for a measured state; see :attr:`setpoint`."""
         stamp, q, tracker = measured.stamp_ns, measured.q, self._tracker
-        if not 0 <= stamp - self._stamp_ns <= self._longest_gap and tracker.active:
-            self._on_time_jump(stamp)
+        if not 0 <= stamp - self._stamp_ns <= self._max_state_gap_ns and tracker.active:
+            self._handle_time_jump(stamp)
         self._stamp_ns = stamp
         if tracker.ended(stamp, q):
-            self._on_end(stamp)
+            self._end_schedule(stamp)
         # While a schedule is tracked, most states need nothing but a command.
-        if self.phase is not _EXECUTING or self._waiting is not None or tracker.check_due(stamp):
-            self._act(measured)
+        if (
+            self.phase is not _EXECUTING
+            or self._waiting_goal is not None
+            or tracker.check_due(stamp)
+        ):
+            self._do_phase_work(measured)
         if tracker.active:
             stuck = tracker.track(stamp, q, obeyed=not self.plant_rests)
-            if stuck and self._active is not None:
-                self._on_stuck(self._active, stuck)
+            if stuck and self._active_goal is not None:
+                self._handle_stuck_joints(self._active_goal, stuck)
         if not tracker.active:
             tracker.hold(q, obeyed=not self.plant_rests)
-        self._commands += 1
+        self._command_count += 1
         return tracker.setpoint
 
-    def _act(self, measured: MeasuredState) -> None:
+    def _do_phase_work(self, measured: MeasuredState) -> None:
         """Do the work of the present phase beside tracking."""
         match self.phase:
             case Phase.MEASURING | Phase.EVALUATING:
                 self._measure_at_rest(measured)
             case Phase.PLANNING:
-                self._take_result()
+                self._take_plan_result()
             case Phase.REPLANNING | Phase.TAKING_OVER:
                 self._await_take_over()
-            case Phase.EXECUTING | Phase.BRAKING if self._waiting is not None:
-                self._measure_in_motion(self._waiting, measured)
+            case Phase.EXECUTING | Phase.BRAKING if self._waiting_goal is not None:
+                self._measure_in_motion(self._waiting_goal, measured)
             case Phase.EXECUTING:
-                assert self._active is not None
-                self._check_path(self._active, measured)
+                assert self._active_goal is not None
+                self._check_path(self._active_goal, measured)
 
-    def _add(self, measured: MeasuredState) -> bool:
+    def _add_to_average(self, measured: MeasuredState) -> bool:
         """Add a state to the average; return whether its base was measured."""
         base = measured.base()
         if base is None:
@@ -437,16 +443,16 @@ class Executive:
         """Plan for a new goal, or evaluate the active one, once the state is known."""
         if not self._worker_is_free():
             return
-        self._add(measured)
+        self._add_to_average(measured)
         if not self._average.complete:
             return
         if self.phase is Phase.MEASURING:
-            assert self._waiting is not None
-            self._plan_for(self._waiting)
+            assert self._waiting_goal is not None
+            self._plan_new_goal(self._waiting_goal)
         # Where that was refused the state is still known, unless it took time.
         if self.phase is Phase.EVALUATING:
-            assert self._active is not None
-            self._evaluate(self._active)
+            assert self._active_goal is not None
+            self._evaluate(self._active_goal)
         self._average.restart()
 
     def _evaluate(self, active: ActiveGoal) -> None:
@@ -455,22 +461,22 @@ class Executive:
         try:
             state = self._average.state()
         except PlanningError as reason:
-            self._report(PlannerState.FAILED, str(reason), active.identified)
+            self._add_status(PlannerState.FAILED, str(reason), active.identified)
             self._end_goal(Event.FAILED)
             return
         error = PoseError.between(state.position, state.quaternion, active.identified.goal, state.q)
         if self.config.tolerance.admits(error, controls):
-            message = f"The goal is reached: {remaining_error(error, controls)}."
-            self._report(PlannerState.REACHED, message, active.identified, active, error)
+            message = f"The goal is reached: {describe_remaining_error(error, controls)}."
+            self._add_status(PlannerState.REACHED, message, active.identified, active, error)
             self._end_goal(Event.REACHED)
             return
         if active.next_plan is PlanReason.CORRECTION:
             if active.corrections >= self.config.max_corrections:
-                self._fail(active, error, f" after {active.corrections} correction(s).")
+                self._fail_goal(active, error, f" after {active.corrections} correction(s).")
                 return
-            off = remaining_error(error, controls)
+            off = describe_remaining_error(error, controls)
             self._count_correction(active, f"The remaining motion is planned: {off}.")
-        self._request(RemainingJob(active.identified, active.next_plan, error), state)
+        self._request_plan(RemainingJob(active.identified, active.next_plan, error), state)
 
     # -- in motion: EXECUTING and BRAKING -----------------------------------------------------
 
@@ -480,8 +486,12 @@ class Executive:
         A plan takes over in motion where the methods allow for it.
         """
         take_over = None
-        if self.phase is Phase.EXECUTING and self._attempts < _MOST_ATTEMPTS and self._can_replan():
-            after = self.config.takeover_time * 2**self._attempts
+        if (
+            self.phase is Phase.EXECUTING
+            and self._in_motion_attempts < _MAX_IN_MOTION_ATTEMPTS
+            and self._can_replan()
+        ):
+            after = self.config.takeover_time * 2**self._in_motion_attempts
             take_over = self._tracker.take_over(self._stamp_ns, measured.q, after)
         if take_over is None and self._worker.background:
             if self.phase is Phase.EXECUTING:
@@ -496,16 +506,16 @@ class Executive:
         if not self._average.count:
             return
         if take_over is None:
-            self._plan_for(waiting)
+            self._plan_new_goal(waiting)
         else:
-            self._plan_in_motion(waiting, take_over)
+            self._plan_new_goal_in_motion(waiting, take_over)
         self._average.restart()
 
-    def _plan_in_motion(self, waiting: IdentifiedGoal, take_over: TakeOver) -> None:
+    def _plan_new_goal_in_motion(self, waiting: IdentifiedGoal, take_over: TakeOver) -> None:
         """Request a plan for a new goal that takes over without a stop."""
-        assert self._active is not None
-        if waiting.goal.equals(self._active.identified.goal):
-            self._keep_schedule_for(waiting, self._active)
+        assert self._active_goal is not None
+        if waiting.goal.equals(self._active_goal.identified.goal):
+            self._keep_schedule_for(waiting, self._active_goal)
             return
         averages = self.config.averaging > 1
         if averages and not self._tracker.check_due(self._stamp_ns):
@@ -516,20 +526,22 @@ class Executive:
             # The next state may be better; if none is, the schedule ends.
             return
         if averages:
-            state = self._tracker.path_check.averaged(state)
-        self._begin_plans()
-        self._request(
+            state = self._tracker.path_check.average_pose(state)
+        self._reset_plan_count()
+        self._request_plan(
             TakeOverJob(waiting, PlanReason.IN_MOTION, take_over=take_over, aim=waiting.goal), state
         )
 
     def _keep_schedule_for(self, identified: IdentifiedGoal, active: ActiveGoal) -> None:
         """Make a goal with the same pose and shape the active one; its schedule goes on."""
-        self._waiting = None
+        self._waiting_goal = None
         left = active.ends_at - self._stamp_ns / 1e9
-        self._active = replace(active, identified=identified, corrections=0, manoeuvre_time=left)
-        self._accepted(self._active)
+        self._active_goal = replace(
+            active, identified=identified, corrections=0, manoeuvre_time=left
+        )
+        self._report_acceptance(self._active_goal)
         message = "The schedule that is executed leads to this goal, too."
-        self._report(PlannerState.EXECUTING, message, identified, self._active)
+        self._add_status(PlannerState.EXECUTING, message, identified, self._active_goal)
 
     def _check_path(self, active: ActiveGoal, measured: MeasuredState) -> None:
         """Plan again when the base is too far off its predicted path, or periodically."""
@@ -540,31 +552,33 @@ class Executive:
         replans = self.config.replanning > 0 and self._can_replan()
         if corrected and not replans:
             return
-        if not self._add(measured):
+        if not self._add_to_average(measured):
             return
         try:
             state = self._average.state()
         except PlanningError as reason:
-            self._notice(Severity.WARNING, f"The path is not known: {reason}")
+            self._add_notice(Severity.WARNING, f"The path is not known: {reason}")
             return
         error = None if corrected else self._tracker.path_check.error(state)
         if error is None:
             if replans:
                 self._replan_remaining(active, state)
         elif self._worker.background:
-            self._correct_path(active, error)
+            self._report_path_correction(active, error)
             self._brake_for_replan(Event.TRACKING_ERROR)
         else:
-            self._request(OffPathJob(active.identified, PlanReason.TRACKING_ERROR, error), state)
+            self._request_plan(
+                OffPathJob(active.identified, PlanReason.TRACKING_ERROR, error), state
+            )
 
     def _can_replan(self) -> bool:
         """Whether a plan may take over in motion from the schedule that is tracked."""
         return (
-            self._active is not None
+            self._active_goal is not None
             and not self.plant_rests
             and self.config.takeover_time > 0
             and not self._tracker.stuck
-            and self._worker.starts_in_motion(self._active.schedule)
+            and self._worker.starts_in_motion(self._active_goal.schedule)
         )
 
     def _replan_remaining(self, active: ActiveGoal, state: RobotState) -> None:
@@ -572,15 +586,15 @@ class Executive:
 
         (Shrinking horizon.) It is not where the present motion leads near enough to the goal.
         """
-        state = self._tracker.path_check.averaged(state)
+        state = self._tracker.path_check.average_pose(state)
         if self._stamp_ns < self._replan_ns or active.schedule.partial:
             return
         self._replan_ns = self._stamp_ns + round(self.config.replanning * 1e9)
-        aim = self._tracker.path_check.aim(
+        aim = self._tracker.path_check.shift_goal(
             active.identified.goal,
             self.config.tolerance,
             active.schedule.controls & POSE,
-            late=active.ends_at - self._stamp_ns / 1e9 < _LATE * active.manoeuvre_time,
+            late=active.ends_at - self._stamp_ns / 1e9 < _LATE_TIME_SHARE * active.manoeuvre_time,
         )
         if aim is None:
             return
@@ -590,36 +604,36 @@ class Executive:
         job = TakeOverJob(
             active.identified, PlanReason.SHRINKING_HORIZON, take_over=take_over, aim=aim
         )
-        self._request(job, replace(state, q=take_over.shapes[0].copy()))
+        self._request_plan(job, replace(state, q=take_over.shapes[0].copy()))
 
     def _brake_for_replan(self, event: Event) -> None:
         """Come to rest along the planned path: in the background plans are made from rest."""
-        assert self._active is not None
-        self._active.next_plan = PlanReason.REPLAN
+        assert self._active_goal is not None
+        self._active_goal.next_plan = PlanReason.REPLAN
         self._tracker.brake(self._stamp_ns)
         self._average.restart()
-        self._go(event, Phase.BRAKING)
+        self._change_phase(event, Phase.BRAKING)
 
     # -- in motion: REPLANNING and TAKING_OVER ------------------------------------------------
 
     def _await_take_over(self) -> None:
         """Take the plan that is made in motion, and have it take over at its tick."""
         if self.phase is Phase.REPLANNING:
-            self._take_result()
-        match self._plan:
+            self._take_plan_result()
+        match self._pending_plan:
             case ReadyPlan(job) as ready if self._stamp_ns >= job.take_over.stamp_ns:
-                self._switch(ready)
+                self._switch_schedule(ready)
             case TakeOverJob(take_over=take_over) as job if self._stamp_ns >= take_over.stamp_ns:
-                self._on_late(job)
+                self._handle_late_plan(job)
 
-    def _switch(self, ready: ReadyPlan) -> None:
+    def _switch_schedule(self, ready: ReadyPlan) -> None:
         """Track the plan that is ready from its first tick on."""
         job, schedule, begins_ns = ready.job, ready.schedule, ready.job.take_over.stamp_ns
-        self._plan = None
+        self._pending_plan = None
         if job.reason.for_new_goal:
-            self._accept(ActiveGoal(job.identified, schedule, begins_ns))
+            self._accept_goal(ActiveGoal(job.identified, schedule, begins_ns))
         reason = job.reason.value
-        self._event(
+        self._add_event(
             EventKind.PLAN_TAKEN_OVER,
             f"A plan takes over in motion: {reason}.",
             job.identified,
@@ -627,51 +641,51 @@ class Executive:
             method=schedule.method,
             duration_s=f"{schedule.duration:.9g}",
         )
-        self._execute(schedule, take_over_ns=begins_ns)
+        self._execute_schedule(schedule, take_over_ns=begins_ns)
 
-    def _on_late(self, job: TakeOverJob) -> None:
+    def _handle_late_plan(self, job: TakeOverJob) -> None:
         """Continue along the present schedule; a new goal is planned for once more."""
         self._drop_plan()
-        self._attempts += job.reason.for_new_goal
-        self._go(Event.PLAN_LATE, Phase.EXECUTING)
+        self._in_motion_attempts += job.reason.for_new_goal
+        self._change_phase(Event.PLAN_LATE, Phase.EXECUTING)
         message = "The plan was not ready when it was to take over."
-        self._notice(Severity.WARNING, message)
-        self._event(EventKind.PLAN_LATE, message, job.identified, 1, reason=job.reason.value)
+        self._add_notice(Severity.WARNING, message)
+        self._add_event(EventKind.PLAN_LATE, message, job.identified, 1, reason=job.reason.value)
 
     # -- plans: request, result, schedule -----------------------------------------------------
 
-    def _plan_for(self, waiting: IdentifiedGoal) -> None:
+    def _plan_new_goal(self, waiting: IdentifiedGoal) -> None:
         """Request a plan for a new goal that begins at rest, or with braking."""
         reason = PlanReason.BLEND if self._tracker.active else PlanReason.NEW_GOAL
         job = PlanJob(waiting, reason)
-        self._begin_plans()
+        self._reset_plan_count()
         try:
             state = self._average.state()
         except PlanningError as refusal:
-            self._go(Event.PLAN_REQUESTED, Phase.PLANNING)
-            self._conclude(job, Refused(str(refusal)))
+            self._change_phase(Event.PLAN_REQUESTED, Phase.PLANNING)
+            self._act_on_result(job, Refused(str(refusal)))
         else:
-            self._request(job, state)
+            self._request_plan(job, state)
 
-    def _begin_plans(self) -> None:
+    def _reset_plan_count(self) -> None:
         """Count plans for the goal that waits, which is planned for now."""
-        self._waiting = None
-        self._plan_time, self._plans = 0.0, 0
+        self._waiting_goal = None
+        self._total_plan_time, self._plan_count = 0.0, 0
 
-    def _request(self, job: PlanJob, state: RobotState) -> None:
+    def _request_plan(self, job: PlanJob, state: RobotState) -> None:
         """Request a plan from a measured state; unless it is to take over, the joints brake."""
-        goal, active = job.identified.goal, None if job.reason.for_new_goal else self._active
+        goal, active = job.identified.goal, None if job.reason.for_new_goal else self._active_goal
         if active is not None and len(active.stuck_at) != len(self._tracker.stuck):
             names = self._robot.joint_names
             active.stuck_at = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
         braking, take_over = None, None
         if isinstance(job, TakeOverJob):
             goal, take_over = job.aim, job.take_over
-            self._go(Event.PLAN_REQUESTED, Phase.REPLANNING)
+            self._change_phase(Event.PLAN_REQUESTED, Phase.REPLANNING)
         else:
             braking = self._tracker.braking_shapes(self._stamp_ns)
             self._commanded_from_ns = self._stamp_ns
-            self._go(Event.PLAN_REQUESTED, Phase.PLANNING)
+            self._change_phase(Event.PLAN_REQUESTED, Phase.PLANNING)
         request = PlanRequest(
             state,
             goal,
@@ -681,92 +695,96 @@ class Executive:
         )
         reason = job.reason.value
         message = f"A plan is made: {reason}."
-        self._event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
+        self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
         task = PlanningTask(request, braking=braking, take_over=take_over)
         if active is not None:
             task = replace(task, stuck=active.stuck_at, required=active.required)
-        self._plan = job
+        self._pending_plan = job
         self._worker.submit(task)
-        self._take_result()
+        self._take_plan_result()
 
-    def _take_result(self) -> None:
+    def _take_plan_result(self) -> None:
         """Act on the result of the plan that is being made, if there is one."""
         result = self._worker.poll()
         if result is None:
             return
-        job = self._plan
+        job = self._pending_plan
         assert isinstance(job, PlanJob)
-        self._plan = None
-        self._plan_time += result.wall_time
-        self._plans += 1
-        self._notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
+        self._pending_plan = None
+        self._total_plan_time += result.wall_time
+        self._plan_count += 1
+        self._add_notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
         if isinstance(result, Planned):
             # A plan may aim beside the goal; its result is judged by the goal.
             schedule = replace(result.schedule, goal=job.identified.goal)
             result = replace(result, schedule=schedule)
-            self._event(
+            self._add_event(
                 EventKind.PLAN_READY,
-                f"The plan is {_gait_by(schedule.method)} of {schedule.duration:.6g} s.",
+                f"The plan is {_name_gait(schedule.method)} of {schedule.duration:.6g} s.",
                 job.identified,
                 method=schedule.method,
                 duration_s=f"{schedule.duration:.9g}",
             )
-        self._conclude(job, result)
+        self._act_on_result(job, result)
 
-    def _conclude(self, job: PlanJob, result: Planned | Refused) -> None:
+    def _act_on_result(self, job: PlanJob, result: Planned | Refused) -> None:
         """Execute a plan, or report the refusal, depending on the job alone."""
-        active = self._active
+        active = self._active_goal
         match job, result:
             case TakeOverJob() as takes_over, Planned(schedule=schedule):
-                self._plan = ReadyPlan(takes_over, schedule)
-                self._go(Event.PLANNED, Phase.TAKING_OVER)
+                self._pending_plan = ReadyPlan(takes_over, schedule)
+                self._change_phase(Event.PLANNED, Phase.TAKING_OVER)
             case TakeOverJob(reason=PlanReason.IN_MOTION), Refused(reason=reason):
-                self._waiting = self._waiting or job.identified
-                self._attempts += 1
-                again = "from a later tick" if self._attempts < _MOST_ATTEMPTS else "from rest"
+                self._waiting_goal = self._waiting_goal or job.identified
+                self._in_motion_attempts += 1
+                again = (
+                    "from a later tick"
+                    if self._in_motion_attempts < _MAX_IN_MOTION_ATTEMPTS
+                    else "from rest"
+                )
                 message = f"No plan begins in motion, so the goal is planned for {again}: {reason}"
-                self._notice(Severity.WARNING, message)
-                self._go(Event.REFUSED, Phase.EXECUTING)
+                self._add_notice(Severity.WARNING, message)
+                self._change_phase(Event.REFUSED, Phase.EXECUTING)
             case TakeOverJob(), Refused(reason=reason):
                 message = f"The remaining motion is not planned again: {reason}"
-                self._notice(Severity.INFO, message)
-                self._go(Event.REFUSED, Phase.EXECUTING)
+                self._add_notice(Severity.INFO, message)
+                self._change_phase(Event.REFUSED, Phase.EXECUTING)
             case OffPathJob(error=error), Planned(schedule=schedule):
                 assert active is not None
-                self._correct_path(active, error)
-                self._execute(schedule)
+                self._report_path_correction(active, error)
+                self._execute_schedule(schedule)
             case OffPathJob(error=error), Refused(reason=reason):
                 message = f"{error}, and the remaining motion cannot be planned again: {reason}"
-                self._notice(Severity.WARNING, message)
-                self._go(Event.REFUSED, self._phase_without_plan())
+                self._add_notice(Severity.WARNING, message)
+                self._change_phase(Event.REFUSED, self._phase_without_plan())
             case RemainingJob(error=remaining), Planned(schedule=schedule):
-                self._execute(schedule, remaining)
+                self._execute_schedule(schedule, remaining)
             case RemainingJob(error=remaining), Refused(reason=reason):
                 assert active is not None
-                self._fail(active, remaining, f", and {reason}", Event.REFUSED)
+                self._fail_goal(active, remaining, f", and {reason}", Event.REFUSED)
             case _, Planned(schedule=schedule):
-                self._accept(ActiveGoal(job.identified, schedule, self._stamp_ns))
-                self._execute(schedule)
+                self._accept_goal(ActiveGoal(job.identified, schedule, self._stamp_ns))
+                self._execute_schedule(schedule)
             case _, Refused(reason=reason):
                 earlier = " The earlier goal is still pursued." if active is not None else ""
-                self._report(PlannerState.REFUSED, f"{reason}{earlier}", job.identified)
-                self._go(Event.REFUSED, self._phase_without_plan())
+                self._add_status(PlannerState.REFUSED, f"{reason}{earlier}", job.identified)
+                self._change_phase(Event.REFUSED, self._phase_without_plan())
 
-    def _accept(self, active: ActiveGoal) -> None:
+    def _accept_goal(self, active: ActiveGoal) -> None:
         """Make a new goal the active one, to be flown to with all joints."""
-        self._active, self._tracker.stuck = active, []
-        self._accepted(active)
+        self._active_goal, self._tracker.stuck = active, []
+        self._report_acceptance(active)
 
-    def _accepted(self, active: ActiveGoal) -> None:
+    def _report_acceptance(self, active: ActiveGoal) -> None:
         """Report that a goal is accepted, and save it."""
-        self._event(EventKind.GOAL_ACCEPTED, "The goal is accepted.", active.identified)
+        self._add_event(EventKind.GOAL_ACCEPTED, "The goal is accepted.", active.identified)
         try:
-            self._file.save({BASE: active.identified})
+            self._goal_file.save({BASE: active.identified})
         except ParameterError as error:
             message = f"{error} The goal is pursued, but would not be resumed."
-            self._notice(Severity.ERROR, message)
+            self._add_notice(Severity.ERROR, message)
 
-    def _execute(
+    def _execute_schedule(
         self,
         schedule: GaitSchedule,
         remaining: PoseError | None = None,
@@ -777,11 +795,11 @@ class Executive:
         ``remaining`` is the error to the goal at its start; ``take_over_ns`` the stamp of its first
         tick where it takes over in motion.
         """
-        active, config = self._active, self.config
+        active, config = self._active_goal, self.config
         assert active is not None
         in_motion = take_over_ns is not None
         begins = self._stamp_ns if take_over_ns is None else take_over_ns
-        self._cut_off(active, begins)
+        self._subtract_remainder(active, begins)
         active.schedule = schedule
         self._replan_ns = begins + round(config.replanning * 1e9)
         averages = (config.replanning > 0 or config.averaging > 1) and config.takeover_time > 0
@@ -791,11 +809,11 @@ class Executive:
         active.manoeuvre_time += schedule.duration
         active.ends_at = begins / 1e9 + schedule.duration
         active.next_plan = PlanReason.CONTINUATION if schedule.partial else PlanReason.CORRECTION
-        self._go(Event.TAKEN_OVER if in_motion else Event.PLANNED, Phase.EXECUTING)
+        self._change_phase(Event.TAKEN_OVER if in_motion else Event.PLANNED, Phase.EXECUTING)
         start = ", which begins in motion" if in_motion else ""
-        self._report(
+        self._add_status(
             PlannerState.EXECUTING,
-            f"Executing {_gait_by(schedule.method)} of {schedule.duration:.6g} s{start}.",
+            f"Executing {_name_gait(schedule.method)} of {schedule.duration:.6g} s{start}.",
             active.identified,
             active,
             remaining,
@@ -804,79 +822,81 @@ class Executive:
         self.outputs.append(ScheduleStart(schedule, begins))
 
     @staticmethod
-    def _cut_off(active: ActiveGoal, stamp_ns: int) -> None:
+    def _subtract_remainder(active: ActiveGoal, stamp_ns: int) -> None:
         """Subtract the rest of the present schedule from the duration of the manoeuvre."""
         remainder = active.ends_at - stamp_ns / 1e9
         if remainder > 0:
             active.manoeuvre_time -= min(remainder, active.schedule.duration)
             active.ends_at = stamp_ns / 1e9
 
-    def _correct_path(self, active: ActiveGoal, error: TrackingError) -> None:
+    def _report_path_correction(self, active: ActiveGoal, error: TrackingError) -> None:
         message = f"{error}: the remaining motion is planned again."
         self._count_correction(active, message)
-        self._notice(Severity.WARNING, message)
+        self._add_notice(Severity.WARNING, message)
 
     def _count_correction(self, active: ActiveGoal, message: str) -> None:
         active.corrections += 1
         count = str(active.corrections)
-        self._event(EventKind.CORRECTION, message, active.identified, 1, corrections=count)
+        self._add_event(EventKind.CORRECTION, message, active.identified, 1, corrections=count)
 
     # -- ends of schedules and goals ----------------------------------------------------------
 
-    def _on_end(self, stamp_ns: int) -> None:
+    def _end_schedule(self, stamp_ns: int) -> None:
         """End the schedule; its result is evaluated unless its goal was given up."""
-        ready = self._plan
+        ready = self._pending_plan
         if isinstance(ready, ReadyPlan):
             # No state was measured since the tick at which it takes over.
-            self._switch(ready)
+            self._switch_schedule(ready)
             if not self._tracker.ended(stamp_ns, ready.schedule.positions[-1]):
                 return
         self._drop_plan()
         at_rest = self.phase is Phase.BRAKING
         self._tracker.stop(at_last_shape=not at_rest)
         self._average.restart()
-        self._go(Event.AT_REST if at_rest else Event.SCHEDULE_ENDED, self._phase_at_rest())
+        self._change_phase(
+            Event.AT_REST if at_rest else Event.SCHEDULE_ENDED, self._phase_at_rest()
+        )
 
-    def _on_time_jump(self, stamp_ns: int) -> None:
+    def _handle_time_jump(self, stamp_ns: int) -> None:
         """Plan the remaining motion where the schedule does not cover the present time."""
         if self._tracker.covers(stamp_ns):
             return
         self._drop_plan()
         self._tracker.stop()
         self._average.restart()
-        if self._active is not None:
-            self._active.next_plan = PlanReason.REPLAN
-        self._go(Event.TIME_JUMPED, self._phase_at_rest())
+        if self._active_goal is not None:
+            self._active_goal.next_plan = PlanReason.REPLAN
+        self._change_phase(Event.TIME_JUMPED, self._phase_at_rest())
         before, now = self._stamp_ns / 1e9, stamp_ns / 1e9
-        self._notice(
+        self._add_notice(
             Severity.WARNING,
             f"The time of the states has jumped from {before:.9g} s to {now:.9g} s, where no "
             "motion is planned.",
         )
 
-    def _on_stuck(self, active: ActiveGoal, stuck: Sequence[int]) -> None:
+    def _handle_stuck_joints(self, active: ActiveGoal, stuck: Sequence[int]) -> None:
         """Stop, and plan the remaining motion with the joints that are not stuck."""
         tracker = self._tracker
         tracker.stuck += stuck
         self._drop_plan()
         tracker.stop()
-        self._cut_off(active, self._stamp_ns)
+        self._subtract_remainder(active, self._stamp_ns)
         active.required = active.schedule.controls & POSE
         active.next_plan = PlanReason.STUCK_JOINTS
         self._average.restart()
-        self._go(Event.JOINTS_STUCK, self._phase_at_rest())
+        self._change_phase(Event.JOINTS_STUCK, self._phase_at_rest())
         names = ", ".join(self._robot.joint_names[i] for i in tracker.stuck)
         message = f"Stuck: {names}. The remaining motion is planned without."
-        self._notice(Severity.WARNING, message)
-        self._event(EventKind.STUCK_JOINT, message, active.identified, 1, joints=names)
+        self._add_notice(Severity.WARNING, message)
+        self._add_event(EventKind.STUCK_JOINT, message, active.identified, 1, joints=names)
 
     def _drop_plan(self) -> None:
         """Drop the plan that is being made or ready; a new goal of it waits again."""
         self._worker.cancel()
-        plan, self._plan = self._plan, None
+        plan, self._pending_plan = self._pending_plan, None
         job = plan.job if isinstance(plan, ReadyPlan) else plan
         if job is not None and job.reason.for_new_goal:
-            self._waiting = self._waiting or job.identified
+            self._waiting_goal = self._waiting_goal or job.identified
 
     def _phase_without_plan(self) -> Phase:
         """Return the next phase where there is no plan."""
@@ -886,43 +906,47 @@ class Executive:
 
     def _phase_at_rest(self) -> Phase:
         """Return the next phase when the joints have come to rest."""
-        if self._waiting is not None:
+        if self._waiting_goal is not None:
             return Phase.MEASURING
-        return Phase.IDLE if self._active is None else Phase.EVALUATING
+        return Phase.IDLE if self._active_goal is None else Phase.EVALUATING
 
-    def _fail(
+    def _fail_goal(
         self, active: ActiveGoal, remaining: PoseError, why: str, event: Event = Event.FAILED
     ) -> None:
         """Report that the active goal is not reached; ``why`` ends the message."""
-        off = remaining_error(remaining, active.schedule.controls)
+        off = describe_remaining_error(remaining, active.schedule.controls)
         message = f"The goal is not reached: {off}{why}"
-        self._report(PlannerState.FAILED, message, active.identified, active, remaining)
+        self._add_status(PlannerState.FAILED, message, active.identified, active, remaining)
         self._end_goal(event)
 
     def _end_goal(self, event: Event) -> None:
         """End the active goal: nothing is to be resumed."""
-        self._file.delete()
-        self._active = None
-        self._go(event, self._phase_at_rest())
+        self._goal_file.delete()
+        self._active_goal = None
+        self._change_phase(event, self._phase_at_rest())
 
     def _forget_goals(self) -> None:
         """Drop the plan and every goal."""
         self._drop_plan()
-        self._waiting = self._active = None
+        self._waiting_goal = self._active_goal = None
 
-    def _latest(self) -> IdentifiedGoal | None:
+    def _latest_goal(self) -> IdentifiedGoal | None:
         """Return the goal that was proposed last, of those that are not decided."""
-        plan = self._plan.job if isinstance(self._plan, ReadyPlan) else self._plan
-        current = plan or self._active
-        return self._waiting or (None if current is None else current.identified)
+        plan = (
+            self._pending_plan.job
+            if isinstance(self._pending_plan, ReadyPlan)
+            else self._pending_plan
+        )
+        current = plan or self._active_goal
+        return self._waiting_goal or (None if current is None else current.identified)
 
-    def _latest_id(self) -> str:
-        latest = self._latest()
+    def _latest_goal_id(self) -> str:
+        latest = self._latest_goal()
         return "" if latest is None else latest.goal_id
 
     # -- outputs ------------------------------------------------------------------------------
 
-    def _go(self, event: Event, target: Phase) -> None:
+    def _change_phase(self, event: Event, target: Phase) -> None:
         """Change the phase and report it; no other method does."""
         transition = Transition(self.phase, event, target)
         if transition not in TRANSITIONS:
@@ -932,10 +956,10 @@ class Executive:
         self.phase = target
         self.outputs.append(transition)
 
-    def _notice(self, severity: Severity, message: str) -> None:
+    def _add_notice(self, severity: Severity, message: str) -> None:
         self.outputs.append(Notice(severity, message))
 
-    def _event(
+    def _add_event(
         self,
         kind: EventKind,
         message: str,
@@ -947,7 +971,7 @@ class Executive:
         now = self._stamp_ns / 1e9
         self.outputs.append(FlightEvent(kind, message, level, now, identified.goal_id, about))
 
-    def _report(
+    def _add_status(
         self,
         state: PlannerState,
         message: str,
@@ -979,6 +1003,6 @@ class Executive:
         self.outputs.append(status)
 
 
-def _gait_by(method: str) -> str:
+def _name_gait(method: str) -> str:
     """Return "an optimal gait" or the like, for messages."""
     return f"{'an' if method[:1] in tuple('aeiou') else 'a'} {method} gait"

@@ -69,7 +69,7 @@ class GoalFile:
         """
         if self._path is None:
             return
-        text = json.dumps({key: _entry(goal) for key, goal in goals.items()})
+        text = json.dumps({key: _encode_goal(goal) for key, goal in goals.items()})
         try:
             # Commanders wait for no disk while they fly.
             write_whole(self._path, text.encode(), durable=False)
@@ -96,7 +96,7 @@ class GoalFile:
         if self._path is None:
             return {}
         try:
-            return self._parse(read_private(self._path).decode())
+            return self._parse_goals(read_private(self._path).decode())
         except FileNotFoundError:
             return {}
         except UntrustedFileError as error:
@@ -109,7 +109,7 @@ class GoalFile:
                 f"Parameter 'resume_file' is '{self._path}', which holds no goal: {why}."
             ) from error
 
-    def _parse(self, text: str) -> dict[str, IdentifiedGoal]:
+    def _parse_goals(self, text: str) -> dict[str, IdentifiedGoal]:
         entries = json.loads(text)
         if not isinstance(entries, dict) or not entries:
             raise ValueError("it names none")
@@ -131,7 +131,7 @@ class GoalFile:
             ) from error
 
 
-def _entry(identified: IdentifiedGoal) -> dict[str, list[float] | str | None]:
+def _encode_goal(identified: IdentifiedGoal) -> dict[str, list[float] | str | None]:
     goal = identified.goal
     shape = goal.joint_positions
     entry: dict[str, list[float] | str | None] = {

@@ -29,22 +29,22 @@ from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, Robot
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 
-_SHAPES = 48
+_MAX_EVALUATED_SHAPES = 48
 """Largest number of shapes along a path for which the model is evaluated."""
 
-_STEP = 1e-6
+_DIFFERENCE_STEP = 1e-6
 """Relative step of the finite differences."""
 
-_SPREAD = 0.1
+_PRIOR_DEVIATION = 0.1
 """Standard deviation of the relative errors of masses and inertias, before any measurement."""
 
-_NOISE = 1e-3
+_POSE_NOISE = 1e-3
 """Standard deviation of each component of a measured pose, m or rad."""
 
-_LARGEST = 6 * _SPREAD
+_MAX_PLAUSIBLE_ERROR = 6 * _PRIOR_DEVIATION
 """Relative errors beyond this have another cause, such as a jump of the measurements."""
 
-_NEAR_ENOUGH, _AIM = (0.6, 0.8), (0.4, 0.6)
+_NEAR_SHARES, _AIM_SHARES = (0.6, 0.8), (0.4, 0.6)
 """Shares of the tolerances, early and late in a motion: the remaining motion is planned again
 where its expected error exceeds the first, and the new plan may end within the second. Turns of
 the base that are left for late take long."""
@@ -95,41 +95,46 @@ class PathCheck:
         self._robot, self._path, self._positions = robot, schedule.path, schedule.positions
         self._period, self._deadband = schedule.control_period, config.shape_deadband
         self._deviation = PathDeviation(schedule.path, average, sensitivity, masses)
-        self._position = config.drift_position or np.inf
-        self._attitude = config.drift_attitude or np.inf
+        self._max_distance = config.drift_position or np.inf
+        self._max_angle = config.drift_attitude or np.inf
         self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
-        self._slack = round(schedule.control_period * 0.5e9)
-        self._next = 0
-        self._used = config.drift_position > 0 or config.drift_attitude > 0 or average > 0
+        self._stamp_slack = round(schedule.control_period * 0.5e9)
+        self._next_pose = 0
+        self._path_counts = config.drift_position > 0 or config.drift_attitude > 0 or average > 0
 
     def due(self, stamp_ns: int) -> bool:
         """Whether the path predicts a pose for this time."""
-        if not self._used:
+        if not self._path_counts:
             return False
         stamps = self._stamps
-        while self._next < len(stamps) and stamps[self._next] < stamp_ns - self._slack:
-            self._next += 1
-        return self._next < len(stamps) and stamps[self._next] <= stamp_ns + self._slack
+        while (
+            self._next_pose < len(stamps) and stamps[self._next_pose] < stamp_ns - self._stamp_slack
+        ):
+            self._next_pose += 1
+        return (
+            self._next_pose < len(stamps)
+            and stamps[self._next_pose] <= stamp_ns + self._stamp_slack
+        )
 
     def error(self, state: RobotState) -> TrackingError | None:
         """Return the tracking error of a state, None if it is within its bounds."""
-        k = self._next
+        k = self._next_pose
         turn = attitude_error(state.quaternion, self._path.quaternion[k])
         distance = float(np.linalg.norm(state.position - self._path.position[k]))
         angle = float(np.linalg.norm(turn))
-        too_far = distance > self._position or angle > self._attitude
+        too_far = distance > self._max_distance or angle > self._max_angle
         return TrackingError(distance, angle) if too_far else None
 
-    def averaged(self, state: RobotState) -> RobotState:
+    def average_pose(self, state: RobotState) -> RobotState:
         """Add a state to the mean deviation; return it with its pose by the mean deviation."""
-        k = self._next
+        k = self._next_pose
         self._deviation.add(k, state.position, state.quaternion, self._lag(state))
         position, quaternion = self._deviation.pose(k)
         return replace(state, position=position, quaternion=quaternion)
 
     def _lag(self, state: RobotState) -> Array:
         """Return the deviation (6,) in W of the base that comes from joints which lag."""
-        lag = state.q - self._positions[round(self._path.time[self._next] / self._period)]
+        lag = state.q - self._positions[round(self._path.time[self._next_pose] / self._period)]
         lag[np.abs(lag) <= self._deadband] = 0.0
         displacement_B = -self._robot.connection(state.q) @ lag
         R_WB = matrix_from_quaternion(state.quaternion)
@@ -138,14 +143,14 @@ class PathCheck:
     @property
     def end(self) -> tuple[Array, Array]:
         """End of the path by the mean deviation: position (3,), attitude (4,)."""
-        return self._deviation.end(self._next)
+        return self._deviation.end(self._next_pose)
 
     @property
     def expected_end(self) -> tuple[Array, Array]:
         """End of the path with the estimated errors of masses: position (3,), attitude (4,)."""
-        return self._deviation.expected_end(self._next)
+        return self._deviation.expected_end(self._next_pose)
 
-    def aim(
+    def shift_goal(
         self, goal: Goal, within: Tolerance, controls: frozenset[Controlled], *, late: bool
     ) -> Goal | None:
         """Return the goal for a plan of the remaining motion; None where its expected end is near.
@@ -155,16 +160,16 @@ class PathCheck:
         """
         position, quaternion = self.end
         error = PoseError.between(*self.expected_end, goal)
-        near = Tolerance(*(_NEAR_ENOUGH[late] * x for x in (within.position, within.attitude)))
+        near = Tolerance(*(_NEAR_SHARES[late] * x for x in (within.position, within.attitude)))
         if near.admits(error, controls):
             return None
-        moved = error.position * _excess(error.distance, _AIM[late] * within.position)
-        turn = error.rotvec * _excess(error.angle, _AIM[late] * within.attitude)
+        moved = error.position * _excess_share(error.distance, _AIM_SHARES[late] * within.position)
+        turn = error.rotvec * _excess_share(error.angle, _AIM_SHARES[late] * within.attitude)
         aimed = quaternion_multiply(quaternion, quaternion_from_rotvec(turn))
         return Goal(position + moved, aimed, goal.joint_positions)
 
 
-def _excess(error: float, allowed: float) -> float:
+def _excess_share(error: float, allowed: float) -> float:
     """Return the share of an error beyond the part that is allowed."""
     return max(0.0, 1.0 - allowed / error) if error > 0 else 0.0
 
@@ -197,7 +202,7 @@ class PathDeviation:
         masses: MassEstimate | None = None,
     ) -> None:
         self._path = path
-        self._recent: deque[tuple[int, Array]] = deque(maxlen=count)
+        self._recent_deviations: deque[tuple[int, Array]] = deque(maxlen=count)
         self._lag = np.zeros(6)
         if sensitivity is None or masses is None:
             sensitivity, masses = np.zeros((len(path.time), 6, 0)), MassEstimate(0)
@@ -215,17 +220,17 @@ class PathDeviation:
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
         deviation = np.concatenate([position - self._path.position[k], turn]) - lag
         self._lag[:] = lag
-        self._recent.append((k, deviation))
+        self._recent_deviations.append((k, deviation))
         self._masses.add(self._sensitivity[k], deviation)
 
     def pose(self, k: int) -> tuple[Array, Array]:
         """Return where the base is at instant k: position (3,) and attitude (4,)."""
-        return self._displaced(k, self._mean(k) + self._lag)
+        return self._displace_pose(k, self._mean_deviation(k) + self._lag)
 
     def end(self, k: int) -> tuple[Array, Array]:
         """Return where the path leads to from instant k, if the base moves as predicted."""
-        mean = self._mean(k)
-        position, quaternion = self._displaced(k, mean)
+        mean = self._mean_deviation(k)
+        position, quaternion = self._displace_pose(k, mean)
         turn = quaternion_from_rotvec(mean[3:])
         way = self._path.position[-1] - self._path.position[k]
         ahead = attitude_error(self._path.quaternion[k], self._path.quaternion[-1])
@@ -237,23 +242,27 @@ class PathDeviation:
     def expected_end(self, k: int) -> tuple[Array, Array]:
         """Return where the path leads to with the estimated errors of masses: (3,) and (4,)."""
         position, quaternion = self.end(k)
-        more = self._of_masses(k, -1)
+        more = self._deviation_by_masses(k, -1)
         turn = quaternion_from_rotvec(more[3:])
         return position + more[:3], quaternion_multiply(turn, quaternion)
 
-    def _displaced(self, k: int, deviation: Array) -> tuple[Array, Array]:
+    def _displace_pose(self, k: int, deviation: Array) -> tuple[Array, Array]:
         turn = quaternion_from_rotvec(deviation[3:])
         position = self._path.position[k] + deviation[:3]
         return position, quaternion_multiply(turn, self._path.quaternion[k])
 
-    def _of_masses(self, begin: int, end: int) -> Array:
+    def _deviation_by_masses(self, begin: int, end: int) -> Array:
         """Return the change of the deviation (6,) between instants by errors of masses."""
         return np.asarray((self._sensitivity[end] - self._sensitivity[begin]) @ self._masses.errors)
 
-    def _mean(self, k: int) -> Array:
-        if not self._recent:
+    def _mean_deviation(self, k: int) -> Array:
+        if not self._recent_deviations:
             return np.zeros(6)
-        return np.asarray(np.mean([d + self._of_masses(i, k) for i, d in self._recent], axis=0))
+        return np.asarray(
+            np.mean(
+                [d + self._deviation_by_masses(i, k) for i, d in self._recent_deviations], axis=0
+            )
+        )
 
 
 class PathSensitivity:
@@ -281,7 +290,7 @@ class PathSensitivity:
         with each parameter changed by a small step.
         """
         robot, bodies = self._robot, self.count // 2
-        factors = 1 + np.vstack([np.zeros(self.count), _STEP * np.eye(self.count)])
+        factors = 1 + np.vstack([np.zeros(self.count), _DIFFERENCE_STEP * np.eye(self.count)])
         weighing = robot.inertial.scaled(factors[:, :bodies], factors[:, bodies:])
         model, arguments = robot.symbolic_model(weighing)
         q, p = ca.SX.sym("q", robot.n), ca.SX.sym("p", arguments.shape[1])
@@ -296,12 +305,13 @@ class PathSensitivity:
         """
         model, arguments = self._model
         variants = arguments.shape[1]
-        of_all = model.map(len(shapes) * variants)(
+        outputs = model.map(len(shapes) * variants)(
             np.repeat(shapes, variants, axis=0).T, np.tile(arguments, len(shapes))
         )
-        turns, centers = (np.asarray(each).T.reshape(len(shapes), variants, -1) for each in of_all)
+        turns, centers = (np.asarray(each).T.reshape(len(shapes), variants, -1) for each in outputs)
         by_turn, by_center = (
-            (each[:, 1:] - each[:, :1]).transpose(0, 2, 1) / _STEP for each in (turns, centers)
+            (each[:, 1:] - each[:, :1]).transpose(0, 2, 1) / _DIFFERENCE_STEP
+            for each in (turns, centers)
         )
         return by_turn.reshape(len(shapes), self._robot.n, 3, self.count), by_center
 
@@ -320,20 +330,20 @@ class PathSensitivity:
         # The model changes little from shape to shape: it is evaluated for some of them, and
         # interpolated in between.
         instants: Array = np.arange(knots, dtype=float)
-        called = np.unique(np.linspace(0, knots - 1, _SHAPES).round().astype(int))
+        called = np.unique(np.linspace(0, knots - 1, _MAX_EVALUATED_SHAPES).round().astype(int))
         turns, centers = self._derivatives(shapes[called])
-        by_joint = _interpolated(instants[:-1] + 0.5, called, turns)
+        by_joint = _interpolate(instants[:-1] + 0.5, called, turns)
         in_base = np.einsum("kjap,kj->kap", by_joint, np.diff(shapes, axis=0))
         steps = (R_WB[:-1] + R_WB[1:]) / 2 @ in_base
         turned = np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
         # The centre of mass C of the system stays where it is: r_WB = r_WC - R_WB r_BC_B.
         r_BC_W = [R @ self._robot.center_of_mass(q) for R, q in zip(R_WB, shapes, strict=True)]
         arms = np.array([hat(each) for each in r_BC_W])
-        moved = arms @ turned - R_WB @ _interpolated(instants, called, centers)
+        moved = arms @ turned - R_WB @ _interpolate(instants, called, centers)
         return np.concatenate([moved - moved[0], turned], axis=1)
 
 
-def _interpolated(at: Array, known: Array, values: Array) -> Array:
+def _interpolate(at: Array, known: Array, values: Array) -> Array:
     """Return values at instants, linearly between those (M, ...) at M known instants."""
     place = np.interp(at, known, np.arange(len(known)))
     before = np.clip(place.astype(int), 0, max(len(known) - 2, 0))
@@ -358,12 +368,12 @@ class MassEstimate:
 
     def __init__(self, count: int) -> None:
         # Information of the prior and of all earlier paths: matrix and vector.
-        self._information = (_NOISE / _SPREAD) ** 2 * np.eye(count)
+        self._information = (_POSE_NOISE / _PRIOR_DEVIATION) ** 2 * np.eye(count)
         self._vector = np.zeros(count)
         self._errors: Array | None = None
-        self._begin()
+        self._clear_path()
 
-    def _begin(self) -> None:
+    def _clear_path(self) -> None:
         count = len(self._vector)
         self._poses = 0
         self._sum_J, self._sum_y = np.zeros((6, count)), np.zeros(6)
@@ -374,7 +384,7 @@ class MassEstimate:
         """Begin with another path; the information of the earlier ones is kept."""
         if self.errors.any():
             self._information, self._vector = self._normal_equations()
-        self._begin()
+        self._clear_path()
 
     def add(self, sensitivity: Array, deviation: Array) -> None:
         """Add the deviation (6,) of a pose, where the path has the sensitivity (6, P)."""
@@ -390,7 +400,7 @@ class MassEstimate:
         """The relative errors (P,) of masses, then of inertias."""
         if self._errors is None:
             errors = np.asarray(np.linalg.solve(*self._normal_equations()))
-            plausible = np.abs(errors).max(initial=0.0) <= _LARGEST
+            plausible = np.abs(errors).max(initial=0.0) <= _MAX_PLAUSIBLE_ERROR
             self._errors = errors if plausible else np.zeros_like(errors)
         return self._errors
 

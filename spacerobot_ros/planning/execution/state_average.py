@@ -16,7 +16,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.planning.core.goal import RobotState
 
-_AT_REST = 1e-9
+_REST_RATE = 1e-9
 """Joint rates below which the joints rest, m/s or rad/s."""
 
 
@@ -62,7 +62,7 @@ class StateAverage:
     """
 
     def __init__(self, robot: SpaceRobot, count: int = 1, rest_tolerance: float = 0.0) -> None:
-        self._robot, self._wanted, self._tolerance = robot, count, rest_tolerance
+        self._robot, self._full_count, self._tolerance = robot, count, rest_tolerance
         self._poses: list[Array] = []
         self._rates: list[Array] = []
         self._shapes: list[Array] = []
@@ -77,7 +77,7 @@ class StateAverage:
     @property
     def complete(self) -> bool:
         """Whether there are as many as wanted."""
-        return self.count >= self._wanted
+        return self.count >= self._full_count
 
     def restart(self) -> None:
         """Forget the states, not the momenta."""
@@ -114,7 +114,7 @@ class StateAverage:
             quaternion = quaternion_multiply(first, quaternion_from_rotvec(turn))
         twist, qdot = rates[:6], rates[6:]
         momenta = self._momenta
-        at_rest = np.abs(qdot).max(initial=0.0) <= max(_AT_REST, self._tolerance)
+        at_rest = np.abs(qdot).max(initial=0.0) <= max(_REST_RATE, self._tolerance)
         if at_rest or momenta is None:
             if at_rest and self._tolerance and np.abs(twist).max() <= self._tolerance:
                 momenta = np.zeros(3), np.zeros(3)

@@ -87,18 +87,18 @@ class PlannerStatus:
         if self.goal_id:
             values["goal_id"] = self.goal_id
         if self.goal:
-            values["goal"] = _text(list(self.goal))
+            values["goal"] = _format_note(list(self.goal))
         if self.position_error_m is not None:
-            values["position_error_m"] = _text(self.position_error_m)
+            values["position_error_m"] = _format_note(self.position_error_m)
         if self.attitude_error_rad is not None:
-            values["attitude_error_rad"] = _text(self.attitude_error_rad)
+            values["attitude_error_rad"] = _format_note(self.attitude_error_rad)
         if self.ends_at_s:
-            values["manoeuvre_time_s"] = _text(self.manoeuvre_time_s)
-            values["ends_at_s"] = _text(self.ends_at_s)
+            values["manoeuvre_time_s"] = _format_note(self.manoeuvre_time_s)
+            values["ends_at_s"] = _format_note(self.ends_at_s)
         if self.method:
             values["method"] = self.method
-            values["duration_s"] = _text(self.duration_s)
-            values.update((name, _text(note)) for name, note in self.notes.items())
+            values["duration_s"] = _format_note(self.duration_s)
+            values.update((name, _format_note(note)) for name, note in self.notes.items())
         return values
 
     @classmethod
@@ -113,7 +113,7 @@ class PlannerStatus:
         given = dict(values)
         try:
             state = PlannerState(given.pop("state"))
-            numbers = {name: float(given.pop(name)) for name in _NUMBERS if name in given}
+            numbers = {name: float(given.pop(name)) for name in _NUMBER_KEYS if name in given}
             return cls(
                 state=state,
                 message=message,
@@ -122,7 +122,7 @@ class PlannerStatus:
                 corrections=int(given.pop("corrections", "0")),
                 method=given.pop("method", ""),
                 **numbers,
-                notes={name: _note(text) for name, text in given.items()},
+                notes={name: _parse_note(text) for name, text in given.items()},
             )
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"This is no status of a planner: {error}.") from error
@@ -152,7 +152,7 @@ class ScheduleStart:
     stamp_ns: int
 
 
-_NUMBERS = (
+_NUMBER_KEYS = (
     *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "ends_at_s", "duration_s"),
 )
 """Values that are one number each."""
@@ -191,24 +191,24 @@ def goal_values(goal: Goal) -> tuple[float, ...]:
     return (*goal.position.tolist(), *goal.quaternion.tolist())
 
 
-def remaining_error(error: PoseError, controls: frozenset[Controlled]) -> str:
+def describe_remaining_error(error: PoseError, controls: frozenset[Controlled]) -> str:
     """Return a clause with the remaining error in the parts of the goal that are controlled."""
     parts: dict[Controlled, str] = {
         "position": f"{error.distance:.3g} m",
         "attitude": f"{error.angle:.3g} rad",
     }
     if len(error.shape):
-        parts["shape"] = f"{error.farthest_joint:.3g} at the joints"
+        parts["shape"] = f"{error.max_joint_error:.3g} at the joints"
     remaining = " and ".join(text for part, text in parts.items() if part in controls)
     return f"{remaining} from the goal"
 
 
-def _text(note: list[float] | Array | float | str) -> str:
+def _format_note(note: list[float] | Array | float | str) -> str:
     numbers = note if isinstance(note, list) else [note]
     return " ".join(f"{x:.9g}" if isinstance(x, float) else str(x) for x in numbers)
 
 
-def _note(text: str) -> list[float] | float | str:
+def _parse_note(text: str) -> list[float] | float | str:
     try:
         numbers = [float(word) for word in text.split()]
     except ValueError:
@@ -272,7 +272,7 @@ def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -
     first = last = schedules[-1]
     for i in reversed(range(last)):
         before = given[i][1]
-        match before.state, _same_goal(before, given[last][1]):
+        match before.state, _share_goal(before, given[last][1]):
             case PlannerState.EXECUTING, True:
                 first = i
             case (PlannerState.PLANNING, _) | (PlannerState.REFUSED, False):
@@ -288,7 +288,7 @@ def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -
     return (ended[0] if ended else end_s) - given[first][0]
 
 
-def _same_goal(first: PlannerStatus, second: PlannerStatus) -> bool:
+def _share_goal(first: PlannerStatus, second: PlannerStatus) -> bool:
     """Whether two statuses are about one goal, or about two of the same pose."""
     same_id = bool(first.goal_id) and first.goal_id == second.goal_id
     return same_id or first.goal == second.goal

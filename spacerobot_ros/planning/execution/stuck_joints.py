@@ -14,13 +14,13 @@ _FOLLOWS_SHARE = 0.5
 """A joint that moves over more than this share follows. In between it is slow, or noise hides
 its motion."""
 
-_PATIENCE = 8
+_PATIENCE_WINDOWS = 8
 """Windows to wait for commands to arrive when no joint moves."""
 
-_LOOK_EVERY = 16
+_CHECK_PERIOD = 16
 """Ticks between two checks of joints that have all followed so far: a check takes time."""
 
-_LEAST_BAND = 1e-6
+_MIN_BAND = 1e-6
 """Errors below this are rounding, m or rad."""
 
 
@@ -48,78 +48,81 @@ class StuckJointWatch:
 
     def __init__(self, joints: int, ticks: int, control_period: float, band: float = 0.0) -> None:
         self._ticks, self._control_period = ticks, control_period
-        self._band = max(band, _LEAST_BAND)
-        self._joints, self._longest = joints, _PATIENCE * ticks
+        self._band = max(band, _MIN_BAND)
+        self._joints, self._max_window = joints, _PATIENCE_WINDOWS * ticks
         self.restart()
 
     def restart(self) -> None:
         """Begin with a new schedule."""
         n = self._joints
-        self._suspicious, self._looks = False, 0
-        self._moving = np.zeros(n, dtype=np.int64)
+        self._suspicious, self._ticks_without_check = False, 0
+        self._moving_ticks = np.zeros(n, dtype=np.int64)
         self._window = np.full(n, self._ticks, dtype=np.int64)
         self._commanded = np.zeros(n)
-        self._asked, self._gone = np.zeros((2, n)), np.zeros((2, n))
-        self._standstill_q, self._standstill_asked = np.full(n, np.inf), np.zeros(n)
+        self._commanded_range, self._measured_range = np.zeros((2, n)), np.zeros((2, n))
+        self._standstill_q, self._standstill_motion = np.full(n, np.inf), np.zeros(n)
         self._standstill_ticks = 0
 
-    def look(self, q: Array, wanted: Array, velocity: Array) -> list[int]:
+    def find_stuck(self, q: Array, wanted: Array, velocity: Array) -> list[int]:
         """Return the indices of the joints that are found stuck, mostly none.
 
         ``q`` and ``wanted`` (n,) are the measured and the wanted shape now, ``velocity`` (n,) the
         command until the next tick.
         """
         if not self._suspicious:
-            self._looks += 1
-            if self._looks % _LOOK_EVERY or not self._ticks:
+            self._ticks_without_check += 1
+            if self._ticks_without_check % _CHECK_PERIOD or not self._ticks:
                 return []
             if np.abs(wanted - q).max(initial=0.0) <= self._band:
                 return []
             self._suspicious = True
-            self._begin(np.ones(self._joints, dtype=np.bool_), q)
+            self._restart_joints(np.ones(self._joints, dtype=np.bool_), q)
         self._watch_standstill(q, velocity)
-        _widen(self._gone, q)
+        _widen_ranges(self._measured_range, q)
         self._commanded += velocity * self._control_period
-        _widen(self._asked, self._commanded)
-        self._moving += np.abs(velocity) * self._control_period > _LEAST_BAND * _STUCK_SHARE
-        due = self._moving >= self._window
+        _widen_ranges(self._commanded_range, self._commanded)
+        self._moving_ticks += np.abs(velocity) * self._control_period > _MIN_BAND * _STUCK_SHARE
+        due = self._moving_ticks >= self._window
         if not due.any():
             return []
-        asked, gone = np.diff(self._asked, axis=0)[0], np.diff(self._gone, axis=0)[0]
-        stuck = due & (gone <= _STUCK_SHARE * asked) & (asked > self._band)
-        moved = asked > self._band
-        still = gone[moved] <= _STUCK_SHARE * asked[moved]
+        commanded, measured = (
+            np.diff(self._commanded_range, axis=0)[0],
+            np.diff(self._measured_range, axis=0)[0],
+        )
+        stuck = due & (measured <= _STUCK_SHARE * commanded) & (commanded > self._band)
+        moved = commanded > self._band
+        still = measured[moved] <= _STUCK_SHARE * commanded[moved]
         none_moves = (np.count_nonzero(moved) > 1 and still.all()) or self._at_standstill
-        if none_moves and self._window[due].max() < self._longest:
+        if none_moves and self._window[due].max() < self._max_window:
             # Joints do not all jam at once: commands do not arrive, perhaps not for long.
             stuck[:] = False
-        follows = due & (gone >= _FOLLOWS_SHARE * asked)
+        follows = due & (measured >= _FOLLOWS_SHARE * commanded)
         # Those in between are looked at for longer.
         self._window[due] *= 2
-        self._begin(follows | stuck, q)
+        self._restart_joints(follows | stuck, q)
         return [int(i) for i in np.flatnonzero(stuck)]
 
     def _watch_standstill(self, q: Array, velocity: Array) -> None:
         """Count the ticks without any motion, and sum the commanded motion of each joint since."""
         if np.abs(q - self._standstill_q).max(initial=0.0) > self._band:
             self._standstill_q[:] = q
-            self._standstill_asked[:] = 0.0
+            self._standstill_motion[:] = 0.0
             self._standstill_ticks = 0
-        self._standstill_asked += np.abs(velocity) * self._control_period
+        self._standstill_motion += np.abs(velocity) * self._control_period
         self._standstill_ticks += 1
 
     @property
     def _at_standstill(self) -> bool:
         """Whether several joints were commanded to move for a while in which none has moved."""
-        asked = int(np.count_nonzero(self._standstill_asked > self._band))
-        return asked > 1 and 2 * self._standstill_ticks >= self._ticks
+        commanded = int(np.count_nonzero(self._standstill_motion > self._band))
+        return commanded > 1 and 2 * self._standstill_ticks >= self._ticks
 
-    def _begin(self, joints: npt.NDArray[np.bool_], q: Array) -> None:
-        self._moving[joints], self._window[joints] = 0, self._ticks
+    def _restart_joints(self, joints: npt.NDArray[np.bool_], q: Array) -> None:
+        self._moving_ticks[joints], self._window[joints] = 0, self._ticks
         self._commanded[joints] = 0.0
-        self._asked[:, joints], self._gone[:, joints] = 0.0, q[joints]
+        self._commanded_range[:, joints], self._measured_range[:, joints] = 0.0, q[joints]
 
 
-def _widen(ranges: Array, values: Array) -> None:
+def _widen_ranges(ranges: Array, values: Array) -> None:
     np.minimum(ranges[0], values, out=ranges[0])
     np.maximum(ranges[1], values, out=ranges[1])

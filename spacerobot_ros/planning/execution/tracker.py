@@ -20,10 +20,10 @@ from spacerobot_ros.planning.execution.path_deviation import (
 from spacerobot_ros.planning.execution.stuck_joints import StuckJointWatch
 from spacerobot_ros.times import SECOND
 
-_AT_END = 1e-6
+_END_TOLERANCE = 1e-6
 """A schedule has ended when every joint is this near its last position, m or rad."""
 
-_LONGEST_SETTLING = 5.0
+_MAX_SETTLING_TIME = 5.0
 """A schedule has also ended this long after its last tick, s."""
 
 
@@ -94,12 +94,12 @@ class ScheduleFollower:
         late = stamp_ns - self._end_ns
         if late < 0:
             return False
-        far = np.abs(self._positions[-1] - q).max(initial=0.0) > max(_AT_END, self._deadband)
-        return not far or late > _LONGEST_SETTLING * SECOND
+        far = np.abs(self._positions[-1] - q).max(initial=0.0) > max(_END_TOLERANCE, self._deadband)
+        return not far or late > _MAX_SETTLING_TIME * SECOND
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether the schedule, or the settling after it, covers a time."""
-        return self._start_ns <= stamp_ns <= self._end_ns + _LONGEST_SETTLING * SECOND
+        return self._start_ns <= stamp_ns <= self._end_ns + _MAX_SETTLING_TIME * SECOND
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
         """Return the first tick ``after`` s from now or later; None after the last tick."""
@@ -159,7 +159,7 @@ class BrakingFollower:
         shape_gain: float,
     ) -> None:
         self.schedule = schedule
-        self._begin = (stamp_ns - start_ns) / SECOND
+        self._begin_s = (stamp_ns - start_ns) / SECOND
         self._stamp_ns, self._duration = stamp_ns, duration
         self._gain = min(shape_gain, 1.0 / schedule.control_period)
 
@@ -174,20 +174,22 @@ class BrakingFollower:
     def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
         """Write the wanted shape now (n,) and the velocities to hold from now (n,)."""
         since = (stamp_ns - self._stamp_ns) / SECOND
-        position[:] = self._shape(since)
+        position[:] = self._shape_after(since)
         tick = self.schedule.control_period
-        velocity[:] = (self._shape(since + tick) - position) / tick + self._gain * (position - q)
+        velocity[:] = (self._shape_after(since + tick) - position) / tick + self._gain * (
+            position - q
+        )
 
     def shapes(self, stamp_ns: int) -> Array:
         """Return the wanted shapes (N + 1, n) at the ticks from now until the rest."""
         tick = self.schedule.control_period
         since = (stamp_ns - self._stamp_ns) / SECOND
         ticks = max(1, math.ceil((self._duration - since) / tick - 1e-9))
-        return np.array([self._shape(since + k * tick) for k in range(ticks + 1)])
+        return np.array([self._shape_after(since + k * tick) for k in range(ticks + 1)])
 
-    def _shape(self, since: float) -> Array:
+    def _shape_after(self, since: float) -> Array:
         tau = min(since / self._duration, 1.0)
-        ticks = (self._begin + self._duration * (tau - tau**2 / 2)) / self.schedule.control_period
+        ticks = (self._begin_s + self._duration * (tau - tau**2 / 2)) / self.schedule.control_period
         positions = self.schedule.positions
         k = min(max(int(ticks), 0), len(positions) - 1)
         ahead = positions[min(k + 1, len(positions) - 1)] - positions[k]
@@ -213,12 +215,16 @@ class TrajectoryTracker:
         # A controller closes its own loop round the reference.
         self._commands_plant = config.output == "commands"
         self._follower: ScheduleFollower | BrakingFollower | None = None
-        self._holding = False
+        self._holds_position = False
         """Whether the position of the setpoint is the shape to hold."""
         self._sensitivity = PathSensitivity(robot) if config.replanning > 0 else None
-        self._masses = MassEstimate(0 if self._sensitivity is None else self._sensitivity.count)
+        self._mass_estimate = MassEstimate(
+            0 if self._sensitivity is None else self._sensitivity.count
+        )
         band = 2 * config.shape_deadband
-        self._watch = StuckJointWatch(robot.n, config.stuck_ticks, config.control_period, band)
+        self._stuck_watch = StuckJointWatch(
+            robot.n, config.stuck_ticks, config.control_period, band
+        )
 
     @property
     def active(self) -> bool:
@@ -242,9 +248,9 @@ class TrajectoryTracker:
         if average and self._sensitivity is not None:
             sensitivity = self._sensitivity.along(schedule)
         self.path_check = PathCheck(
-            self._robot, schedule, stamp_ns, config, average, sensitivity, self._masses
+            self._robot, schedule, stamp_ns, config, average, sensitivity, self._mass_estimate
         )
-        self._watch.restart()
+        self._stuck_watch.restart()
 
     def brake(self, stamp_ns: int) -> None:
         """Brake along the planned path from now on."""
@@ -286,9 +292,9 @@ class TrajectoryTracker:
         """Track nothing more; hold the schedule's last shape, or the one that is measured next."""
         if at_last_shape and isinstance(self._follower, ScheduleFollower):
             self.setpoint.position[:] = self._follower.schedule.positions[-1]
-            self._holding = True
+            self._holds_position = True
         else:
-            self._holding = False
+            self._holds_position = False
         self._follower = None
 
     def check_due(self, stamp_ns: int) -> bool:
@@ -310,16 +316,16 @@ class TrajectoryTracker:
         if self.stuck:
             velocity[self.stuck] = 0.0
         if not obeyed:
-            self._watch.restart()
+            self._stuck_watch.restart()
             return []
-        return self._watch.look(q, position, velocity)
+        return self._stuck_watch.find_stuck(q, position, velocity)
 
     def hold(self, q: Array, *, obeyed: bool = True) -> None:
         """Write the setpoint that keeps the shape, where nothing is tracked."""
         # The reference of a controller must not follow the measured shape; for a plant, rest is any
         # shape. Motions while no command is in force are not undone afterwards.
-        if self._commands_plant or not self._holding or not obeyed:
+        if self._commands_plant or not self._holds_position or not obeyed:
             if math.isfinite(q.dot(q)):
                 self.setpoint.position[:] = q
             self.setpoint.velocity[:] = 0.0
-            self._holding = True
+            self._holds_position = True

@@ -26,7 +26,7 @@ from spacerobot_ros.planning.execution.tracker import TakeOver
 from spacerobot_ros.planning.methods.registry import METHODS, build_method
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 
-LONGEST_END = 1.5
+MAX_THREAD_END_TIME = 1.5
 """Wall s that a thread may take to end after its cancellation."""
 
 
@@ -169,9 +169,9 @@ class PlanningWorker:
             config.integration_step,
             config.method_options,
         )
-        self._remaining: tuple[PlanningTask, GaitMethod] | None = None
+        self._remaining_joints: tuple[PlanningTask, GaitMethod] | None = None
         """The method without some joints that was built last, and the task that needed it."""
-        self._job: _Job | None = None
+        self._job: _PlanThread | None = None
 
     @property
     def background(self) -> bool:
@@ -191,7 +191,7 @@ class PlanningWorker:
     def submit(self, task: PlanningTask) -> None:
         """Make a plan: at once, or in a thread."""
         assert self._job is None, "one plan at a time"
-        self._job = job = _Job(self, task)
+        self._job = job = _PlanThread(self, task)
         if self.background:
             job.start()
         else:
@@ -222,7 +222,7 @@ class PlanningWorker:
         self.cancel()
         if self._job is not None and self._job.is_alive():
             # It would crash a process that ends, in the middle of CasADi.
-            self._job.join(LONGEST_END)
+            self._job.join(MAX_THREAD_END_TIME)
 
     def plan(self, task: PlanningTask, cancellation: Cancellation) -> GaitSchedule:
         """Make a plan at once.
@@ -232,20 +232,20 @@ class PlanningWorker:
         PlanningError
             There is none; the message says why.
         """
-        method = self._method_for(task)
+        method = self._choose_method(task)
         if task.take_over is not None:
-            state = self._predicted(task.request.state, task.take_over.shapes)[0]
+            state = self._predict_motion(task.request.state, task.take_over.shapes)[0]
             motion = task.take_over.motion
             return method.plan(replace(task.request, state=state, motion=motion), cancellation)
         if task.braking is None:
             return method.plan(task.request, cancellation)
-        return self._blended(task.braking, task.request, method, cancellation)
+        return self._plan_with_braking(task.braking, task.request, method, cancellation)
 
-    def _method_for(self, task: PlanningTask) -> GaitMethod:
+    def _choose_method(self, task: PlanningTask) -> GaitMethod:
         if not task.stuck:
             return self._method
-        if self._remaining is not None:
-            earlier, method = self._remaining
+        if self._remaining_joints is not None:
+            earlier, method = self._remaining_joints
             if (earlier.stuck, earlier.required) == (task.stuck, task.required):
                 return method
         config = self._config
@@ -258,10 +258,10 @@ class PlanningWorker:
             options=config.method_options,
             required=task.required,
         )
-        self._remaining = task, method
+        self._remaining_joints = task, method
         return method
 
-    def _blended(
+    def _plan_with_braking(
         self,
         shapes: Array,
         request: PlanRequest,
@@ -274,7 +274,7 @@ class PlanningWorker:
         """
         state, period = request.state, self._config.control_period
         shapes[0] = state.q
-        at_rest, positions, attitudes = self._predicted(state, shapes)
+        at_rest, positions, attitudes = self._predict_motion(state, shapes)
         times: Array = period * np.arange(len(shapes), dtype=float)
         gait = method.plan(replace(request, state=at_rest), cancellation)
         path = BasePath(
@@ -284,7 +284,7 @@ class PlanningWorker:
         )
         return replace(gait, positions=np.vstack([shapes[:-1], gait.positions]), path=path)
 
-    def _predicted(self, state: RobotState, shapes: Array) -> tuple[RobotState, Array, Array]:
+    def _predict_motion(self, state: RobotState, shapes: Array) -> tuple[RobotState, Array, Array]:
         """Return the state after shapes (K + 1, n) at ticks, and the base poses at these.
 
         The positions are (K + 1, 3), the attitudes (K + 1, 4).
@@ -300,7 +300,7 @@ class PlanningWorker:
         return after, positions, attitudes
 
 
-class _Job(Thread):
+class _PlanThread(Thread):
     """One plan that is being made, and its result."""
 
     def __init__(self, worker: PlanningWorker, task: PlanningTask) -> None:

@@ -29,7 +29,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import (
-    WORST_CONDITION,
+    MAX_CONDITION,
     best_triple,
     require_three_slots,
     sliders_of,
@@ -281,7 +281,7 @@ class LieBracketGait(GaitMethod):
         # M holds the curvature of the pairs 12, 23 and 31, which brackets are the negative of.
         brackets = M * np.array([-1.0, -1.0, 1.0])
         condition = float(np.linalg.cond(brackets))
-        if not condition < WORST_CONDITION:
+        if not condition < MAX_CONDITION:
             raise PlanningError(
                 "The first-order Lie brackets of the sliders do not span the three axes of "
                 f"rotation at the final shape {np.round(z_f, 4).tolist()} (condition number "

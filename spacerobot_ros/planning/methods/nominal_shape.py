@@ -19,7 +19,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.planning.core.controllability import (
-    WORST_CONDITION,
+    MAX_CONDITION,
     curvature_matrices,
     curvatures,
     sample_shapes,
@@ -165,7 +165,7 @@ class NominalChoice:
                 f"joint '{names[least]}' no room for the loops of area_loop."
             )
         largest, _, smallest = chosen.singular_values
-        if not smallest * WORST_CONDITION > largest:
+        if not smallest * MAX_CONDITION > largest:
             raise PlanningError(
                 f"The curvature matrix of joints {', '.join(names)} is singular at the nominal "
                 f"shape {np.round(chosen.shape, 4).tolist()} (condition number "
