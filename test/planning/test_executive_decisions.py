@@ -47,7 +47,7 @@ def reasons(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> list[PlanReason]:
         requested.append(job.reason)
         request(job, state)
 
-    monkeypatch.setattr(loop.executive, "_request", recorded)
+    monkeypatch.setattr(loop.executive, "_request_plan", recorded)
     return requested
 
 
