@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.events import Event as FlightEvent
@@ -52,7 +52,7 @@ from spacerobot_ros.planning.execution.worker import (
     TakeOverJob,
 )
 
-_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
+_MAX_GAP, _MAX_GAP_PERIODS = 1.0, 10
 """A longer time between two states, or a negative one, is a jump of time: s, control periods."""
 
 _MAX_IN_MOTION_ATTEMPTS = 2
@@ -222,9 +222,7 @@ class Executive:
         self._goal_file = goal_file or GoalFile("")
         self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
         self._tracker = TrajectoryTracker(robot, config)
-        self._max_state_gap_ns = round(
-            max(_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS * config.control_period) * 1e9
-        )
+        self._max_gap_ns = round(max(_MAX_GAP, _MAX_GAP_PERIODS * config.control_period) * 1e9)
         self.phase = Phase.IDLE
         """The present phase; :meth:`_change_phase` alone changes it."""
         self.outputs: deque[Output] = deque()
@@ -233,7 +231,7 @@ class Executive:
         """Whether the plant reports that no command is in force; the owner sets it."""
         self._stamp_ns = 0
         """Stamp of the state that is answered, ns."""
-        self._waiting_goal: IdentifiedGoal | None = None
+        self._new_goal: IdentifiedGoal | None = None
         """A new goal that waits to be planned for."""
         self._in_motion_attempts = 0
         """Plans in motion for it that were late or refused."""
@@ -255,7 +253,7 @@ class Executive:
     @property
     def measuring(self) -> bool:
         """Whether the next measured base will be planned from, or evaluated."""
-        return self._waiting_goal is not None or self.phase is _EVALUATING
+        return self._new_goal is not None or self.phase is _EVALUATING
 
     @property
     def statistics(self) -> PlannerStatistics:
@@ -266,7 +264,7 @@ class Executive:
 
     def propose(self, identified: IdentifiedGoal) -> None:
         """Plan for a goal from the states that are measured next; it replaces any other."""
-        self._waiting_goal, self._in_motion_attempts = identified, 0
+        self._new_goal, self._in_motion_attempts = identified, 0
         self._average.restart()
         match self.phase:
             case Phase.IDLE | Phase.MEASURING | Phase.EVALUATING:
@@ -286,7 +284,7 @@ class Executive:
             case Phase.IDLE:
                 return None
             case Phase.MEASURING if self._active_goal is None:
-                self._waiting_goal = None
+                self._new_goal = None
                 self._change_phase(Event.ABORTED, Phase.IDLE)
                 return None
             case Phase.MEASURING | Phase.PLANNING | Phase.EVALUATING:
@@ -386,17 +384,13 @@ class Executive:
     def update(self, measured: MeasuredState) -> Setpoint:
         """Return the setpoint for a measured state; see :attr:`setpoint`."""
         stamp, q, tracker = measured.stamp_ns, measured.q, self._tracker
-        if not 0 <= stamp - self._stamp_ns <= self._max_state_gap_ns and tracker.active:
+        if not 0 <= stamp - self._stamp_ns <= self._max_gap_ns and tracker.active:
             self._handle_time_jump(stamp)
         self._stamp_ns = stamp
         if tracker.ended(stamp, q):
             self._end_schedule(stamp)
         # While a schedule is tracked, most states need nothing but a command.
-        if (
-            self.phase is not _EXECUTING
-            or self._waiting_goal is not None
-            or tracker.check_due(stamp)
-        ):
+        if self.phase is not _EXECUTING or self._new_goal is not None or tracker.check_due(stamp):
             self._do_phase_work(measured)
         if tracker.active:
             stuck = tracker.track(stamp, q, obeyed=not self.plant_rests)
@@ -416,8 +410,8 @@ class Executive:
                 self._take_plan_result()
             case Phase.REPLANNING | Phase.TAKING_OVER:
                 self._await_take_over()
-            case Phase.EXECUTING | Phase.BRAKING if self._waiting_goal is not None:
-                self._measure_in_motion(self._waiting_goal, measured)
+            case Phase.EXECUTING | Phase.BRAKING if self._new_goal is not None:
+                self._measure_in_motion(self._new_goal, measured)
             case Phase.EXECUTING:
                 assert self._active_goal is not None
                 self._check_path(self._active_goal, measured)
@@ -447,8 +441,8 @@ class Executive:
         if not self._average.complete:
             return
         if self.phase is Phase.MEASURING:
-            assert self._waiting_goal is not None
-            self._plan_new_goal(self._waiting_goal)
+            assert self._new_goal is not None
+            self._plan_new_goal(self._new_goal)
         # Where that was refused the state is still known, unless it took time.
         if self.phase is Phase.EVALUATING:
             assert self._active_goal is not None
@@ -528,20 +522,17 @@ class Executive:
         if averages:
             state = self._tracker.path_check.average_pose(state)
         self._reset_plan_count()
-        self._request_plan(
-            TakeOverJob(waiting, PlanReason.IN_MOTION, take_over=take_over, aim=waiting.goal), state
-        )
+        job = TakeOverJob(waiting, PlanReason.IN_MOTION, take_over, waiting.goal)
+        self._request_plan(job, state)
 
     def _keep_schedule_for(self, identified: IdentifiedGoal, active: ActiveGoal) -> None:
         """Make a goal with the same pose and shape the active one; its schedule goes on."""
-        self._waiting_goal = None
+        self._new_goal = None
         left = active.ends_at - self._stamp_ns / 1e9
-        self._active_goal = replace(
-            active, identified=identified, corrections=0, manoeuvre_time=left
-        )
-        self._report_acceptance(self._active_goal)
+        active = replace(active, identified=identified, corrections=0, manoeuvre_time=left)
+        self._accept_goal(active)
         message = "The schedule that is executed leads to this goal, too."
-        self._add_status(PlannerState.EXECUTING, message, identified, self._active_goal)
+        self._add_status(PlannerState.EXECUTING, message, identified, active)
 
     def _check_path(self, active: ActiveGoal, measured: MeasuredState) -> None:
         """Plan again when the base is too far off its predicted path, or periodically."""
@@ -567,9 +558,8 @@ class Executive:
             self._report_path_correction(active, error)
             self._brake_for_replan(Event.TRACKING_ERROR)
         else:
-            self._request_plan(
-                OffPathJob(active.identified, PlanReason.TRACKING_ERROR, error), state
-            )
+            job = OffPathJob(active.identified, PlanReason.TRACKING_ERROR, error)
+            self._request_plan(job, state)
 
     def _can_replan(self) -> bool:
         """Whether a plan may take over in motion from the schedule that is tracked."""
@@ -601,9 +591,7 @@ class Executive:
         take_over = self._tracker.take_over(self._stamp_ns, state.q, self.config.takeover_time)
         if take_over is None:
             return
-        job = TakeOverJob(
-            active.identified, PlanReason.SHRINKING_HORIZON, take_over=take_over, aim=aim
-        )
+        job = TakeOverJob(active.identified, PlanReason.SHRINKING_HORIZON, take_over, aim)
         self._request_plan(job, replace(state, q=take_over.shapes[0].copy()))
 
     def _brake_for_replan(self, event: Event) -> None:
@@ -669,7 +657,7 @@ class Executive:
 
     def _reset_plan_count(self) -> None:
         """Count plans for the goal that waits, which is planned for now."""
-        self._waiting_goal = None
+        self._new_goal = None
         self._total_plan_time, self._plan_count = 0.0, 0
 
     def _request_plan(self, job: PlanJob, state: RobotState) -> None:
@@ -735,7 +723,7 @@ class Executive:
                 self._pending_plan = ReadyPlan(takes_over, schedule)
                 self._change_phase(Event.PLANNED, Phase.TAKING_OVER)
             case TakeOverJob(reason=PlanReason.IN_MOTION), Refused(reason=reason):
-                self._waiting_goal = self._waiting_goal or job.identified
+                self._new_goal = self._new_goal or job.identified
                 self._in_motion_attempts += 1
                 again = (
                     "from a later tick"
@@ -771,12 +759,8 @@ class Executive:
                 self._change_phase(Event.REFUSED, self._phase_without_plan())
 
     def _accept_goal(self, active: ActiveGoal) -> None:
-        """Make a new goal the active one, to be flown to with all joints."""
+        """Make a new goal the active one, to be flown to with all joints, and save it."""
         self._active_goal, self._tracker.stuck = active, []
-        self._report_acceptance(active)
-
-    def _report_acceptance(self, active: ActiveGoal) -> None:
-        """Report that a goal is accepted, and save it."""
         self._add_event(EventKind.GOAL_ACCEPTED, "The goal is accepted.", active.identified)
         try:
             self._goal_file.save({BASE: active.identified})
@@ -797,8 +781,9 @@ class Executive:
         """
         active, config = self._active_goal, self.config
         assert active is not None
-        in_motion = take_over_ns is not None
-        begins = self._stamp_ns if take_over_ns is None else take_over_ns
+        begins, event, start = self._stamp_ns, Event.PLANNED, ""
+        if take_over_ns is not None:
+            begins, event, start = take_over_ns, Event.TAKEN_OVER, ", which begins in motion"
         self._subtract_remainder(active, begins)
         active.schedule = schedule
         self._replan_ns = begins + round(config.replanning * 1e9)
@@ -809,8 +794,7 @@ class Executive:
         active.manoeuvre_time += schedule.duration
         active.ends_at = begins / 1e9 + schedule.duration
         active.next_plan = PlanReason.CONTINUATION if schedule.partial else PlanReason.CORRECTION
-        self._change_phase(Event.TAKEN_OVER if in_motion else Event.PLANNED, Phase.EXECUTING)
-        start = ", which begins in motion" if in_motion else ""
+        self._change_phase(event, Phase.EXECUTING)
         self._add_status(
             PlannerState.EXECUTING,
             f"Executing {_name_gait(schedule.method)} of {schedule.duration:.6g} s{start}.",
@@ -896,7 +880,7 @@ class Executive:
         plan, self._pending_plan = self._pending_plan, None
         job = plan.job if isinstance(plan, ReadyPlan) else plan
         if job is not None and job.reason.for_new_goal:
-            self._waiting_goal = self._waiting_goal or job.identified
+            self._new_goal = self._new_goal or job.identified
 
     def _phase_without_plan(self) -> Phase:
         """Return the next phase where there is no plan."""
@@ -906,7 +890,7 @@ class Executive:
 
     def _phase_at_rest(self) -> Phase:
         """Return the next phase when the joints have come to rest."""
-        if self._waiting_goal is not None:
+        if self._new_goal is not None:
             return Phase.MEASURING
         return Phase.IDLE if self._active_goal is None else Phase.EVALUATING
 
@@ -928,7 +912,7 @@ class Executive:
     def _forget_goals(self) -> None:
         """Drop the plan and every goal."""
         self._drop_plan()
-        self._waiting_goal = self._active_goal = None
+        self._new_goal = self._active_goal = None
 
     def _latest_goal(self) -> IdentifiedGoal | None:
         """Return the goal that was proposed last, of those that are not decided."""
@@ -938,7 +922,7 @@ class Executive:
             else self._pending_plan
         )
         current = plan or self._active_goal
-        return self._waiting_goal or (None if current is None else current.identified)
+        return self._new_goal or (None if current is None else current.identified)
 
     def _latest_goal_id(self) -> str:
         latest = self._latest_goal()
@@ -981,26 +965,18 @@ class Executive:
         schedule: GaitSchedule | None = None,
     ) -> None:
         """Report a status of a goal, with corrections, durations, remaining error and schedule."""
-        status = PlannerStatus(state, message, identified.goal_id, goal_values(identified.goal))
+        values: dict[str, Any] = {}
         if active is not None:
-            status = replace(
-                status,
-                corrections=active.corrections,
-                manoeuvre_time_s=active.manoeuvre_time,
-                ends_at_s=active.ends_at,
-            )
+            values["corrections"] = active.corrections
+            values |= {"manoeuvre_time_s": active.manoeuvre_time, "ends_at_s": active.ends_at}
         if remaining is not None:
-            status = replace(
-                status, position_error_m=remaining.distance, attitude_error_rad=remaining.angle
-            )
+            values["position_error_m"] = remaining.distance
+            values["attitude_error_rad"] = remaining.angle
         if schedule is not None:
-            status = replace(
-                status,
-                method=schedule.method,
-                duration_s=schedule.duration,
-                notes=schedule.notes,
-            )
-        self.outputs.append(status)
+            values |= {"method": schedule.method, "duration_s": schedule.duration}
+            values["notes"] = schedule.notes
+        goal = goal_values(identified.goal)
+        self.outputs.append(PlannerStatus(state, message, identified.goal_id, goal, **values))
 
 
 def _name_gait(method: str) -> str:

@@ -12,6 +12,11 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 
+_NUMBER_KEYS = (
+    *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "ends_at_s", "duration_s"),
+)
+"""Keys of the values that are one number each."""
+
 
 class PlannerState(str, Enum):
     """The value of ``state`` in planner/status."""
@@ -150,12 +155,6 @@ class ScheduleStart:
 
     schedule: GaitSchedule
     stamp_ns: int
-
-
-_NUMBER_KEYS = (
-    *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "ends_at_s", "duration_s"),
-)
-"""Values that are one number each."""
 
 
 @dataclass(frozen=True)
