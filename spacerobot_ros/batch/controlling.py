@@ -84,7 +84,7 @@ class BatchController:
 
     # -- one flight ---------------------------------------------------------------------------
 
-    def begin(self, row: int, state: ControlState) -> tuple[ReferenceProfile, Array]:
+    def begin_flight(self, row: int, state: ControlState) -> tuple[ReferenceProfile, Array]:
         """Begin a flight at its first measured state.
 
         Returns
@@ -97,12 +97,12 @@ class BatchController:
         program, controller = self.program, self.controller
         controller.reset()
         controller.set_gains(self._gains(row))
-        joints = None if program.joints is None else _of(program.joints, row)
+        joints = None if program.joints is None else _select_row(program.joints, row)
         controller.set_goals(
             0.0,
             state,
-            base=_pose(program.base, row),
-            end_effector=_pose(program.end_effector, row),
+            base=_pose_goal(program.base, row),
+            end_effector=_pose_goal(program.end_effector, row),
             joints=joints,
         )
         profile = controller.profile
@@ -110,27 +110,27 @@ class BatchController:
         controller.law.command(state, profile.at(0.0))
         return profile, controller.error_bounds(self._config.error_margin.as_errors())
 
-    def time(self, tick: int) -> float:
+    def time_of_tick(self, tick: int) -> float:
         """Return the time of a tick as controllers know it, s."""
         return tick * self._period_ns / SECOND
 
     def command(self, tick: int, state: ControlState) -> list[Array]:
         """Return efforts and wrench for a state of the flight that was begun last."""
-        time = self.time(tick)
+        time = self.time_of_tick(tick)
         realised = self.controller.command(time, state, state.q, state.qdot).realised
         return [realised.tau, realised.wrench_B]
 
-    def decision(self, monitor: GoalMonitor, tick: int, qdot: Array, bounds: Array) -> Decision:
+    def decide(self, monitor: GoalMonitor, tick: int, qdot: Array, bounds: Array) -> Decision:
         """Return the decision about the goal after the last command.
 
-        ``qdot`` (n,) are measured joint rates, ``bounds`` (m,) those of :meth:`begin`.
+        ``qdot`` (n,) are measured joint rates, ``bounds`` (m,) those of :meth:`begin_flight`.
         """
-        controller, time = self.controller, self.time(tick)
-        found = monitor.decision(
+        controller, time = self.controller, self.time_of_tick(tick)
+        found = monitor.decide(
             time,
             controller.reference_at_rest(time),
             controller.errors(),
-            controller.joint_rate_limits.largest_share(qdot),
+            controller.joint_rate_limits.largest_rate_share(qdot),
             self.law.largest_error_share(bounds),
             self._config,
         )
@@ -142,11 +142,11 @@ class BatchController:
 
     # -- lanes --------------------------------------------------------------------------------
 
-    def numbers(self, profile: ReferenceProfile) -> Array:
+    def profile_argument(self, profile: ReferenceProfile) -> Array:
         """Return the argument ``profile`` of :meth:`function`."""
         return profile_numbers(profile, *self._groups)
 
-    def gains(self, rows: Sequence[int]) -> Array:
+    def gains_argument(self, rows: Sequence[int]) -> Array:
         """Return the argument ``gains``, Kp over Kd, of flights: (flights, 2 m)."""
         selection = self.law.outputs.selection
         return np.array([np.concatenate(self._gains(row).diagonals(selection)) for row in rows])
@@ -155,13 +155,13 @@ class BatchController:
         each = self.program.gains
         return each[row] if each else self._config.gains
 
-    def exact(
+    def exact_command(
         self, row: int, profile: ReferenceProfile, tick: int, state: ControlState
     ) -> Saturated:
         """Return a command that :meth:`function` cannot give."""
         self.law.set_gains(self._gains(row))
-        commanded = self.law.command(state, profile.at(self.time(tick)))
-        return self.controller.limited(state, commanded)
+        commanded = self.law.command(state, profile.at(self.time_of_tick(tick)))
+        return self.controller.apply_limits(state, commanded)
 
     def function(self) -> ca.Function:
         """Return the function from :data:`CONTROL_INPUTS` to :data:`CONTROL_OUTPUTS`.
@@ -171,11 +171,11 @@ class BatchController:
         ``normals`` (12 + 2 n,), ``bias`` (6 + n,), ``sigma`` (6,)
             Random numbers in the order of :class:`.Sensors`, measurement errors.
         ``time``, ``profile``, ``gains``, ``bounds``
-            Time, s; :meth:`numbers`; :meth:`gains`; of :meth:`begin`.
+            Time, s; :meth:`profile_argument`; :meth:`gains_argument`; of :meth:`begin_flight`.
         ``monitor``, ``next_monitor`` (3,)
             Memory of :class:`.GoalMonitor` without ``started``, which is zero.
         ``command`` (n + 6,)
-            Efforts and wrench, unless ``exact``: then :meth:`exact` gives them.
+            Efforts and wrench, unless ``exact``: then :meth:`exact_command` gives them.
         ``measured`` (13 + 2 n,)
             The measured state.
         ``verdict``
@@ -211,9 +211,7 @@ class BatchController:
         )
         results = dict(zip(names, values, strict=True))
         omega, q, qdot = measured[10:13], measured[13 : 13 + n], measured[13 + n :]
-        actuation, lowered = self.controller.limited_expression(
-            omega, q, qdot, results["actuation"]
-        )
+        actuation, lowered = self.controller.limits_expression(omega, q, qdot, results["actuation"])
         exact = ca.logic_or(lowered, ca.logic_not(law.defined(results)))
         largest = dict.fromkeys(("position", "attitude", "joints"), ca.SX(0))
         error_share, rate_share = ca.SX(0), ca.SX(0)
@@ -229,7 +227,7 @@ class BatchController:
         for rate, limit in zip(ca.vertsplit(qdot), limits, strict=True):
             rate_share = ca.fmax(rate_share, ca.fabs(rate) * (1.0 / limit))
         monitor = GoalMonitor(0.0, *ca.vertsplit(memory))
-        verdict = monitor.decision(
+        verdict = monitor.decide(
             time, time >= profile[0], Errors(**largest), rate_share, error_share, self._config
         )
         command = ca.vertcat(actuation[6:], actuation[:6])
@@ -238,12 +236,12 @@ class BatchController:
         return ca.Function("control", inputs, dense, CONTROL_INPUTS, CONTROL_OUTPUTS)
 
 
-def _of(array: Array, row: int) -> Array:
+def _select_row(array: Array, row: int) -> Array:
     return np.asarray(array if array.ndim == 1 else array[row])
 
 
-def _pose(goal: Array | None, row: int) -> PoseReference | None:
+def _pose_goal(goal: Array | None, row: int) -> PoseReference | None:
     if goal is None:
         return None
-    one = _of(goal, row)
+    one = _select_row(goal, row)
     return PoseReference(one[:3], one[3:])

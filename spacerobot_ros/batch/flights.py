@@ -73,20 +73,18 @@ class Starts:
         ParameterError
             The plant would refuse one of them.
         """
-        centers = [each.center_of_mass for each in initial]
+        of_center = [each.center_of_mass is not None for each in initial]
+        positions = [
+            each.position if each.center_of_mass is None else each.center_of_mass
+            for each in initial
+        ]
         return cls(
-            np.array(
-                [
-                    each.position if center is None else center
-                    for each, center in zip(initial, centers, strict=True)
-                ],
-                dtype=float,
-            ).reshape(-1, 3),
+            np.array(positions, dtype=float).reshape(-1, 3),
             np.array([each.attitude() for each in initial]).reshape(-1, 4),
             np.array([each.shape(robot) for each in initial]).reshape(-1, robot.n),
             np.array([each.rates(robot) for each in initial]).reshape(-1, robot.n),
             np.array([each.momenta() for each in initial]).reshape(-1, 6),
-            np.array([center is not None for center in centers], dtype=np.bool_),
+            np.array(of_center, dtype=np.bool_),
         )
 
     @classmethod

@@ -40,7 +40,7 @@ from spacerobot_ros.times import SECOND
 _BLOCK_BYTES = 32 * 2**20
 """Memory of a block of flights, including noise and commands."""
 
-_MOST_GROUPS = 64
+_MAX_BLOCK_GROUPS = 64
 """Largest number of groups in a block: more gain nothing."""
 
 _CHUNK_TICKS = 2000
@@ -121,7 +121,7 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
             tables = []
     each += sum(2 * table[0].nbytes for table in tables if table.ndim == 3)
     lanes = tick.unit.lanes
-    groups = max(1, min(_MOST_GROUPS, _BLOCK_BYTES // (each * lanes)))
+    groups = max(1, min(_MAX_BLOCK_GROUPS, _BLOCK_BYTES // (each * lanes)))
     return int(groups * lanes)
 
 
@@ -142,11 +142,11 @@ class _Block:
         self._modulator = None
         if flights.thrusters is not None:
             self._modulator = ThrusterModulator(flights.thrusters, flights.control_period)
-        self._memory = _aligned((self._groups, self._rows.count, self._lanes))
+        self._memory = _aligned_array((self._groups, self._rows.count, self._lanes))
         self._memory[:, self._rows["alive"]] = 1.0
         self._memory[:, self._rows["decided_state"]] = np.nan
         self._memory[:, self._rows["end_state"]] = np.nan
-        self._set("p", p[self._rows_of_lanes])
+        self._write_rows("p", p[self._rows_of_lanes])
         self._noise = SensorNoise(flights, self._rows_of_lanes)
         self._stopped: dict[int, EffortPlant] = {}
         """Scalar plants of flights that have touched a stop, by their lane in the block."""
@@ -154,57 +154,57 @@ class _Block:
         """Ticks at which flights failed, by their lane in the block."""
         self._profiles: dict[int, ReferenceProfile] = {}
         """Reference profiles of flights with a controller, by their lane in the block."""
-        self._place(model, p)
+        self._write_starts(model, p)
         self._at = np.zeros(self._groups, np.int64)
         self._pending = np.zeros(self._groups, np.uint8)
         width = self._rows.size("end_state")
-        self._reports = _aligned((self._groups, len(flights.instants), width, self._lanes))
-        self._job, self._referenced = self._prepared()
+        self._reports = _aligned_array((self._groups, len(flights.instants), width, self._lanes))
+        self._job, self._referenced = self._prepare_job()
 
-    def _set(self, name: str, values: Array) -> None:
+    def _write_rows(self, name: str, values: Array) -> None:
         """Write rows (flights of the block, size) of a name."""
         part = values.reshape(self._groups, self._lanes, -1)
         self._memory[:, self._rows[name]] = np.swapaxes(part, 1, 2)
 
-    def _get(self, name: str) -> Array:
+    def _read_rows(self, name: str) -> Array:
         """Return rows (flights of the block, size) of a name."""
         part = np.swapaxes(self._memory[:, self._rows[name]], 1, 2)
         return part.reshape(len(self._rows_of_lanes), -1)
 
-    def _place(self, model: ModelFunctions, p: Array) -> None:
+    def _write_starts(self, model: ModelFunctions, p: Array) -> None:
         """Write the initial states, biases and gains of the flights."""
         starts, at = self._flights.starts, self._rows_of_lanes
         quaternion = starts.quaternion[at]
         quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
         q, r = starts.q[at], starts.position[at]
         centers = model.function("center_of_mass", compile=False)(q.T, p[at].T).full().T
-        of_base = r + _rotated(quaternion, centers)
+        of_base = r + _rotate_vectors(quaternion, centers)
         r_cm = np.where(starts.of_center[at][:, None], r, of_base)
         if self._flights.actuation == "velocity":
             state = np.concatenate([q, quaternion], axis=1)
-            self._set("momenta", starts.momenta[at])
-            self._set("r_cm", r_cm)
+            self._write_rows("momenta", starts.momenta[at])
+            self._write_rows("r_cm", r_cm)
         else:
             state = np.concatenate(
                 [q, quaternion, starts.qdot[at], starts.momenta[at], r_cm], axis=1
             )
-        self._set("state", state)
+        self._write_rows("state", state)
         if self._flights.sensors is not None:
-            self._set("joint_bias", self._flights.sensors.joint_bias[at])
-            self._set("joint_noise", self._flights.sensors.noise[at, 4:5])
+            self._write_rows("joint_bias", self._flights.sensors.joint_bias[at])
+            self._write_rows("joint_noise", self._flights.sensors.noise[at, 4:5])
         if self._tick.controller is not None:
             initial = astuple(GoalMonitor())[1:]
             self._memory[:, self._rows["monitor"]] = np.reshape(initial, (1, -1, 1))
             self._memory[:, self._rows["decided"]] = -1.0
-            self._set("gains", self._tick.controller.gains(at.tolist()))
+            self._write_rows("gains", self._tick.controller.gains_argument(at.tolist()))
             if self._flights.sensors is not None:
                 errors = self._flights.sensors
-                self._set("bias", np.hstack([errors.pose_bias[at], errors.joint_bias[at]]))
-                self._set("sigma", errors.noise[at])
+                self._write_rows("bias", np.hstack([errors.pose_bias[at], errors.joint_bias[at]]))
+                self._write_rows("sigma", errors.noise[at])
 
-    def _prepared(self) -> tuple[Job, list[npt.NDArray[np.generic]]]:
+    def _prepare_job(self) -> tuple[Job, list[npt.NDArray[np.generic]]]:
         """Return the driver's job, and the arrays that it points to."""
-        flights, program, table = self._flights, self._flights.program, self._table()
+        flights, program, table = self._flights, self._flights.program, self._command_table()
         each_table = table.ndim == 4
         arrays: dict[str, npt.NDArray[np.generic]] = {
             "memory": self._memory,
@@ -231,7 +231,7 @@ class _Block:
             program=_PROGRAMS[type(program)],
             table_ticks=table.shape[1] if each_table else table.shape[0],
             each_table=each_table,
-            noisy=self._noise.commanded_by,
+            noisy=self._noise.affects_commands,
             instant_count=len(flights.instants),
             ends=isinstance(program, Controlled) and program.until_decided,
             **{name: array.ctypes.data for name, array in arrays.items()},
@@ -241,7 +241,7 @@ class _Block:
             job.deadband = program.deadband
         return job, list(arrays.values())
 
-    def _table(self) -> Array:
+    def _command_table(self) -> Array:
         """Return commands (ticks, width), or (groups, ticks, width, lanes) where they differ."""
         program = self._flights.program
         match program:
@@ -255,7 +255,7 @@ class _Block:
                 ticks = max(part.shape[-2] for part in parts)
                 each = max(part.ndim for part in parts)
                 table = np.concatenate(
-                    [_lengthened(part, ticks, each, len(self._rows_of_lanes)) for part in parts],
+                    [_pad_table(part, ticks, each, len(self._rows_of_lanes)) for part in parts],
                     axis=-1,
                 )
             case Controlled():
@@ -275,7 +275,7 @@ class _Block:
         flights, job, library = self._flights, self._job, self._tick.library
         # A tick of no duration under no command reports the start.
         library.start_flights(job)
-        self._set("h", np.full(len(self._rows_of_lanes), flights.control_period))
+        self._write_rows("h", np.full(len(self._rows_of_lanes), flights.control_period))
         alive = self._memory[:, self._rows.first("alive")]
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
             if not alive.any():
@@ -283,7 +283,7 @@ class _Block:
             end = min(begin + _CHUNK_TICKS, flights.ticks)
             # The state at the end is measured too.
             last = end + (end == flights.ticks)
-            normals = self._noise.drawn(begin, last, alive)
+            normals = self._noise.draw_ticks(begin, last, alive)
             if normals is not None:
                 job.normals = normals.ctypes.data
                 job.normals_from, job.normals_ticks, job.normals_width = begin, *normals.shape[1:3]
@@ -293,9 +293,9 @@ class _Block:
                 self._step_outside_lanes(result, failures)
         if self._tick.controller is not None:
             library.end_flights(job)
-        self._write(result)
+        self._write_results(result)
 
-    def _fail(self, index: int, tick: int, message: str, failures: dict[int, str]) -> None:
+    def _end_flight(self, index: int, tick: int, message: str, failures: dict[int, str]) -> None:
         """End the flight of a lane that fails at a tick."""
         group, lane = divmod(index, self._lanes)
         self._memory[group, self._rows["alive"], lane] = 0.0
@@ -309,30 +309,32 @@ class _Block:
         if controller is None:
             return
         self._tick.library.measure_starts(self._job)
-        states = self._get("measured")
+        states = self._read_rows("measured")
         numbers = np.zeros((len(states), self._rows.size("profile")))
         most = np.zeros((len(states), self._rows.size("bounds")))
         for index, (row, state) in enumerate(zip(self._rows_of_lanes, states, strict=True)):
             try:
-                profile, most[index] = controller.begin(int(row), ControlState.unstack(state))
+                profile, most[index] = controller.begin_flight(
+                    int(row), ControlState.unstack(state)
+                )
             except SpaceRobotError as error:
-                self._fail(index, 0, str(error), failures)
+                self._end_flight(index, 0, str(error), failures)
                 continue
             self._profiles[index] = profile
-            numbers[index] = controller.numbers(profile)
-        self._set("profile", numbers)
-        self._set("bounds", most)
+            numbers[index] = controller.profile_argument(profile)
+        self._write_rows("profile", numbers)
+        self._write_rows("bounds", most)
 
     def _step_outside_lanes(self, result: BatchResult, failures: dict[int, str]) -> None:
         """Do the step that lanes wait for: a command, an allocation, or a tick of the plant."""
         rows, alive = self._rows, self._rows.first("alive")
         steps: dict[Pending, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
-            Pending.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._step_plant)
+            Pending.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._step_lane)
         }
         if self._tick.controller is not None:
-            steps[Pending.TICK] = rows.first("exact"), self._command
+            steps[Pending.TICK] = rows.first("exact"), self._command_lane
         if self._modulator is not None:
-            steps[Pending.FIRE] = rows.first("unallocated"), self._allocate
+            steps[Pending.FIRE] = rows.first("unallocated"), self._allocate_lane
         for group in np.flatnonzero(self._pending):
             waiting, step = steps[Pending(self._pending[group])]
             lanes = (self._memory[group, waiting] != 0.0) & (self._memory[group, alive] != 0.0)
@@ -341,22 +343,22 @@ class _Block:
                 try:
                     step(int(group), int(lane), index, result)
                 except SpaceRobotError as error:
-                    self._fail(index, int(self._at[group]), str(error), failures)
+                    self._end_flight(index, int(self._at[group]), str(error), failures)
                 else:
                     if index < len(self._flown):
                         result.fallback_ticks[self._flown[index]] += 1
 
-    def _command(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+    def _command_lane(self, group: int, lane: int, index: int, result: BatchResult) -> None:
         """Take the command from the controller itself."""
         controller, row = self._tick.controller, int(self._rows_of_lanes[index])
         assert controller is not None
         state = ControlState.unstack(self._memory[group, self._rows["measured"], lane])
         tick = int(self._at[group])
-        realised = controller.exact(row, self._profiles[index], tick, state).realised
+        realised = controller.exact_command(row, self._profiles[index], tick, state).realised
         command = np.concatenate([realised.tau, realised.wrench_B])
         self._memory[group, self._rows["command"], lane] = command
 
-    def _allocate(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+    def _allocate_lane(self, group: int, lane: int, index: int, result: BatchResult) -> None:
         """Allocate an impulse beyond the thrust, which is a linear programme."""
         modulator, period = self._modulator, self._flights.control_period
         assert modulator is not None
@@ -368,7 +370,7 @@ class _Block:
         most = modulator.table.min_on_time + period - rows("remaining")
         rows("levels")[:] = modulator.allocation.allocate(impulse, most).levels
 
-    def _step_plant(self, group: int, lane: int, index: int, result: BatchResult) -> None:
+    def _step_lane(self, group: int, lane: int, index: int, result: BatchResult) -> None:
         """Step the scalar plant, in which a joint touches its stop."""
         row, n = int(self._rows_of_lanes[index]), self._flights.robot.n
         if index not in self._stopped:
@@ -386,7 +388,7 @@ class _Block:
         if index < len(self._flown):
             result.limited["stroke"][row] += plant.stroke_limited - before
 
-    def _write(self, result: BatchResult) -> None:
+    def _write_results(self, result: BatchResult) -> None:
         count, n, rows = len(self._flown), self._flights.robot.n, self._flown
         reports = np.moveaxis(self._reports, 3, 1).reshape(-1, *self._reports.shape[1:3])
         for index, tick in self._ended.items():
@@ -397,49 +399,49 @@ class _Block:
         for name, part in zip(names, np.split(reports[:count], ends[:-1], axis=2), strict=True):
             getattr(result, name)[rows] = part
         for name in ("peak_rate", "peak_effort", "peak_wrench", "impulse", "lowest", "highest"):
-            getattr(result, name)[rows] = self._get(name)[:count]
-        limits = self._get("limits")[:count].astype(np.int64)
+            getattr(result, name)[rows] = self._read_rows(name)[:count]
+        limits = self._read_rows("limits")[:count].astype(np.int64)
         first = "effort" if self._flights.actuation == "effort" else "rate"
         result.limited[first][rows] = limits[:, :n]
         if first == "rate":
             result.limited["stroke"][rows] = limits[:, n:]
         if self._modulator is not None:
-            result.propellant[rows] = self._get("propellant")[:count, 0]
+            result.propellant[rows] = self._read_rows("propellant")[:count, 0]
         if self._tick.controller is not None:
             self._write_decisions(result, rows)
-        pose, q = self._noise.measured(result.pose[rows], result.q[rows])
+        pose, q = self._noise.measure(result.pose[rows], result.q[rows])
         result.measured_pose[rows], result.measured_q[rows] = pose, q
 
     def _write_decisions(self, result: BatchResult, rows: Counts) -> None:
         """Write the decisions about goals, and the ends of the flights."""
         controller, count = self._tick.controller, len(rows)
         assert controller is not None
-        result.decision[rows] = self._get("decision")[:count, 0].astype(np.int64)
-        result.decided_tick[rows] = self._get("decided")[:count, 0].astype(np.int64)
-        result.momentum_drift[rows] = self._get("drift")[:count]
-        result.end_state[rows] = self._get("end_state")[:count]
-        result.end_tick[rows] = self._get("ended")[:count, 0].astype(np.int64)
-        states = self._get("decided_state")
+        result.decision[rows] = self._read_rows("decision")[:count, 0].astype(np.int64)
+        result.decided_tick[rows] = self._read_rows("decided")[:count, 0].astype(np.int64)
+        result.momentum_drift[rows] = self._read_rows("drift")[:count]
+        result.end_state[rows] = self._read_rows("end_state")[:count]
+        result.end_tick[rows] = self._read_rows("ended")[:count, 0].astype(np.int64)
+        states = self._read_rows("decided_state")
         for index in np.flatnonzero(result.decision[rows] != Decision.NONE).tolist():
             goal, state = self._profiles[index].goal, ControlState.unstack(states[index])
             distance = controller.distance(state, goal)
             result.decided_distance[rows[index]] = astuple(distance)
 
 
-def _rotated(quaternion: Array, vectors: Array) -> Array:
+def _rotate_vectors(quaternion: Array, vectors: Array) -> Array:
     """Return ``R v`` of quaternions (N, 4) and vectors (N, 3)."""
     x, w = quaternion[:, :3], quaternion[:, 3:]
     return np.asarray(vectors + 2 * np.cross(x, np.cross(x, vectors) + w * vectors))
 
 
-def _lengthened(table: Array, ticks: int, dimensions: int, count: int) -> Array:
+def _pad_table(table: Array, ticks: int, dimensions: int, count: int) -> Array:
     """Return commands with zeros after their last, and a copy for each flight where wanted."""
     rest = np.zeros((*table.shape[:-2], ticks - table.shape[-2], table.shape[-1]))
     whole = np.concatenate([table, rest], axis=-2)
     return np.broadcast_to(whole, (count, *whole.shape)) if dimensions > whole.ndim else whole
 
 
-def _aligned(shape: tuple[int, ...], value: float = 0.0) -> Array:
+def _aligned_array(shape: tuple[int, ...], value: float = 0.0) -> Array:
     """Return equal numbers that begin where a vector register can be loaded from."""
     count = int(np.prod(shape))
     memory = np.full(count + 8, value)
@@ -452,7 +454,7 @@ class SensorNoise:
 
     def __init__(self, flights: Flights, rows: Counts) -> None:
         self._errors: SensorErrors | None = flights.sensors
-        self._whole = isinstance(flights.program, Controlled)
+        self._affects_all = isinstance(flights.program, Controlled)
         self._instants = flights.instants
         self._n = flights.robot.n
         self._rows = rows
@@ -466,15 +468,15 @@ class SensorNoise:
         self._at_instants = np.zeros((len(rows), len(self._instants), 12 + 2 * self._n))
 
     @property
-    def commanded_by(self) -> bool:
+    def affects_commands(self) -> bool:
         """Whether commands depend on errors: along schedules, on those of joints."""
         errors = self._errors
         if errors is None:
             return False
         joints = errors.noise[self._rows, 4].any() or errors.joint_bias[self._rows].any()
-        return bool(self._whole or joints)
+        return bool(self._affects_all or joints)
 
-    def drawn(self, begin: int, end: int, alive: Array) -> Array | None:
+    def draw_ticks(self, begin: int, end: int, alive: Array) -> Array | None:
         """Draw the noise of the ticks from ``begin`` to before ``end``.
 
         ``alive`` (groups, lanes): whether flights are still under way. Returns the noise that the
@@ -484,9 +486,9 @@ class SensorNoise:
         if self._errors is None:
             return None
         ticks, width = end - begin, 12 + 2 * self._n
-        columns = slice(0, width) if self._whole else slice(12, 12 + self._n)
+        columns = slice(0, width) if self._affects_all else slice(12, 12 + self._n)
         kept = None
-        if self.commanded_by:
+        if self.affects_commands:
             kept = np.zeros((len(self._rows), ticks, columns.stop - columns.start))
         chosen = [(i, tick - begin) for i, tick in enumerate(self._instants) if begin <= tick < end]
         drawn = np.empty((ticks, width))
@@ -503,7 +505,7 @@ class SensorNoise:
         grouped = kept.reshape(-1, alive.shape[1], *kept.shape[1:])
         return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
 
-    def measured(self, pose: Array, q: Array) -> tuple[Array, Array]:
+    def measure(self, pose: Array, q: Array) -> tuple[Array, Array]:
         """Return the measurements of poses (count, I, 7) and shapes (count, I, n)."""
         if self._errors is None:
             return pose, q

@@ -33,9 +33,9 @@ from spacerobot_ros.model.model_functions import Composition, ModelFunctions
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.simulation import effort_plant, velocity_plant
 
-_HERE = Path(__file__).resolve().parent
+_SOURCE_FOLDER = Path(__file__).resolve().parent
 
-_SELECTION = re.compile(r"\((\w+)\?(\w+):0\)")
+_CASADI_SELECTION = re.compile(r"\((\w+)\?(\w+):0\)")
 """How CasADi writes a number that is zero unless a condition holds."""
 
 
@@ -68,7 +68,7 @@ UNITS: dict[str, VectorUnit] = {
 }
 """Vector registers by the name of the processor's flag, the widest first."""
 
-_PLAIN = VectorUnit("two at a time", 2, (), "")
+_PORTABLE_UNIT = VectorUnit("two at a time", 2, (), "")
 """For other processors, whose registers the compiler chooses."""
 
 
@@ -78,10 +78,10 @@ def vector_unit() -> VectorUnit:
     try:
         text = Path("/proc/cpuinfo").read_text("utf-8", errors="replace")
     except OSError:
-        return _PLAIN
+        return _PORTABLE_UNIT
     found = re.search(r"^flags\s*:(.*)$", text, re.MULTILINE)
     flags = found[1].split() if found else []
-    return next((unit for flag, unit in UNITS.items() if flag in flags), _PLAIN)
+    return next((unit for flag, unit in UNITS.items() if flag in flags), _PORTABLE_UNIT)
 
 
 class Program(IntEnum):
@@ -104,7 +104,7 @@ class Pending(IntEnum):
     """To fire thrusters, after some lanes have got their allocation."""
 
 
-_JOB = (
+_JOB_MEMBERS = (
     ("V *", "memory", "(groups, ROWS)"),
     ("long long", "groups", ""),
     ("long long *", "at", "(groups,) the next tick"),
@@ -137,9 +137,9 @@ _MEMBER_TYPES: dict[str, Any] = {"long long": ctypes.c_longlong, "double": ctype
 
 
 class Job(ctypes.Structure):
-    """Argument of the functions in ``driver.hpp``; its members are those of ``_JOB``."""
+    """Argument of the functions in ``driver.hpp``; its members are those of ``_JOB_MEMBERS``."""
 
-    _fields_ = [(name, _MEMBER_TYPES.get(kind, ctypes.c_void_p)) for kind, name, _ in _JOB]
+    _fields_ = [(name, _MEMBER_TYPES.get(kind, ctypes.c_void_p)) for kind, name, _ in _JOB_MEMBERS]
 
 
 class Rows:
@@ -213,7 +213,7 @@ class CompiledTick:
             key = (*key, believed, repr(parameters), repr(program.config.motion))
             key = (*key, flights.thruster_count)
         if key not in model.derived:
-            model.derived[key] = cls._new(flights, model)
+            model.derived[key] = cls._compile(flights, model)
         compiled: CompiledTick = model.derived[key]
         if compiled.controller is not None and isinstance(program, Controlled):
             controller = BatchController(program, compiled.controller.controller)
@@ -221,7 +221,7 @@ class CompiledTick:
         return compiled
 
     @classmethod
-    def _new(cls, flights: Flights, model: ModelFunctions) -> CompiledTick:
+    def _compile(cls, flights: Flights, model: ModelFunctions) -> CompiledTick:
         effort, robot = flights.actuation == "effort", flights.robot
         names, n = _TICKS[flights.actuation], robot.n
         make = (effort_plant if effort else velocity_plant).tick_function
@@ -300,8 +300,8 @@ class CompiledTick:
             )
         if controller is not None:
             constants["EXPECTED_ROW"] = state + 2 * n + 4
-        declarations, unit = _declarations(rows, constants, arrays, spans), vector_unit()
-        library = _library(functions, declarations, unit, count)
+        declarations, unit = _declare_shared(rows, constants, arrays, spans), vector_unit()
+        library = _load_library(functions, declarations, unit, count)
         return cls(library, unit, rows, controller)
 
 
@@ -345,7 +345,7 @@ _TICKS = {
 }
 
 
-def _library(
+def _load_library(
     functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit, thrusters: int
 ) -> ctypes.CDLL:
     """Return the library of ``driver.hpp``, with the C library's vector functions if it has them.
@@ -370,28 +370,28 @@ def _compile_library(
     functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit, thrusters: int
 ) -> ctypes.CDLL:
     given = list(functions.values())
-    renamed = [_renamed(function, f"vector_{function.name()}") for function in given]
+    renamed = [_rename_function(function, f"vector_{function.name()}") for function in given]
     parts = [
-        _file("lanes.hpp"),
-        _SELECTION.sub(r"where(\1,\2)", vector_source(renamed, "V")),
+        _read_source("lanes.hpp"),
+        _CASADI_SELECTION.sub(r"where(\1,\2)", vector_source(renamed, "V")),
         *(f"#define {name} {each.name()}" for name, each in zip(functions, renamed, strict=True)),
         declarations,
-        _file("thrusters.hpp"),
-        _file("driver.hpp"),
-        *map(_trial, given),
+        _read_source("thrusters.hpp"),
+        _read_source("driver.hpp"),
+        *map(_trial_source, given),
     ]
     # Vectors as arguments between functions of this file: no other is called with them.
     flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *unit.flags)
     name = f"lanes_{given[0].name()}"
     if unit.libmvec:
-        source = "\n".join([_definitions(given, unit, unit.libmvec, thrusters), *parts])
+        source = "\n".join([_define_sizes(given, unit, unit.libmvec, thrusters), *parts])
         with suppress(NoLibraryError):
             return native_library(name, source, flags, ("-lmvec",), given)
-    source = "\n".join([_definitions(given, unit, "", thrusters), *parts])
+    source = "\n".join([_define_sizes(given, unit, "", thrusters), *parts])
     return native_library(name, source, flags, (), given)
 
 
-def _declarations(
+def _declare_shared(
     rows: Rows,
     constants: Mapping[str, int],
     arrays: Mapping[str, Iterable[int]],
@@ -406,22 +406,26 @@ def _declarations(
         members = ", ".join(f"{each.name} = {each.value}" for each in enum)
         lines.append(f"namespace {enum.__name__.lower()} {{ enum {{ {members} }}; }}")
     lines.append("struct Span { long long from, to, count; };  // rows")
-    lines += [f"static const long long {name}[] = {_braces(x)};" for name, x in arrays.items()]
+    lines += [f"static const long long {name}[] = {_cpp_list(x)};" for name, x in arrays.items()]
     lines += [
-        f"static const Span {name}[] = {{{', '.join(map(_braces, each))}}};"
+        f"static const Span {name}[] = {{{', '.join(map(_cpp_list, each))}}};"
         for name, each in spans.items()
     ]
-    lines += ["struct Job {", *(f"  {kind} {name};  // {text}" for kind, name, text in _JOB), "};"]
+    lines += [
+        "struct Job {",
+        *(f"  {kind} {name};  // {text}" for kind, name, text in _JOB_MEMBERS),
+        "};",
+    ]
     return "\n".join(lines)
 
 
-def _renamed(function: ca.Function, name: str) -> ca.Function:
+def _rename_function(function: ca.Function, name: str) -> ca.Function:
     inputs = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
     outputs = function.call(inputs, True, False)
     return ca.Function(name, inputs, outputs, function.name_in(), function.name_out())
 
 
-def _definitions(
+def _define_sizes(
     functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str, thrusters: int
 ) -> str:
     numbers = {
@@ -444,22 +448,23 @@ def _definitions(
     return "\n".join(lines)
 
 
-def _trial(function: ca.Function) -> str:
+def _trial_source(function: ca.Function) -> str:
     """Return the C++ that gives the vector function CasADi's interface for single numbers."""
     name = function.name()
-    inputs = [function.nnz_in(i) for i in range(function.n_in())]
-    outputs = [function.nnz_out(i) for i in range(function.n_out())]
+    count_in, count_out = function.n_in(), function.n_out()
+    sizes_in = _cpp_list(function.nnz_in(i) for i in range(count_in))
+    sizes_out = _cpp_list(function.nnz_out(i) for i in range(count_out))
     return (
         f'extern "C" int {name}(const double **arguments, double **results, long long *, double *, '
-        f"int) {{\n  static const long long in[] = {_braces(inputs)}, out[] = {_braces(outputs)};\n"
-        f"  return trial(vector_{name}, in, {len(inputs)}, out, {len(outputs)}, arguments, "
+        f"int) {{\n  static const long long in[] = {sizes_in}, out[] = {sizes_out};\n"
+        f"  return trial(vector_{name}, in, {count_in}, out, {count_out}, arguments, "
         "results);\n}\n"
     )
 
 
-def _braces(numbers: Iterable[int]) -> str:
+def _cpp_list(numbers: Iterable[int]) -> str:
     return "{" + ", ".join(map(str, numbers)) + "}"
 
 
-def _file(name: str) -> str:
-    return (_HERE / name).read_text("utf-8")
+def _read_source(name: str) -> str:
+    return (_SOURCE_FOLDER / name).read_text("utf-8")

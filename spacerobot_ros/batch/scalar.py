@@ -45,7 +45,7 @@ def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> Batch
         try:
             if controller is None and isinstance(flights.program, Controlled):
                 controller = BatchController.of(flights)
-            _fly(flights, row, result, controller)
+            _fly_row(flights, row, result, controller)
         except SpaceRobotError as error:
             failures[row] = str(error)
     return replace(result, engine="scalar", failures=failures)
@@ -62,7 +62,7 @@ def plant_of(flights: Flights, row: int) -> Plant:
     )
 
 
-def _fly(
+def _fly_row(
     flights: Flights, row: int, result: BatchResult, controller: BatchController | None
 ) -> None:
     plant, period = plant_of(flights, row), flights.control_period
@@ -82,22 +82,22 @@ def _fly(
             assert controller is not None
             command = _controlled_commands(controller, row, result)
     instants = {tick: column for column, tick in enumerate(flights.instants)}
-    momenta, drift = _unexplained(plant), np.zeros(2)
+    momenta, drift = _unexplained_momenta(plant), np.zeros(2)
     try:
         for tick in range(flights.ticks + 1):
             sensors.measure()
             measured = sensors if sensors.used else plant
             if tick in instants:
-                _report(plant, measured, result, row, instants[tick])
+                _write_report(plant, measured, result, row, instants[tick])
             decided = result.decision[row] != Decision.NONE
             if tick == flights.ticks or (ends and decided):
                 result.end_tick[row] = tick
                 break
             commands = command(tick, measured)
             plant.step(*commands)
-            _account(plant, commands, period, result, row)
+            _update_peaks(plant, commands, period, result, row)
             if controller is not None:
-                drift = np.maximum(drift, momentum_change(_unexplained(plant), momenta))
+                drift = np.maximum(drift, momentum_change(_unexplained_momenta(plant), momenta))
         if controller is not None:
             parts = plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum
             result.end_state[row] = np.concatenate(parts)
@@ -112,7 +112,7 @@ def _fly(
 def _held_commands(flights: Flights, program: HeldCommands, row: int) -> _Commands:
     """Return the commands of a table, zero after its end."""
     tables = [program.joints] if program.wrench is None else [program.joints, program.wrench]
-    tables = [_of_row(table, row) for table in tables]
+    tables = [_table_of_row(table, row) for table in tables]
 
     def command(tick: int, measured: Plant | Sensors) -> Sequence[Array]:
         return [table[tick] if tick < len(table) else np.zeros(table.shape[1]) for table in tables]
@@ -125,7 +125,7 @@ def _schedule_commands(flights: Flights, program: FollowedSchedule, row: int) ->
     goal = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     path = BasePath(np.zeros(1), goal.position[None], goal.quaternion[None])
     names, period = flights.robot.joint_names, flights.control_period
-    schedule = GaitSchedule("", names, period, _of_row(program.positions, row), path, goal)
+    schedule = GaitSchedule("", names, period, _table_of_row(program.positions, row), path, goal)
     follower = ScheduleFollower(schedule, 0, program.shape_gain, program.deadband)
     period_ns = round(period * SECOND)
     position, velocity = np.zeros(flights.robot.n), np.zeros(flights.robot.n)
@@ -147,10 +147,10 @@ def _controlled_commands(controller: BatchController, row: int, result: BatchRes
         parts = pose[:3], pose[3:], twist[:3], twist[3:], measured.q, measured.qdot
         state = ControlState(*(part.copy() for part in parts))
         if tick == 0:
-            profile, bounds = controller.begin(row, state)
+            profile, bounds = controller.begin_flight(row, state)
             goal = profile.goal
         commands = controller.command(tick, state)
-        decision = controller.decision(monitor, tick, state.qdot, bounds)
+        decision = controller.decide(monitor, tick, state.qdot, bounds)
         if decision is not Decision.NONE and result.decision[row] == Decision.NONE:
             result.decision[row], result.decided_tick[row] = decision, tick
             result.decided_distance[row] = astuple(controller.distance(state, goal))
@@ -159,16 +159,16 @@ def _controlled_commands(controller: BatchController, row: int, result: BatchRes
     return command
 
 
-def _unexplained(plant: Plant) -> Array:
+def _unexplained_momenta(plant: Plant) -> Array:
     """Return the part of the momenta (6,) that thrust does not explain."""
     return np.asarray(plant.momentum[:6] - plant.expected_momenta)
 
 
-def _of_row(array: Array, row: int) -> Array:
+def _table_of_row(array: Array, row: int) -> Array:
     return array if array.ndim == 2 else np.asarray(array[row])
 
 
-def _report(
+def _write_report(
     plant: Plant, measured: Plant | Sensors, result: BatchResult, row: int, column: int
 ) -> None:
     for name in ("pose", "twist", "q", "qdot", "momentum"):
@@ -176,7 +176,7 @@ def _report(
     result.measured_pose[row, column], result.measured_q[row, column] = measured.pose, measured.q
 
 
-def _account(
+def _update_peaks(
     plant: Plant, commands: Sequence[Array], control_period: float, result: BatchResult, row: int
 ) -> None:
     """Update the peaks and integrals of a flight after a tick."""

@@ -72,7 +72,7 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
             "more flights of one of them."
         )
     # Metrics that only one of them requires are compared too, if both have them.
-    names = list(dict.fromkeys([*first.shown, *second.shown]))
+    names = list(dict.fromkeys([*first.shown_metrics, *second.shown_metrics]))
     names = [name for name in names if name in first.columns and name in second.columns]
     found = []
     for name in names:

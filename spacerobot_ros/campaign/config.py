@@ -29,7 +29,7 @@ _CAMPAIGN_KEYS = (
     *("scenario", "flights", "seed", "sampler", "method", "set", "longest", "disperse"),
     *("criteria", "engine", "description"),
 )
-_MOST_FLIGHTS = 10_000_000
+_MAX_FLIGHTS = 10_000_000
 ENGINES = ("auto", "lanes", "flights", "ros")
 """Names of the engines that may fly a campaign."""
 
@@ -52,7 +52,7 @@ class Distribution:
     arguments: Mapping[str, float] = field(default_factory=dict)
     choices: tuple[Any, ...] = ()
 
-    def at(self, shares: Array) -> list[Any]:
+    def quantiles(self, shares: Array) -> list[Any]:
         """Return the quantiles (N,) of cumulative probabilities (N,), 0 to 1."""
         if self.choices:
             last = len(self.choices) - 1
@@ -204,25 +204,13 @@ def parse_campaign(
         A key or value is refused.
     """
     for key in section:
-        if key not in _CAMPAIGN_KEYS:
-            raise ParameterError(
-                f"there is no key '{key}'; there are {', '.join(_CAMPAIGN_KEYS)}."
-                f"{suggestion(str(key), _CAMPAIGN_KEYS)}"
-            )
+        _require_known("key", key, _CAMPAIGN_KEYS)
     scenario = scenario or _read_scenario(section, folder)
-    flights = _read_whole_number(section, "flights", 100, 1, _MOST_FLIGHTS)
+    flights = _read_whole_number(section, "flights", 100, 1, _MAX_FLIGHTS)
     sampler = str(section.get("sampler", "random"))
-    if sampler not in SAMPLERS:
-        known = ", ".join(SAMPLERS)
-        raise ParameterError(
-            f"there is no sampler '{sampler}'; there are {known}.{suggestion(sampler, SAMPLERS)}"
-        )
     engine = str(section.get("engine", "auto"))
-    if engine not in ENGINES:
-        known = ", ".join(ENGINES)
-        raise ParameterError(
-            f"there is no engine '{engine}'; there are {known}.{suggestion(engine, ENGINES)}"
-        )
+    _require_known("sampler", sampler, SAMPLERS)
+    _require_known("engine", engine, ENGINES)
     dispersions = _read_dispersions(_read_mapping(section, "disperse"), scenario)
     if sampler == "saltelli" and not dispersions:
         raise ParameterError("the sampler 'saltelli' needs at least one dispersion.")
@@ -239,6 +227,14 @@ def parse_campaign(
         description=str(section.get("description", "")),
         section=dict(section),
     )
+
+
+def _require_known(kind: str, name: Any, known: Sequence[str]) -> None:
+    if name not in known:
+        raise ParameterError(
+            f"there is no {kind} '{name}'; there are {', '.join(known)}."
+            f"{suggestion(str(name), known)}"
+        )
 
 
 def _read_scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
@@ -430,11 +426,15 @@ def _read_criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Crit
     return tuple(found)
 
 
-def passed(criteria: Sequence[Criterion], outcome: str, metrics: Mapping[str, float]) -> bool:
+def passes_criteria(
+    criteria: Sequence[Criterion], outcome: str, metrics: Mapping[str, float]
+) -> bool:
     """Return whether a flight has reached its goal and met every criterion."""
-    return outcome == "reached" and all(meets(criterion, metrics) for criterion in criteria)
+    return outcome == "reached" and all(
+        meets_criterion(criterion, metrics) for criterion in criteria
+    )
 
 
-def meets(criterion: Criterion, metrics: Mapping[str, float]) -> bool:
+def meets_criterion(criterion: Criterion, metrics: Mapping[str, float]) -> bool:
     """Return whether a metric is there and within its criterion."""
     return criterion.minimum <= metrics.get(criterion.metric, math.nan) <= criterion.maximum

@@ -87,7 +87,7 @@ class Dataset:
             self._lock()
             for left in (self.folder / _FLIGHTS_FOLDER).glob(".*"):
                 left.unlink()  # An earlier process was killed while it wrote this.
-            done = self.done()
+            done = self.flown_numbers()
             self._write_description(
                 campaign, max([campaign.flights, *(number + 1 for number in done)])
             )
@@ -154,13 +154,7 @@ class Dataset:
         os.replace(new, path)
 
     def _lock(self) -> None:
-        """Lock the folder against other processes, until this process ends.
-
-        Raises
-        ------
-        ParameterError
-            Another process has locked it.
-        """
+        """Lock the folder until this process ends, unless another process has locked it."""
         descriptor = os.open(self.folder / _FLIGHTS_FOLDER, os.O_RDONLY | os.O_CLOEXEC)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -217,7 +211,7 @@ class Dataset:
 
     # -- rows ---------------------------------------------------------------------------------
 
-    def done(self) -> set[int]:
+    def flown_numbers(self) -> set[int]:
         """Return the numbers of the flights that are there."""
         found: set[int] = set()
         for part in self._row_files():
@@ -278,13 +272,7 @@ class Dataset:
 
 
 def _read_row_file(part: Path, columns: Sequence[str] | None = None) -> Any:
-    """Return a file of rows as a pyarrow table.
-
-    Raises
-    ------
-    ParameterError
-        It is damaged.
-    """
+    """Return a file of rows as a pyarrow table, unless it is damaged."""
     arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
     try:
         return parquet.read_table(part, columns=columns)

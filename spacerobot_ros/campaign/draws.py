@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model.description import Array
 
-_LEAST_SHARE = 1e-12
+_MIN_PROBABILITY = 1e-12
 """Least distance of shares from 0 and 1, where many distributions are infinite."""
 
 _BLOCK_SIZE = 256
@@ -91,9 +91,10 @@ class Draws:
         else:
             given = self.shares[first : first + _BLOCK_SIZE]
             shares[: len(given)] = given
-        shares = np.clip(shares, _LEAST_SHARE, 1.0 - _LEAST_SHARE)
+        shares = np.clip(shares, _MIN_PROBABILITY, 1.0 - _MIN_PROBABILITY)
         columns = [
-            each.distribution.at(u) for each, u in zip(campaign.dispersions, shares.T, strict=True)
+            each.distribution.quantiles(u)
+            for each, u in zip(campaign.dispersions, shares.T, strict=True)
         ]
         made = []
         for place, own in enumerate(seeds):
@@ -147,9 +148,7 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
         A drawn mass or inertia is not that of a body.
     """
     flight = common or DrawnFlight.of(campaign.scenario)
-    flight = replace(
-        flight, scenario=flight.scenario.with_overrides("plant", {"sensors.seed": draw.seed})
-    )
+    flight = flight.with_overrides("plant", {"sensors.seed": draw.seed})
     for dispersion in campaign.dispersions:
         value = draw.values[dispersion.name]
         if not dispersion.target.text and not math.isfinite(value):

@@ -52,10 +52,10 @@ from spacerobot_ros.times import SECOND
 _STATES_PER_FLIGHT = 40
 """States of a flight along a schedule that are evaluated, beside its last one."""
 
-_MOST_BATCH_TICKS = 4_000_000
+_MAX_BATCH_TICKS = 4_000_000
 """Largest number of ticks of one batch, whose schedules are in memory."""
 
-_LONGEST_BATCH_PREPARATION = 4.0
+_MAX_BATCH_PREPARATION_TIME = 4.0
 """Wall time, s, after which a batch is flown with the draws that are ready; an interruption of the
 campaign loses no more."""
 
@@ -125,7 +125,7 @@ class LanesEngine:
     """Many flights at once, in SIMD lanes."""
 
     name = LANES
-    least = 64
+    efficient_flights = 64
 
     def __init__(self) -> None:
         self._flights = FlightsEngine()
@@ -162,15 +162,15 @@ class LanesEngine:
             try:
                 ready = lanes.prepare_draw(campaign, draw, drawn_flight(campaign, draw, common))
             except Exception as error:  # The error becomes a row.
-                yield Row.failed(draw, error, self.name)
+                yield Row.of_error(draw, error, self.name)
                 continue
             if isinstance(ready, Fallback):
                 yield ready
                 continue
             batch.append(ready)
             ticks += 0 if ready.plan is None else ready.schedule.ticks
-            late = time.perf_counter() - began > _LONGEST_BATCH_PREPARATION
-            if late or len(batch) >= lanes.most or ticks > _MOST_BATCH_TICKS:
+            late = time.perf_counter() - began > _MAX_BATCH_PREPARATION_TIME
+            if late or len(batch) >= lanes.max_batch_flights or ticks > _MAX_BATCH_TICKS:
                 yield from self._fly_batch(campaign, lanes, batch)
                 batch, ticks, began = [], 0, time.perf_counter()
         if batch:
@@ -208,11 +208,11 @@ class LanesEngine:
 class _ScheduledLanes:
     """Flights along the schedules that the planner's executive makes for the first states."""
 
-    most = 512
+    max_batch_flights = 512
     """Largest number of flights of one batch."""
 
     def __init__(self) -> None:
-        self._last: tuple[str, _Plan | None] | None = None
+        self._last_plan: tuple[str, _Plan | None] | None = None
         """The last plan from a state measured without noise, and the values that determine it."""
         self._planner: tuple[PlannerConfig, str] | None = None
         """The planner's configuration of the last draw, mostly that of all, and its text."""
@@ -251,9 +251,9 @@ class _ScheduledLanes:
         if self._planner is None or self._planner[0] is not planner:
             self._planner = planner, repr(values_of(planner))
         key = self._planner[1] + _plan_key(flight)
-        if self._last is None or self._last[0] != key:
-            self._last = key, _first_plan(flight)
-        return self._last[1]
+        if self._last_plan is None or self._last_plan[0] != key:
+            self._last_plan = key, _first_plan(flight)
+        return self._last_plan[1]
 
     def flights(self, campaign: Campaign, batch: Sequence[_ReadyDraw]) -> Flights:
         """Return the batch of some draws."""
@@ -321,7 +321,7 @@ class _ScheduledLanes:
 class _ControlledLanes:
     """Flights of coordinated control, to the decisions about their goals."""
 
-    most = 128
+    max_batch_flights = 128
     """Largest number of flights of one batch."""
 
     def refusal(self, campaign: Campaign, *, asked: bool) -> str:
@@ -350,7 +350,7 @@ class _ControlledLanes:
             return str(error)
         if law.fixed_inputs is None:
             return f"the law '{law.name}' with these options is more than one function"
-        for key, goal in _goals_by_name(scenario).items():
+        for key, goal in _goals_by_frame(scenario).items():
             if goal is not None and not getattr(law.outputs.selection, key):
                 return f"the law '{law.name}' does not control the {key.replace('_', '-')}"
         return ""
@@ -376,7 +376,7 @@ class _ControlledLanes:
         """
         scenario = campaign.scenario
         drawn = [each.flight for each in batch]
-        goals = [_goals_by_name(each.scenario) for each in drawn]
+        goals = [_goals_by_frame(each.scenario) for each in drawn]
         dispersed = any(each.name.startswith(_GAIN_PREFIX) for each in campaign.dispersions)
         gains = tuple(each.scenario.controller.gains for each in drawn) if dispersed else ()
         program = Controlled(
@@ -513,7 +513,7 @@ def _pad_positions(positions: Array, ticks: int) -> Array:
 # -- control ----------------------------------------------------------------------------------
 
 
-def _goals_by_name(scenario: Scenario) -> dict[str, Goal | None]:
+def _goals_by_frame(scenario: Scenario) -> dict[str, Goal | None]:
     return {"base": scenario.goal, "end_effector": scenario.end_effector_goal}
 
 

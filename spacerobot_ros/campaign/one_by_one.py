@@ -32,7 +32,7 @@ class _OneByOneEngine(ABC):
     """Flies one draw after the other; a draw that cannot be flown does not end the others."""
 
     name: str
-    least = 1
+    efficient_flights = 1
 
     def fly(
         self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
@@ -43,22 +43,18 @@ class _OneByOneEngine(ABC):
             if stopped():
                 return
             try:
-                flown = self.flown(campaign, drawn_flight(campaign, draw, common), stopped)
+                flown = self.fly_draw(campaign, drawn_flight(campaign, draw, common), stopped)
                 if stopped() and flown.outcome is Outcome.INTERRUPTED:
                     return
                 yield Row.of(campaign, draw, flown.measures, self.name)
             except Exception as error:  # It is a row, with its reason.
-                yield Row.failed(draw, error, self.name)
+                yield Row.of_error(draw, error, self.name)
 
     @abstractmethod
-    def flown(self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]) -> Flight:
-        """Fly one draw.
-
-        Raises
-        ------
-        SpaceRobotError
-            A parameter, the robot or the goal is refused.
-        """
+    def fly_draw(
+        self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]
+    ) -> Flight:
+        """Fly one draw, or raise a :class:`.SpaceRobotError` about the one that is refused."""
 
 
 class FlightsEngine(_OneByOneEngine):
@@ -74,7 +70,7 @@ class FlightsEngine(_OneByOneEngine):
             return str(error)
         return ""
 
-    def flown(
+    def fly_draw(
         self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool] = lambda: False
     ) -> Flight:
         """Fly one draw; see the base class."""
@@ -158,12 +154,14 @@ class RosEngine(_OneByOneEngine):
         """Return the reason why this engine cannot fly a campaign, as a clause."""
         return "it kills nodes on the way" if campaign.scenario.kills else ""
 
-    def flown(self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]) -> Flight:
-        """Fly one draw; see :meth:`FlightsEngine.flown`. It is not stopped on the way."""
+    def fly_draw(
+        self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]
+    ) -> Flight:
+        """Fly one draw; see :meth:`FlightsEngine.fly_draw`. It is not stopped on the way."""
         began = time.perf_counter()
         with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
             bag = Path(folder, "flight.mcap")
-            scenario = flight.finished().scenario
+            scenario = flight.with_masses_in_urdf().scenario
             self._run_scenario(scenario, Path(folder, "draw.yaml"), bag, campaign.longest)
             flown = read_run(bag)
         if flown.duration > campaign.longest:  # The stack looks five times a second of wall time.

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from spacerobot_ros.campaign.config import Campaign, Criterion, meets
+from spacerobot_ros.campaign.config import Campaign, Criterion, meets_criterion
 from spacerobot_ros.campaign.dataset import DRAW_PREFIX, Dataset
 from spacerobot_ros.campaign.draws import Draws, require_module
 from spacerobot_ros.campaign.statistics import (
@@ -43,7 +43,7 @@ _WORST_FLIGHTS_SHOWN = 10
 _MAX_BADNESS = 100.0
 """Distance from a bound at which the order of the worst flights saturates, standard deviations."""
 
-_MOST_PLOTS = 6
+_MAX_PLOTS = 6
 """Largest number of metrics with a histogram."""
 
 Flags = npt.NDArray[np.bool_]
@@ -131,14 +131,14 @@ class Results:
         return share(int(self.passed.sum()), len(self))
 
     @property
-    def drawn(self) -> dict[str, Array]:
+    def drawn_numbers(self) -> dict[str, Array]:
         """(N,) drawn values, by name of the dispersion; numbers only."""
         names = [each.name for each in self.campaign.dispersions]
         found = {name: self.columns[f"{DRAW_PREFIX}{name}"] for name in names}
         return {name: x for name, x in found.items() if isinstance(x, np.ndarray)}
 
     @property
-    def shown(self) -> list[str]:
+    def shown_metrics(self) -> list[str]:
         """Metrics of the report: those with a criterion, and the main ones that have values."""
         names = [criterion.metric for criterion in self.campaign.criteria]
         names += [name for name in _MAIN_METRICS if name not in names]
@@ -146,20 +146,20 @@ class Results:
 
     def metrics(self) -> dict[str, Array]:
         """Return the columns of the metrics of the report."""
-        return {name: self.columns[name] for name in self.shown}
+        return {name: self.columns[name] for name in self.shown_metrics}
 
-    def requirement(self, criterion: Criterion) -> Share:
+    def requirement_share(self, criterion: Criterion) -> Share:
         """Return the share of flights that meet a criterion."""
         values = self.columns[criterion.metric].tolist()
-        met = sum(meets(criterion, {criterion.metric: value}) for value in values)
+        met = sum(meets_criterion(criterion, {criterion.metric: value}) for value in values)
         return share(met, len(self))
 
     def influences(self) -> list[Influence]:
         """Return the sensitivities, the strongest first, with Sobol indices if available."""
-        found = influences(self.drawn, self.metrics())
+        found = influences(self.drawn_numbers, self.metrics())
         whole = self.campaign.sampler == "saltelli" and len(self) == self.total
-        if whole and len(self.drawn) == len(self.campaign.dispersions):
-            names, with_indices = list(self.drawn), []
+        if whole and len(self.drawn_numbers) == len(self.campaign.dispersions):
+            names, with_indices = list(self.drawn_numbers), []
             indices = {name: sobol_indices(names, x) for name, x in self.metrics().items()}
             for each in found:
                 known = indices[each.metric].get(each.cause)
@@ -170,7 +170,7 @@ class Results:
             found = with_indices
         return sorted(found, key=lambda each: -each.strength)
 
-    def worst(self) -> list[int]:
+    def worst_rows(self) -> list[int]:
         """Return the rows of the worst flights: first those that failed, then those that missed.
 
         Flights that passed are ordered by their distance from a bound, in standard deviations.
@@ -208,7 +208,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     write_output(path, html_page(title, _page_body(results), MADE_BY))
     lines = [f"success     {results.success}"]
     lines += [f"note        {results.bias}"] if results.bias else []
-    lines += [f"required    {c}: {results.requirement(c)}" for c in results.campaign.criteria]
+    lines += [f"required    {c}: {results.requirement_share(c)}" for c in results.campaign.criteria]
     for each in results.influences()[:3]:
         lines.append(f"driver      {each}")
     return lines
@@ -308,7 +308,7 @@ def _criteria_section(results: Results) -> str:
     for criterion in results.campaign.criteria:
         values = percentiles(results.columns[criterion.metric])
         middle, high = values[PERCENTILES.index(50.0)], values[PERCENTILES.index(95.0)]
-        met = results.requirement(criterion)
+        met = results.requirement_share(criterion)
         rows.append([str(criterion), *_share_cells(met), f"{middle:.4g}", f"{high:.4g}"])
     rows.append(["all together", *_share_cells(results.success), "", ""])
     head = ["requirement", "met by", "95 % interval", "median", "95 percentile"]
@@ -345,7 +345,7 @@ def _outcomes_section(results: Results) -> str:
 
 
 def _percentiles_section(results: Results) -> str:
-    if not results.shown:
+    if not results.shown_metrics:
         return '<p class="missing">No flight has any metric.</p>'
     rows = []
     for name, values in results.metrics().items():
@@ -357,7 +357,7 @@ def _percentiles_section(results: Results) -> str:
 
 
 def _histograms_section(results: Results) -> str:
-    names = results.shown[:_MOST_PLOTS]
+    names = results.shown_metrics[:_MAX_PLOTS]
     if not names:
         return ""
     figure, axes = figure_with_axes(len(names), 2)
@@ -411,7 +411,7 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
 
 
 def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
-    chosen = list(found[:_MOST_PLOTS])
+    chosen = list(found[:_MAX_PLOTS])
     if not chosen:
         return ""
     figure, axes = figure_with_axes(len(chosen), 3, 2.4)
@@ -419,7 +419,7 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
     # The largest number of points on a page.
     few = np.random.default_rng(0).permutation(len(results))[:2000]
     for panel, each in zip(axes, chosen, strict=True):
-        x, y = results.drawn[each.cause][few], results.columns[each.metric][few]
+        x, y = results.drawn_numbers[each.cause][few], results.columns[each.metric][few]
         for ok, colour in ((True, PALETTE[0]), (False, PALETTE[1])):
             of = passed[few] == ok
             panel.plot(x[of], y[of], ".", ms=3, alpha=0.5, color=colour, rasterized=True)
@@ -431,9 +431,9 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
 
 
 def _worst_flights_section(results: Results) -> str:
-    names = results.shown
+    names = results.shown_metrics
     rows = []
-    for row in results.worst():
+    for row in results.worst_rows():
         number = int(results.numbers[row])
         values = [f"{results.columns[name][row]:.4g}" for name in names]
         command = f"spacerobot campaign rerun {shlex.quote(str(results.folder))} {number}"
@@ -457,13 +457,13 @@ def _convergence_section(results: Results) -> str:
     )
     axes[0].plot(at, [s.value for s in shares], color=PALETTE[0])
     axes[0].set_ylabel("success, with 95 % interval")
-    for i, name in enumerate(results.shown[:3]):
+    for i, name in enumerate(results.shown_metrics[:3]):
         values = results.columns[name]
         final = percentiles(values)[PERCENTILES.index(95.0)] or 1.0
         line = [percentiles(values[:k])[PERCENTILES.index(95.0)] / final for k in at]
         axes[1].plot(at, line, color=PALETTE[i], label=name)
     axes[1].set_ylabel("95 percentile over its last value")
-    if results.shown:
+    if results.shown_metrics:
         axes[1].legend(fontsize=7, frameon=False)
     for panel in axes:
         panel.set_xlabel("flights")
@@ -482,7 +482,9 @@ def _dispersions_section(campaign: Campaign) -> str:
     for each in campaign.dispersions:
         numbers = [""] * len(_QUANTILES_SHOWN)
         if not each.distribution.choices:
-            numbers = [f"{value:.4g}" for value in each.distribution.at(np.array(_QUANTILES_SHOWN))]
+            numbers = [
+                f"{value:.4g}" for value in each.distribution.quantiles(np.array(_QUANTILES_SHOWN))
+            ]
         rows.append([each.name, str(each.distribution), each.target.unit or "", *numbers])
     if not rows:
         return '<p class="missing">No dispersions: flights differ in their noise only.</p>'

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from spacerobot_ros.campaign.config import Campaign, passed
+from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import SpaceRobotError
@@ -64,14 +64,14 @@ class Row:
             outcome=measures.outcome.value,
             reason=measures.message,
             metrics=metrics,
-            passed=passed(campaign.criteria, measures.outcome.value, metrics),
+            passed=passes_criteria(campaign.criteria, measures.outcome.value, metrics),
             engine=engine,
             wall_time=measures.wall_time,
             plan_time=measures.plan_time,
         )
 
     @classmethod
-    def failed(cls, draw: Draw, error: BaseException, engine: str) -> Row:
+    def of_error(cls, draw: Draw, error: BaseException, engine: str) -> Row:
         """Return the row of a draw that could not be flown."""
         reason = str(error)
         if not isinstance(error, SpaceRobotError):
@@ -93,11 +93,11 @@ class Fallback:
 class Engine(Protocol):
     """Flies draws.
 
-    ``least`` flights at once are flown best: fewer take as long.
+    ``efficient_flights``: number of flights that take as long as fewer.
     """
 
     name: str
-    least: int
+    efficient_flights: int
 
     def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
         """Return why this engine does not fly a campaign, as a clause; empty if it does.

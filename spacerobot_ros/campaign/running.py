@@ -13,7 +13,7 @@ from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
 from spacerobot_ros.campaign.rows import LANES, Row
-from spacerobot_ros.campaign.workers import THIS_PROCESS, Cluster, Distribution, open_workers
+from spacerobot_ros.campaign.workers import THIS_PROCESS, Cluster, TaskDistributor, open_workers
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
@@ -39,7 +39,7 @@ class Progress:
     seconds: float
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Wall time that is left, s; infinite before the first flight."""
         return (self.total - self.done) / self.rate if self.rate else float("inf")
 
@@ -120,7 +120,7 @@ def _fly_rows(
             yield [row]
         return
     with open_workers(cluster, len(numbers)) as workers:
-        yield from Distribution(workers, campaign, draws, engine, stopped).rows(numbers)
+        yield from TaskDistributor(workers, campaign, draws, engine, stopped).rows(numbers)
 
 
 RERUN_TOLERANCE = 1e-9
@@ -155,7 +155,7 @@ class Rerun:
     note: str = ""
 
     @property
-    def same(self) -> bool:
+    def agrees(self) -> bool:
         """Whether the metrics agree with the dataset, or cannot be compared with it."""
         if self.deviation is None or self.note:
             return True
@@ -203,7 +203,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
             f"flight {number}."
         )
     draw = draws[number]
-    scenario = drawn_flight(campaign, draw).finished().scenario
+    scenario = drawn_flight(campaign, draw).with_masses_in_urdf().scenario
     run_scenario(scenario, bag, longest=campaign.longest)
     row = Row.of(campaign, draw, read_run(bag).measures, "ros")
     known = stored_flight(dataset, number)
@@ -221,7 +221,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
 
 def stored_flight(dataset: Dataset, number: int) -> tuple[str, str, dict[str, float]] | None:
     """Return outcome, engine and metrics of a flight in a dataset; None: it is not there."""
-    if number not in dataset.done():
+    if number not in dataset.flown_numbers():
         return None
     (record,) = [row for row in dataset.table().to_pylist() if row["flight"] == number]
     metrics = {

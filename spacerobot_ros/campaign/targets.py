@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -79,7 +79,7 @@ class DrawnFlight:
     Attributes
     ----------
     scenario
-        The scenario; the plant's masses are not in it before :meth:`finished`.
+        The scenario; the plant's masses are not in it before :meth:`with_masses_in_urdf`.
     nominal
         The robot without dispersions.
     mass, inertia
@@ -90,9 +90,9 @@ class DrawnFlight:
 
     scenario: Scenario
     nominal: RobotDescription
-    mass: Array = field(default_factory=lambda: np.ones(0))
-    inertia: Array = field(default_factory=lambda: np.ones(0))
-    com: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    mass: Array
+    inertia: Array
+    com: Array
 
     @classmethod
     def of(cls, scenario: Scenario) -> DrawnFlight:
@@ -103,6 +103,10 @@ class DrawnFlight:
         count = len(robot.bodies)
         return cls(scenario, robot, np.ones(count), np.ones(count), np.zeros((count, 3)))
 
+    def with_overrides(self, node: str, parameters: Mapping[str, Any]) -> DrawnFlight:
+        """Return the flight with other parameters of a node."""
+        return replace(self, scenario=self.scenario.with_overrides(node, parameters))
+
     @property
     def inertial(self) -> InertialParameters | None:
         """Masses, centres and inertias of the bodies; None: those of the robot's description."""
@@ -111,7 +115,7 @@ class DrawnFlight:
         parameters = InertialParameters.of(self.nominal)
         return parameters.scaled(self.mass, self.mass * self.inertia).shifted(self.com)
 
-    def finished(self) -> DrawnFlight:
+    def with_masses_in_urdf(self) -> DrawnFlight:
         """Return the flight with its masses in the URDF of the plant.
 
         The commanders go on to believe in the robot as it was, unless they have one of their own.
@@ -215,9 +219,7 @@ def _scalar_target(name: str, node: str, declaration: Parameter, value: Any) -> 
     whole = isinstance(declaration.default, int)
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-        given = round(drawn) if whole else drawn
-        scenario = flight.scenario.with_overrides(node, {declaration.name: given})
-        return replace(flight, scenario=scenario)
+        return flight.with_overrides(node, {declaration.name: round(drawn) if whole else drawn})
 
     return Target(name, apply, declaration.unit, isinstance(value, str), frozenset({name}))
 
@@ -243,8 +245,7 @@ def _entry_target(
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         values = _list_values(name, node, declaration, flight.scenario)
         values[place] = float(drawn)
-        scenario = flight.scenario.with_overrides(node, {declaration.name: values})
-        return replace(flight, scenario=scenario)
+        return flight.with_overrides(node, {declaration.name: values})
 
     one = frozenset({f"{node}.{declaration.name}[{place}]"})
     return Target(name, apply, declaration.unit, False, one)
@@ -257,11 +258,8 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
     if values:
         return [float(x) for x in values]
     if node == "plant" and declaration.length is None:
-        return (
-            _start_positions(scenario)
-            if "positions" in name
-            else [0.0] * len(_start_positions(scenario))
-        )
+        start = _start_positions(scenario)
+        return start if "positions" in name else [0.0] * len(start)
     raise ParameterError(
         f"'{name}': the list is empty, which has a meaning of its own: give all of it under 'set'."
     )
@@ -276,7 +274,7 @@ def _start_positions(scenario: Scenario) -> list[float]:
     return [float(x) for x in np.clip(zero, robot.limits("lower"), robot.limits("upper"))]
 
 
-def _bodies_called(name: str, scenario: Scenario) -> list[tuple[int, str]]:
+def _find_bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
     """Return the bodies of a name, all for ``*``, each with its index."""
     names = [body.name for body in description_of(scenario).bodies]
     if name == "*":
@@ -300,8 +298,8 @@ def _mass_property_targets(kind: str, dot: str, rest: str, scenario: Scenario) -
         return Target(name, apply, "1", False, frozenset(f"{kind}.{body}" for _, body in bodies))
 
     if not dot:
-        return [target(_bodies_called("*", scenario), kind)]
-    return [target([body], f"{kind}.{body[1]}") for body in _bodies_called(rest, scenario)]
+        return [target(_find_bodies("*", scenario), kind)]
+    return [target([body], f"{kind}.{body[1]}") for body in _find_bodies(rest, scenario)]
 
 
 def _center_targets(rest: str, scenario: Scenario) -> list[Target]:
@@ -311,14 +309,14 @@ def _center_targets(rest: str, scenario: Scenario) -> list[Target]:
     if not dot or axis not in (*AXES, "*"):
         raise ParameterError(
             f"'{f'com.{rest}'.rstrip('.')}' must be com.BODY.x, y, z or *, or com.*; the bodies "
-            f"are {', '.join(name for _, name in _bodies_called('*', scenario))}."
+            f"are {', '.join(name for _, name in _find_bodies('*', scenario))}."
         )
-    found = []
-    for index, name in _bodies_called(body, scenario):
-        for column, letter in enumerate(AXES):
-            if axis in (letter, "*"):
-                found.append(_center_target(index, column, f"com.{name}.{letter}"))
-    return found
+    return [
+        _center_target(index, column, f"com.{name}.{letter}")
+        for index, name in _find_bodies(body, scenario)
+        for column, letter in enumerate(AXES)
+        if axis in (letter, "*")
+    ]
 
 
 def _center_target(index: int, column: int, name: str) -> Target:
@@ -347,18 +345,15 @@ def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
         offset = np.zeros(3)
         offset[column] = float(drawn)
         if kind == "initial":
-            return replace(flight, scenario=_move_start(flight.scenario, part, offset))
+            return _move_start(flight, part, offset)
         goal: Goal = getattr(flight.scenario, kind)
         if part == "position":
             goal = replace(goal, position=goal.position + offset)
         else:
             turned = quaternion_multiply(goal.quaternion, quaternion_from_rotvec(offset))
             goal = replace(goal, quaternion=turned)
-        scenario = flight.scenario
-        if kind == "goal":
-            moved = scenario.with_poses(goal, scenario.end_effector_goal)
-        else:
-            moved = scenario.with_poses(scenario.goal, goal)
+        goals = {key: getattr(flight.scenario, key) for key in ("goal", "end_effector_goal")}
+        moved = flight.scenario.with_poses(*(goals | {kind: goal}).values())
         return replace(flight, scenario=moved)
 
     sets = {name}
@@ -367,15 +362,15 @@ def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
     return Target(name, apply, "m" if part == "position" else "rad", False, frozenset(sets))
 
 
-def _move_start(scenario: Scenario, part: str, offset: Array) -> Scenario:
-    plant = scenario.plant
+def _move_start(flight: DrawnFlight, part: str, offset: Array) -> DrawnFlight:
+    plant = flight.scenario.plant
     if part == "position":
         where = "initial_center_of_mass" if plant.initial_center_of_mass else "initial_position"
         moved = np.array(getattr(plant, where) or (0.0, 0.0, 0.0)) + offset
-        return scenario.with_overrides("plant", {where: moved.tolist()})
+        return flight.with_overrides("plant", {where: moved.tolist()})
     attitude = np.array(plant.initial_orientation or (0.0, 0.0, 0.0, 1.0))
     turned = quaternion_multiply(attitude, quaternion_from_rotvec(offset))
-    return scenario.with_overrides("plant", {"initial_orientation": turned.tolist()})
+    return flight.with_overrides("plant", {"initial_orientation": turned.tolist()})
 
 
 def _initial_joint_target(name: str, joint: str, scenario: Scenario) -> Target:
@@ -390,8 +385,7 @@ def _initial_joint_target(name: str, joint: str, scenario: Scenario) -> Target:
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         values = _start_positions(flight.scenario)
         values[index] += float(drawn)
-        scenario = flight.scenario.with_overrides("plant", {"initial_joint_positions": values})
-        return replace(flight, scenario=scenario)
+        return flight.with_overrides("plant", {"initial_joint_positions": values})
 
     one = frozenset({f"plant.initial_joint_positions[{index}]"})
     return Target(name, apply, "m or rad", False, one)
@@ -410,8 +404,7 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Targe
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         lines = list(flight.scenario.plant.faults)
         lines[index] = _edit_fault_line(lines[index].split(), part, repr(float(drawn)))
-        scenario = flight.scenario.with_overrides("plant", {"faults": lines})
-        return replace(flight, scenario=scenario)
+        return flight.with_overrides("plant", {"faults": lines})
 
     return Target(name, apply, "" if part == "value" else "s", False, frozenset({name}))
 

@@ -419,7 +419,7 @@ class _SubmittedTask:
     engine: str
 
 
-class Distribution:
+class TaskDistributor:
     """Distributes draws to workers.
 
     Fallbacks of an engine are distributed again, in tasks of fewer flights for the engine
@@ -450,7 +450,7 @@ class Distribution:
         self._workers, self._packed = workers, pack_campaign(campaign)
         self._draws, self._engine, self._stopped = draws, engine, stopped
         self._sizes = {
-            name: float(max(_MIN_FIRST_TASK_FLIGHTS, engine_by_name(name).least))
+            name: float(max(_MIN_FIRST_TASK_FLIGHTS, engine_by_name(name).efficient_flights))
             for name in (engine, FLIGHTS)
         }
         """Flights of a task, by the engine."""
@@ -476,7 +476,7 @@ class Distribution:
             if not ended:
                 yield []
             for task in ended:
-                yield self._take_rows(task)
+                yield self._collect_rows(task)
         if self._running:
             self._workers.cancel(list(self._running))
 
@@ -491,7 +491,7 @@ class Distribution:
                 (self._fallbacks, FLIGHTS) if self._fallbacks else (waiting, self._engine)
             )
             # The last tasks are smaller, so that no worker is alone at the end.
-            share = max(engine_by_name(engine).least, len(queue) / workers)
+            share = max(engine_by_name(engine).efficient_flights, len(queue) / workers)
             count = min(len(queue), max(1, round(min(self._sizes[engine], share))))
             self._submit_task([queue.popleft() for _ in range(count)], engine)
 
@@ -501,7 +501,7 @@ class Distribution:
         self._running[task] = _SubmittedTask(numbers, engine)
         return task
 
-    def _take_rows(self, ended: Any) -> list[Row]:
+    def _collect_rows(self, ended: Any) -> list[Row]:
         """Return the rows of a task; none if its worker died."""
         task = self._running.pop(ended)
         alone = ended is self._alone
@@ -519,7 +519,7 @@ class Distribution:
             took = sum(row.wall_time for row in rows if not math.isnan(row.wall_time))
             if took > 0:
                 size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TASK_TIME / took
-                least = engine_by_name(task.engine).least
+                least = engine_by_name(task.engine).efficient_flights
                 self._sizes[task.engine] = max(least, min(_MAX_TASK_FLIGHTS, size))
         return [
             replace(row, fallback=self._reasons[number])

@@ -122,7 +122,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
     for line in result.lines:
         click.echo(line)
     end_if_requested()
-    if not result.same:
+    if not result.agrees:
         fail("The flight is another one than that in the dataset.")
 
 
@@ -159,7 +159,8 @@ def _progress_bar(label: str) -> Iterator[Callable[[Progress], None]]:
 
         def show(progress: Progress) -> None:
             flown = f"{progress.done}/{progress.total}, {progress.rate:.3g}/s"
-            left = "?" if math.isinf(progress.left) else timedelta(seconds=round(progress.left))
+            seconds = progress.seconds_left
+            left = "?" if math.isinf(seconds) else timedelta(seconds=round(seconds))
             step = max(0, 1000 * progress.done // progress.total - bar.pos)
             bar.update(step, f"{flown}, {left} left")
 

@@ -32,7 +32,7 @@ _BRAKE_RATE = 2.0
 """Rate at which joints are brought to rest when the base is no longer known, 1/s."""
 
 
-_MOST_PERIODS = 20
+_MAX_HELD_PERIODS = 20
 """Largest number of control periods between two commands; a longer gap is a jump of time."""
 
 
@@ -120,7 +120,7 @@ class CoordinatedController:
         """
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
-        start = self._present(time, state)
+        start = self._present_reference(time, state)
         goal = start if self.profile is None else self.profile.goal
         if base is not None:
             goal = replace(goal, base=base)
@@ -169,40 +169,44 @@ class CoordinatedController:
         NotFiniteError
             A measurement is not finite.
         """
-        state = self._state(measured, q, qdot)
+        state = self._known_state(measured, q, qdot)
         if state is None:
-            commanded = self._stopping(q, qdot)
+            commanded = self._braking_command(q, qdot)
         else:
             if self.profile is None:
                 self.profile = StepReference(
-                    self._present(time, state), self._present(time, state), self._motion
+                    self._present_reference(time, state),
+                    self._present_reference(time, state),
+                    self._motion,
                 )
                 self._began = time
             # Evaluated in any case: errors and status are those of the law.
-            commanded = self.law.command(state, self._reference(time))
+            commanded = self.law.command(state, self._reference_at(time))
             if self.coming_to_rest:
                 commanded = self.joint_rate_limits.to_rest(state)
         if state is not None:
-            result = self.limited(state, commanded, self._periods_held(time))
+            result = self.apply_limits(state, commanded, self._periods_held(time))
         else:
             result = self._limits.apply(commanded)
         self._sent = result.realised
         return result
 
-    def limited(self, state: ControlState, commanded: Actuation, periods: int = 1) -> Saturated:
+    def apply_limits(
+        self, state: ControlState, commanded: Actuation, periods: int = 1
+    ) -> Saturated:
         """Return the realised part of a command that is held for some control periods."""
         result = self._limits.apply(commanded)
         kept = self.joint_rate_limits.apply(state, result.realised, self._limits.effort, periods)
         return result if kept is result.realised else Saturated.of(commanded, kept)
 
-    def limited_expression(
+    def limits_expression(
         self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX
     ) -> tuple[ca.SX, ca.SX]:
         """Return the part of ``[f; n; tau]`` (6 + n,) within the actuators' limits, and whether the
-        limits of joint rates lower it further, which only :meth:`limited` can do.
+        limits of joint rates lower it further, which only :meth:`apply_limits` can do.
         """
         realised = self._limits.expression(actuation)
-        return realised, self.joint_rate_limits.lowered(omega, q, qdot, realised)
+        return realised, self.joint_rate_limits.lowering_expression(omega, q, qdot, realised)
 
     @property
     def goal(self) -> Reference:
@@ -269,16 +273,16 @@ class CoordinatedController:
         """
         before, self._commanded_at = self._commanded_at, time
         periods = (time - before) / self._control_period
-        return round(periods) if 1.0 < periods < _MOST_PERIODS else 1
+        return round(periods) if 1.0 < periods < _MAX_HELD_PERIODS else 1
 
-    def _present(self, time: float, state: ControlState) -> Reference:
+    def _present_reference(self, time: float, state: ControlState) -> Reference:
         """Return the present reference; before the first one, the pose of the robot."""
         if self.profile is not None:
             return self.profile.at(time - self._began)
         link = self.law.outputs.selection.end_effector_link
         return Reference.present(self.law.robot, state, link)
 
-    def _reference(self, time: float) -> Reference:
+    def _reference_at(self, time: float) -> Reference:
         assert self.profile is not None
         own, given = self.profile.at(time - self._began), self._followed
         if given.base is None and given.joints is None and given.end_effector is None:
@@ -289,7 +293,9 @@ class CoordinatedController:
             given.joints or own.joints,
         )
 
-    def _state(self, measured: ControlState | None, q: Array, qdot: Array) -> ControlState | None:
+    def _known_state(
+        self, measured: ControlState | None, q: Array, qdot: Array
+    ) -> ControlState | None:
         """Return the measured state, its estimate, or None when it is not known any more."""
         if measured is not None:
             if self._estimator is not None:
@@ -309,7 +315,7 @@ class CoordinatedController:
         self.mode = Mode.ESTIMATED
         return self._estimator.step(self._sent, q, qdot)
 
-    def _stopping(self, q: Array, qdot: Array) -> Actuation:
+    def _braking_command(self, q: Array, qdot: Array) -> Actuation:
         """Return a command with thrusters off and joints to rest, whatever the pose of the base."""
         robot = self.law.robot
         if self._brake is None:

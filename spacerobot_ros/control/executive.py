@@ -76,7 +76,7 @@ class ControlExecutive:
         self._config = config
         self._report, self._warn, self._report_event = report, warn, report_event
         self._file = goal_file if goal_file is not None else GoalFile("", GOAL_KEYS)
-        self._longest_gap = max(_GAP, _GAP_PERIODS * config.control_period)
+        self._longest_gap = max(_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS * config.control_period)
         self.reset()
 
     def reset(self) -> None:
@@ -255,12 +255,16 @@ class ControlExecutive:
             A measurement is not finite.
         """
         if self._time is not None and not 0 <= time - self._time <= self._longest_gap:
-            self._shift_time(time - self._time)
+            # Time has jumped: the goal continues as if it had not.
+            jump = time - self._time
+            self.controller.shift_time(jump)
+            self._monitor.shift_time(jump)
+            self._next_report += jump
         self._time = time
         self._guided = reference is not None
         if measured is not None:
             if self._abort_requested or self._hold_here or self.plant_blocked:
-                self._hold(time, measured)
+                self._hold_pose(time, measured)
             elif self._begin_anew:
                 self.controller.begin_anew(time, measured)
                 self._monitor.settle_anew()
@@ -268,7 +272,7 @@ class ControlExecutive:
             self._begin_anew = False
             too_fast = self.controller.coming_to_rest and self._monitor.fast_states
             if self._pending and not too_fast:
-                self._begin(time, measured)
+                self._begin_goals(time, measured)
             self._watch_rates(qdot)
         if reference is not None:
             self.controller.follow(reference)
@@ -281,9 +285,9 @@ class ControlExecutive:
         if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
             at_rest = self.controller.reference_at_rest(time)
             errors = self.controller.errors()
-            decision = self._monitor.outcome(time, at_rest, errors, self._config)
+            decision = self._monitor.decide_by_errors(time, at_rest, errors, self._config)
             if decision != Decision.NONE:
-                self._goal_state, kind = _DECIDED[Decision(int(decision))]
+                self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
                 self._file.delete()
                 self._decided(kind, self._message(self._goal_state), self._goal_state)
         state = self.state
@@ -302,13 +306,15 @@ class ControlExecutive:
 
     def _watch_rates(self, qdot: Array) -> None:
         """Give up if a joint stays far beyond its rate: its motor does not master it."""
-        lost = self._monitor.rates_lost(self.controller.joint_rate_limits.largest_share(qdot))
+        lost = self._monitor.check_rates(self.controller.joint_rate_limits.largest_rate_share(qdot))
         if not lost or self._not_in_charge:
             return
         rates = self.controller.joint_rate_limits.rates
         joint = int(np.argmax(np.abs(qdot) / rates))
         name = self.controller.law.robot.joint_names[joint]
-        self._lose(f"joint '{name}' moves at {qdot[joint]:.3g}/s instead of {rates[joint]:.3g}/s")
+        self._lose_control(
+            f"joint '{name}' moves at {qdot[joint]:.3g}/s instead of {rates[joint]:.3g}/s"
+        )
 
     def _watch_errors(self) -> None:
         """Give up if the errors grow far beyond the distance of the goal."""
@@ -318,28 +324,22 @@ class ControlExecutive:
             margins = self._config.error_margin
             self._error_bounds = self.controller.error_bounds(margins.as_errors())
         share = self.controller.law.largest_error_share(self._error_bounds)
-        if self._monitor.errors_lost(share):
+        if self._monitor.check_errors(share):
             away = self.controller.distance_from_reference()
-            self._lose(f"the errors grow, the robot is {away} from the reference")
+            self._lose_control(f"the errors grow, the robot is {away} from the reference")
 
     @property
     def _not_in_charge(self) -> bool:
         """Whether the robot moves for another reason than the goals of this controller."""
         return bool(self._guided or self.plant_blocked or self.controller.coming_to_rest)
 
-    def _lose(self, why: str) -> None:
+    def _lose_control(self, why: str) -> None:
         """Give up every goal, and bring the robot to rest."""
         self._give_up(f"Aborted: control is lost, {why}; the robot is brought to rest.")
         self.controller.come_to_rest()
         self._report_abort()
 
-    def _shift_time(self, seconds: float) -> None:
-        """Continue the goal as if time had not jumped."""
-        self.controller.shift_time(seconds)
-        self._monitor.shift_time(seconds)
-        self._next_report += seconds
-
-    def _hold(self, time: float, state: ControlState) -> None:
+    def _hold_pose(self, time: float, state: ControlState) -> None:
         """Hold the measured pose, after an abort or when the plant obeys again."""
         self.controller.hold_here(time, state)
         if self._abort_requested:
@@ -348,7 +348,7 @@ class ControlExecutive:
             self._goal_state, self._goal_id = ControllerState.HOLDING, ""
         self._abort_requested = self._hold_here = False
 
-    def _begin(self, time: float, state: ControlState) -> None:
+    def _begin_goals(self, time: float, state: ControlState) -> None:
         """Start towards the goals that are pending."""
         self._goal_id = self._latest_id()
         goals = {key: pending.goal for key, pending in self._pending.items()}
@@ -368,11 +368,11 @@ class ControlExecutive:
         self._monitor.begin(time)
         self._next_report, self._error_bounds = time, None
         try:
-            self._file.save(self._pursued())
+            self._file.save(self._goals_to_save())
         except ParameterError as error:
             self._warn(f"{error} The goal is pursued, but not resumed after a restart.")
 
-    def _pursued(self) -> dict[str, IdentifiedGoal]:
+    def _goals_to_save(self) -> dict[str, IdentifiedGoal]:
         """Return the goals of all controlled poses, to resume with."""
         goal, selection = self.controller.goal, self.controller.law.outputs.selection
         shape = goal.joints.q if goal.joints is not None and selection.joints else None
@@ -427,10 +427,10 @@ def decided_message(state: ControllerState, distance: OutputDistance) -> str:
     return f"The goal is {'reached' if reached else 'not reached in time'}: {distance} from it."
 
 
-_GAP, _GAP_PERIODS = 1.0, 10
+_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
 """Longest time between two states, s, or in control periods; a longer one is a jump of time."""
 
-_DECIDED = {
+_STATE_AND_EVENT_OF_DECISION = {
     Decision.REACHED: (ControllerState.REACHED, EventKind.GOAL_REACHED),
     Decision.FAILED: (ControllerState.FAILED, EventKind.GOAL_FAILED),
 }

@@ -26,7 +26,7 @@ LOST_STATES = 3
 _ROUNDING = 1e-9
 """Largest rounding of a sum of control periods, s."""
 
-_OUTSIDE = -1.0
+_NOT_WITHIN = -1.0
 """Value of ``within_since`` while an error is beyond its tolerance."""
 
 
@@ -58,24 +58,24 @@ class GoalMonitor:
     """
 
     started: Scalar = 0.0
-    within_since: Scalar = _OUTSIDE
+    within_since: Scalar = _NOT_WITHIN
     fast_states: Scalar = 0
     astray_states: Scalar = 0
 
     def begin(self, time: Scalar) -> None:
         """Begin a goal at a time (s); joints that are too fast stay so."""
-        self.started, self.within_since, self.astray_states = time, _OUTSIDE, 0
+        self.started, self.within_since, self.astray_states = time, _NOT_WITHIN, 0
 
     def settle_anew(self) -> None:
         """Begin the settling time again."""
-        self.within_since = _OUTSIDE
+        self.within_since = _NOT_WITHIN
 
     def shift_time(self, seconds: Scalar) -> None:
         """Discount a jump of time (s), which is no progress of the goal."""
         self.started += seconds
         self.settle_anew()
 
-    def rates_lost(self, largest_share: Scalar) -> Scalar:
+    def check_rates(self, largest_share: Scalar) -> Scalar:
         """Count a state by its largest joint rate, as a share of that joint's limit.
 
         Returns whether joints were beyond :data:`LOST_RATE` in :data:`LOST_STATES` states.
@@ -83,7 +83,7 @@ class GoalMonitor:
         self.fast_states = (largest_share > LOST_RATE) * (self.fast_states + 1)
         return self.fast_states >= LOST_STATES
 
-    def errors_lost(self, largest_share: Scalar) -> Scalar:
+    def check_errors(self, largest_share: Scalar) -> Scalar:
         """Count a state by its largest error, as a share of that error's bound.
 
         Returns whether errors were beyond their bounds in :data:`LOST_STATES` states.
@@ -91,7 +91,7 @@ class GoalMonitor:
         self.astray_states = (largest_share > 1.0) * (self.astray_states + 1)
         return self.astray_states >= LOST_STATES
 
-    def outcome(
+    def decide_by_errors(
         self, time: Scalar, at_rest: Scalar, errors: Errors, config: ControllerConfig
     ) -> Scalar:
         """Return the :class:`Decision` about a goal under control, by the errors of a state.
@@ -116,13 +116,13 @@ class GoalMonitor:
         )
         was_within = self.within_since >= 0
         since = was_within * self.within_since + (1 - was_within) * time
-        self.within_since = within * since + (1 - within) * _OUTSIDE
+        self.within_since = within * since + (1 - within) * _NOT_WITHIN
         settled = within * (time - since >= config.settle_time - _ROUNDING)
         late = time - self.started >= config.time_limit - _ROUNDING
         failed = (1 - settled) * late if config.time_limit else 0
         return settled * Decision.REACHED + failed * Decision.FAILED
 
-    def decision(
+    def decide(
         self,
         time: Scalar,
         at_rest: Scalar,
@@ -131,8 +131,8 @@ class GoalMonitor:
         error_share: Scalar,
         config: ControllerConfig,
     ) -> Scalar:
-        """Return the :class:`Decision` by one state: lost, or else :meth:`outcome`."""
-        rates, lost = self.rates_lost(rate_share), self.errors_lost(error_share)
+        """Return the :class:`Decision` by one state: lost, or else :meth:`decide_by_errors`."""
+        rates, lost = self.check_rates(rate_share), self.check_errors(error_share)
         controlled = (1 - rates) * (1 - lost)
-        outcome = self.outcome(time, at_rest, errors, config)
+        outcome = self.decide_by_errors(time, at_rest, errors, config)
         return (1 - controlled) * Decision.LOST + controlled * outcome

@@ -21,19 +21,19 @@ from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
-_SHARE = 0.5
+_REFERENCE_THRUST_SHARE = 0.5
 """Share of the thrust for references; feedback and errors of the masses need the rest."""
 
 
-_PERIODS = 2
+_MIN_PERIODS_TO_LIMIT = 2
 """Shortest time in which a joint may reach its largest rate, in control periods: neither the held
 efforts nor the next ones may carry it beyond, even if the model is slightly wrong."""
 
-_FREE = 0.5
+_SLOW_RATE_SHARE = 0.5
 """Share of a joint's largest rate up to which, after the next period, its dynamics are not
 evaluated."""
 
-_SHAPES = 16
+_MOBILITY_SHAPES = 16
 """Number of random shapes for the estimate of each joint's largest mobility."""
 
 _REST_RATE = 2.0
@@ -83,16 +83,16 @@ class MotionLimits:
         force at the base needs if the centre of mass is elsewhere. Without thrusters nothing is
         lowered.
         """
-        torque = _SHARE * actuators.torque
+        force, torque = (_REFERENCE_THRUST_SHARE * x for x in (actuators.force, actuators.torque))
         lever = float(np.linalg.norm(robot.center_of_mass(q)))
-        accelerations = [self.acceleration, _SHARE * actuators.force / robot.total_mass]
+        accelerations = [self.acceleration, force / robot.total_mass]
         if lever > 0:
             accelerations.append(torque / (robot.total_mass * lever))
         inertia = float(np.linalg.eigvalsh(robot.inertia_matrix(q)[3:6, 3:6])[-1])
         return replace(
             self,
-            acceleration=_smallest(accelerations),
-            angular_acceleration=_smallest([self.angular_acceleration, torque / inertia]),
+            acceleration=_smallest_positive(accelerations),
+            angular_acceleration=_smallest_positive([self.angular_acceleration, torque / inertia]),
         )
 
 
@@ -152,8 +152,8 @@ class ActuatorLimits:
         """Return the command within the limits."""
         wrench = np.concatenate(
             [
-                _scaled(commanded.wrench_B[:3], self.force),
-                _scaled(commanded.wrench_B[3:], self.torque),
+                _limit_norm(commanded.wrench_B[:3], self.force),
+                _limit_norm(commanded.wrench_B[3:], self.torque),
             ]
         )
         tau = np.clip(commanded.tau, -self.effort, self.effort)
@@ -169,12 +169,12 @@ class ActuatorLimits:
         return ca.vertcat(*parts, ca.fmin(ca.fmax(actuation[6:], -self.effort), self.effort))
 
 
-def _scaled(vector: Array, limit: float) -> Array:
+def _limit_norm(vector: Array, limit: float) -> Array:
     size = math.sqrt(vector.dot(vector))
     return vector if size <= limit else vector * (limit / size)
 
 
-def _smallest(accelerations: list[float]) -> float:
+def _smallest_positive(accelerations: list[float]) -> float:
     return min(a for a in accelerations if a > 0 and math.isfinite(a))
 
 
@@ -205,9 +205,9 @@ class JointRateLimits:
         self._control_period = control_period
         self._rest_rate = min(_REST_RATE, _REST_RATE_PER_PERIOD / control_period)
         self._dynamics = BufferedFunction(_joint_dynamics(robot))
-        self._per_rate = 1 / (_FREE * self.rates)
+        self._per_rate = 1 / (_SLOW_RATE_SHARE * self.rates)
         self._inverse = (1 / self.rates).tolist()
-        self._per_effort = self._mobilities() * control_period * self._per_rate
+        self._per_effort = self._largest_mobilities() * control_period * self._per_rate
 
     def apply(
         self, state: ControlState, given: Actuation, effort: Array, periods: int = 1
@@ -220,20 +220,20 @@ class JointRateLimits:
         gained = np.abs(given.tau) * (periods * self._per_effort)
         if not (np.abs(state.qdot) * self._per_rate + gained).max(initial=0.0) > 1.0:
             return given
-        Js, Fs, G = self._at(state)
+        Js, Fs, G = self._evaluate_dynamics(state)
         pushed = G @ given.wrench_B
         qddot = np.linalg.solve(Js, given.tau + pushed - Fs)
-        soonest = _PERIODS * periods * self._control_period
+        soonest = _MIN_PERIODS_TO_LIMIT * periods * self._control_period
         lowest = (-self.rates - state.qdot) / soonest
         highest = (self.rates - state.qdot) / soonest
         if np.all((lowest <= qddot) & (qddot <= highest)):
             return given
         wanted = Js @ np.clip(qddot, lowest, highest) + Fs
-        share = _largest_share(wanted, pushed, effort)
+        share = _bearable_push_share(wanted, pushed, effort)
         tau = np.clip(wanted - share * pushed, -effort, effort)
         return Actuation(share * given.wrench_B, tau)
 
-    def lowered(self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX) -> ca.SX:
+    def lowering_expression(self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX) -> ca.SX:
         """Return whether :meth:`apply` changes the command ``[f; n; tau]`` (6 + n,)."""
         if not np.isfinite(self.rates).any():
             return ca.SX(0)
@@ -244,7 +244,7 @@ class JointRateLimits:
         flat, Fs, columns = self._dynamics.function(q, omega, qdot)
         Js, G = ca.reshape(flat, n, n).T, ca.reshape(columns, 6, n).T
         qddot = solve_positive_definite(Js, tau + G @ actuation[:6] - Fs)
-        soonest = _PERIODS * self._control_period
+        soonest = _MIN_PERIODS_TO_LIMIT * self._control_period
         beyond = []
         for i, rate in enumerate(self.rates.tolist()):
             if np.isfinite(rate):
@@ -252,7 +252,7 @@ class JointRateLimits:
                 beyond.append(ca.logic_or(qddot[i] < lowest, qddot[i] > highest))
         return ca.logic_and(near > 0, ca.sum1(ca.vertcat(*beyond)) > 0)
 
-    def largest_share(self, qdot: Array) -> float:
+    def largest_rate_share(self, qdot: Array) -> float:
         """Return the largest of rates (n,) as a share of its limit."""
         # Python numbers: arrays of a few joints take longer, and every state calls this.
         share = 0.0
@@ -274,10 +274,10 @@ class JointRateLimits:
         torque = -r * (H[3:6, 3:6] @ state.omega_WB_B + H[3:6, 6:] @ state.qdot)
         # A force at the base has a moment about the center of mass.
         wrench = np.concatenate([force, torque + np.cross(robot.center_of_mass(state.q), force)])
-        Js, Fs, G = self._at(state)
+        Js, Fs, G = self._evaluate_dynamics(state)
         return Actuation(wrench, -r * (Js @ state.qdot) + Fs - G @ wrench)
 
-    def _at(self, state: ControlState) -> tuple[Array, Array, Array]:
+    def _evaluate_dynamics(self, state: ControlState) -> tuple[Array, Array, Array]:
         inputs = self._dynamics.inputs
         inputs[0][:], inputs[1][:], inputs[2][:] = state.q, state.omega_WB_B, state.qdot
         self._dynamics.evaluate()
@@ -285,20 +285,20 @@ class JointRateLimits:
         n = self._robot.n
         return Js.reshape((n, n)), Fs, G.reshape((n, 6))
 
-    def _mobilities(self) -> Array:
+    def _largest_mobilities(self) -> Array:
         """Return the largest acceleration (n,) of each joint by an effort of one of its own."""
         n, rng = self._robot.n, np.random.default_rng(1)
         lower = np.maximum(self._robot.lower, -np.pi)
         upper = np.maximum(np.minimum(self._robot.upper, np.pi), lower)
         zero, largest = np.zeros(3), np.zeros(n)
-        for shape in rng.uniform(0.0, 1.0, (_SHAPES, n)):
+        for shape in rng.uniform(0.0, 1.0, (_MOBILITY_SHAPES, n)):
             q = lower + shape * (upper - lower)
-            Js, _, _ = self._at(ControlState(zero, zero, zero, zero, q, np.zeros(n)))
+            Js, _, _ = self._evaluate_dynamics(ControlState(zero, zero, zero, zero, q, np.zeros(n)))
             largest = np.maximum(largest, np.diag(np.linalg.inv(Js)))
         return largest
 
 
-def _largest_share(wanted: Array, pushed: Array, effort: Array) -> float:
+def _bearable_push_share(wanted: Array, pushed: Array, effort: Array) -> float:
     """Return the largest share in [0, 1] of a push with which ``wanted`` is within efforts.
 
     Zero if there is none: motors that cannot brake joints are not loaded further.

@@ -40,7 +40,7 @@ from spacerobot_ros.model.symbolic_rotations import (
 AXES: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
 """Components in W of a position and of a rotation."""
 
-_PARALLEL = 1e-6
+_PARALLEL_TOLERANCE = 1e-6
 """Sine of the largest angle between axes that count as parallel."""
 
 
@@ -157,7 +157,7 @@ def default_selection(description: RobotDescription, end_effector_link: str) -> 
     point: tuple[str, ...] = AXES[:3]
     fewest = 3
     normal = plane_normal(description)
-    if normal is not None and np.max(np.abs(normal)) > 1 - _PARALLEL:
+    if normal is not None and np.max(np.abs(normal)) > 1 - _PARALLEL_TOLERANCE:
         along = int(np.argmax(np.abs(normal)))
         point = tuple(axis for i, axis in enumerate(AXES[:3]) if i != along)
         base, fewest = (*point, AXES[3 + along]), 2
@@ -189,19 +189,19 @@ def plane_normal(description: RobotDescription) -> Array | None:
             slides.append(axis)
         elif normal is None:
             normal = axis
-        elif np.linalg.norm(np.cross(normal, axis)) > _PARALLEL:
+        elif np.linalg.norm(np.cross(normal, axis)) > _PARALLEL_TOLERANCE:
             return None
-    if normal is None or any(abs(normal @ slide) > _PARALLEL for slide in slides):
+    if normal is None or any(abs(normal @ slide) > _PARALLEL_TOLERANCE for slide in slides):
         return None
     return normal
 
 
-_POSE_REFERENCE = 19
+_POSE_REFERENCE_SIZE = 19
 """Numbers of a pose reference: position 3, quaternion 4, two velocities and two accelerations."""
 
 
 @dataclass(frozen=True)
-class _Group:
+class _OutputGroup:
     """Outputs of one kind: error, error rate, wanted acceleration, rows of J_z, bias."""
 
     error: ca.SX
@@ -210,8 +210,8 @@ class _Group:
     J: ca.SX
     bias: ca.SX
 
-    def rows(self, chosen: list[int]) -> _Group:
-        return _Group(
+    def rows(self, chosen: list[int]) -> _OutputGroup:
+        return _OutputGroup(
             self.error[chosen],
             self.error_rate[chosen],
             self.acceleration[chosen],
@@ -276,12 +276,12 @@ class OutputVector:
         groups = []
         references = []
         if selection.base:
-            target = ca.SX.sym("base_reference", _POSE_REFERENCE)
+            target = ca.SX.sym("base_reference", _POSE_REFERENCE_SIZE)
             references.append(target)
             pose = self._pose_group(J_base, r_WB, self._quaternion, target)
             groups.append(pose.rows([AXES.index(axis) for axis in selection.base]))
         if selection.end_effector:
-            target = ca.SX.sym("end_effector_reference", _POSE_REFERENCE)
+            target = ca.SX.sym("end_effector_reference", _POSE_REFERENCE_SIZE)
             references.append(target)
             pose = self._end_effector_group(r_WB, target)
             groups.append(pose.rows([AXES.index(axis) for axis in selection.end_effector]))
@@ -349,7 +349,9 @@ class OutputVector:
     def _link_jacobian(self, link: str) -> ca.SX:
         return self.model(f"jacobian:{link}", self.q)
 
-    def _pose_group(self, J_B: ca.SX, position: ca.SX, quaternion: ca.SX, target: ca.SX) -> _Group:
+    def _pose_group(
+        self, J_B: ca.SX, position: ca.SX, quaternion: ca.SX, target: ca.SX
+    ) -> _OutputGroup:
         """Build the six outputs of a frame from its Jacobian in base components."""
         R = self._R_WB
         p_des, quaternion_des, v_des, omega_des, a_des, alpha_des = ca.vertsplit(
@@ -366,7 +368,7 @@ class OutputVector:
         ]
         J = ca.vertcat(R @ J_B[:3, :], R @ J_B[3:, :])
         velocity = J @ self.z0dot
-        return _Group(
+        return _OutputGroup(
             ca.vertcat(p_des - position, rotation_error(quaternion, quaternion_des)),
             ca.vertcat(v_des, omega_des) - velocity,
             ca.vertcat(a_des, alpha_des),
@@ -374,7 +376,7 @@ class OutputVector:
             ca.vertcat(*bias),
         )
 
-    def _end_effector_group(self, r_WB: ca.SX, target: ca.SX) -> _Group:
+    def _end_effector_group(self, r_WB: ca.SX, target: ca.SX) -> _OutputGroup:
         link = self.selection.end_effector_link
         _, r_BL = self.model("link_poses", self.q)
         position = r_WB + self._R_WB @ r_BL[:, self.robot.link_names.index(link)]
@@ -382,11 +384,11 @@ class OutputVector:
         quaternion = quaternion_multiply(self._quaternion, attitude)
         return self._pose_group(self._link_jacobian(link), position, quaternion, target)
 
-    def _joint_group(self, target: ca.SX) -> _Group:
+    def _joint_group(self, target: ca.SX) -> _OutputGroup:
         n = self.robot.n
         q_des, qdot_des, qddot_des = ca.vertsplit(target, [0, n, 2 * n, 3 * n])
         J = ca.horzcat(ca.SX(n, 6), ca.SX.eye(n))
-        return _Group(q_des - self.q, qdot_des - self.qdot, qddot_des, J, ca.SX(n, 1))
+        return _OutputGroup(q_des - self.q, qdot_des - self.qdot, qddot_des, J, ca.SX(n, 1))
 
 
 def _pose_parts(frame: str, pose: PoseReference | None) -> list[Array]:

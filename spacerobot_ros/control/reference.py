@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -24,10 +24,10 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 
-_PEAK_RATE = 15 / 8
+_QUINTIC_PEAK_RATE = 15 / 8
 """Largest ds/dt of the quintic over one second."""
 
-_PEAK_ACCELERATION = 10 / math.sqrt(3)
+_QUINTIC_PEAK_ACCELERATION = 10 / math.sqrt(3)
 """Largest d2s/dt2 of the quintic over one second."""
 
 
@@ -124,14 +124,14 @@ class QuinticReference(ReferenceProfile):
         if goal.joints is not None and start.joints is not None:
             self._joints = goal.joints.q - start.joints.q
         needs = [
-            _shortest(float(abs(d)), limits.joint_speed, limits.joint_acceleration)
+            _quintic_duration(float(abs(d)), limits.joint_speed, limits.joint_acceleration)
             for d in self._joints
         ]
         for line in (self._base, self._end_effector):
             if line is not None:
-                needs.append(_shortest(line.length, limits.speed, limits.acceleration))
+                needs.append(_quintic_duration(line.length, limits.speed, limits.acceleration))
                 needs.append(
-                    _shortest(line.angle, limits.angular_speed, limits.angular_acceleration)
+                    _quintic_duration(line.angle, limits.angular_speed, limits.angular_acceleration)
                 )
         self.duration = max(needs, default=0.0)
 
@@ -139,11 +139,7 @@ class QuinticReference(ReferenceProfile):
         """Return the reference ``time`` s after its start; before it, that at the start."""
         if time >= self.duration:
             return self.goal
-        T = self.duration
-        u = max(time, 0.0) / T
-        s = u**3 * (10 + u * (6 * u - 15))
-        rate = 30 * u**2 * (1 - u) ** 2 / T
-        acceleration = 60 * u * (1 - u) * (1 - 2 * u) / T**2
+        s, rate, acceleration = _quintic(max(time, 0.0) / self.duration, self.duration)
         joints = None
         if self.start.joints is not None and self.goal.joints is not None:
             d = self._joints
@@ -153,6 +149,12 @@ class QuinticReference(ReferenceProfile):
             None if self._end_effector is None else self._end_effector.at(s, rate, acceleration),
             joints,
         )
+
+
+def _quintic(u: Any, T: Any) -> tuple[Any, Any, Any]:
+    """Return ``s`` at ``u = t / T``, its rate (1/s) and acceleration (1/s^2)."""
+    s = u**3 * (10 + u * (6 * u - 15))
+    return s, 30 * u**2 * (1 - u) ** 2 / T, 60 * u * (1 - u) * (1 - 2 * u) / T**2
 
 
 def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n: int) -> Array:
@@ -187,10 +189,7 @@ def profile_expression(
     """
     sizes = _profile_sizes(base, end_effector, n)
     duration, *rest = ca.vertsplit(numbers, np.cumsum([0, *sizes]).tolist())
-    u = ca.fmax(time, 0) / duration
-    s = u**3 * (10 + u * (6 * u - 15))
-    rate = 30 * u**2 * (1 - u) ** 2 / duration
-    acceleration = 60 * u * (1 - u) * (1 - 2 * u) / duration**2
+    s, rate, acceleration = _quintic(ca.fmax(time, 0) / duration, duration)
     moving, resting = [], []
     for k in range(base + end_effector):
         r, d, quaternion, half_turn, turn_W, angle, goal, attitude = rest[8 * k : 8 * k + 8]
@@ -284,8 +283,9 @@ class _PoseLine:
         )
 
 
-def _shortest(distance: float, speed: float, acceleration: float) -> float:
+def _quintic_duration(distance: float, speed: float, acceleration: float) -> float:
     """Return the shortest duration (s) of a quintic over a distance within its limits."""
     return max(
-        _PEAK_RATE * distance / speed, math.sqrt(_PEAK_ACCELERATION * distance / acceleration)
+        _QUINTIC_PEAK_RATE * distance / speed,
+        math.sqrt(_QUINTIC_PEAK_ACCELERATION * distance / acceleration),
     )

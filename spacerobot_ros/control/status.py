@@ -8,7 +8,7 @@ from enum import Enum
 
 from spacerobot_ros.errors import SpaceRobotError
 
-_ERROR = "error."
+_ERROR_PREFIX = "error."
 """Prefix of the keys of output errors."""
 
 
@@ -102,9 +102,10 @@ class ControllerStatus:
         if self.command is not None:
             values["law"] = self.command.law
             values["singular"] = str(self.command.singular).lower()
-            values.update((name, f"{getattr(self.command, name):.6g}") for name in _NUMBERS)
+            values.update((name, f"{getattr(self.command, name):.6g}") for name in _NUMBER_KEYS)
             values.update(
-                (f"{_ERROR}{label}", f"{error:.6g}") for label, error in self.command.errors.items()
+                (f"{_ERROR_PREFIX}{label}", f"{error:.6g}")
+                for label, error in self.command.errors.items()
             )
         return values
 
@@ -123,11 +124,11 @@ class ControllerStatus:
                 command = CommandReport(
                     law=values["law"],
                     singular=values["singular"] == "true",
-                    **{name: float(values[name]) for name in _NUMBERS},
+                    **{name: float(values[name]) for name in _NUMBER_KEYS},
                     errors={
-                        key.removeprefix(_ERROR): float(value)
+                        key.removeprefix(_ERROR_PREFIX): float(value)
                         for key, value in values.items()
-                        if key.startswith(_ERROR)
+                        if key.startswith(_ERROR_PREFIX)
                     },
                 )
             state = ControllerState(values["state"])
@@ -136,7 +137,13 @@ class ControllerStatus:
             raise SpaceRobotError(f"This is no status of a controller: {error}.") from error
 
 
-_NUMBERS = ("smallest_singular_value", "damping", "lost_force_N", "lost_torque_Nm", "lost_effort")
+_NUMBER_KEYS = (
+    "smallest_singular_value",
+    "damping",
+    "lost_force_N",
+    "lost_torque_Nm",
+    "lost_effort",
+)
 """Values of a command report that are one number each."""
 
 

@@ -35,11 +35,16 @@ STANDARD_GRAVITY = 9.80665
 IN_URDF = "urdf"
 """Source of a table in the robot's URDF."""
 
-_LARGEST = 1e12
+_MAX_TABLE_NUMBER = 1e12
 """Largest number in a table, in SI units."""
 
-_AXES = ("force along x", "force along y", "force along z", *(f"torque about {x}" for x in "xyz"))
-_KEYS = {"name", "link", "position", "rpy", "direction", "force", "min_on_time", "isp"}
+_WRENCH_AXES = (
+    "force along x",
+    "force along y",
+    "force along z",
+    *(f"torque about {x}" for x in "xyz"),
+)
+_THRUSTER_KEYS = {"name", "link", "position", "rpy", "direction", "force", "min_on_time", "isp"}
 
 COST_WEIGHT = 1e-5
 """Weight of the cost relative to the wrench. The cost takes some 1e-10 from the wrench, which is
@@ -49,7 +54,7 @@ TIE_BREAK = 0.01
 """Largest relative change of a cost. Thrusters placed symmetrically have many allocations
 of the same cost, among which rounding, which differs between machines, would choose."""
 
-_ACHIEVED = 1e-9
+_ACHIEVED_TOLERANCE = 1e-9
 """Largest relative error of a wrench that counts as achieved."""
 
 _WRENCH_WEIGHT = 1e4
@@ -58,7 +63,7 @@ _WRENCH_WEIGHT = 1e4
 _ROUNDING = 1e-9
 """Shorter parts of a time count as zero."""
 
-_UNMET = 1e-6
+_MIN_UNMET_WRENCH = 1e-6
 """Smaller parts of a wrench are not counted as missing, N or N m."""
 
 
@@ -120,7 +125,7 @@ class ThrusterTable:
         wrenches = self.wrenches[:, kept]
         wrenches = wrenches / np.linalg.norm(wrenches, axis=0)
         lacking = []
-        for axis, name in enumerate(_AXES):
+        for axis, name in enumerate(_WRENCH_AXES):
             for sign, text in ((1.0, name), (-1.0, f"negative {name}")):
                 wanted = np.zeros(6)
                 wanted[axis] = sign
@@ -219,23 +224,23 @@ def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription
         if not name or name in names:
             problem = "is used twice; names are unique" if name else "is missing"
             raise ParameterError(f"The name of {where if name else 'a thruster'} {problem}.")
-        unknown = sorted(set(entry) - _KEYS)
+        unknown = sorted(set(entry) - _THRUSTER_KEYS)
         if unknown:
             raise ParameterError(
-                f"The {where} has '{unknown[0]}'; known are {', '.join(sorted(_KEYS))}."
+                f"The {where} has '{unknown[0]}'; known are {', '.join(sorted(_THRUSTER_KEYS))}."
             )
-        mount = _mount(str(entry.get("link", robot.base_link)), robot, where)
+        mount = _pose_of_link(str(entry.get("link", robot.base_link)), robot, where)
         frame = Pose(
-            matrix_from_rpy(_vector(entry, "rpy", where, (0.0, 0.0, 0.0))),
-            _vector(entry, "position", where),
+            matrix_from_rpy(_read_vector(entry, "rpy", where, (0.0, 0.0, 0.0))),
+            _read_vector(entry, "position", where),
         )
         pose = mount @ frame
-        direction = _vector(entry, "direction", where, (1.0, 0.0, 0.0))
+        direction = _read_vector(entry, "direction", where, (1.0, 0.0, 0.0))
         length = float(np.linalg.norm(direction))
         if length < 1e-9:
             raise ParameterError(f"The direction of {where} is zero; say which way it pushes.")
         numbers = [
-            _number(entry, key, where, positive=key != "min_on_time")
+            _read_number(entry, key, where, positive=key != "min_on_time")
             for key in ("force", "min_on_time", "isp")
         ]
         names.append(name)
@@ -246,7 +251,7 @@ def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription
     )
 
 
-def _mount(link: str, robot: RobotDescription, where: str) -> Pose:
+def _pose_of_link(link: str, robot: RobotDescription, where: str) -> Pose:
     if link not in robot.frames:
         raise ParameterError(f"The link of {where} is '{link}', but there is no such link.")
     body, pose = robot.frames[link]
@@ -258,7 +263,7 @@ def _mount(link: str, robot: RobotDescription, where: str) -> Pose:
     return pose
 
 
-def _vector(
+def _read_vector(
     entry: Mapping[str, Any], key: str, where: str, default: Sequence[float] | None = None
 ) -> Array:
     try:
@@ -266,24 +271,24 @@ def _vector(
     except (TypeError, ValueError):
         vector = np.empty(0)
     # Larger numbers are slips, and their squares overflow.
-    if vector.shape != (3,) or not np.all(np.abs(vector) <= _LARGEST):
+    if vector.shape != (3,) or not np.all(np.abs(vector) <= _MAX_TABLE_NUMBER):
         raise ParameterError(
             f"The {key} of {where} is {entry.get(key, 'missing')}; it must be three finite numbers "
-            f"of at most {_LARGEST:g}."
+            f"of at most {_MAX_TABLE_NUMBER:g}."
         )
     return vector
 
 
-def _number(entry: Mapping[str, Any], key: str, where: str, *, positive: bool) -> float:
+def _read_number(entry: Mapping[str, Any], key: str, where: str, *, positive: bool) -> float:
     given = entry.get(key, None if positive else 0.0)
     try:
         value = float(given)
     except (TypeError, ValueError):
         value = math.nan
-    if not 0 <= value <= _LARGEST or (positive and value < 1 / _LARGEST):
+    if not 0 <= value <= _MAX_TABLE_NUMBER or (positive and value < 1 / _MAX_TABLE_NUMBER):
         wanted = "a positive number" if positive else "zero or more"
-        if value > _LARGEST:
-            wanted += f" up to {_LARGEST:g}"
+        if value > _MAX_TABLE_NUMBER:
+            wanted += f" up to {_MAX_TABLE_NUMBER:g}"
         raise ParameterError(
             f"The {key} of {where} is {'missing' if given is None else given}; it must be {wanted}."
         )
@@ -362,17 +367,17 @@ class ThrusterAllocation:
         if size > 0.0 and self._usable.size:
             target = target / size
             share, _ = self._nnls(self._extended, np.append(target, 0.0))
-            share = self._corrected(share, target, share > 0.0)
+            share = self._correct_levels(share, target, share > 0.0)
             bounds = most[self._usable] / size
             if np.any(share > bounds):
                 achieved = self._columns @ share
-                if np.linalg.norm(achieved - target) > _ACHIEVED:
+                if np.linalg.norm(achieved - target) > _ACHIEVED_TOLERANCE:
                     target = achieved
                 share = self._largest_part(target, bounds)
             levels[self._usable] = np.minimum(size * share, most[self._usable])
         return Allocation(levels, self._wrenches @ levels)
 
-    def _corrected(self, levels: Array, target: Array, free: npt.NDArray[np.bool_]) -> Array:
+    def _correct_levels(self, levels: Array, target: Array, free: npt.NDArray[np.bool_]) -> Array:
         """Return levels, at least zero, of which the free ones remove the error from the target."""
         columns = self._columns[:, free]
         corrected = levels.copy()
@@ -389,7 +394,7 @@ class ThrusterAllocation:
         solution = linprog(cost, A_eq=equations, b_eq=np.zeros(6), bounds=limits).x
         levels, part = solution[:-1], solution[-1]
         inside = (levels > 0.0) & (levels < bounds)
-        return np.minimum(self._corrected(levels, part * target, inside), bounds)
+        return np.minimum(self._correct_levels(levels, part * target, inside), bounds)
 
 
 class ThrusterModulator:
@@ -492,7 +497,7 @@ class ThrusterModulator:
         wanted = self.pending_impulse + h * wrench
         shares = self.allocation.allocate(wanted, self._shortest + h - self._remaining)
         self.unmet[:] = (wanted - shares.achieved) / h
-        self.unmet_periods += bool(np.any(np.abs(self.unmet) > _UNMET))
+        self.unmet_periods += bool(np.any(np.abs(self.unmet) > _MIN_UNMET_WRENCH))
         self._pulses.inputs[0][:] = shares.levels
         self._pulses.evaluate()
         on_time, added, remaining, opened, begun = self._pulses.outputs

@@ -193,7 +193,7 @@ def test_narrower_registers_give_the_same_flights(
     robots: dict[str, SpaceRobot], monkeypatch: pytest.MonkeyPatch, unit: str
 ) -> None:
     widest = native.vector_unit()
-    chosen = native._PLAIN if unit == "plain" else native.UNITS[unit]
+    chosen = native._PORTABLE_UNIT if unit == "plain" else native.UNITS[unit]
     if chosen.lanes > widest.lanes:
         pytest.skip(f"this processor has no {chosen.name}")
     monkeypatch.setattr(native, "vector_unit", lambda: chosen)

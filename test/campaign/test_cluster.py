@@ -22,7 +22,7 @@ from support.campaigns import campaign, section
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.running import run_campaign
-from spacerobot_ros.campaign.workers import Cluster, Distribution, open_workers, pack_campaign
+from spacerobot_ros.campaign.workers import Cluster, TaskDistributor, open_workers, pack_campaign
 from spacerobot_ros.version import __version__
 
 pytestmark = pytest.mark.slow
@@ -83,7 +83,7 @@ def started(folder: Path, *command: str, path: Path | None = None) -> Iterator[S
 
 
 def flown(folder: Path) -> int:
-    return len(Dataset(folder).done()) if (folder / "flights").is_dir() else 0
+    return len(Dataset(folder).flown_numbers()) if (folder / "flights").is_dir() else 0
 
 
 def until(folder: Path, count: int, run: Started) -> None:
@@ -263,13 +263,13 @@ def test_what_lanes_leave_is_flown_in_small_tasks(
         disperse={"mass.*": {"norm": {"loc": 1.0, "scale": 0.03}}}, flights=70, set=corrected
     )
     tasks: list[tuple[int, str]] = []
-    deal = Distribution._submit_task
+    deal = TaskDistributor._submit_task
 
     def dealt(self: Any, numbers: list[int], engine: str, **options: Any) -> Any:
         tasks.append((len(numbers), engine))
         return deal(self, numbers, engine, **options)
 
-    monkeypatch.setattr(Distribution, "_submit_task", dealt)
+    monkeypatch.setattr(TaskDistributor, "_submit_task", dealt)
     run_campaign(made, tmp_path / "here", engine="lanes")
     run_campaign(made, tmp_path / "there", engine="lanes", cluster=Cluster(workers=2))
     here, there = (

@@ -19,7 +19,7 @@ from support.chromium import browser, chromium
 
 from spacerobot_ros.campaign import report
 from spacerobot_ros.campaign.comparing import write_comparison
-from spacerobot_ros.campaign.config import Campaign, passed
+from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draw, Draws
 from spacerobot_ros.campaign.report import Results, write_campaign_report
@@ -53,7 +53,7 @@ def filled(
     for draw in (each for each in Draws(made) if flown(each.number)):
         metrics = {"position_error_m": error(draw), "manoeuvre_time_s": 4.0, **others}
         outcome = "reached" if metrics["position_error_m"] < 0.05 else "failed"
-        ok = passed(made.criteria, outcome, metrics)
+        ok = passes_criteria(made.criteria, outcome, metrics)
         left = "needed corrections" if draw.number % 50 == 0 else ""
         rows.append(Row(draw, outcome, f"{outcome}.", metrics, ok, "lanes", left, 0.01, 0.0))
     dataset.add(rows)
@@ -115,11 +115,11 @@ def test_what_grows_to_both_sides_is_found(tmp_path: Path) -> None:
     assert (strongest.cause, strongest.metric) == ("mass.mass_1", "position_error_m")
     assert abs(strongest.correlation) < 0.3
     assert strongest.departure > 0.9
-    x, y = results.drawn["mass.mass_1"], results.columns["position_error_m"]
+    x, y = results.drawn_numbers["mass.mass_1"], results.columns["position_error_m"]
     expected = stats.spearmanr(np.abs(x - np.median(x)), y)
     assert strongest.departure == pytest.approx(expected.statistic)
     assert "distance from the median" in str(strongest)
-    worst = results.worst()
+    worst = results.worst_rows()
     errors = results.columns["position_error_m"]
     assert [errors[row] for row in worst] == sorted(errors, reverse=True)[:10]
 
@@ -131,7 +131,7 @@ def test_the_worst_flights_that_pass_are_those_next_to_their_bounds(tmp_path: Pa
     results = Results.of(filled(tmp_path, made, lambda draw: 0.8 * bowl(draw)))
     assert results.passed.all()
     errors = results.columns["position_error_m"]
-    assert [errors[row] for row in results.worst()] == sorted(errors, reverse=True)[:10]
+    assert [errors[row] for row in results.worst_rows()] == sorted(errors, reverse=True)[:10]
     mixed = campaign(disperse=MASSES, flights=43, seed=8, criteria=loose)
     dataset = Dataset(tmp_path)
     dataset.begin(mixed)
@@ -140,7 +140,7 @@ def test_the_worst_flights_that_pass_are_those_next_to_their_bounds(tmp_path: Pa
     dataset.add([Row(draws[40], "error", "."), Row(draws[41], "reached", ".", bad)])
     dataset.add([Row(draws[42], "failed", ".", {**bad, "position_error_m": 0.06})])
     dataset.close()
-    assert Results.of(tmp_path).worst()[:3] == [40, 42, 41]
+    assert Results.of(tmp_path).worst_rows()[:3] == [40, 42, 41]
 
 
 def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:

@@ -260,7 +260,7 @@ def test_rows_flown_again_through_ros_are_the_same(tmp_path: Path, count: int) -
     chosen = np.random.default_rng(6).permutation(made.flights)[:count]
     for number in chosen.tolist():
         again = rerun_flight(tmp_path, number, tmp_path / f"{number}.mcap")
-        assert again.same, again.lines
+        assert again.agrees, again.lines
         assert again.deviation is not None
         assert again.deviation < RERUN_TOLERANCE
         assert again.row.draw.values["mass.mass_1"] != 1.0
@@ -289,7 +289,7 @@ def test_the_stack_ends_flights_that_are_too_long(tmp_path: Path) -> None:
     (row,) = rows(tmp_path)
     assert (row["outcome"], row["duration_s"]) == ("interrupted", 4.0)
     again = rerun_flight(tmp_path, 0, tmp_path / "0.mcap")
-    assert again.same
+    assert again.agrees
     assert again.lines[-1].startswith("It was interrupted")
     assert 4.0 <= again.row.metrics["duration_s"] < 1000.0
     (there,) = RosEngine().fly(made, [_draw(made, 0)], lambda: False)

@@ -29,7 +29,7 @@ def decisions(
     """Return the decision at each state of (at rest, errors, rate share, error share)."""
     monitor, found = GoalMonitor(), []
     for tick, (at_rest, errors, rate, error) in enumerate(states):
-        found.append(int(monitor.decision(0.1 * tick, at_rest, errors, rate, error, config)))
+        found.append(int(monitor.decide(0.1 * tick, at_rest, errors, rate, error, config)))
     return found
 
 
@@ -62,11 +62,11 @@ def test_a_goal_fails_at_its_time_limit_unless_it_is_reached_then() -> None:
 def test_the_time_limit_counts_from_the_beginning_of_the_goal_and_not_through_jumps() -> None:
     monitor = GoalMonitor()
     monitor.begin(5.0)
-    assert monitor.outcome(5.9, 1.0, ASTRAY, CONFIG) == Decision.NONE
-    monitor.outcome(5.95, 1.0, WITHIN, CONFIG)
+    assert monitor.decide_by_errors(5.9, 1.0, ASTRAY, CONFIG) == Decision.NONE
+    monitor.decide_by_errors(5.95, 1.0, WITHIN, CONFIG)
     monitor.shift_time(100.0)
-    assert monitor.outcome(105.9, 1.0, WITHIN, CONFIG) == Decision.NONE, "it settles anew"
-    assert monitor.outcome(106.0, 1.0, ASTRAY, CONFIG) == Decision.FAILED
+    assert monitor.decide_by_errors(105.9, 1.0, WITHIN, CONFIG) == Decision.NONE, "it settles anew"
+    assert monitor.decide_by_errors(106.0, 1.0, ASTRAY, CONFIG) == Decision.FAILED
 
 
 @pytest.mark.parametrize(("rate", "error"), [(1.51, 0.0), (0.0, 1.01)])
@@ -78,11 +78,11 @@ def test_control_is_lost_in_the_third_consecutive_state(rate: float, error: floa
 def test_a_new_goal_forgets_errors_and_not_joints_that_are_too_fast() -> None:
     monitor = GoalMonitor()
     for _ in range(2):
-        assert not monitor.errors_lost(2.0)
-        assert not monitor.rates_lost(2.0)
+        assert not monitor.check_errors(2.0)
+        assert not monitor.check_rates(2.0)
     monitor.begin(1.0)
-    assert not monitor.errors_lost(2.0)
-    assert monitor.rates_lost(2.0)
+    assert not monitor.check_errors(2.0)
+    assert monitor.check_rates(2.0)
 
 
 def test_symbols_give_the_decisions_of_numbers() -> None:
@@ -90,7 +90,7 @@ def test_symbols_give_the_decisions_of_numbers() -> None:
     memory, state = ca.SX.sym("memory", 4), ca.SX.sym("state", 7)
     monitor = GoalMonitor(*ca.vertsplit(memory))
     time, at_rest, *errors, rate, error = ca.vertsplit(state)
-    decision = monitor.decision(time, at_rest, Errors(*errors), rate, error, CONFIG)
+    decision = monitor.decide(time, at_rest, Errors(*errors), rate, error, CONFIG)
     after = ca.vertcat(*dataclasses.astuple(monitor))
     function = ca.Function("monitor", [memory, state], [after, decision])
     rng = np.random.default_rng(7)
@@ -105,7 +105,7 @@ def test_symbols_give_the_decisions_of_numbers() -> None:
                 values[3:] = [1.6, 0.9] if lost % 2 else [1.4, 1.1]
             rest = float(tick > 2)
             position, attitude, joints, rate_, error_ = values.tolist()
-            found = numbers.decision(
+            found = numbers.decide(
                 *(0.1 * tick, rest, Errors(position, attitude, joints), rate_, error_, CONFIG)
             )
             symbols, other = function(symbols, [0.1 * tick, rest, *values])

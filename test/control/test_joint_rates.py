@@ -22,7 +22,7 @@ from spacerobot_ros.control import Actuation, ControlState, PoseReference, Refer
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
-from spacerobot_ros.control.limits import JointRateLimits, _largest_share
+from spacerobot_ros.control.limits import JointRateLimits, _bearable_push_share
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
@@ -470,5 +470,5 @@ def test_the_largest_share_of_a_push_that_motors_bear(
     wanted: list[float], pushed: list[float], share: float
 ) -> None:
     """``abs(wanted - share * pushed) <= effort`` for all, of 200 and 50 N m."""
-    found = _largest_share(np.array(wanted), np.array(pushed), np.array([200.0, 50.0]))
+    found = _bearable_push_share(np.array(wanted), np.array(pushed), np.array([200.0, 50.0]))
     assert found == pytest.approx(share)

@@ -29,4 +29,4 @@ def campaign(**given: Any) -> Campaign:
 def flown(made: Campaign, number: int = 0) -> tuple[Flight, dict[str, Any]]:
     """Fly one draw; return the flight and what was drawn."""
     draw = Draws(made)[number]
-    return FlightsEngine().flown(made, drawn_flight(made, draw)), dict(draw.values)
+    return FlightsEngine().fly_draw(made, drawn_flight(made, draw)), dict(draw.values)

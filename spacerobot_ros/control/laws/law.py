@@ -88,9 +88,9 @@ class Gains:
     def diagonals(self, selection: OutputSelection) -> tuple[Array, Array]:
         """Return the diagonals of Kp and Kd (m,) of the selected outputs."""
         pairs = [
-            *(_pair(axis, self.base_position, self.base_attitude) for axis in selection.base),
+            *(_axis_gains(axis, self.base_position, self.base_attitude) for axis in selection.base),
             *(
-                _pair(axis, self.end_effector_position, self.end_effector_attitude)
+                _axis_gains(axis, self.end_effector_position, self.end_effector_attitude)
                 for axis in selection.end_effector
             ),
             *(self.joints for _ in selection.joints),
@@ -296,5 +296,5 @@ class ControlLaw(ABC):
         return Actuation(actuation[:6].copy(), actuation[6:].copy())
 
 
-def _pair(axis: str, position: GainPair, attitude: GainPair) -> GainPair:
+def _axis_gains(axis: str, position: GainPair, attitude: GainPair) -> GainPair:
     return attitude if axis.startswith("r") else position
