@@ -88,7 +88,7 @@ class Starts:
         )
 
     @classmethod
-    def alike(cls, robot: SpaceRobot, initial: InitialState, count: int) -> Starts:
+    def repeated(cls, robot: SpaceRobot, initial: InitialState, count: int) -> Starts:
         """Return ``count`` equal rows, of which the caller may change columns.
 
         Raises

@@ -219,7 +219,7 @@ class _Case:
         inertial = robot.inertial.scaled(
             rng.uniform(low, high, (count, bodies)), rng.uniform(low, high, (count, bodies))
         )
-        starts = Starts.alike(robot, InitialState(), count)
+        starts = Starts.repeated(robot, InitialState(), count)
         starts.position[:] = 0.01 * rng.normal(size=(count, 3))
         program = (
             HeldCommands(self.commands)

@@ -31,15 +31,11 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
     ParameterError
         Seed, sampler, number of flights or a dispersion differs.
     """
-
-    def drawn(campaign: Campaign) -> dict[str, object]:
-        return {"seed": campaign.seed, "sampler": campaign.sampler, "flights": campaign.flights}
-
-    ours, theirs = drawn(first), drawn(second)
     sentence = f"The campaigns '{first.name}' and '{second.name}' do not have the same draws: "
-    for key, value in ours.items():
-        if theirs[key] != value:
-            raise ParameterError(f"{sentence}'{key}' is {value} and {theirs[key]}.")
+    for key in ("seed", "sampler", "flights"):
+        ours, theirs = getattr(first, key), getattr(second, key)
+        if ours != theirs:
+            raise ParameterError(f"{sentence}'{key}' is {ours} and {theirs}.")
     # In order, because the third number of a draw is that of the third dispersion.
     for ours_is, theirs_is in zip_longest(first.dispersions, second.dispersions):
         a, b = (
@@ -74,13 +70,11 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     # Metrics that only one of them requires are compared too, if both have them.
     names = list(dict.fromkeys([*first.shown_metrics, *second.shown_metrics]))
     names = [name for name in names if name in first.columns and name in second.columns]
-    found = []
-    for name in names:
-        difference = paired_difference(
-            name, first.columns[name][rows_a], second.columns[name][rows_b]
-        )
-        if difference is not None:
-            found.append(difference)
+    pairs = (
+        paired_difference(name, first.columns[name][rows_a], second.columns[name][rows_b])
+        for name in names
+    )
+    found = [difference for difference in pairs if difference is not None]
     passed_a, passed_b = first.passed[rows_a], second.passed[rows_b]
     only_a, only_b, p = paired_success(passed_a, passed_b)
     a, b = first.campaign.name, second.campaign.name

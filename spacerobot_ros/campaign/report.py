@@ -133,9 +133,8 @@ class Results:
     @property
     def drawn_numbers(self) -> dict[str, Array]:
         """(N,) drawn values, by name of the dispersion; numbers only."""
-        names = [each.name for each in self.campaign.dispersions]
-        found = {name: self.columns[f"{DRAW_PREFIX}{name}"] for name in names}
-        return {name: x for name, x in found.items() if isinstance(x, np.ndarray)}
+        columns = {name: self.columns[f"{DRAW_PREFIX}{name}"] for name in self.campaign.names}
+        return {name: x for name, x in columns.items() if isinstance(x, np.ndarray)}
 
     @property
     def shown_metrics(self) -> list[str]:
@@ -159,15 +158,11 @@ class Results:
         found = influences(self.drawn_numbers, self.metrics())
         whole = self.campaign.sampler == "saltelli" and len(self) == self.total
         if whole and len(self.drawn_numbers) == len(self.campaign.dispersions):
-            names, with_indices = list(self.drawn_numbers), []
+            names = list(self.drawn_numbers)
             indices = {name: sobol_indices(names, x) for name, x in self.metrics().items()}
-            for each in found:
-                known = indices[each.metric].get(each.cause)
-                if known is not None:
-                    a, b, c, d = known
-                    each = replace(each, first=(a, b), total=(c, d))
-                with_indices.append(each)
-            found = with_indices
+            for place, each in enumerate(found):
+                if known := indices[each.metric].get(each.cause):
+                    found[place] = replace(each, first=known[:2], total=known[2:])
         return sorted(found, key=lambda each: -each.strength)
 
     def worst_rows(self) -> list[int]:
@@ -179,8 +174,7 @@ class Results:
         for criterion in self.campaign.criteria:
             x = self.columns[criterion.metric]
             spread = x[np.isfinite(x)].std() if np.isfinite(x).any() else 1.0
-            spread = spread or 1.0
-            over = np.maximum(x - criterion.maximum, criterion.minimum - x) / spread
+            over = np.maximum(x - criterion.maximum, criterion.minimum - x) / (spread or 1.0)
             # A missing metric counts as beyond its bounds.
             badness = np.maximum(
                 badness, np.clip(np.nan_to_num(over, nan=_MAX_BADNESS), -_MAX_BADNESS, _MAX_BADNESS)
@@ -233,11 +227,8 @@ def figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figu
 def metric_label(metric: str) -> str:
     """Return the name of a metric with its unit, unless the name has it."""
     unit = METRICS[metric.partition(".")[0]].unit
-    return (
-        metric
-        if not unit or metric.endswith(("_m", "_rad", "_s", "_kg", "_N", "_Nm"))
-        else (f"{metric}, {unit}")
-    )
+    named = metric.endswith(("_m", "_rad", "_s", "_kg", "_N", "_Nm"))
+    return f"{metric}, {unit}" if unit and not named else metric
 
 
 # -- parts of the page ------------------------------------------------------------------------
@@ -290,11 +281,7 @@ def _success_section(results: Results) -> str:
     wall = float(np.nansum(results.columns["wall_time_s"]))
     rows = [
         ("success", f"{100 * success.value:.4g} %", f"{success.count} of {success.total}"),
-        (
-            "95 % interval (Wilson)",
-            f"{100 * success.interval_low:.4g} to {100 * success.interval_high:.4g} %",
-            "",
-        ),
+        ("95 % interval (Wilson)", _share_cells(success)[1], ""),
         ("95 % interval (Clopper-Pearson)", f"{100 * low:.4g} to {100 * high:.4g} %", ""),
         ("flown", f"{wall:.4g} s", "of workers' time"),
     ]
@@ -335,12 +322,12 @@ def _outcomes_section(results: Results) -> str:
     made = table("outcomes", ["outcome", "flights", "message"], rows)
     fallbacks = Counter(text for text in results.columns.get("fallback", ()) if text)
     for reason, count in fallbacks.most_common(6):
-        flights = f"{count} flight{'s' if count > 1 else ''}"
-        refused = reason.endswith(".")  # The sentence of an error.
-        line = (
-            f"used engine 'flights': {reason}" if refused else f"{reason} and used engine 'flights'"
-        )
-        made += f'<p class="facts">{escape(flights)} {escape(line)}</p>'
+        line = f"{count} flight{'s' if count > 1 else ''} "
+        if reason.endswith("."):  # The sentence of an error.
+            line += f"used engine 'flights': {reason}"
+        else:
+            line += f"{reason} and used engine 'flights'"
+        made += f'<p class="facts">{escape(line)}</p>'
     return made
 
 

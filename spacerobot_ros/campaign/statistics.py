@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,8 @@ PERCENTILES = (5.0, 50.0, 95.0, 99.0)
 class Share:
     """A share of flights with its confidence intervals.
 
-    ``low`` to ``high`` is the interval of Wilson, ``exact`` that of Clopper and Pearson.
+    ``interval_low`` to ``interval_high`` is the interval of Wilson, ``exact`` that of Clopper and
+    Pearson.
     """
 
     count: int
@@ -120,12 +121,12 @@ def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> lis
             x, y = drawn[there], values[there]
             away = np.abs(x - np.median(x))
             side = spearmanr(x, y)
-            made = Influence(cause, metric, float(side.statistic), float(side.pvalue))
+            numbers = [float(side.statistic), float(side.pvalue), 0.0, 1.0]
             if np.ptp(away) > 0.0:
                 both = spearmanr(away, y)
-                numbers = float(both.statistic), float(both.pvalue)
-                made = replace(made, departure=numbers[0], p_departure=numbers[1])
-            found.append(made)
+                numbers[2:] = float(both.statistic), float(both.pvalue)
+            correlation, p, departure, p_departure = numbers
+            found.append(Influence(cause, metric, correlation, p, departure, p_departure))
     return found
 
 

@@ -413,10 +413,13 @@ def open_workers(cluster: Cluster, flights: int) -> Iterator[Workers]:
 
 @dataclass(frozen=True)
 class _SubmittedTask:
-    """Numbers of the draws that a worker flies now, and the name of the engine."""
+    """Numbers of the draws that a worker flies now, the name of the engine, and whether it is one
+    flight alone, after the death of a worker.
+    """
 
     numbers: list[int]
     engine: str
+    alone: bool
 
 
 class TaskDistributor:
@@ -462,8 +465,6 @@ class TaskDistributor:
         self._retry_alone: deque[int] = deque()
         """Draws of tasks whose worker died."""
         self._deaths: Counter[int] = Counter()
-        self._alone: Any = None
-        """The running task of one of them."""
 
     def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
         """Yield the rows of these draws as their tasks end, and empty lists in between."""
@@ -484,8 +485,9 @@ class TaskDistributor:
         """Keep the workers busy."""
         workers = self._workers.count()
         most = workers * self._workers.tasks_per_worker
-        if self._retry_alone and self._alone is None and len(self._running) < most:
-            self._alone = self._submit_task([self._retry_alone.popleft()], self._engine, alone=True)
+        alone = any(task.alone for task in self._running.values())
+        if self._retry_alone and not alone and len(self._running) < most:
+            self._submit_task([self._retry_alone.popleft()], self._engine, alone=True)
         while (self._fallbacks or waiting) and len(self._running) < most:
             queue, engine = (
                 (self._fallbacks, FLIGHTS) if self._fallbacks else (waiting, self._engine)
@@ -495,27 +497,23 @@ class TaskDistributor:
             count = min(len(queue), max(1, round(min(self._sizes[engine], share))))
             self._submit_task([queue.popleft() for _ in range(count)], engine)
 
-    def _submit_task(self, numbers: list[int], engine: str, *, alone: bool = False) -> Any:
+    def _submit_task(self, numbers: list[int], engine: str, *, alone: bool = False) -> None:
         draws = [self._draws[number] for number in numbers]
         task = self._workers.submit(self._packed, __version__, draws, engine, alone)
-        self._running[task] = _SubmittedTask(numbers, engine)
-        return task
+        self._running[task] = _SubmittedTask(numbers, engine, alone)
 
     def _collect_rows(self, ended: Any) -> list[Row]:
         """Return the rows of a task; none if its worker died."""
         task = self._running.pop(ended)
-        alone = ended is self._alone
-        if alone:
-            self._alone = None
         try:
             made = self._workers.result(ended)
         except WorkerDeath:
-            return self._on_worker_death(task.numbers, alone=alone)
+            return self._on_worker_death(task)
         rows = [each for each in made if isinstance(each, Row)]
         passed_on = [each for each in made if isinstance(each, Fallback)]
         self._fallbacks += [each.draw.number for each in passed_on]
         self._reasons |= {each.draw.number: each.reason for each in passed_on}
-        if not alone and rows:
+        if not task.alone and rows:
             took = sum(row.wall_time for row in rows if not math.isnan(row.wall_time))
             if took > 0:
                 size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TASK_TIME / took
@@ -528,16 +526,15 @@ class TaskDistributor:
             for row in rows
         ]
 
-    def _on_worker_death(self, numbers: list[int], *, alone: bool) -> list[Row]:
+    def _on_worker_death(self, task: _SubmittedTask) -> list[Row]:
         """Have the flights of a task flown again alone; return rows of those that died twice."""
         given_up = []
-        for number in numbers:
-            if alone or not self._deaths[number]:
+        for number in task.numbers:
+            if task.alone or not self._deaths[number]:
                 self._deaths[number] += 1
             if self._deaths[number] >= _MAX_WORKER_DEATHS:
                 reason = f"The process that flew it died {_MAX_WORKER_DEATHS} times."
-                row = Row(self._draws[number], KILLED, reason, engine=self._engine)
-                given_up.append(row)
+                given_up.append(Row(self._draws[number], KILLED, reason, engine=self._engine))
             else:
                 self._retry_alone.append(number)
         return given_up

@@ -265,9 +265,9 @@ def test_what_lanes_leave_is_flown_in_small_tasks(
     tasks: list[tuple[int, str]] = []
     deal = TaskDistributor._submit_task
 
-    def dealt(self: Any, numbers: list[int], engine: str, **options: Any) -> Any:
+    def dealt(self: Any, numbers: list[int], engine: str, **options: Any) -> None:
         tasks.append((len(numbers), engine))
-        return deal(self, numbers, engine, **options)
+        deal(self, numbers, engine, **options)
 
     monkeypatch.setattr(TaskDistributor, "_submit_task", dealt)
     run_campaign(made, tmp_path / "here", engine="lanes")
