@@ -14,16 +14,16 @@ from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.report.figures import INK, MUTED, PALETTE, inches, panel
 from spacerobot_ros.times import SECOND
 
-LANE = 0.62
+EVENT_STRIP_HEIGHT = 0.62
 """Height of a strip of events with its key below a time axis, inches."""
 
-_MOST = 2000
+_MAX_MARKS = 2000
 """Most marks in a strip: more would merge."""
 
-_BELOW = 0.44
+_STRIP_DISTANCE = 0.44
 """Distance of the strip's upper edge from the axis, inches: labels are between."""
 
-_HEIGHT = 0.24
+_STRIP_HEIGHT = 0.24
 _GOOD, _BAD, _WARN, _PLAIN = PALETTE[2], "#c62f2f", PALETTE[1], PALETTE[0]
 
 
@@ -39,11 +39,11 @@ class FlightEvent:
     def text(self) -> str:
         """The event in a few words, such as ``fault on: joint_stuck elbow at 5``."""
         label, about = _MARKS[self.event.kind].label, self.event.about
-        details = [about[key] for key in _DETAILS if about.get(key)]
+        details = [about[key] for key in _DETAIL_KEYS if about.get(key)]
         return f"{label}: {', '.join(details)}" if details else label
 
 
-_DETAILS = ("fault", "joints", "reason", "method", "node")
+_DETAIL_KEYS = ("fault", "joints", "reason", "method", "node")
 """Keys that distinguish an event from others of its kind."""
 
 
@@ -105,12 +105,14 @@ _GLYPHS = {
 }
 """Markers of matplotlib as characters, full and hollow."""
 
-_FAULTS = frozenset((EventKind.FAULT_INJECTED, EventKind.FAULT_ENDED, EventKind.FAULTS_CLEARED))
-_STRONG = _FAULTS | {EventKind.STUCK_JOINT, EventKind.LATCHED, EventKind.GOAL_ABORTED}
+_FAULT_KINDS = frozenset(
+    (EventKind.FAULT_INJECTED, EventKind.FAULT_ENDED, EventKind.FAULTS_CLEARED)
+)
+_PROMINENT_KINDS = _FAULT_KINDS | {EventKind.STUCK_JOINT, EventKind.LATCHED, EventKind.GOAL_ABORTED}
 """Kinds that are marked over the whole height of a chart."""
 
 
-def mark_of(kind: EventKind) -> dict[str, Any]:
+def event_style(kind: EventKind) -> dict[str, Any]:
     """Return how events of a kind look on a page."""
     mark = _MARKS[kind]
     return {
@@ -118,8 +120,8 @@ def mark_of(kind: EventKind) -> dict[str, Any]:
         "glyph": _GLYPHS[mark.marker][mark.hollow],
         "colour": mark.colour,
         # Faults have a row of their own between, so that texts do not overlap.
-        "row": 1 if kind in _FAULTS else 2 * mark.row,
-        "strong": kind in _STRONG,
+        "row": 1 if kind in _FAULT_KINDS else 2 * mark.row,
+        "strong": kind in _PROMINENT_KINDS,
     }
 
 
@@ -149,14 +151,14 @@ def drawn_events(
 def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
     """Draw a strip below a time axis with the events in its span, and a key of their marks."""
     start, end = axes.get_xlim()
-    shown = [each for each in events if start <= each.time <= end][:_MOST]
+    shown = [each for each in events if start <= each.time <= end][:_MAX_MARKS]
     figure = axes.figure
     assert isinstance(figure, Figure)
     across, up = figure.get_size_inches()
     box = axes.get_position()
     x, width = box.x0 * across, box.width * across
-    height = inches(_HEIGHT)
-    lane = panel(figure, x, box.y0 * up - inches(_BELOW) - height, width, height)
+    height = inches(_STRIP_HEIGHT)
+    lane = panel(figure, x, box.y0 * up - inches(_STRIP_DISTANCE) - height, width, height)
     lane.set_xlim(start, end)
     lane.set_ylim(-0.6, 1.6)
     lane.grid(False)
@@ -167,10 +169,10 @@ def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
     for kind, mark in _MARKS.items():
         times = [each.time for each in shown if each.event.kind is kind]
         if times:
-            lane.plot(times, [1 - mark.row] * len(times), clip_on=False, **_style(mark))
+            lane.plot(times, [1 - mark.row] * len(times), clip_on=False, **_marker_style(mark))
     kinds = {each.event.kind for each in shown}
     keys = [
-        Line2D([], [], label=mark.label, **_style(mark))
+        Line2D([], [], label=mark.label, **_marker_style(mark))
         for kind, mark in _MARKS.items()
         if kind in kinds
     ]
@@ -187,7 +189,7 @@ def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
         )
 
 
-def _style(mark: _Mark) -> dict[str, Any]:
+def _marker_style(mark: _Mark) -> dict[str, Any]:
     return {
         "linestyle": "none",
         "marker": mark.marker,

@@ -41,16 +41,16 @@ GHOST = PALETTE[3]
 WIDTH = 9.6
 """Width of a figure of a page, inches."""
 
-_NARROW = 6.0
+_NARROW_WIDTH = 6.0
 """Width of a figure below which it is drawn for one column of a paper, inches."""
 
 COLUMNS = 960
 """Slices of time across a figure in which a dense trace is summed up."""
 
-SLICES = 240
+LARGEST_VALUE_SLICES = 240
 """Slices of time of a trace drawn by the largest value of each."""
 
-_UNSEEN = 5e-4
+_INVISIBLE_ERROR = 5e-4
 """Largest error of a simplified line, as a share of the height of its panel."""
 
 _PATH_DATA = re.compile(rb' d="[^"]*"')
@@ -59,10 +59,10 @@ _DECIMALS = re.compile(rb"(\.\d\d)\d+")
 _FONT_SIZE = 8.5
 """Font size that the distances of these modules are made for, points."""
 
-_FONT_SIZES = (3.0, 30.0)
+_FONT_SIZE_RANGE = (3.0, 30.0)
 """Least and largest font size of a style file, points."""
 
-_KEPT: Any = {
+_FIXED_SETTINGS: Any = {
     # Names of joints may contain dollar signs.
     "text.parse_math": False,
     # Figures keep their requested width; these modules place the panels.
@@ -73,8 +73,8 @@ _KEPT: Any = {
 """Settings that style files cannot change."""
 
 
-_width = ContextVar("_width", default=WIDTH)
-_scale = ContextVar("_scale", default=1.0)
+_figure_width = ContextVar("_figure_width", default=WIDTH)
+_font_scale = ContextVar("_font_scale", default=1.0)
 """Ratio of the font size to 8.5 points."""
 
 
@@ -98,24 +98,24 @@ def drawing(width: float = WIDTH, style: str = "report", own: Path | None = None
     """
     shipped = Path(str(files("spacerobot_ros.report").joinpath(f"{style}.mplstyle")))
     with mpl.rc_context():
-        _use(shipped)
+        _apply_style(shipped)
         if own is not None:
-            _use(own)
+            _apply_style(own)
             _require_fonts(own)
-        mpl.rcParams.update(_KEPT)
-        across = _width.set(width)
-        scale = _scale.set(float(mpl.rcParams["font.size"]) / _FONT_SIZE)
+        mpl.rcParams.update(_FIXED_SETTINGS)
+        across = _figure_width.set(width)
+        scale = _font_scale.set(float(mpl.rcParams["font.size"]) / _FONT_SIZE)
         try:
             yield
         finally:
-            _width.reset(across)
-            _scale.reset(scale)
+            _figure_width.reset(across)
+            _font_scale.reset(scale)
 
 
-def _use(path: Path) -> None:
+def _apply_style(path: Path) -> None:
     with _collected_warnings() as warnings:
         try:
-            settings = _settings(path)
+            settings = _read_style(path)
         except (OSError, ValueError, KeyError) as error:
             why = getattr(error, "strerror", None) or error
             raise SpaceRobotError(f"The style file {path} cannot be read: {why}.") from error
@@ -124,7 +124,7 @@ def _use(path: Path) -> None:
     mpl.rcParams.update(settings)
 
 
-def _settings(path: Path) -> mpl.RcParams:
+def _read_style(path: Path) -> mpl.RcParams:
     if not path.exists():
         # The import reads all styles of matplotlib.
         import matplotlib.style as styles
@@ -140,10 +140,10 @@ def _settings(path: Path) -> mpl.RcParams:
 def _require_fonts(path: Path) -> None:
     """Check that the font settings of a style file can be used."""
     size = float(mpl.rcParams["font.size"])
-    if not _FONT_SIZES[0] <= size <= _FONT_SIZES[1]:
+    if not _FONT_SIZE_RANGE[0] <= size <= _FONT_SIZE_RANGE[1]:
         raise SpaceRobotError(
             f"The style file {path} is refused: font.size is {size:g}, and letters have "
-            f"{_FONT_SIZES[0]:g} to {_FONT_SIZES[1]:g} points."
+            f"{_FONT_SIZE_RANGE[0]:g} to {_FONT_SIZE_RANGE[1]:g} points."
         )
     if mpl.rcParams["text.usetex"]:
         raise SpaceRobotError(
@@ -151,7 +151,7 @@ def _require_fonts(path: Path) -> None:
             "leaves no text that can be edited."
         )
     families = mpl.rcParams["font.family"]
-    found = [family for family in families if _installed(family)]
+    found = [family for family in families if _is_font_installed(family)]
     if not found:
         raise SpaceRobotError(
             f"The style file {path} is refused: of the fonts that it names "
@@ -161,7 +161,7 @@ def _require_fonts(path: Path) -> None:
     mpl.rcParams["font.family"] = list(dict.fromkeys([*found, "DejaVu Sans"]))
 
 
-def _installed(family: str) -> bool:
+def _is_font_installed(family: str) -> bool:
     with _collected_warnings():
         try:
             findfont(FontProperties(family=[family]), fallback_to_default=False)
@@ -201,17 +201,17 @@ class _Warnings(logging.Filter):
 
 def width() -> float:
     """Return the width of a figure, inches."""
-    return _width.get()
+    return _figure_width.get()
 
 
 def narrow() -> bool:
     """Whether a figure is for one column of a paper."""
-    return _width.get() / _scale.get() < _NARROW
+    return _figure_width.get() / _font_scale.get() < _NARROW_WIDTH
 
 
 def inches(length: float) -> float:
     """Return a length made for letters of 8.5 points, scaled to the font size, inches."""
-    return length * _scale.get()
+    return length * _font_scale.get()
 
 
 def sheet(
@@ -230,7 +230,7 @@ def sheet(
     there is room for labels ``left`` and ``right`` of the panels, at the ``bottom``, and for titles
     in the ``gap`` between the rows, and for a ``lane`` below every row.
     """
-    scale = _scale.get()
+    scale = _font_scale.get()
     if narrow() and left > 0.5:
         # Panels are small, so tick labels have few digits.
         left = max(left, 0.95)
@@ -347,9 +347,9 @@ def draw_traces(
     dense = False
     for index, tint in enumerate(colours):
         values = factor * signal.values[:, index]
-        in_sight = Signal(signal.time, values[:, np.newaxis] / (_UNSEEN * (high - low)))
+        in_sight = Signal(signal.time, values[:, np.newaxis] / (_INVISIBLE_ERROR * (high - low)))
         crowded = len(signal) > 2 * columns
-        if crowded and _shakes(in_sight, columns):
+        if crowded and _needs_band(in_sight, columns):
             kept, off = np.empty(0, np.int64), np.inf
         else:
             kept, off = simplified(in_sight, columns)
@@ -373,7 +373,7 @@ def draw_traces(
     return dense
 
 
-def _shakes(signal: Signal, columns: int) -> bool:
+def _needs_band(signal: Signal, columns: int) -> bool:
     """Whether a signal, in tolerances, is mostly off the line through ``columns`` samples."""
     nodes = np.linspace(0, len(signal) - 1, columns + 1).astype(int)
     values = signal.values[:, 0]
@@ -381,11 +381,11 @@ def _shakes(signal: Signal, columns: int) -> bool:
     return bool(np.mean(np.abs(values - line) > 1.0) > 0.5)
 
 
-def upper_edge(signal: Signal, column: int) -> tuple[Array, Array]:
+def largest_over_time(signal: Signal, column: int) -> tuple[Array, Array]:
     """Return times and values of a column; of a dense one the largest in each slice of time."""
-    if len(signal) <= 2 * SLICES:
+    if len(signal) <= 2 * LARGEST_VALUE_SLICES:
         return signal.time, signal.values[:, column]
-    time, _, high = envelope(signal, column, SLICES)
+    time, _, high = envelope(signal, column, LARGEST_VALUE_SLICES)
     return time, high
 
 
@@ -424,7 +424,7 @@ def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
     wanted = np.clip([(value - low) / (high - low) for value, _, _ in ordered], 0.0, 1.0)
     height = axes.get_window_extent().height / axes.figure.dpi
     gap = min(inches(0.155) / height, 1.0 / max(len(ordered) - 1, 1))
-    for at, (_, text, tint) in zip(_spread(wanted, gap), ordered, strict=True):
+    for at, (_, text, tint) in zip(_separate_labels(wanted, gap), ordered, strict=True):
         axes.annotate(
             text,
             (1.0, float(at)),
@@ -437,7 +437,7 @@ def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
         )
 
 
-def _spread(wanted: Array, gap: float) -> Array:
+def _separate_labels(wanted: Array, gap: float) -> Array:
     """Move ascending positions (n,) in 0..1 apart until neighbours keep a gap."""
     at = wanted.copy()
     for _ in range(200):
@@ -451,7 +451,7 @@ def _spread(wanted: Array, gap: float) -> Array:
     return at
 
 
-def key(tint: str, label: str, dashes: tuple[float, ...] = ()) -> Line2D:
+def legend_entry(tint: str, label: str, dashes: tuple[float, ...] = ()) -> Line2D:
     """Return an entry of a legend."""
     line = Line2D([], [], color=tint, linewidth=1.2, label=label)
     if dashes:

@@ -20,21 +20,22 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvecs_from_quaternions,
 )
-from spacerobot_ros.report.events import LANE, draw_events
+from spacerobot_ros.report.events import EVENT_STRIP_HEIGHT, draw_events
 from spacerobot_ros.report.figures import (
     COLUMNS,
     FAINT,
     INK,
+    LARGEST_VALUE_SLICES,
     MUTED,
     PALETTE,
-    SLICES,
     ReportFigure,
     TraceGroup,
     colour,
     draw_traces,
     end_labels,
-    key,
+    largest_over_time,
     legend_above,
+    legend_entry,
     narrow,
     room_for,
     scaled,
@@ -42,7 +43,6 @@ from spacerobot_ros.report.figures import (
     set_time,
     sheet,
     short,
-    upper_edge,
 )
 from spacerobot_ros.report.flight import FlightReport, Target, joint_unit
 from spacerobot_ros.report.signals import Cycles, Indices, envelope
@@ -52,7 +52,7 @@ SHOWN_CYCLES = 3
 
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
-_ROW = 0.8
+_DUTY_ROW_HEIGHT = 0.8
 """Height of a duty cycle of one, in its row."""
 
 BAND = (
@@ -84,21 +84,21 @@ def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
         tint = MUTED if len(owners) == len(group.names) else colours[owners[0]]
         axes.axhline(bound, color=tint, lw=1.0, ls=(0, DOTS), zorder=1.8)
     if shown:
-        keys.append(key(MUTED, "limit (URDF)", DOTS))
+        keys.append(legend_entry(MUTED, "limit (URDF)", DOTS))
     dense = draw_traces(axes, group.signal, colours, share)
     for start, end, index, value in group.goals:
         axes.hlines(value, start, end, color=colours[index], ls=(0, DASHES), lw=1.2, zorder=3)
     if group.goals:
-        keys.append(key(MUTED, "goal", DASHES))
+        keys.append(legend_entry(MUTED, "goal", DASHES))
     later = [status.time for status in flight.executing[1:]]
     for time in later:
         axes.axvline(time, color=FAINT, lw=1.0, zorder=1.5)
     if later:
-        keys.append(key(FAINT, "new schedule"))
+        keys.append(legend_entry(FAINT, "new schedule"))
     legend_above(axes, keys)
     set_time(axes, 0.0, flight.end)
     axes.set_ylabel(f"{group.label} ({group.unit})")
-    _name_traces(axes, group.signal, group)
+    _label_trace_ends(axes, group.signal, group)
     return dense
 
 
@@ -121,7 +121,7 @@ def time_figure(
     if len(heights) != len(rows) * len(groups):
         heights = heights * len(groups)
     right = room_for([name for group in groups for name in group.names])
-    lane = LANE if flight.events else 0.0
+    lane = EVENT_STRIP_HEIGHT if flight.events else 0.0
     left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
     figure, panels = sheet(rows * len(groups), heights, left=left, right=right, lane=lane)
     share = min(1.0, 4 / len(groups))
@@ -132,8 +132,8 @@ def time_figure(
         if cycles is not None:
             whole[0].set_title("whole flight")
             first, last = (axes for row in below for axes in row)
-            dense.append(_first_part(first, group, cycles))
-            _last_cycles(last, group, cycles)
+            dense.append(_draw_before_cycles(first, group, cycles))
+            _draw_last_cycles(last, group, cycles)
     if flight.events:
         for axes in (each for row in panels for each in row):
             draw_events(axes, flight.events)
@@ -146,7 +146,7 @@ def time_figure(
     if cycles is not None:
         aside += (
             f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
-            f"the part before them, and {_close_up(cycles)}."
+            f"the part before them, and {_close_up_text(cycles)}."
         )
     aside += f" {BAND}" if any(dense) else ""
     caption += aside + (f" {EVENTS}" if flight.events else "")
@@ -166,9 +166,11 @@ def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
         # A value holds from the sample before.
         on = high > 0
         on[:-1] |= on[1:]
-        axes.fill_between(time, foot, foot + _ROW * high, on, step="pre", color=tint, linewidth=0.3)
+        axes.fill_between(
+            time, foot, foot + _DUTY_ROW_HEIGHT * high, on, step="pre", color=tint, linewidth=0.3
+        )
     axes.set_ylim(-0.2, count)
-    axes.set_yticks([count - 1 - k + _ROW / 2 for k in range(count)], group.names)
+    axes.set_yticks([count - 1 - k + _DUTY_ROW_HEIGHT / 2 for k in range(count)], group.names)
     axes.tick_params(axis="y", length=0, labelsize="small")
     axes.grid(axis="y", visible=False)
     axes.set_title(f"{group.label} ({group.unit})")
@@ -176,11 +178,11 @@ def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
     return dense
 
 
-def _close_up(cycles: Cycles) -> str:
+def _close_up_text(cycles: Cycles) -> str:
     return f"the last {SHOWN_CYCLES} of them, as change since the first instant shown"
 
 
-def _first_part(axes: Axes, group: TraceGroup, cycles: Cycles) -> bool:
+def _draw_before_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> bool:
     """Draw the part before the cycles; the first cycles if there is none."""
     end = cycles.start if cycles.start > 0 else SHOWN_CYCLES * cycles.period
     part = group.signal.between(0.0, end)
@@ -190,18 +192,18 @@ def _first_part(axes: Axes, group: TraceGroup, cycles: Cycles) -> bool:
     set_time(axes, 0.0, end)
     axes.set_title(f"first {end:.4g} s")
     axes.set_ylabel(group.unit)
-    _name_traces(axes, part, group)
+    _label_trace_ends(axes, part, group)
     return dense
 
 
-def _name_traces(axes: Axes, part: Signal, group: TraceGroup) -> None:
+def _label_trace_ends(axes: Axes, part: Signal, group: TraceGroup) -> None:
     if not len(part):
         return
     ends = part.values[-1].tolist()
     end_labels(axes, list(zip(ends, group.names, group.colours, strict=True)))
 
 
-def _last_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> None:
+def _draw_last_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> None:
     start, end = cycles.last(SHOWN_CYCLES)
     part = group.signal.between(start, end).since_first()
     factor, unit = scaled(group.unit, float(np.abs(part.values).max(initial=0.0)))
@@ -330,11 +332,11 @@ def attitude_figure(flight: FlightReport) -> ReportFigure | str:
 def shape_figure(flight: FlightReport) -> ReportFigure | str:
     """Joint positions, with the limits of the URDF that are in range."""
     if not len(flight.shape) or not flight.joint_names:
-        return _no_joints(flight)
+        return _why_no_joints(flight)
     return time_figure(flight, "shape", "Shape", "Joint positions", shape_groups(flight))
 
 
-def _no_joints(flight: FlightReport) -> str:
+def _why_no_joints(flight: FlightReport) -> str:
     """Return the reason why there is no figure of the joints."""
     jointless = flight.robot is not None and not flight.robot.joint_names
     return "The robot has no joints." if jointless else NO_JOINTS
@@ -343,13 +345,13 @@ def _no_joints(flight: FlightReport) -> str:
 def rates_figure(flight: FlightReport) -> ReportFigure | str:
     """Joint velocities, one panel a joint."""
     if not flight.joint_names:
-        return _no_joints(flight)
+        return _why_no_joints(flight)
     if not len(flight.rates):
         return "The bag holds no joint velocities."
     names, cycles = flight.joint_names, flight.cycles
     height = 1.0 if len(names) <= 4 else 0.75
     widths = [1.0] if cycles is None else [2.2, 1.0]
-    lane = LANE if flight.events else 0.0
+    lane = EVENT_STRIP_HEIGHT if flight.events else 0.0
     bottom = 0.5 + lane
     figure, panels = sheet([widths] * len(names), [height] * len(names), gap=0.36, bottom=bottom)
     dense, groups = [], []
@@ -412,18 +414,18 @@ def twist_figure(flight: FlightReport) -> ReportFigure | None:
     return time_figure(flight, "twist", "Base velocity", caption, groups)
 
 
-_DECADES = 4
+_MOMENTUM_DECADES = 4
 
-_PEAKS = 0.02
+_MAX_PEAK_SHARE = 0.02
 """Largest share of the samples that may be beyond the axis, as peaks."""
 
-_FAR = (3.0, 1e4)
+_PEAK_RATIOS = (3.0, 1e4)
 """Least and largest ratio of the span of all samples to that without peaks for which the axis
 leaves the peaks out. Below the first, both can be read together; above the second, the robot rests
 but for the peaks.
 """
 
-_SMALLEST = 1e-9
+_EFFORT_ROUNDING = 1e-9
 """Forces and torques up to this one are rounding errors, N or N m."""
 
 
@@ -435,14 +437,14 @@ def efforts_figure(flight: FlightReport) -> ReportFigure | None:
         return [-limit, limit] if np.isfinite(limit) else []
 
     def readable(groups: list[TraceGroup]) -> list[TraceGroup]:
-        return [replace(group, window=window_of(group.signal)) for group in groups]
+        return [replace(group, window=range_without_peaks(group.signal)) for group in groups]
 
     wrench = axis_groups(flight.wrench, (("thruster force", "N"), ("thruster torque", "N m")))
-    wrench = [g for g in wrench if np.abs(g.signal.values).max(initial=0.0) > _SMALLEST]
+    wrench = [g for g in wrench if np.abs(g.signal.values).max(initial=0.0) > _EFFORT_ROUNDING]
     joints: list[TraceGroup] = []
-    if np.abs(flight.efforts.values).max(initial=0.0) > _SMALLEST:
+    if np.abs(flight.efforts.values).max(initial=0.0) > _EFFORT_ROUNDING:
         units, count = {"m": "N", "rad": "N m"}, len(flight.joint_names)
-        joints = joint_groups(flight, flight.efforts, "joints", units, bounds, most=count)
+        joints = joint_groups(flight, flight.efforts, "joint effort", units, bounds, most=count)
     groups = readable(wrench + joints)
     if not groups:
         return None
@@ -457,15 +459,15 @@ def efforts_figure(flight: FlightReport) -> ReportFigure | None:
     return time_figure(flight, "efforts", "Wrench and efforts", caption, groups)
 
 
-def window_of(signal: Signal) -> tuple[float, float] | None:
+def range_without_peaks(signal: Signal) -> tuple[float, float] | None:
     """Return the range of a signal without its few highest peaks; None if it has no such peaks."""
     if not len(signal):
         return None
     low, high = (float(np.min(signal.values)), float(np.max(signal.values)))
-    inner = np.quantile(signal.values, (_PEAKS / 2, 1 - _PEAKS / 2), axis=0)
+    inner = np.quantile(signal.values, (_MAX_PEAK_SHARE / 2, 1 - _MAX_PEAK_SHARE / 2), axis=0)
     inner_low, inner_high = float(inner[0].min()), float(inner[1].max())
     span = inner_high - inner_low
-    if not _FAR[0] * span < high - low < _FAR[1] * span:
+    if not _PEAK_RATIOS[0] * span < high - low < _PEAK_RATIOS[1] * span:
         return None
     return max(low, inner_low - 0.3 * span), min(high, inner_high + 0.3 * span)
 
@@ -501,17 +503,17 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     changes = np.column_stack(
         [np.linalg.norm(balance[:, k : k + 3] - balance[0, k : k + 3], axis=1) for k in (0, 3)]
     )
-    bottom = 0.5 + (LANE if flight.events else 0.0)
+    bottom = 0.5 + (EVENT_STRIP_HEIGHT if flight.events else 0.0)
     figure, ((above,), (below,)) = sheet([[1.0], [1.0]], [1.6, 1.1], bottom=bottom)
     largest = float(changes.max())
     top = np.ceil(np.log10(largest)) if largest > 0 else -15.0
     above.set_yscale("log")
-    above.set_ylim(10.0 ** (top - _DECADES), 10.0**top)
+    above.set_ylim(10.0 ** (top - _MOMENTUM_DECADES), 10.0**top)
     # Values below the axis, such as zero, are drawn on its lower edge.
-    shown = np.maximum(changes, 10.0 ** (top - _DECADES))
+    shown = np.maximum(changes, 10.0 ** (top - _MOMENTUM_DECADES))
     for i in range(2):
         above.plot(
-            *upper_edge(Signal(time, shown), i),
+            *largest_over_time(Signal(time, shown), i),
             color=colour(i),
             lw=2.6 - 1.3 * i,
             marker="o" if len(time) == 1 else "",
@@ -520,11 +522,11 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     set_time(above, 0.0, flight.end, label=False)
     if not narrow():
         above.set_title("change of the total momenta since the start")
-    above.set_ylabel("SI units")
+    above.set_ylabel("kg m/s, kg m²/s")
     above.minorticks_off()
     above.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
     names = ("|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)")
-    legend_above(above, [key(colour(i), name) for i, name in enumerate(names)])
+    legend_above(above, [legend_entry(colour(i), name) for i, name in enumerate(names)])
     energy = balance[:, 6:7]
     set_range(below, np.append(energy, 0.0))
     dense = draw_traces(below, Signal(time, energy), [colour(2)])
@@ -533,7 +535,9 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     set_time(below, 0.0, flight.end)
     if flight.events:
         draw_events(below, flight.events)
-    largest_of = ", the largest in each slice of time" if len(time) > 2 * SLICES else ""
+    largest_of = (
+        ", the largest in each slice of time" if len(time) > 2 * LARGEST_VALUE_SLICES else ""
+    )
     caption = (
         "The momentum balance of the whole system. Top: change of the linear momentum p and of the "
         "angular momentum L about the centre of mass since the start, less the impulse of the "
@@ -547,9 +551,9 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
             Signal(time, changes),
             ["|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)"],
             "change of the total momenta",
-            "SI units",
+            "kg m/s, kg m²/s",
             PALETTE[:2],
-            decades=_DECADES,
+            decades=_MOMENTUM_DECADES,
         ),
         TraceGroup(Signal(time, energy), ["energy"], "kinetic energy", "J", [colour(2)]),
     ]
@@ -562,7 +566,7 @@ def power_of_ten(value: float) -> str:
     return f"10{exponent}"
 
 
-_SMALLEST_ERROR = 1e-12
+_SENSOR_ROUNDING = 1e-12
 """Sensor errors up to this one are rounding errors, m or rad."""
 
 
@@ -615,24 +619,26 @@ def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
 def sensors_figure(flight: FlightReport) -> ReportFigure | None:
     """Measured minus true poses and joint positions; None if sensors have no errors."""
     true = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
-    pose, at = _at_the_same_times(flight.sensed_pose, true)
+    pose, at = _match_times(flight.sensed_pose, true)
     turn = quaternion_multiply(pose.values[:, 3:], quaternion_inverse(true.values[at, 3:]))
     offset = pose.values[:, :3] - true.values[at, :3]
     errors = Signal(pose.time, np.hstack([offset, rotvecs_from_quaternions(turn)]))
     groups = axis_groups(errors, (("base position", "m"), ("base attitude", "rad")))
-    shape, at = _at_the_same_times(flight.signal("measured_q"), flight.shape)
+    shape, at = _match_times(flight.signal("measured_q"), flight.shape)
     if len(shape):
         off = Signal(shape.time, shape.values - flight.shape.values[at])
         units = {"m": "m", "rad": "rad"}
-        groups += joint_groups(flight, off, "joints", units, lambda joint: [], JOINTS_A_PANEL)
-    groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SMALLEST_ERROR]
+        groups += joint_groups(
+            flight, off, "joint position", units, lambda joint: [], JOINTS_A_PANEL
+        )
+    groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SENSOR_ROUNDING]
     if not groups:
         return None
     caption = "Measured minus true values, at the times of the measurements"
     return time_figure(flight, "sensors", "Errors of the sensors", caption, groups)
 
 
-def _at_the_same_times(measured: Signal, true: Signal) -> tuple[Signal, Indices]:
+def _match_times(measured: Signal, true: Signal) -> tuple[Signal, Indices]:
     """Return the measured samples that have a true one of equal time, and its index."""
     if not len(true):
         return Signal.empty(measured.width), np.zeros(0, int)

@@ -23,8 +23,8 @@ from spacerobot_ros.report.figures import (
     ReportFigure,
     colour,
     end_labels,
-    key,
     legend_above,
+    legend_entry,
     narrow,
     set_range,
     sheet,
@@ -42,14 +42,14 @@ from spacerobot_ros.report.solids import Canvas, Solids, View
 
 PIXELS = 420
 """Width of the picture of a robot, pixels."""
-_INSTANTS = 6
+_SHOWN_INSTANTS = 6
 
 
 def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     """The robot at several instants from the first state to the last, and the goal."""
     if flight.drawn is None:
         return flight.not_drawn
-    indices = _instants(flight)
+    indices = _choose_instants(flight)
     scenes = [flight.drawn.at(flight.joints[index], flight.base_at(index)) for index in indices]
     across = min(len(indices), 2 if narrow() else 3)
     rows = [[1.0] * across for _ in range(0, len(indices), across)]
@@ -83,7 +83,7 @@ def view_of(flight: FlightReport) -> View:
     return View(-90.0, 90.0) if flight.flat else View()
 
 
-def _instants(flight: FlightReport) -> list[int]:
+def _choose_instants(flight: FlightReport) -> list[int]:
     """Return up to six recorded states with about equal motion in between.
 
     Of a gait that ends with equal cycles, three are before the cycles and three at one phase of the
@@ -94,16 +94,16 @@ def _instants(flight: FlightReport) -> list[int]:
         places = [0.0, 0.5 * cycles.start, cycles.start]
         places += [cycles.start + cycles.period * (cycles.count * k // 3) for k in (1, 2, 3)]
         found = np.searchsorted(time, np.array(places) - 1e-9)
-        return _ending_at(len(time) - 1, found)
+        return _end_at(len(time) - 1, found)
     moved = np.column_stack([flight.position.values, flight.attitude.values, flight.joints])
     extent = np.maximum(np.ptp(moved, axis=0), 1e-3)
     steps = np.linalg.norm(np.diff(moved, axis=0) / extent, axis=1)
     progress = np.append(0.0, np.cumsum(steps))
-    wanted = np.linspace(0.0, progress[-1], _INSTANTS) if progress[-1] > 0 else np.zeros(1)
-    return _ending_at(len(time) - 1, np.searchsorted(progress, wanted))
+    wanted = np.linspace(0.0, progress[-1], _SHOWN_INSTANTS) if progress[-1] > 0 else np.zeros(1)
+    return _end_at(len(time) - 1, np.searchsorted(progress, wanted))
 
 
-def _ending_at(last: int, found: Indices) -> list[int]:
+def _end_at(last: int, found: Indices) -> list[int]:
     """Return indices, each once, the last one replaced by that of the last recorded state."""
     return np.unique([*np.minimum(found[:-1], last), last]).tolist()
 
@@ -145,7 +145,7 @@ def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Lin
         flat = view(path)
         dense = len(path) > 2 * COLUMNS
         axes.plot(flat[:, 0], flat[:, 1], color=INK, lw=0.8, zorder=5, rasterized=dense)
-        keys.append(key(INK, "path of the base"))
+        keys.append(legend_entry(INK, "path of the base"))
     if flight.goal is not None and flight.drawn is not None:
         # Without a goal of the position, the ghost shows the attitude alone.
         r = flight.goal.position if flight.position_counts else path[-1]
@@ -153,7 +153,7 @@ def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Lin
         for line in flight.drawn.base_outlines(pose):
             flat = view(line)
             axes.plot(flat[:, 0], flat[:, 1], color=GHOST, lw=0.9, ls=(0, DASHES), zorder=6)
-        keys.append(key(GHOST, "goal", DASHES))
+        keys.append(legend_entry(GHOST, "goal", DASHES))
     axes.axis(limits)
     return keys
 
@@ -164,8 +164,8 @@ def _round_length(longest: float) -> float:
     return max(step * power for step in (1, 2, 5) if step * power <= longest * (1 + 1e-9))
 
 
-_PLAN, _TOOL = PALETTE[1], PALETTE[4]
-_OTHERS = (PALETTE[0], PALETTE[2], PALETTE[5], *PALETTE[6:])
+_PLANNED_COLOUR, _TOOL_COLOUR = PALETTE[1], PALETTE[4]
+_FLIGHT_COLOURS = (PALETTE[0], PALETTE[2], PALETTE[5], *PALETTE[6:])
 """Colors of the flights, this one first."""
 
 
@@ -178,15 +178,15 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     # Beside the reach of an arm, the path of a base without thrust would be a dot.
     shows_tool = len(flight.tool) > 0 and len(flight.tool_goals) > 0
     flown = [flight, *(other for other in beside if len(other.position))]
-    tints = [_OTHERS[k % len(_OTHERS)] for k in range(len(flown))]
+    tints = [_FLIGHT_COLOURS[k % len(_FLIGHT_COLOURS)] for k in range(len(flown))]
     paths = [(each.position.values, tint) for each, tint in zip(flown, tints, strict=True)]
     names = [each.label for each in flown] if beside else ["base"]
-    keys = [key(tint, name) for tint, name in zip(tints, names, strict=True)]
+    keys = [legend_entry(tint, name) for tint, name in zip(tints, names, strict=True)]
     if shows_tool:
-        paths.append((flight.tool.values[:, :3], _TOOL))
-        keys.append(key(_TOOL, "end-effector"))
+        paths.append((flight.tool.values[:, :3], _TOOL_COLOUR))
+        keys.append(legend_entry(_TOOL_COLOUR, "end-effector"))
     if flight.planned:
-        keys.append(key(_PLAN, "planned", DASHES))
+        keys.append(legend_entry(_PLANNED_COLOUR, "planned", DASHES))
     everything = np.concatenate(
         [path for path, _ in paths] + flight.planned + [goal.position[np.newaxis] for goal in goals]
     )
@@ -207,10 +207,17 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
             axes.plot(*path[0, [i, j]], "o", color=tint, mfc="white", ms=5, zorder=4)
             axes.plot(*path[-1, [i, j]], "o", color=tint, ms=5, zorder=4)
         for planned in flight.planned:
-            axes.plot(planned[:, i], planned[:, j], color=_PLAN, lw=1.3, ls=(0, DASHES), zorder=3)
+            axes.plot(
+                planned[:, i],
+                planned[:, j],
+                color=_PLANNED_COLOUR,
+                lw=1.3,
+                ls=(0, DASHES),
+                zorder=3,
+            )
         for goal in goals:
             axes.plot(*goal.position[[i, j]], "x", color=GHOST, ms=8, mew=2, zorder=5)
-        _square(axes, middle[[i, j]], half)
+        _set_square_limits(axes, middle[[i, j]], half)
         axes.set_xlabel(f"{'xyz'[i]} (m)")
         axes.set_ylabel(f"{'xyz'[j]} (m)")
         axes.set_title(title)
@@ -228,7 +235,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     return ReportFigure("path", "Paths", caption, figure)
 
 
-def _square(axes: Axes, middle: Array, half: float) -> None:
+def _set_square_limits(axes: Axes, middle: Array, half: float) -> None:
     axes.set_xlim(middle[0] - half, middle[0] + half)
     axes.set_ylim(middle[1] - half, middle[1] + half)
     axes.set_box_aspect(1.0)
@@ -264,16 +271,17 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
         axes.plot(x[:1], y[:1], "o", color=colour(0), mfc="white", ms=5, zorder=4)
         axes.plot(x[-1:], y[-1:], "o", color=colour(0), ms=2.5, zorder=4)
         set_range(axes, y)
-        _set_across(axes, x)
+        _set_x_range(axes, x)
         units = [joint_unit(flight, names[k]) for k in (i, j)]
         axes.set_xlabel(f"{names[i]} ({units[0]})")
         axes.set_ylabel(f"{names[j]} ({units[1]})")
         if cycles is not None:
             last = part.between(cycles.end - cycles.period, cycles.end).values
             area = _signed_area(last[:, i], last[:, j])
-            unit = {"m": "m²", "rad": "rad²"}.get(units[0] if units[0] == units[1] else "", "SI")
+            factors = [f"({unit})" if " " in unit else unit for unit in units]
+            unit = f"{factors[0]}²" if factors[0] == factors[1] else " ".join(factors)
             axes.set_title(f"area {area:+.4g} {unit}")
-            _arrow(axes, x, y)
+            _draw_direction(axes, x, y)
     if cycles is None:
         caption = (
             "Joint positions against each other; a circle marks the first shape, a dot the last."
@@ -290,7 +298,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
     return ReportFigure("loops", heading, caption, figure)
 
 
-def _set_across(axes: Axes, values: Array) -> None:
+def _set_x_range(axes: Axes, values: Array) -> None:
     low, high = float(values.min()), float(values.max())
     half = (high - low if high - low > 1e-6 else 0.1) / 2
     axes.set_xlim((low + high) / 2 - 1.12 * half, (low + high) / 2 + 1.12 * half)
@@ -302,7 +310,7 @@ def _signed_area(x: Array, y: Array) -> float:
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
 
 
-def _arrow(axes: Axes, x: Array, y: Array) -> None:
+def _draw_direction(axes: Axes, x: Array, y: Array) -> None:
     """Draw the direction of a loop as an arrow at its fastest point."""
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     steps = np.hypot(np.diff(x) / (high - low)[0], np.diff(y) / (high - low)[1])
@@ -315,11 +323,11 @@ def _arrow(axes: Axes, x: Array, y: Array) -> None:
     )
 
 
-_BACK = 0.02
+_CLOSED_LOOP_DISTANCE = 0.02
 """Distance from its first shape below which a loop is closed, as a share of its size."""
 
-_FEWEST = 4
-_DECADE = 10.0
+_MIN_LOOPS = 4
+_LOG_AXIS_RATIO = 10.0
 
 
 def cycles_figure(flight: FlightReport) -> ReportFigure | None:
@@ -329,8 +337,8 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     """
     if not len(flight.shape) or len(flight.attitude) != len(flight.shape):
         return None
-    ends = returns(flight.shape)
-    if len(ends) < _FEWEST:
+    ends = loop_ends(flight.shape)
+    if len(ends) < _MIN_LOOPS:
         return None
     number = np.arange(len(ends))
     attitude = flight.attitude.values[ends]
@@ -345,7 +353,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     for i, value in enumerate(wanted):
         above.axhline(value, color=PALETTE[i], ls=(0, DASHES), lw=1.2, zorder=1.8)
     if goal is not None:
-        legend_above(above, [key(MUTED, "goal", DASHES)])
+        legend_above(above, [legend_entry(MUTED, "goal", DASHES)])
     above.set_ylabel("rotation vector (rad)")
     end_labels(above, list(zip(attitude[-1].tolist(), "xyz", PALETTE[:3], strict=True)))
     caption = (
@@ -359,7 +367,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
         below.plot(number, left, color=PALETTE[0], marker=dots)
         below.set_ylabel("remaining angle (rad)")
         caption += "; dashed, the goal. Below, the remaining angle to the goal"
-        if left.min() > 0 and left.max() > _DECADE * left.min():
+        if left.min() > 0 and left.max() > _LOG_AXIS_RATIO * left.min():
             below.set_yscale("log")
             below.minorticks_off()
             below.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
@@ -368,11 +376,11 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
             set_range(below, np.append(left, 0.0))
     for axes in (row[0] for row in panels):
         axes.set_xlim(0, len(ends) - 1)
-    panels[-1][0].set_xlabel("cycle")
+    panels[-1][0].set_xlabel("number of the cycle")
     return ReportFigure("cycles", "Attitude cycle by cycle", f"{caption}.", figure)
 
 
-def returns(shape: Signal) -> Indices:
+def loop_ends(shape: Signal) -> Indices:
     """Return the samples at which the shape returns to the last one, where its loops are closed.
 
     A rest there counts once, with its last sample; a rest at the end of the flight with its first.
@@ -386,7 +394,7 @@ def returns(shape: Signal) -> Indices:
     used = extent > 1e-3 * extent.max(initial=0.0)
     off = np.abs(values[: end + 1, used] - values[end, used]) / extent[used]
     distance = off.max(axis=1)
-    near = np.flatnonzero(distance < _BACK)
+    near = np.flatnonzero(distance < _CLOSED_LOOP_DISTANCE)
     runs = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
     nearest = [int(run[np.argmin(distance[run])]) for run in runs[:-1]]
     return np.array([*nearest, end], np.int64)

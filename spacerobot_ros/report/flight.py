@@ -22,7 +22,7 @@ from spacerobot_ros.flight.reading import (
 )
 from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model import RobotDescription
-from spacerobot_ros.model.description import Array, Joint, JointKind, Pose
+from spacerobot_ros.model.description import Array, Joint, Pose
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
 from spacerobot_ros.model.visuals import meshes_in
@@ -139,7 +139,7 @@ class FlightReport:
             A message is damaged.
         """
         flight = read_flight(bag)
-        base = _since(flight.signal("pose"), bag.began)
+        base = _shift_time(flight.signal("pose"), bag.began)
         return cls(
             bag=bag,
             flight=flight,
@@ -153,7 +153,7 @@ class FlightReport:
 
     def signal(self, name: str) -> Signal:
         """Return a quantity of the flight over the time since its first state."""
-        return _since(self.flight.signal(name), self.bag.began)
+        return _shift_time(self.flight.signal(name), self.bag.began)
 
     @cached_property
     def attitude(self) -> Signal:
@@ -189,7 +189,7 @@ class FlightReport:
     def wrench(self) -> Signal:
         """Commanded force (N) and torque (N m) of the thrusters, in the base link (N, 6)."""
         wrench = self.bag.signal("base_wrench", WRENCH_COLUMNS, 6)
-        return _since(wrench, self.bag.began)
+        return _shift_time(wrench, self.bag.began)
 
     @property
     def efforts(self) -> Signal:
@@ -200,7 +200,9 @@ class FlightReport:
         given = [] if velocity else self.bag.names("joint_commands")
         if not given or sorted(given) != sorted(names):
             return Signal.empty(len(names))
-        efforts = _since(self.bag.signal("joint_commands", ["effort"], len(names)), self.bag.began)
+        efforts = _shift_time(
+            self.bag.signal("joint_commands", ["effort"], len(names)), self.bag.began
+        )
         return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
 
     @property
@@ -318,7 +320,7 @@ class FlightReport:
             for status in self.executing
             if status.report is not None and (goal := reported_goal(status.report, sent))
         ]
-        return self._each_until_the_next(found or self._sent(sent))
+        return self._targets_until_next(found or self._timed_goals(sent))
 
     @property
     def goal(self) -> Goal | None:
@@ -333,12 +335,12 @@ class FlightReport:
     @property
     def tool_targets(self) -> list[Target]:
         """Goals of the end-effector, each until the next."""
-        return self._each_until_the_next(self._sent(self.tool_goals))
+        return self._targets_until_next(self._timed_goals(self.tool_goals))
 
-    def _sent(self, goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
+    def _timed_goals(self, goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
         return [(sent.time - self.bag.began, sent.goal) for sent in goals]
 
-    def _each_until_the_next(self, goals: list[tuple[float, Goal]]) -> list[Target]:
+    def _targets_until_next(self, goals: list[tuple[float, Goal]]) -> list[Target]:
         ends = [*(time for time, _ in goals), self.end][1:]
         return [Target(t, end, goal) for (t, goal), end in zip(goals, ends, strict=True)]
 
@@ -504,7 +506,7 @@ class FlightReport:
         return next((joint for joint in joints if joint.name == name), None)
 
 
-def _since(signal: Signal, start: float) -> Signal:
+def _shift_time(signal: Signal, start: float) -> Signal:
     """Return a signal over the time since ``start``, s."""
     return Signal(signal.time - start, signal.values)
 
@@ -523,6 +525,4 @@ def read_report(path: Path, namespace: str | None = None) -> FlightReport:
 def joint_unit(flight: FlightReport, name: str) -> str:
     """Return m or rad; without a robot description, that it is one of them."""
     joint = flight.joint(name)
-    if joint is None:
-        return "m or rad"
-    return "m" if joint.kind is JointKind.PRISMATIC else "rad"
+    return "m or rad" if joint is None else joint.unit

@@ -11,7 +11,7 @@ import numpy as np
 
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.flight import Signal
-from spacerobot_ros.report.events import FlightEvent, mark_of
+from spacerobot_ros.report.events import FlightEvent, event_style
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup
 from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page_parts import (
@@ -33,7 +33,7 @@ from spacerobot_ros.report.tables import (
     runs_table,
 )
 
-_USE = (
+_CHART_HELP = (
     '<p class="facts" id="use">Drag across a chart to look at a part of the time in all of them, '
     "click twice for the whole flight. Click once to see the robot at that instant above; the "
     "upright line is the instant that is shown there. Click a name to hide its trace.</p>"
@@ -69,24 +69,24 @@ def page(
         '<button id="theme" type="button" hidden>Dark</button>',
         f"<h1>{escape(name)}</h1>",
         f"<p>{escape(flight.description)}</p>" if flight.description else "",
-        _facts(flight),
-        _outcome(flight),
+        _facts_html(flight),
+        _outcome_html(flight),
         tiles(headline(flight)),
         "</header>",
-        *_runs(flight, beside),
+        *_runs_html(flight, beside),
         player.markup,
-        *_numbers(flight),
-        *_published(flight),
-        *_events(flight.events),
+        *_numbers_html(flight),
+        *_published_html(flight),
+        *_events_html(flight.events),
         "<h2>Figures</h2>",
-        _USE if charts.data else "",
-        *_figures(figures),
-        *_parameters(flight),
+        _CHART_HELP if charts.data else "",
+        *_figures_html(figures),
+        *_parameters_html(flight),
     ]
-    return html_page(title, body, _footer(flight), (player, charts, controls))
+    return html_page(title, body, _footer_text(flight), (player, charts, controls))
 
 
-def _facts(flight: FlightReport) -> str:
+def _facts_html(flight: FlightReport) -> str:
     found = []
     if flight.method:
         found.append(f"method {flight.method}")
@@ -101,7 +101,7 @@ def _facts(flight: FlightReport) -> str:
     return facts(found)
 
 
-def _outcome(flight: FlightReport) -> str:
+def _outcome_html(flight: FlightReport) -> str:
     if not flight.statuses:
         return (
             '<p class="outcome">The bag holds no status of a planner or a controller '
@@ -115,13 +115,13 @@ def _outcome(flight: FlightReport) -> str:
     return f'<p class="outcome {escape(last.state)}">{state}{escape(sentence)}</p>'
 
 
-def _runs(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str]:
+def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str]:
     if not beside:
         return []
-    return ["<h2>Runs side by side</h2>", _table("runs", runs_table([flight, *beside]))]
+    return ["<h2>Runs side by side</h2>", _table_html("runs", runs_table([flight, *beside]))]
 
 
-def _numbers(flight: FlightReport) -> list[str]:
+def _numbers_html(flight: FlightReport) -> list[str]:
     result, joints = result_table(flight), joint_table(flight)
     parts = ["<h2>Numbers of the run</h2>"]
     if flight.goal is None:
@@ -129,27 +129,27 @@ def _numbers(flight: FlightReport) -> list[str]:
     if result.rows:
         parts.append(table("numbers", (), result.rows))
     if joints is not None:
-        parts.append(_table("joints", joints))
+        parts.append(_table_html("joints", joints))
     return parts
 
 
-def _published(flight: FlightReport) -> list[str]:
+def _published_html(flight: FlightReport) -> list[str]:
     found = published_table(flight)
     if found is None:
         return []
     return [
         "<h2>Published and measured values</h2>",
-        _table("published", found),
+        _table_html("published", found),
         '<p class="facts">Source: “planner”, values of the first schedule; “flight”, '
         "measured values.</p>",
     ]
 
 
-def _table(identity: str, given: Table) -> str:
+def _table_html(identity: str, given: Table) -> str:
     return table(identity, given.head, given.rows, given.numeric)
 
 
-def _figures(figures: Figures) -> list[str]:
+def _figures_html(figures: Figures) -> list[str]:
     parts, numbers = [], chart_numbers(figures)
     for sentence in dict.fromkeys(each for each in figures if isinstance(each, str)):
         parts.append(f'<p class="missing">{escape(sentence)}</p>')
@@ -157,19 +157,19 @@ def _figures(figures: Figures) -> list[str]:
     for number, each in enumerate(drawn, start=1):
         charts = f' data-charts="{numbers[each.name]}"' if each.name in numbers else ""
         heading = escape(each.heading)
-        caption = f"<b>Figure {number}. {heading}.</b> {_caption(each)}"
+        caption = f"<b>Figure {number}. {heading}.</b> {_caption_html(each)}"
         parts.append(figure(each.name, each.svg, each.heading, caption, charts))
     return parts
 
 
-def _caption(each: ReportFigure) -> str:
+def _caption_html(each: ReportFigure) -> str:
     if not each.of_picture:
         return escape(each.caption)
     before, aside, after = each.caption.partition(each.of_picture)
     return f'{escape(before)}<span class="still">{escape(aside)}</span>{escape(after)}'
 
 
-def _events(events: Sequence[FlightEvent]) -> list[str]:
+def _events_html(events: Sequence[FlightEvent]) -> list[str]:
     """Return the table of events by time; of very many the first rows."""
     if not events:
         return []
@@ -186,7 +186,7 @@ def _events(events: Sequence[FlightEvent]) -> list[str]:
     return ["<h2>Events</h2>", shown]
 
 
-def _parameters(flight: FlightReport) -> list[str]:
+def _parameters_html(flight: FlightReport) -> list[str]:
     nodes = {
         name.partition("/")[2]: values
         for name, values in flight.bag.metadata.items()
@@ -206,7 +206,7 @@ def _parameters(flight: FlightReport) -> list[str]:
     return parts
 
 
-def _footer(flight: FlightReport) -> str:
+def _footer_text(flight: FlightReport) -> str:
     version = flight.bag.metadata.get("spacerobot", {}).get("version", "")
     by = f", recorded by spacerobot_ros {version}" if version else ""
     return f"Made from the bag {flight.file_name} alone: {flight.bag.message_count} messages{by}."
@@ -226,7 +226,7 @@ def charts_of(flight: FlightReport, figures: Figures) -> PagePart:
         return PagePart()
     charts = {
         "end": flight.end,
-        "charts": [_chart(group) for group in groups],
+        "charts": [_chart_data(group) for group in groups],
         "events": _chart_events(flight),
     }
     return PagePart(
@@ -246,7 +246,7 @@ def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
         text = f"{each.text} (+{len(sentences)})" if sentences else each.text
         sentences.append(each.event.message)
         shown = {"time": each.time, "sentence": " ".join(sentences), "text": text}
-        found.append(shown | mark_of(each.event.kind))
+        found.append(shown | event_style(each.event.kind))
     return found
 
 
@@ -260,8 +260,8 @@ def chart_numbers(figures: Figures) -> dict[str, str]:
     return found
 
 
-def _chart(group: TraceGroup) -> dict[str, Any]:
-    signal = thinned(group.signal)
+def _chart_data(group: TraceGroup) -> dict[str, Any]:
+    signal = thin_out(group.signal)
     values = signal.values
     if group.decades:
         largest = float(np.nanmax(values, initial=0.0))
@@ -270,14 +270,14 @@ def _chart(group: TraceGroup) -> dict[str, Any]:
         values = np.log10(np.maximum(values, 10.0 ** (top - group.decades)))
     if group.rows:
         values = values * 0.8 + np.arange(values.shape[1])[::-1]
-    low, high = _extent(group)
+    low, high = _limit_range(group)
     return {
         "label": group.label,
         "unit": group.unit,
         "names": list(group.names),
         "colours": list(group.colours),
-        "time": _packed(signal.time, "<f8"),
-        "values": [_packed(column, "<f4") for column in values.T],
+        "time": _encode_numbers(signal.time, "<f8"),
+        "values": [_encode_numbers(column, "<f4") for column in values.T],
         "goals": [list(map(float, goal)) for goal in group.goals],
         "limits": [[k, value] for k, value in group.limits if low < value < high],
         "window": group.window,
@@ -286,7 +286,7 @@ def _chart(group: TraceGroup) -> dict[str, Any]:
     }
 
 
-def _extent(group: TraceGroup) -> tuple[float, float]:
+def _limit_range(group: TraceGroup) -> tuple[float, float]:
     """Return the range of values (lower, upper) in which limits are drawn."""
     goals = np.array([goal[3] for goal in group.goals])
     numbers = np.append(group.signal.values, goals)
@@ -295,7 +295,7 @@ def _extent(group: TraceGroup) -> tuple[float, float]:
     return low - 0.2 * span, high + 0.2 * span
 
 
-def thinned(signal: Signal) -> Signal:
+def thin_out(signal: Signal) -> Signal:
     """Return fewer samples of a signal for a chart that looks the same.
 
     Kept are the samples off the lines between others or, where these would be too many, the
@@ -318,6 +318,6 @@ def thinned(signal: Signal) -> Signal:
     return Signal(signal.time[kept], signal.values[kept])
 
 
-def _packed(values: Any, kind: str) -> str:
+def _encode_numbers(values: Any, kind: str) -> str:
     """Return the bytes of numbers, little-endian, as base64."""
     return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()

@@ -16,8 +16,8 @@ from html import escape
 from importlib.resources import files
 from typing import Any
 
-_HINT = '<p class="hint">Wider than this screen: scroll sideways →</p>'
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+_SCROLL_HINT = '<p class="hint">Wider than this screen: scroll sideways →</p>'
+_SECURITY_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 @dataclass(frozen=True)
@@ -62,17 +62,17 @@ def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[Page
     parts
         Their scripts, styles and licences go into the page; their markup stands in ``body``.
     """
-    policy = "; ".join(filter(None, (_POLICY, _script_policy(parts))))
+    policy = "; ".join(filter(None, (_SECURITY_POLICY, _script_policy(parts))))
     css = "".join(part.style for part in parts) + package_file("page.css")
     end = f"<footer><p>{escape(footer)}</p></footer>"
-    content = "\n".join(filter(None, (*body, _licences(parts), end)))
+    content = "\n".join(filter(None, (*body, _licences_html(parts), end)))
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
         f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<main>\n"
-        f"{content}\n</main>\n{_scripts(parts)}\n</body>\n</html>\n"
+        f"{content}\n</main>\n{_scripts_html(parts)}\n</body>\n</html>\n"
     )
 
 
@@ -84,7 +84,7 @@ def _script_policy(parts: Sequence[PagePart]) -> str:
     return f"script-src {allowed}" if allowed else ""
 
 
-def _scripts(parts: Sequence[PagePart]) -> str:
+def _scripts_html(parts: Sequence[PagePart]) -> str:
     made = []
     for part in parts:
         for identity, content in part.data.items():
@@ -96,7 +96,7 @@ def _scripts(parts: Sequence[PagePart]) -> str:
     return "\n".join(made)
 
 
-def _licences(parts: Sequence[PagePart]) -> str:
+def _licences_html(parts: Sequence[PagePart]) -> str:
     """Return the licences of third-party scripts, folded up."""
     notices = [notice for part in parts for notice in part.notices]
     if not notices:
@@ -144,7 +144,7 @@ def table(
     body = "".join(row(cells, "td") for cells in rows)
     titles = f"<thead>\n{row(head, 'th')}</thead>" if head else ""
     return (
-        f'{_HINT}<div class="scroll"><table id="{identity}">{titles}'
+        f'{_SCROLL_HINT}<div class="scroll"><table id="{identity}">{titles}'
         f"<tbody>\n{body}</tbody></table></div>"
     )
 
@@ -167,7 +167,7 @@ def figure(name: str, svg: bytes, text: str, caption: str, attributes: str = "")
     """
     data = base64.b64encode(svg).decode()
     return (
-        f'<figure id="{name}"{attributes}>{_HINT}'
+        f'<figure id="{name}"{attributes}>{_SCROLL_HINT}'
         f'<div class="scroll"><img src="data:image/svg+xml;base64,{data}" '
         f'alt="{escape(text)}"></div>\n<figcaption>{caption}</figcaption></figure>'
     )

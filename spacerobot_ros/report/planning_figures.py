@@ -15,7 +15,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
 
-from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_quaternions
 from spacerobot_ros.planning.analysis import Analysis
@@ -41,31 +40,31 @@ from spacerobot_ros.report.figures import (
 )
 from spacerobot_ros.simulation.trials import PlanEvaluation, Problem
 
-_FINE, _COARSE = 61, 37
+_FINE_GRID, _COARSE_GRID = 61, 37
 """Points a side of a map, of robots with up to three joints and with more."""
 
-_LEVELS = 16
-_CONDITIONS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.0, 100.0)
-_POOR = 300.0
+_COLOUR_LEVELS = 16
+_CONDITION_LEVELS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.0, 100.0)
+_MAX_CONDITION = 300.0
 """Condition numbers above are drawn as this one: singular shapes are lines between grid points."""
 
-_LEAST_ROOM = 0.25
+_MIN_LIMIT_DISTANCE = 0.25
 """Squares are drawn round a centre that is as far from the joint limits, rad."""
 
-_SIDES = 60
-_BAR = WIDTH - 0.86
+_SQUARE_COUNT = 60
+_COLOUR_BAR_X = WIDTH - 0.86
 """Where a bar of colours stands, inches."""
 
-_AXES = ("x", "y", "z")
+_AXIS_NAMES = ("x", "y", "z")
 
 
 def draw_analysis(found: Analysis, format: PictureFormat = PictureFormat.PNG) -> bytes | None:
     """Return the curvature maps of a robot as a picture; None where no loop turns its base."""
     with drawing():
         if found.planar.controllable:
-            figure = _planar(found)
+            figure = _planar_figure(found)
         elif found.nominal is not None:
-            figure = _spatial(found)
+            figure = _spatial_figure(found)
         else:
             return None
         return picture_of(figure, format)
@@ -74,7 +73,7 @@ def draw_analysis(found: Analysis, format: PictureFormat = PictureFormat.PNG) ->
 # -- planar robots ------------------------------------------------------------------------------
 
 
-def _planar(found: Analysis) -> Figure:
+def _planar_figure(found: Analysis) -> Figure:
     """Draw H over the plane of two joints, and the phase of squares round its peak."""
     robot = found.robot
     i, j = sorted(robot.joint_names.index(name) for name in found.planar.joints)
@@ -86,38 +85,39 @@ def _planar(found: Analysis) -> Figure:
     bar = panel(figure, 4.4, 0.6, 0.12, 3.55)
     x, y = (np.linspace(low, high, 121) for low, high in zip(lower, upper, strict=True))
     H = -plane.curvature(np.stack(np.meshgrid(x, y), axis=-1))
-    norm = _signed(np.abs(H).max())
-    _map(left, x, y, H, norm)
+    norm = _symmetric_norm(np.abs(H).max())
+    _draw_map(left, x, y, H, norm)
     left.plot(*centre, marker="+", color=INK, ms=9, mew=1.4)
     left.set_xlim(lower[0], upper[0])
     left.set_ylim(lower[1], upper[1])
     left.set_xlabel(f"{robot.joint_names[i]} (rad)")
     left.set_ylabel(f"{robot.joint_names[j]} (rad)")
     left.set_title("H: turn by small clockwise loops over area (1/rad)")
-    _bar(figure, bar, norm, "RdBu_r", "H (1/rad)")
+    _draw_colour_bar(figure, bar, norm, "RdBu_r", "H (1/rad)")
     right = panel(figure, 5.9, 0.6, WIDTH - 6.2, 3.55)
 
-    def room(point: Array) -> float:
+    def distance_to_limits(point: Array) -> float:
         return float(np.minimum(robot.upper[[i, j]] - point, point - robot.lower[[i, j]]).min())
 
-    if room(centre) < _LEAST_ROOM:
+    if distance_to_limits(centre) < _MIN_LIMIT_DISTANCE:
         # The peak is on a joint limit: squares need one that is not.
         quarter = (upper - lower) / 4
         inner = np.array([[lower + quarter, upper - quarter]])
         centre = curvature_peaks(plane, np.zeros(2), inner)[0]
-    _phases(right, plane, centre, 2 * room(centre))
+    _draw_square_turns(right, plane, centre, 2 * distance_to_limits(centre))
     return figure
 
 
-def _phases(axes: Axes, plane: PhasePlane, centre: Array, room: float) -> None:
+def _draw_square_turns(axes: Axes, plane: PhasePlane, centre: Array, room: float) -> None:
     """Draw the turn by a square round a centre against its side (paper 3, figure 3)."""
-    sides = np.linspace(0.0, min(np.pi, room), _SIDES)
-    turns = np.abs(plane.squares(np.tile(centre, (_SIDES, 1)), sides))
+    sides = np.linspace(0.0, min(np.pi, room), _SQUARE_COUNT)
+    turns = np.abs(plane.squares(np.tile(centre, (_SQUARE_COUNT, 1)), sides))
     small = abs(float(plane.curvature(centre))) * sides**2
     axes.plot(sides, turns, color=PALETTE[0], label="round the best centre")
     axes.plot(sides, small, color=MUTED, dashes=(4, 3), lw=0.9, label="|H| z², small squares")
     axes.set_xlabel("side z of the square (rad)")
-    axes.set_title("turn of the base by one square loop (rad)")
+    axes.set_title("turn of the base by one square loop")
+    axes.set_ylabel("turn (rad)")
     axes.set_xlim(0.0, None)
     axes.set_ylim(0.0, 1.35 * turns.max())
     axes.legend(loc="upper left")
@@ -126,77 +126,84 @@ def _phases(axes: Axes, plane: PhasePlane, centre: Array, room: float) -> None:
 # -- spatial robots -----------------------------------------------------------------------------
 
 
-def _spatial(found: Analysis) -> Figure:
+def _spatial_figure(found: Analysis) -> Figure:
     """Draw the entries of M where joints turn, and the condition number of M in any case."""
     assert found.nominal is not None
     joints = found.nominal.joints
-    kinds = [found.robot.description.movable_joints[k].kind for k in joints]
-    sliding = all(kind is JointKind.PRISMATIC for kind in kinds)
+    movable = found.robot.description.movable_joints
+    sliding = all(movable[k].kind is JointKind.PRISMATIC for k in joints)
     rows = 1 if sliding else 4
     high, gap = (2.35, 0.75) if sliding else (1.95, 0.72)
     figure = new_figure(0.35 + rows * (high + gap) + (2.1 if sliding else 0.0))
     width, across = 2.2, 0.62
-    maps = [_over_plane(found, pair) for pair in PLANES]
+    maps = [_curvature_over_plane(found, pair) for pair in PLANES]
     bottom = float(figure.get_size_inches()[1]) - 0.35
     for row, (pair, (x, y, K, _)) in enumerate(zip(PLANES, maps, strict=True)):
         if sliding:
             break
         bottom -= high + (gap if row else 0.0)
-        norm = _signed(np.abs(K).max())
+        norm = _symmetric_norm(np.abs(K).max())
         for column, values in enumerate(K):
             axes = panel(figure, 0.7 + column * (width + across), bottom, width, high)
-            _map(axes, x, y, values, norm)
-            _mark(axes, found, pair)
-            first, second = (_symbol(pair, k) for k in (0, 1))
-            axes.set_title(f"turn about {_AXES[column]} by loops of {first}, {second}")
+            _draw_map(axes, x, y, values, norm)
+            _mark_shape(axes, found, pair)
+            first, second = (_joint_symbol(pair, k) for k in (0, 1))
+            axes.set_title(f"turn about {_AXIS_NAMES[column]} by loops of {first}, {second}")
         # A turn in rad for an area in the plane of the two joints.
-        first, second = (_unit(found.robot, joints[k]) for k in pair)
+        first, second = (movable[joints[k]].unit for k in pair)
         area = f"{first}²" if first == second else f"({first} {second})"
         label = f"curvature K (rad/{area})"
-        _bar(figure, panel(figure, _BAR, bottom, 0.12, high), norm, "RdBu_r", label)
+        _draw_colour_bar(
+            figure, panel(figure, _COLOUR_BAR_X, bottom, 0.12, high), norm, "RdBu_r", label
+        )
     bottom -= high + (0.0 if sliding else gap)
-    poor = BoundaryNorm(_CONDITIONS, 256, extend="max")
+    poor = BoundaryNorm(_CONDITION_LEVELS, 256, extend="max")
     for column, (pair, (x, y, _, condition)) in enumerate(zip(PLANES, maps, strict=True)):
         axes = panel(figure, 0.7 + column * (width + across), bottom, width, high)
-        axes.contourf(x, y, condition, _CONDITIONS, norm=poor, cmap="viridis_r", extend="max")
-        _mark(axes, found, pair)
+        axes.contourf(x, y, condition, _CONDITION_LEVELS, norm=poor, cmap="viridis_r", extend="max")
+        _mark_shape(axes, found, pair)
         axes.set_title("condition number of M")
     label = "condition number of M (1)"
-    _bar(figure, panel(figure, _BAR, bottom, 0.12, high), poor, "viridis_r", label)
+    _draw_colour_bar(
+        figure, panel(figure, _COLOUR_BAR_X, bottom, 0.12, high), poor, "viridis_r", label
+    )
     if sliding:
-        _distribution(panel(figure, 0.7, 0.55, WIDTH - 1.0, 1.5), found.conditions)
+        _draw_condition_shares(panel(figure, 0.7, 0.55, WIDTH - 1.0, 1.5), found.conditions)
     return figure
 
 
-def _over_plane(found: Analysis, pair: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
+def _curvature_over_plane(
+    found: Analysis, pair: tuple[int, int]
+) -> tuple[Array, Array, Array, Array]:
     """Return grids x and y (P,), the curvature (3, P, P) of two of the three joints over their
     plane, and the condition number (P, P) of M there.
     """
     assert found.nominal is not None
     robot, joints = found.robot, found.nominal.joints
     i, j = (joints[k] for k in pair)
-    count = _FINE if robot.n <= 3 else _COARSE
+    count = _FINE_GRID if robot.n <= 3 else _COARSE_GRID
     lower, upper = shape_box(robot)
     x, y = (np.linspace(lower[k], upper[k], count) for k in (i, j))
     shapes = np.tile(found.shape, (count * count, 1))
     shapes[:, i], shapes[:, j] = (grid.ravel() for grid in np.meshgrid(x, y))
     K = curvatures(robot, shapes)
     values = np.linalg.svd(curvature_matrices(K, joints), compute_uv=False)
-    condition = values[:, 0] / np.maximum(values[:, 2], values[:, 0] / _POOR)
+    condition = values[:, 0] / np.maximum(values[:, 2], values[:, 0] / _MAX_CONDITION)
     grid = (count, count)
     return x, y, K[:, :, i, j].T.reshape(3, *grid), condition.reshape(grid)
 
 
-def _mark(axes: Axes, found: Analysis, pair: tuple[int, int]) -> None:
+def _mark_shape(axes: Axes, found: Analysis, pair: tuple[int, int]) -> None:
     """Mark the shape of the analysis, and name the joints of the plane."""
     assert found.nominal is not None
     i, j = (found.nominal.joints[k] for k in pair)
     axes.plot(found.shape[i], found.shape[j], marker="+", color=INK, ms=8, mew=1.3)
     for k, index, label in ((i, 0, axes.set_xlabel), (j, 1, axes.set_ylabel)):
-        label(f"{_symbol(pair, index)}: {found.robot.joint_names[k]} ({_unit(found.robot, k)})")
+        joint = found.robot.description.movable_joints[k]
+        label(f"{_joint_symbol(pair, index)}: {joint.name} ({joint.unit})")
 
 
-def _distribution(axes: Axes, conditions: Array) -> None:
+def _draw_condition_shares(axes: Axes, conditions: Array) -> None:
     finite = np.sort(conditions[np.isfinite(conditions)])
     share = np.arange(1, len(finite) + 1) / len(conditions)
     axes.step(finite, share, where="post", color=PALETTE[0])
@@ -204,15 +211,15 @@ def _distribution(axes: Axes, conditions: Array) -> None:
     axes.xaxis.set_major_formatter("{x:g}")
     axes.set_xlim(1.0, None)
     axes.set_ylim(0.0, 1.05)
-    axes.set_xlabel("condition number of the best three brackets")
+    axes.set_xlabel("condition number of the best three brackets (1)")
     axes.set_title(f"share of {len(conditions)} shapes all over the shape space that are as good")
 
 
 # -- parts --------------------------------------------------------------------------------------
 
 
-def _map(axes: Axes, x: Array, y: Array, values: Array, norm: Normalize) -> None:
-    levels = np.linspace(norm.vmin or 0.0, norm.vmax or 1.0, _LEVELS + 1)
+def _draw_map(axes: Axes, x: Array, y: Array, values: Array, norm: Normalize) -> None:
+    levels = np.linspace(norm.vmin or 0.0, norm.vmax or 1.0, _COLOUR_LEVELS + 1)
     axes.contourf(x, y, values, levels, norm=norm, cmap="RdBu_r")
     for lines, color, linewidth in ((levels, MUTED, 0.35), (np.zeros(1), INK, 0.8)):
         # Matplotlib before 3.7 warns where there is nothing to draw.
@@ -225,23 +232,18 @@ def _map(axes: Axes, x: Array, y: Array, values: Array, norm: Normalize) -> None
         spine.set_color(FAINT)
 
 
-def _signed(peak: float) -> Normalize:
+def _symmetric_norm(peak: float) -> Normalize:
     return TwoSlopeNorm(0.0, -peak, peak)
 
 
-def _bar(figure: Figure, axes: Axes, norm: Any, colours: str, label: str) -> None:
+def _draw_colour_bar(figure: Figure, axes: Axes, norm: Any, colours: str, label: str) -> None:
     bar = figure.colorbar(ScalarMappable(norm, colours), cax=axes, label=label)
     bar.outline.set_linewidth(0.0)
     axes.grid(False)
 
 
-def _symbol(pair: Sequence[int], index: int) -> str:
+def _joint_symbol(pair: Sequence[int], index: int) -> str:
     return f"φ{'₁₂₃'[pair[index]]}"
-
-
-def _unit(robot: SpaceRobot, index: int) -> str:
-    sliding = robot.description.movable_joints[index].kind is JointKind.PRISMATIC
-    return "m" if sliding else "rad"
 
 
 # -- a plan -------------------------------------------------------------------------------------
@@ -252,10 +254,10 @@ def draw_plan(
 ) -> bytes:
     """Return the picture of a plan: joints, their velocities, base path, and goal."""
     with drawing():
-        return picture_of(_plan(problem, trial), format)
+        return picture_of(_plan_figure(problem, trial), format)
 
 
-def _plan(problem: Problem, trial: PlanEvaluation) -> Figure:
+def _plan_figure(problem: Problem, trial: PlanEvaluation) -> Figure:
     robot, goal = problem.robot, problem.goal
     positions = trial.positions
     ticks = problem.control_period * np.arange(len(positions), dtype=np.float64)
@@ -265,14 +267,13 @@ def _plan(problem: Problem, trial: PlanEvaluation) -> Figure:
     names = robot.joint_names
     figure, rows = sheet([[1], [1], [1, 1]], [1.9, 1.9, 1.9], right=room_for(names) + 0.35)
     joints, speeds, (place, attitude) = rows[0][0], rows[1][0], rows[2]
-    kinds = {joint.kind is JointKind.PRISMATIC for joint in robot.description.movable_joints}
-    units = [unit for unit, prismatic in (("m", True), ("rad", False)) if prismatic in kinds]
+    units = sorted({joint.unit for joint in robot.description.movable_joints})
     title = f"{trial.method}, {trial.duration:.6g} s: joints ({', '.join(units)})"
-    _panel(joints, title, ticks, positions, names)
+    _draw_panel(joints, title, ticks, positions, names)
     # Held over a tick: steps.
     held = np.repeat(rates, 2, axis=0)
     title = f"held joint velocities ({', '.join(f'{unit}/s' for unit in units)})"
-    _panel(speeds, title, np.repeat(ticks, 2)[1:-1], held, names)
+    _draw_panel(speeds, title, np.repeat(ticks, 2)[1:-1], held, names)
     for axes, title, values, wanted in (
         (place, "base position (m) and goal", path.position, goal.position),
         (
@@ -282,12 +283,12 @@ def _plan(problem: Problem, trial: PlanEvaluation) -> Figure:
             rotvec_from_quaternion(goal.quaternion),
         ),
     ):
-        _panel(axes, title, path.time, values, _AXES, wanted)
+        _draw_panel(axes, title, path.time, values, _AXIS_NAMES, wanted)
         axes.set_xlabel("time (s)")
     return figure
 
 
-def _panel(
+def _draw_panel(
     axes: Axes,
     title: str,
     time: Array,

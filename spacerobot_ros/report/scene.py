@@ -26,7 +26,7 @@ from spacerobot_ros.report.figures import FAINT, GHOST, PALETTE
 from spacerobot_ros.report.flight import FlightReport, Target
 from spacerobot_ros.report.page_parts import PagePart, package_file
 from spacerobot_ros.report.signals import Cycles, Indices, simplified
-from spacerobot_ros.report.solids import EDGE, SolidRobot, body_color
+from spacerobot_ros.report.solids import EDGE_COLOUR, SolidRobot, body_color
 
 Command = dict[str, Any]
 
@@ -61,7 +61,7 @@ def set_transform(path: str, matrix: Array) -> Command:
     return {"type": "set_transform", "path": path, "matrix": flat}
 
 
-def _object(path: str, geometry: Command, material: Command, kind: str) -> Command:
+def _set_object(path: str, geometry: Command, material: Command, kind: str) -> Command:
     names = {"geometry": f"{path} geometry", "material": f"{path} material"}
     unit = np.eye(4).ravel().tolist()
     return {
@@ -78,22 +78,22 @@ def _object(path: str, geometry: Command, material: Command, kind: str) -> Comma
 
 def line(path: str, points: Array, color: str) -> Command:
     """A line through points (k, 3)."""
-    return _object(path, _points(points), _stroke(color, 1.0), "Line")
+    return _set_object(path, _point_geometry(points), _line_material(color, 1.0), "Line")
 
 
 def segments(path: str, ends: Array, color: str, opacity: float = 1.0) -> Command:
     """Separate lines between points (2 k, 3)."""
-    return _object(path, _points(ends), _stroke(color, opacity), "LineSegments")
+    return _set_object(path, _point_geometry(ends), _line_material(color, opacity), "LineSegments")
 
 
-def _points(points: Array) -> Command:
-    numbers = {"type": "Float32Array", "array": _rounded(points)}
+def _point_geometry(points: Array) -> Command:
+    numbers = {"type": "Float32Array", "array": _round_values(points)}
     position = {"itemSize": 3, "normalized": False, **numbers}
     return {"type": "BufferGeometry", "data": {"attributes": {"position": position}}}
 
 
-def _stroke(color: str, opacity: float) -> Command:
-    stroke = {"type": "LineBasicMaterial", "color": _number(color), "linewidth": 1}
+def _line_material(color: str, opacity: float) -> Command:
+    stroke = {"type": "LineBasicMaterial", "color": _color_number(color), "linewidth": 1}
     return stroke if opacity == 1.0 else stroke | {"transparent": True, "opacity": opacity}
 
 
@@ -113,7 +113,7 @@ def clip(path: str, time: Array, tracks: dict[str, Array]) -> Command:
             # The viewer interpolates the short way between quaternions of equal sign.
             flips = np.cumsum((values[1:] * values[:-1]).sum(axis=1) < 0) % 2
             values = values * np.append(1, 1 - 2 * flips)[:, np.newaxis]
-        numbers = {"times": np.round(time, 4).tolist(), "values": _rounded(values)}
+        numbers = {"times": np.round(time, 4).tolist(), "values": _round_values(values)}
         made.append({"name": f".{name}", "type": kinds[name], **numbers})
     return {"path": path, "clip": {"fps": 1, "name": "flight", "tracks": made}}
 
@@ -130,7 +130,7 @@ def solid(path: str, visual: Visual, color: str, opacity: float = 1.0) -> list[C
     if shape.kind == "cylinder":
         # Along y in three.js, along z in URDF.
         matrix = matrix @ np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
-    look = {"type": "MeshPhongMaterial", "color": _number(color), "shininess": 15}
+    look = {"type": "MeshPhongMaterial", "color": _color_number(color), "shininess": 15}
     # Keep edges and ghosts visible in the surface of a solid.
     look |= {"polygonOffset": True, "polygonOffsetFactor": 1, "polygonOffsetUnits": 1}
     if opacity < 1.0:
@@ -139,23 +139,23 @@ def solid(path: str, visual: Visual, color: str, opacity: float = 1.0) -> list[C
     if shape.kind == "mesh":
         # Both sides are drawn, because files differ in which one is outside.
         look |= {"flatShading": True, "side": 2}
-        return [_object(f"{path}/solid", _triangles(visual.mesh), look, "Mesh")]
+        return [_set_object(f"{path}/solid", _mesh_geometry(visual.mesh), look, "Mesh")]
     geometry = {"box": _box, "cylinder": _cylinder, "sphere": _sphere}[shape.kind](shape.size)
     commands = [
-        _object(f"{path}/solid", geometry, look, "Mesh"),
+        _set_object(f"{path}/solid", geometry, look, "Mesh"),
         set_transform(f"{path}/solid", matrix),
     ]
     edges = visual.edges.lines
     if len(edges):
-        tint = EDGE if opacity == 1.0 else color
+        tint = EDGE_COLOUR if opacity == 1.0 else color
         ends = edges.reshape(-1, 3)
         commands.append(segments(f"{path}/edges", ends, tint, 0.5 if opacity == 1.0 else 1.0))
     return commands
 
 
-def _triangles(mesh: TriangleMesh) -> Command:
+def _mesh_geometry(mesh: TriangleMesh) -> Command:
     kind = "Uint16Array" if len(mesh.vertices) < 1 << 16 else "Uint32Array"
-    made = _points(mesh.vertices)
+    made = _point_geometry(mesh.vertices)
     made["data"]["index"] = {"type": kind, "array": mesh.faces.ravel().tolist()}
     return made
 
@@ -175,11 +175,11 @@ def _sphere(size: tuple[float, ...]) -> dict[str, Any]:
     return {"type": "SphereGeometry", "radius": size[0], "widthSegments": 24, "heightSegments": 16}
 
 
-def _rounded(values: Array) -> list[float]:
+def _round_values(values: Array) -> list[float]:
     return np.round(values.ravel(), 5).tolist()
 
 
-def _number(color: str) -> int:
+def _color_number(color: str) -> int:
     """Return a color ``#rrggbb`` as a number."""
     return int(color[1:], 16)
 
@@ -214,11 +214,11 @@ def player_of(scene: Scene | str) -> PagePart:
         markup=_MARKUP.format(caption=escape(scene.caption)),
         data={"flight": {"parts": parts, "commands": scene.commands}},
         programs=(viewer, package_file("player.js")),
-        notices=_notices(),
+        notices=_licence_notices(),
     )
 
 
-def _notices() -> tuple[tuple[str, str], ...]:
+def _licence_notices() -> tuple[tuple[str, str], ...]:
     """Return the licences of MeshCat and of the libraries in its viewer, such as three.js."""
     own, others = "", []
     for file in distribution("meshcat").files or ():
@@ -240,8 +240,8 @@ def _notices() -> tuple[tuple[str, str], ...]:
 FULL_CYCLES = 3
 """Cycles at the beginning and at the end of a gait that are shown in full."""
 
-_MOST = 1000
-_MOST_INSTANTS = 300
+_MAX_KEY_FRAMES = 1000
+_MAX_CYCLE_INSTANTS = 300
 """Instants of equal phase between the cycles that are shown in full."""
 
 
@@ -281,12 +281,12 @@ def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
         start = cycles.start + FULL_CYCLES * cycles.period
         count = cycles.count - 2 * FULL_CYCLES
         end = start + count * cycles.period
-        every = max(1, -(-count // _MOST_INSTANTS))
+        every = max(1, -(-count // _MAX_CYCLE_INSTANTS))
         instants = start + cycles.period * np.arange(0, count + 1, every)
         full = (motion.time <= start) | (motion.time >= end - 1e-9)
         places = np.searchsorted(motion.time, instants - 1e-9)
         shown = np.union1d(np.flatnonzero(full), np.minimum(places, len(motion) - 1))
-    chosen, error = simplified(Signal(motion.time[shown], motion.values[shown]), _MOST)
+    chosen, error = simplified(Signal(motion.time[shown], motion.values[shown]), _MAX_KEY_FRAMES)
     return KeyFrames(shown[chosen], error, every)
 
 
@@ -296,15 +296,15 @@ _POSITION_TOLERANCE = 0.001
 _ANGLE_TOLERANCE = 0.005
 """Tolerance of angles between key frames, rad."""
 
-_LINE_POINTS = 4000
-_MOST_FACES = 20_000
+_MAX_LINE_POINTS = 4000
+_MAX_MESH_FACES = 20_000
 """Largest number of faces of all meshes together: some 0.6 MB."""
 
 _BACKGROUND = [246 / 255, 247 / 255, 249 / 255]
 _FIELD_OF_VIEW = 30.0
 """Field of view of the camera, deg."""
 
-_AXES = ("#d55e00", "#009e73", "#0072b2")
+_AXIS_COLOURS = ("#d55e00", "#009e73", "#0072b2")
 WORLD, ROBOT = "/flight", "/flight/robot"
 
 
@@ -313,18 +313,18 @@ def scene_of(flight: FlightReport) -> Scene | str:
     drawn = flight.drawn
     if drawn is None:
         return flight.not_drawn
-    center, radius = _extent(flight, drawn)
-    frames = key_frames(_visible(flight, radius), flight.cycles)
-    commands = _stage(center, radius, flight.flat)
-    commands += _robot(drawn.robot, flight.meshes)
-    commands += _lines(flight)
-    ghosts = _ghosts(flight, drawn.robot, radius)
+    center, radius = _center_and_radius(flight, drawn)
+    frames = key_frames(_scaled_motion(flight, radius), flight.cycles)
+    commands = _stage_commands(center, radius, flight.flat)
+    commands += _robot_commands(drawn.robot, flight.meshes)
+    commands += _path_commands(flight)
+    ghosts = _goal_commands(flight, drawn.robot, radius)
     commands += ghosts
-    commands.append(_motion(flight, drawn, frames.indices))
-    return Scene(commands, _parts(flight), _caption(flight, frames, radius, bool(ghosts)))
+    commands.append(_motion_command(flight, drawn, frames.indices))
+    return Scene(commands, _time_spans(flight), _caption_text(flight, frames, radius, bool(ghosts)))
 
 
-def _extent(flight: FlightReport, drawn: SolidRobot) -> tuple[Array, float]:
+def _center_and_radius(flight: FlightReport, drawn: SolidRobot) -> tuple[Array, float]:
     """Return center (3,) and radius of the visible scene, m."""
     clouds = [flight.position.values, flight.tool.values[:, :3]]
     for index in flight.samples(12):
@@ -336,7 +336,7 @@ def _extent(flight: FlightReport, drawn: SolidRobot) -> tuple[Array, float]:
     return (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
 
 
-def _visible(flight: FlightReport, radius: float) -> Signal:
+def _scaled_motion(flight: FlightReport, radius: float) -> Signal:
     """Return the visible motion (N, k), in tolerances."""
     assert flight.robot is not None
     columns = [flight.position.values / (_POSITION_TOLERANCE * radius)]
@@ -347,7 +347,7 @@ def _visible(flight: FlightReport, radius: float) -> Signal:
     return Signal(flight.position.time, np.column_stack(columns))
 
 
-def _stage(center: Array, radius: float, flat: bool) -> list[Command]:
+def _stage_commands(center: Array, radius: float, flat: bool) -> list[Command]:
     """Background, camera, world axes and grid; the scene is moved and scaled to radius 1."""
     world = np.eye(4)
     world[:3, :3] /= radius
@@ -373,15 +373,15 @@ def _stage(center: Array, radius: float, flat: bool) -> list[Command]:
         # The camera's own y axis is up.
         set_property(camera, "position", [x, z, -y]),
         set_transform(WORLD, world),
-        segments(f"{WORLD}/grid", _grid(center, radius, spacing, flat), FAINT, 0.6),
+        segments(f"{WORLD}/grid", _grid_commands(center, radius, spacing, flat), FAINT, 0.6),
         *[
             segments(f"{WORLD}/world/{name}", np.array([[0.0] * 3, 0.25 * radius * unit]), tint)
-            for name, unit, tint in zip("xyz", np.eye(3), _AXES, strict=True)
+            for name, unit, tint in zip("xyz", np.eye(3), _AXIS_COLOURS, strict=True)
         ],
     ]
 
 
-def _grid(center: Array, radius: float, spacing: float, flat: bool) -> Array:
+def _grid_commands(center: Array, radius: float, spacing: float, flat: bool) -> Array:
     """Ends (2 k, 3) of lines parallel to x and y, on whole multiples of ``spacing``."""
     z = center[2] - (0.0 if flat else 0.8 * radius)
     first = np.floor((center[:2] - 1.3 * radius) / spacing)
@@ -401,10 +401,10 @@ def _link_paths(robot: RobotDescription) -> dict[str, str]:
     return paths
 
 
-def _robot(robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> list[Command]:
+def _robot_commands(robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> list[Command]:
     commands: list[Command] = []
     paths = _link_paths(robot)
-    visuals = visuals_of(robot, meshes, _faces(meshes))
+    visuals = visuals_of(robot, meshes, _faces_per_mesh(meshes))
     for joint in robot.joints:
         commands.append(set_transform(paths[joint.child], matrix_of(joint.origin)))
     for number, visual in enumerate(visuals):
@@ -413,12 +413,12 @@ def _robot(robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> list[
     return commands
 
 
-def _faces(meshes: Mapping[str, TriangleMesh]) -> int:
+def _faces_per_mesh(meshes: Mapping[str, TriangleMesh]) -> int:
     """Return the largest number of faces of a mesh, so that the page stays small."""
-    return _MOST_FACES // max(len(meshes), 1)
+    return _MAX_MESH_FACES // max(len(meshes), 1)
 
 
-def _motion(flight: FlightReport, drawn: SolidRobot, indices: Indices) -> Command:
+def _motion_command(flight: FlightReport, drawn: SolidRobot, indices: Indices) -> Command:
     """The animation: position and quaternion of the base, and of every link that a joint moves."""
     time, paths = flight.position.time[indices], _link_paths(drawn.robot)
     base = {"position": flight.position.values[indices], "quaternion": flight.quaternion[indices]}
@@ -433,27 +433,29 @@ def _motion(flight: FlightReport, drawn: SolidRobot, indices: Indices) -> Comman
     return set_animation(clips)
 
 
-def _lines(flight: FlightReport) -> list[Command]:
+def _path_commands(flight: FlightReport) -> list[Command]:
     """Paths of base and end-effector, and the path of the base that was planned."""
     lines = [("path of the base", flight.position.values, PALETTE[0])]
     if len(flight.tool):
         lines.append(("path of the end-effector", flight.tool.values[:, :3], PALETTE[4]))
     commands = []
     for name, points, tint in lines:
-        step = max(1, len(points) // _LINE_POINTS)
+        step = max(1, len(points) // _MAX_LINE_POINTS)
         shown = np.concatenate([points[:-1:step], points[-1:]])
         if len(shown) > 1 and float(np.ptp(shown, axis=0).max()) > 0.0:
             commands.append(line(f"{WORLD}/{name}", shown, tint))
     return commands
 
 
-def _ghosts(flight: FlightReport, robot: RobotDescription, radius: float) -> list[Command]:
+def _goal_commands(flight: FlightReport, robot: RobotDescription, radius: float) -> list[Command]:
     """The base at its last goal and a mark at the end-effector's."""
     commands: list[Command] = []
     if flight.goal is not None and flight.controls("base"):
-        matrix = matrix_of(Pose(matrix_from_quaternion(flight.goal.quaternion), _aim(flight)))
+        matrix = matrix_of(
+            Pose(matrix_from_quaternion(flight.goal.quaternion), _ghost_position(flight))
+        )
         commands.append(set_transform(f"{WORLD}/goal", matrix))
-        visuals = visuals_of(robot, flight.meshes, _faces(flight.meshes) // 4)
+        visuals = visuals_of(robot, flight.meshes, _faces_per_mesh(flight.meshes) // 4)
         for number, visual in enumerate(visuals):
             if visual.body == 0:
                 path = f"{WORLD}/goal/{visual.link.replace('/', '_')} {number}"
@@ -467,19 +469,19 @@ def _ghosts(flight: FlightReport, robot: RobotDescription, radius: float) -> lis
         ball = Shape("sphere", (0.03 * radius,), Pose())
         commands += solid(f"{path}/mark", Visual("", 0, ball, solid_mesh(ball)), GHOST, 0.4)
         if set(flight.controls("end_effector")) & {3, 4, 5}:
-            for name, unit, tint in zip("xyz", np.eye(3), _AXES, strict=True):
+            for name, unit, tint in zip("xyz", np.eye(3), _AXIS_COLOURS, strict=True):
                 ends = np.array([np.zeros(3), 0.12 * radius * unit])
                 commands.append(segments(f"{path}/{name}", ends, tint))
     return commands
 
 
-def _aim(flight: FlightReport) -> Array:
+def _ghost_position(flight: FlightReport) -> Array:
     """Return the position of the ghost: the goal, or the last one if only attitude is a goal."""
     assert flight.goal is not None
     return flight.goal.position if flight.position_counts else flight.position.values[-1]
 
 
-def _parts(flight: FlightReport) -> list[tuple[str, float, float]]:
+def _time_spans(flight: FlightReport) -> list[tuple[str, float, float]]:
     end = float(flight.position.time[-1])
     parts = [("whole flight", 0.0, end)]
     cycles = flight.cycles
@@ -492,7 +494,7 @@ def _parts(flight: FlightReport) -> list[tuple[str, float, float]]:
     return parts
 
 
-def _caption(flight: FlightReport, frames: KeyFrames, radius: float, ghosts: bool) -> str:
+def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts: bool) -> str:
     text = (
         "The robot from the shapes of its URDF, each moving link in the color of its joint in the "
         "figures below; lines are the paths of the base (blue)"

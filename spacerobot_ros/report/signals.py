@@ -15,11 +15,11 @@ from spacerobot_ros.model.rotations import rotvecs_from_quaternions
 
 Indices = npt.NDArray[np.int64]
 
-_FEWEST_CYCLES = 12
-_STRETCHES = 64
+_MIN_CYCLES = 12
+_INITIAL_STRETCHES = 64
 """Stretches a long recording is first cut into before it is simplified, which bounds the work."""
 
-_LONGEST_LOOK = 1 << 14
+_MAX_PERIOD_SAMPLES = 1 << 14
 """Samples at the end of a gait in which a period is looked for."""
 
 
@@ -71,21 +71,21 @@ def simplified(motion: Signal, most: int) -> tuple[Indices, float]:
     -------
     The samples kept, and the largest distance, in tolerances, of one that was dropped.
     """
-    bounds = np.unique(np.linspace(0, len(motion) - 1, _STRETCHES + 1).astype(int)).tolist()
+    bounds = np.unique(np.linspace(0, len(motion) - 1, _INITIAL_STRETCHES + 1).astype(int)).tolist()
     if len(bounds) < 2:
         return np.array(bounds, np.int64), 0.0
     kept = set(bounds)
-    heap = [_worst(motion, a, b) for a, b in itertools.pairwise(bounds)]
+    heap = [_farthest_sample(motion, a, b) for a, b in itertools.pairwise(bounds)]
     heapq.heapify(heap)
     while -heap[0][0] > 1.0 and len(kept) < most:
         _, a, b, k = heapq.heappop(heap)
         kept.add(k)
-        heapq.heappush(heap, _worst(motion, a, k))
-        heapq.heappush(heap, _worst(motion, k, b))
+        heapq.heappush(heap, _farthest_sample(motion, a, k))
+        heapq.heappush(heap, _farthest_sample(motion, k, b))
     return np.array(sorted(kept), np.int64), -heap[0][0]
 
 
-def _worst(motion: Signal, a: int, b: int) -> tuple[float, int, int, int]:
+def _farthest_sample(motion: Signal, a: int, b: int) -> tuple[float, int, int, int]:
     """Minus the largest distance from the line between samples a and b, a, b, and where it is."""
     if b - a < 2:
         return 0.0, a, b, a
@@ -136,18 +136,18 @@ def find_cycles(rates: Signal) -> Cycles | None:
     """
     peak = np.abs(rates.values).max(axis=0, initial=0.0)
     moving = np.flatnonzero((np.abs(rates.values) > 1e-6 * peak).any(axis=1))
-    if len(moving) < 4 * _FEWEST_CYCLES:
+    if len(moving) < 4 * _MIN_CYCLES:
         return None
     values = rates.values[: int(moving[-1]) + 1] / np.where(peak > 0, peak, 1.0)
     # What comes before the cycles may be a good part of all.
-    looks = (values[-min(_LONGEST_LOOK, len(values) // part) :] for part in (1, 2, 4))
-    lag = next((lag for look in looks if (lag := _period(look))), None)
+    looks = (values[-min(_MAX_PERIOD_SAMPLES, len(values) // part) :] for part in (1, 2, 4))
+    lag = next((lag for look in looks if (lag := _period_in_samples(look))), None)
     if lag is None:
         return None
     different = np.abs(values[lag:] - values[:-lag]).max(axis=1) > 0.1
     # The last stretch, between samples that are different, of enough cycles.
     bounds = np.concatenate([[-1], np.flatnonzero(different), [len(different)]])
-    enough = np.flatnonzero(np.diff(bounds) - 1 >= (_FEWEST_CYCLES - 1) * lag)
+    enough = np.flatnonzero(np.diff(bounds) - 1 >= (_MIN_CYCLES - 1) * lag)
     if not len(enough):
         return None
     first, stop = int(bounds[enough[-1]]) + 1, int(bounds[enough[-1] + 1]) + lag
@@ -156,7 +156,7 @@ def find_cycles(rates: Signal) -> Cycles | None:
     return Cycles(start, end, lag * (end - start) / (last - first))
 
 
-def _period(values: Array) -> int | None:
+def _period_in_samples(values: Array) -> int | None:
     """Shortest shift, in samples, by which the columns match themselves; None without one."""
     n = len(values)
     spectrum = np.fft.rfft(values, 2 * n, axis=0)

@@ -23,7 +23,7 @@ _OVERSAMPLING = 2
 _EDGE_WIDTH = 3
 """Width of an edge, in pixels before averaging."""
 
-_FLAT = 1e-6
+_MIN_FACING_COSINE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,10 @@ class Canvas:
     def draw(self, faces: list[Face], edges: list[Edge]) -> None:
         """Draw faces, and over them the edges that no face hides."""
         for face in faces:
-            if face.normal @ self._view.toward > _FLAT:
-                self._fill(face)
+            if face.normal @ self._view.toward > _MIN_FACING_COSINE:
+                self._fill_face(face)
         for edge in edges:
-            self._line(edge)
+            self._draw_edge(edge)
 
     def image(self) -> Image:
         """Return the picture (rows, columns, 4), the top row first, transparent where empty."""
@@ -106,13 +106,13 @@ class Canvas:
         image[..., 3] /= n * n
         return image[::-1]
 
-    def _place(self, points: Array) -> Array:
+    def _to_pixels(self, points: Array) -> Array:
         """World points (k, 3) to column, row and nearness (k, 3)."""
         at = (self._view(points) - self._low) * self._scale
         return np.column_stack([at, points @ self._view.toward])
 
-    def _fill(self, face: Face) -> None:
-        corners = self._place(face.corners)
+    def _fill_face(self, face: Face) -> None:
+        corners = self._to_pixels(face.corners)
         rows, columns = self._depth.shape
         bottom = max(math.ceil(float(corners[:, 1].min()) - 0.5), 0)
         top = min(math.floor(float(corners[:, 1].max()) - 0.5) + 1, rows)
@@ -132,28 +132,31 @@ class Canvas:
         counts = np.maximum(last - first + 1, 0)
         row = np.repeat(np.arange(bottom, top), counts)
         column = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts - first, counts)
-        depth = self._plane(face, column + 0.5, row + 0.5)
+        depth = self._face_depth(face, column + 0.5, row + 0.5)
         nearer = depth > self._depth[row, column]
         row, column = row[nearer], column[nearer]
         self._depth[row, column] = depth[nearer]
         self._pixels[row, column] = [*self._view.shade(face), 1.0]
 
-    def _plane(self, face: Face, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Array:
+    def _face_depth(self, face: Face, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Array:
         """Nearness of the plane of a face at places in pixels."""
         across, up = self._view.paper @ face.normal
         offset = float(face.normal @ face.corners[0]) - self._low @ (across, up)
         depth = offset - (across * x + up * y) / self._scale
         return np.asarray(depth / float(face.normal @ self._view.toward))
 
-    def _line(self, edge: Edge) -> None:
-        at = self._place(edge.line)
+    def _draw_edge(self, edge: Edge) -> None:
+        at = self._to_pixels(edge.line)
         # An edge lies in the faces beside it and is drawn a little nearer.
         at[:, 2] += 2.0 * _EDGE_WIDTH / self._scale
         rows, columns = self._depth.shape
         brush = np.arange(_EDGE_WIDTH) - (_EDGE_WIDTH - 1) / 2
         offsets = np.stack(np.meshgrid(brush, brush), axis=-1).reshape(-1, 1, 2)
         for k in range(len(at) - 1):
-            if len(edge.normals) and not (edge.normals[k] @ self._view.toward > _FLAT).any():
+            if (
+                len(edge.normals)
+                and not (edge.normals[k] @ self._view.toward > _MIN_FACING_COSINE).any()
+            ):
                 continue
             count = max(2, math.ceil(float(np.abs(at[k + 1, :2] - at[k, :2]).max())) + 1)
             points = np.linspace(at[k], at[k + 1], count)
@@ -165,9 +168,9 @@ class Canvas:
             self._pixels[row[seen], column[seen]] = [*edge.fill, 1.0]
 
 
-_BASE = "#c4c9d2"
-EDGE = "#3d4450"
-_FACES = 1500
+_BASE_COLOUR = "#c4c9d2"
+EDGE_COLOUR = "#3d4450"
+_MAX_MESH_FACES = 1500
 """Largest number of faces of a mesh: each is filled by itself."""
 
 Colour = tuple[float, float, float]
@@ -194,7 +197,7 @@ class Solids:
                 self.faces.append(Face(triangle, normal / length, fill))
         edges = visual.edges
         self.edges += [
-            Edge(line, normals[np.newaxis], _rgb(EDGE))
+            Edge(line, normals[np.newaxis], _rgb(EDGE_COLOUR))
             for line, normals in zip(
                 edges.lines @ pose.R.T + pose.r, edges.normals @ pose.R.T, strict=True
             )
@@ -209,7 +212,7 @@ class SolidRobot:
 
     def __init__(self, robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> None:
         self.robot = robot
-        self._visuals = visuals_of(robot, meshes, _FACES)
+        self._visuals = visuals_of(robot, meshes, _MAX_MESH_FACES)
         self.kinematics = ForwardKinematics(robot)
 
     def link_poses(self, q: Array, base: Pose) -> dict[str, Pose]:
@@ -232,7 +235,7 @@ class SolidRobot:
             if visual.body == 0:
                 placed = base @ self.robot.frames[visual.link][1]
                 lines += list(visual.outline @ placed.R.T + placed.r)
-        return lines or _cross(base)
+        return lines or _cross_lines(base)
 
 
 def _rgb(name: str) -> Colour:
@@ -242,9 +245,9 @@ def _rgb(name: str) -> Colour:
 
 def body_color(body: int) -> str:
     """Return the color of the links of a moving body: that of its joint, grey on the base."""
-    return _BASE if body == 0 else colour(body - 1)
+    return _BASE_COLOUR if body == 0 else colour(body - 1)
 
 
-def _cross(pose: Pose) -> list[Array]:
+def _cross_lines(pose: Pose) -> list[Array]:
     """Return a small cross (three lines), in place of a base without visuals."""
     return [pose.r + 0.1 * np.array([-axis, axis]) @ pose.R.T for axis in np.eye(3)]

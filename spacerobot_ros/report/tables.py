@@ -13,8 +13,8 @@ from spacerobot_ros.planning import PoseError
 from spacerobot_ros.report.flight import FlightReport, joint_unit
 from spacerobot_ros.scenario import Published
 
-_ABSENT = "–"
-_TICKS = 1.5
+_NO_VALUE = "–"
+_EQUAL_TIME_TICKS = 1.5
 """Control periods by which times may differ that count as equal."""
 
 
@@ -43,7 +43,7 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         note = f"{tool.angle:.3g} rad" if turned else ""
         rows.append(("End-effector error", f"{tool.distance:.3g} m", note))
     if flight.manoeuvre_time is not None:
-        rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", _to_end(flight)))
+        rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", _time_to_end_text(flight)))
     if flight.method:
         rows.append(("Method", flight.method, ""))
     if len(flight.momentum):
@@ -60,7 +60,7 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
     found = [{label: value for label, value, _ in headline(flight)} for flight in flights]
     labels = list(dict.fromkeys(label for values in found for label in values))
     rows = [
-        (flight.file_name, *(values.get(label, _ABSENT) for label in labels))
+        (flight.file_name, *(values.get(label, _NO_VALUE) for label in labels))
         for flight, values in zip(flights, found, strict=True)
     ]
     return Table(("Bag", *labels), rows)
@@ -74,28 +74,32 @@ def result_table(flight: FlightReport) -> Table:
         last = flight.statuses[-1].state if flight.statuses else ""
         refused = " (refused)" if last == "refused" and not flight.executing else ""
         if flight.position_counts:
-            rows.append((f"Goal position{refused}", f"({_vector(goal.position)}) m"))
-        rows.append((f"Goal attitude{refused}", _attitude(rotvec_from_quaternion(goal.quaternion))))
+            rows.append((f"Goal position{refused}", f"({_format_vector(goal.position)}) m"))
+        rows.append(
+            (f"Goal attitude{refused}", _format_attitude(rotvec_from_quaternion(goal.quaternion)))
+        )
     if len(flight.position):
-        rows.append(("Final position", f"({_vector(flight.position.values[-1])}) m"))
-        rows.append(("Final attitude", _attitude(rotvec_from_quaternion(flight.quaternion[-1]))))
+        rows.append(("Final position", f"({_format_vector(flight.position.values[-1])}) m"))
+        rows.append(
+            ("Final attitude", _format_attitude(rotvec_from_quaternion(flight.quaternion[-1])))
+        )
     if error is not None:
         if flight.position_counts:
-            left = f"{error.distance:.4g} m{_tolerance(flight, 'position', 'm')}"
+            left = f"{error.distance:.4g} m{_tolerance_text(flight, 'position', 'm')}"
             rows.append(("Position error", left))
         angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
-        rows.append(("Attitude error", f"{angle}{_tolerance(flight, 'attitude', 'rad')}"))
+        rows.append(("Attitude error", f"{angle}{_tolerance_text(flight, 'attitude', 'rad')}"))
     if (sensed := flight.sensed_error) is not None:
         parts = [f"{sensed.distance:.4g} m"] if flight.position_counts else []
         rows.append(("Errors as measured", ", ".join([*parts, f"{sensed.angle:.4g} rad"])))
     if flight.tool_error is not None:
         rows += _tool_rows(flight, flight.tool_error)
     if flight.manoeuvre_time is not None:
-        rows.append(("Manoeuvre time", f"{flight.manoeuvre_time:.6g} s{_schedules(flight)}"))
-        if to_end := _to_end(flight):
+        rows.append(("Manoeuvre time", f"{flight.manoeuvre_time:.6g} s{_schedules_text(flight)}"))
+        if to_end := _time_to_end_text(flight):
             rows.append(("First schedule to the end", to_end.partition(" from ")[0]))
     if len(flight.position):
-        rows.append(("Recorded", _recorded(flight)))
+        rows.append(("Recorded", _recorded_text(flight)))
     if len(flight.momentum):
         linear, angular = flight.drift
         drifts = f"linear {linear:.3g} kg m/s, angular {angular:.3g} kg m²/s"
@@ -106,8 +110,8 @@ def result_table(flight: FlightReport) -> Table:
 def _tool_rows(flight: FlightReport, error: PoseError) -> list[tuple[str, ...]]:
     goal, last = flight.tool_goals[-1].goal, flight.tool.values[-1]
     rows: list[tuple[str, ...]] = [
-        ("End-effector goal", f"({_vector(goal.position)}) m"),
-        ("End-effector, final", f"({_vector(last[:3])}) m"),
+        ("End-effector goal", f"({_format_vector(goal.position)}) m"),
+        ("End-effector, final", f"({_format_vector(last[:3])}) m"),
         ("End-effector error", f"{error.distance:.4g} m"),
     ]
     if set(flight.controls("end_effector")) & {3, 4, 5}:
@@ -125,7 +129,7 @@ def joint_table(flight: FlightReport) -> Table | None:
         joint = flight.joint(name)
         unit = joint_unit(flight, name)
         first, last = flight.shape.values[[0, -1], i]
-        limits = limit = share = peak_text = _ABSENT
+        limits = limit = share = peak_text = _NO_VALUE
         if joint is not None:
             if math.isfinite(joint.limits.lower) and math.isfinite(joint.limits.upper):
                 limits = f"{joint.limits.lower:.5g} to {joint.limits.upper:.5g}"
@@ -136,9 +140,19 @@ def joint_table(flight: FlightReport) -> Table | None:
             peak_text = f"{peak:.5f} {unit}/s"
             if joint is not None and 0 < joint.limits.velocity < math.inf:
                 share = f"{100 * peak / joint.limits.velocity:.1f} %"
-        kind = joint.kind.value if joint is not None else _ABSENT
+        kind = joint.kind.value if joint is not None else _NO_VALUE
         rows.append(
-            (name, kind, unit, _number(first), _number(last), limits, peak_text, limit, share)
+            (
+                name,
+                kind,
+                unit,
+                _format_number(first),
+                _format_number(last),
+                limits,
+                peak_text,
+                limit,
+                share,
+            )
         )
     head = ["Joint", "Type", "Unit", "Start", "Final", "Limits", "Peak velocity", "Limit", "Used"]
     return Table(tuple(head), rows, (3, 4, 5, 6, 7, 8))
@@ -150,18 +164,18 @@ def published_table(flight: FlightReport) -> Table | None:
         return None
     rows = []
     for row in flight.published:
-        measured, source = _measured(flight, row)
-        ours = _ABSENT
+        measured, source = _measured_values(flight, row)
+        ours = _NO_VALUE
         if measured:
-            decimals = [_decimals(x) for x in row.printed]
+            decimals = [_count_decimals(x) for x in row.printed]
             decimals += [max(decimals, default=4)] * (len(measured) - len(decimals))
             ours = ", ".join(f"{x:.{d}f}" for x, d in zip(measured, decimals, strict=False))
-        printed = ", ".join(f"{x:.{_decimals(x)}f}" for x in row.printed)
+        printed = ", ".join(f"{x:.{_count_decimals(x)}f}" for x in row.printed)
         rows.append((row.quantity, printed, ours, source, row.note))
     return Table(("Quantity", "Printed", "Measured", "Source", "Note"), rows)
 
 
-def _measured(flight: FlightReport, row: Published) -> tuple[list[float], str]:
+def _measured_values(flight: FlightReport, row: Published) -> tuple[list[float], str]:
     """Return the figure of this flight for a published one, and its source."""
     figures: dict[str, Iterable[float]] = {}
     if len(flight.position):
@@ -182,45 +196,45 @@ def _measured(flight: FlightReport, row: Published) -> tuple[list[float], str]:
     return numbers, "planner" if numbers else ""
 
 
-def _decimals(x: float) -> int:
+def _count_decimals(x: float) -> int:
     """Return the number of decimals of a printed figure."""
     text = repr(x)
     return 0 if "e" in text or text.endswith(".0") else len(text.partition(".")[2])
 
 
-def _vector(values: Iterable[float]) -> str:
-    return ", ".join(_number(x) for x in values)
+def _format_vector(values: Iterable[float]) -> str:
+    return ", ".join(_format_number(x) for x in values)
 
 
-def _number(x: float) -> str:
+def _format_number(x: float) -> str:
     """Return a number of m or rad with 5 decimals; -0 becomes 0."""
     return f"{round(x, 5) + 0.0:.5f}"
 
 
-def _attitude(rotvec: Iterable[float]) -> str:
+def _format_attitude(rotvec: Iterable[float]) -> str:
     angle = math.degrees(math.hypot(*rotvec))
-    return f"rotation vector ({_vector(rotvec)}) rad, {angle:.3f}° in all"
+    return f"rotation vector ({_format_vector(rotvec)}) rad, {angle:.3f}° in all"
 
 
-def _tolerance(flight: FlightReport, what: str, unit: str) -> str:
+def _tolerance_text(flight: FlightReport, what: str, unit: str) -> str:
     value = flight.parameter("planner", f"{what}_tolerance")
     return f" (tolerance {value:.4g} {unit})" if isinstance(value, float | int) else ""
 
 
-def _schedules(flight: FlightReport) -> str:
+def _schedules_text(flight: FlightReport) -> str:
     count = len(flight.executing)
     return f", {count} schedules in the whole flight" if count > 1 else ""
 
 
-def _to_end(flight: FlightReport) -> str:
+def _time_to_end_text(flight: FlightReport) -> str:
     """Return the time to the end if it differs from that of the schedules; else nothing."""
     whole, flown = flight.time_to_end, flight.manoeuvre_time
-    if whole is None or flown is None or abs(whole - flown) < _TICKS * flight.tick:
+    if whole is None or flown is None or abs(whole - flown) < _EQUAL_TIME_TICKS * flight.tick:
         return ""
     return f"{whole:.6g} s from the first schedule to the end"
 
 
-def _recorded(flight: FlightReport) -> str:
+def _recorded_text(flight: FlightReport) -> str:
     time = flight.position.time
     if len(time) < 2:
         return "1 state"

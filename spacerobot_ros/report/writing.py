@@ -53,13 +53,13 @@ from spacerobot_ros.report.page import page
 from spacerobot_ros.report.scene import player_of, scene_of
 from spacerobot_ros.resources import suggestion
 
-_WIDTHS = (40.0, 400.0)
+_PAPER_WIDTHS = (40.0, 400.0)
 """Least and largest width of a figure for a paper, mm."""
 
-_PICTURE_WIDTH = 1000
+_PICTURE_PIXELS = 1000
 """Pixels."""
 
-_ROBOT_WIDTH = 3.9
+_ROBOT_PANEL_WIDTH = 3.9
 """Of the robot in the picture, inches."""
 
 FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
@@ -81,7 +81,7 @@ FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
 }
 """The figures of :func:`write_figures`, by name."""
 
-_REPORTED = (
+_REPORT_FIGURES = (
     configurations_figure,
     position_figure,
     attitude_figure,
@@ -115,7 +115,7 @@ def write_report(
     flight = read_report(bag, namespace)
     others = [read_report(other) for other in beside]
     with drawing():
-        figures = [*(draw(flight) for draw in _REPORTED), path_figure(flight, others)]
+        figures = [*(draw(flight) for draw in _REPORT_FIGURES), path_figure(flight, others)]
         text = page(flight, player_of(scene_of(flight)), figures, others)
     write_output(html, text)
 
@@ -167,8 +167,8 @@ def write_figures(
     if unknown:
         known, meant = ", ".join(FIGURES), suggestion(unknown[0], FIGURES)
         raise SpaceRobotError(f"There is no figure '{unknown[0]}': there are {known}.{meant}")
-    if not _WIDTHS[0] <= width <= _WIDTHS[1]:
-        least, most = _WIDTHS
+    if not _PAPER_WIDTHS[0] <= width <= _PAPER_WIDTHS[1]:
+        least, most = _PAPER_WIDTHS
         raise SpaceRobotError(f"A figure is {least:g} to {most:g} mm wide, and not {width:g} mm.")
     if folder.suffix.lower() in {f".{each.value}" for each in PictureFormat}:
         raise SpaceRobotError(
@@ -215,10 +215,10 @@ def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> 
     if not len(flight.position):
         raise SpaceRobotError(NO_STATES)
     with drawing():
-        write_output(picture, picture_of(_overview(flight), format, _PICTURE_WIDTH))
+        write_output(picture, picture_of(_overview_figure(flight), format, _PICTURE_PIXELS))
 
 
-def _overview(flight: FlightReport) -> Figure:
+def _overview_figure(flight: FlightReport) -> Figure:
     """Base pose and shape over time, beside the robot where it can be drawn."""
     groups = [position_group(flight), attitude_group(flight)]
     if len(flight.shape):
@@ -229,7 +229,7 @@ def _overview(flight: FlightReport) -> Figure:
     up = 0.5 + (height + gap) * len(groups) + 0.35
     figure = new_figure(up)
     right = room_for([name for group in groups for name in group.names])
-    width = WIDTH - left - right - (_ROBOT_WIDTH if robot else 0.1)
+    width = WIDTH - left - right - (_ROBOT_PANEL_WIDTH if robot else 0.1)
     for number, group in enumerate(groups):
         y = up - 0.35 - (number + 1) * (height + gap)
         axes = panel(figure, left, y + 0.05, width, height)
@@ -238,7 +238,7 @@ def _overview(flight: FlightReport) -> Figure:
             axes.set_xlabel("")
             axes.tick_params(labelbottom=False)
     if robot is not None:
-        size = _ROBOT_WIDTH - 0.15
+        size = _ROBOT_PANEL_WIDTH - 0.15
         axes = panel(figure, WIDTH - size - 0.1, 0.2, size, up - 1.0)
         view = view_of(flight)
         draw_robot(axes, robot, robot.points(), view)

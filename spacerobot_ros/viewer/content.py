@@ -24,10 +24,10 @@ Color = tuple[int, int, int]
 SILENT_AFTER = 1.0
 """Wall time without a state after which the page reports it, s."""
 
-_NEAR_LIMIT = 0.05
+_NEAR_LIMIT_SHARE = 0.05
 """Distance from a limit below which a joint is marked, as a share of its range."""
 
-_LONGEST_NAME = 21
+_MAX_NAME_LENGTH = 21
 """Characters shown of the name of a joint."""
 
 COLORS: Mapping[Verdict, Color] = {
@@ -38,10 +38,10 @@ COLORS: Mapping[Verdict, Color] = {
 }
 """Colours of the ghost, by the verdict on its goal."""
 
-_LEVELS = ("#2a9d5c", "#c98a00", "#d23c3c")
+_LEVEL_COLORS = ("#2a9d5c", "#c98a00", "#d23c3c")
 """Text colours of the levels OK, WARN and ERROR: readable on white and on black."""
 
-_QUIET = "#8a8f98"
+_FAINT_COLOR = "#8a8f98"
 
 
 # -- the head of the page -----------------------------------------------------------------------
@@ -83,34 +83,36 @@ def status_html(state: StackState, *, described: bool = True) -> str:
     lines = []
     silence = silence_message(state)
     if silence:
-        lines.append(_line(silence, 2))
+        lines.append(_line_html(silence, 2))
     elif not described:
-        lines.append(_line("No robot is shown: no valid robot_description has been received.", 2))
+        lines.append(
+            _line_html("No robot is shown: no valid robot_description has been received.", 2)
+        )
     for name, seconds in sorted(state.silent.items()):
-        lines.append(_line(f"Node '{name}' has been silent for {math.floor(seconds)} s.", 2))
-    lines.extend(_line(f"Node '{name}' is not active.", 1) for name in sorted(state.inactive))
+        lines.append(_line_html(f"Node '{name}' has been silent for {math.floor(seconds)} s.", 2))
+    lines.extend(_line_html(f"Node '{name}' is not active.", 1) for name in sorted(state.inactive))
     if state.measured is not None:
         left = time_to_go(state)
         text = f"t = {state.measured.time_s:.2f} s"
-        lines.append(_line(text if left is None else f"{text}, {left:.1f} s to go", None))
+        lines.append(_line_html(text if left is None else f"{text}, {left:.1f} s to go", None))
     if state.replay is not None:
         replay = state.replay
         word = "ended" if replay.ended else "paused" if replay.paused else "playing"
         text = f"Replay {word}: {replay.position_s:.2f} s of {replay.duration_s:.2f} s"
-        lines.append(_line(text, 0))
+        lines.append(_line_html(text, 0))
     if state.plant is not None:
         plant = state.plant
-        text = _status("Plant", plant.state.value, plant.message, plant.level)
-        lines.append(_greyed(text, offline="plant" in state.absent))
-        lines.extend(_line(f"Fault: {each}", 1) for each in state.plant.faults)
+        text = _node_html("Plant", plant.state.value, plant.message, plant.level)
+        lines.append(_grey_out(text, offline="plant" in state.absent))
+        lines.extend(_line_html(f"Fault: {each}", 1) for each in state.plant.faults)
     if state.planner is not None:
         status = state.planner
-        text = _status("Planner", status.state.value, status.message, status.state.level)
-        lines.append(_greyed(text, offline="planner" in state.absent))
+        text = _node_html("Planner", status.state.value, status.message, status.state.level)
+        lines.append(_grey_out(text, offline="planner" in state.absent))
     if state.controller is not None:
         control = state.controller
-        text = _status("Controller", control.state.value, control.message, control.state.level)
-        lines.append(_greyed(text, offline="controller" in state.absent))
+        text = _node_html("Controller", control.state.value, control.message, control.state.level)
+        lines.append(_grey_out(text, offline="controller" in state.absent))
     return padded("".join(lines))
 
 
@@ -119,21 +121,21 @@ def padded(html: str) -> str:
     return f'<div style="padding:2px 12px;font-size:.85em;line-height:1.35">{html}</div>'
 
 
-def _status(name: str, word: str, message: str, level: int) -> str:
+def _node_html(name: str, word: str, message: str, level: int) -> str:
     return (
         f'<div style="margin:2px 0"><b>{escape(name)}</b> '
-        f'<span style="color:{_LEVELS[level]};font-weight:600">{escape(word)}</span> '
+        f'<span style="color:{_LEVEL_COLORS[level]};font-weight:600">{escape(word)}</span> '
         f"{escape(message)}</div>"
     )
 
 
-def _greyed(html: str, *, offline: bool) -> str:
+def _grey_out(html: str, *, offline: bool) -> str:
     """Return the message of a node, greyed out if the node is offline."""
     return f'<div style="opacity:.45">{html}</div>' if offline else html
 
 
-def _line(text: str, level: int | None) -> str:
-    style = "" if level is None else f"color:{_LEVELS[level]};font-weight:600;"
+def _line_html(text: str, level: int | None) -> str:
+    style = "" if level is None else f"color:{_LEVEL_COLORS[level]};font-weight:600;"
     return f'<div style="{style}margin:2px 0">{escape(text)}</div>'
 
 
@@ -163,14 +165,16 @@ def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -
     lower, upper = robot.limits("lower"), robot.limits("upper")
     fastest, strongest = robot.limits("velocity"), robot.limits("effort")
     for i, joint in enumerate(robot.movable_joints):
-        share = _share(q[i], lower[i], upper[i])
+        share = _share_of_range(q[i], lower[i], upper[i])
         level = 0
-        if share is not None and not _NEAR_LIMIT <= share <= 1 - _NEAR_LIMIT:
+        if share is not None and not _NEAR_LIMIT_SHARE <= share <= 1 - _NEAR_LIMIT_SHARE:
             level = 2 if not 0.0 <= share <= 1.0 else 1
-        bar = "no limits" if share is None else _bar(share, level)
+        bar = "no limits" if share is None else _bar_html(share, level)
         name = f'<span title="{escape(joint.name)}">{escape(shortened(joint.name))}</span>'
-        cells = [name, f"{_fixed(q[i], 3)} {joint.unit}", bar]
-        cells += [_of(qdot[i], fastest[i]), _of(effort[i], strongest[i])]
+        cells = [name, f"{_format_decimals(q[i], 3)} {joint.unit}", bar]
+        effort_unit = "N" if joint.unit == "m" else "N m"
+        cells.append(_value_and_limit(qdot[i], fastest[i], f"{joint.unit}/s"))
+        cells.append(_value_and_limit(effort[i], strongest[i], effort_unit))
         rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
     titles = ("joint", "at", "in range", "rate", "effort")
     heads = "".join(f"<th>{title}</th>" for title in titles)
@@ -183,33 +187,33 @@ def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -
 
 def shortened(name: str) -> str:
     """Return a name, its middle left out if it is too long for a label."""
-    half = (_LONGEST_NAME - 1) // 2
-    return name if len(name) <= _LONGEST_NAME else f"{name[:half]}…{name[-half:]}"
+    half = (_MAX_NAME_LENGTH - 1) // 2
+    return name if len(name) <= _MAX_NAME_LENGTH else f"{name[:half]}…{name[-half:]}"
 
 
-def _share(value: float, lower: float, upper: float) -> float | None:
+def _share_of_range(value: float, lower: float, upper: float) -> float | None:
     """Return the place of a value between its limits, 0 to 1; None if a limit is infinite."""
     if not (math.isfinite(lower) and math.isfinite(upper)) or upper <= lower:
         return None
     return float((value - lower) / (upper - lower))
 
 
-def _bar(share: float, level: int) -> str:
+def _bar_html(share: float, level: int) -> str:
     place = 100 * min(1.0, max(0.0, share))
-    color = _LEVELS[level]
+    color = _LEVEL_COLORS[level]
     return (
-        f'<div style="width:44px;height:8px;background:{_QUIET}55;border-radius:4px;'
+        f'<div style="width:44px;height:8px;background:{_FAINT_COLOR}55;border-radius:4px;'
         f'position:relative"><div style="position:absolute;left:{place:.0f}%;top:-2px;width:4px;'
         f'height:12px;margin-left:-2px;background:{color};border-radius:2px"></div></div>'
     )
 
 
-def _of(value: float, limit: float) -> str:
-    number = _fixed(value, 2)
-    return number if not math.isfinite(limit) else f"{number} of {limit:.3g}"
+def _value_and_limit(value: float, limit: float, unit: str) -> str:
+    number = _format_decimals(value, 2)
+    return f"{number} of {limit:.3g} {unit}" if math.isfinite(limit) else f"{number} {unit}"
 
 
-def _fixed(value: float, digits: int) -> str:
+def _format_decimals(value: float, digits: int) -> str:
     """Return a number with some decimals; a rounded zero has no sign."""
     return f"{round(float(value), digits) + 0.0:.{digits}f}"
 
@@ -219,9 +223,9 @@ def log_html(notices: Iterable[Notice]) -> str:
     rows = []
     for notice in notices:
         time = "" if notice.time_s is None else f"{notice.time_s:.2f} s"
-        color = _LEVELS[notice.level] if notice.level else "inherit"
+        color = _LEVEL_COLORS[notice.level] if notice.level else "inherit"
         rows.append(
-            f'<div style="margin:2px 0"><span style="color:{_QUIET}">{time} '
+            f'<div style="margin:2px 0"><span style="color:{_FAINT_COLOR}">{time} '
             f'{escape(notice.source)}</span> <span style="color:{color}">'
             f"{escape(notice.message)}</span></div>"
         )
@@ -293,12 +297,12 @@ def faults_html(lines: Sequence[str]) -> str:
     """Return the active faults."""
     if not lines:
         return hint_html("No fault is active.")
-    return padded("".join(_line(line, 1) for line in lines))
+    return padded("".join(_line_html(line, 1) for line in lines))
 
 
 def hint_html(text: str) -> str:
     """Return an explanation, greyed."""
-    return padded(f'<span style="color:{_QUIET}">{escape(text)}</span>')
+    return padded(f'<span style="color:{_FAINT_COLOR}">{escape(text)}</span>')
 
 
 # -- over time ----------------------------------------------------------------------------------

@@ -36,11 +36,11 @@ Defer = Callable[[Callable[[], None]], None]
 AT_REST_S = 0.3
 """Wall time without a change after which a goal is checked, s."""
 
-_APART = 0.01
+_HIDDEN_GHOST_DISTANCE = 0.01
 """Distance from the robot below which the ghost is hidden, in robot lengths and rad."""
 
-_BASE, _TOOL = "/goal", "/end_effector_goal"
-_PART_OF: dict[str, Part] = {_BASE: "base", _TOOL: "end_effector"}
+_BASE_GIZMO, _TOOL_GIZMO = "/goal", "/end_effector_goal"
+_PART_OF: dict[str, Part] = {_BASE_GIZMO: "base", _TOOL_GIZMO: "end_effector"}
 
 
 class GoalEditor:
@@ -79,7 +79,7 @@ class GoalEditor:
             hint="Off: the end-effector keeps its current goal, if any.",
         )
         self._tool_too.visible = False
-        self._final = _FinalShape(gui, defer, self._change)
+        self._final = _FinalShape(gui, defer, self._mark_changed)
 
         @self._tool_too.on_update
         async def _(event: Any) -> None:
@@ -92,21 +92,21 @@ class GoalEditor:
     @property
     def placed(self) -> bool:
         """Whether there is a goal."""
-        return _BASE in self._poses
+        return _BASE_GIZMO in self._poses
 
     @property
     def has_tool(self) -> bool:
         """Whether there is a goal of the end-effector."""
-        return _TOOL in self._poses
+        return _TOOL_GIZMO in self._poses
 
     def add_tool(self, pose: Array | None) -> None:
         """Add a goal of the end-effector at a pose (7,)."""
         if pose is not None and self.placed:
-            self._add_gizmo(_TOOL, 0.2 * self._reach)
-            self._move(_TOOL, pose)
+            self._add_gizmo(_TOOL_GIZMO, 0.2 * self._reach)
+            self._move_gizmo(_TOOL_GIZMO, pose)
             self.touch(time.monotonic())
 
-    def on_to_robot(self, act: Callable[[], None]) -> None:
+    def on_goal_to_robot(self, act: Callable[[], None]) -> None:
         """Call a function when the button that moves the goal to the robot is pressed."""
 
         @self._to_robot.on_click
@@ -126,16 +126,19 @@ class GoalEditor:
     def place(self, base: Array, tool: Array | None, q: Array, now: float) -> None:
         """Set the goal to poses (7,) and the ghost to joint positions (n,)."""
         assert self._robot is not None
-        if _BASE not in self._gizmos:
-            self._add_gizmo(_BASE, 0.45 * self._reach)
+        if _BASE_GIZMO not in self._gizmos:
+            self._add_gizmo(_BASE_GIZMO, 0.45 * self._reach)
             self._ghost = RobotDrawing(
-                self._server.scene, f"{_BASE}/ghost", self._robot, color=COLORS[Verdict.UNCHECKED]
+                self._server.scene,
+                f"{_BASE_GIZMO}/ghost",
+                self._robot,
+                color=COLORS[Verdict.UNCHECKED],
             )
         self._final.robot_is_at(q)
         self._final.fill()
-        self._move(_BASE, base)
+        self._move_gizmo(_BASE_GIZMO, base)
         if tool is not None and self.has_tool:
-            self._move(_TOOL, tool)
+            self._move_gizmo(_TOOL_GIZMO, tool)
         self.robot_is_at(base, q)
         self._show_fields()
         self._changed_at = now
@@ -154,21 +157,24 @@ class GoalEditor:
             final = self._final.positions
             shape = q if final is None else final
             self._ghost.set_joint_positions(shape)
-        self._ghost.base.visible = not self._is_there(pose, q, shape)
+        self._ghost.base.visible = not self._is_at_goal(pose, q, shape)
 
-    def _is_there(self, pose: Array, q: Array, shape: Array) -> bool:
+    def _is_at_goal(self, pose: Array, q: Array, shape: Array) -> bool:
         """Whether a robot at a pose and joint positions ``q`` coincides with the ghost."""
-        goal = self._poses[_BASE]
+        goal = self._poses[_BASE_GIZMO]
         distance = float(np.linalg.norm(goal[:3] - pose[:3]))
         turned = 2.0 * math.acos(min(1.0, abs(float(goal[3:] @ pose[3:]))))
         bent = float(np.abs(shape - q).max(initial=0.0))
-        return distance < _APART * self._reach and max(turned, bent) < _APART
+        return (
+            distance < _HIDDEN_GHOST_DISTANCE * self._reach
+            and max(turned, bent) < _HIDDEN_GHOST_DISTANCE
+        )
 
     def show_tool(self, *, there: bool) -> None:
         """Show or hide the controls of the end-effector."""
         self._tool_too.visible = there
-        if _TOOL in self._gizmos:
-            self._gizmos[_TOOL].visible = there and self._tool_too.value
+        if _TOOL_GIZMO in self._gizmos:
+            self._gizmos[_TOOL_GIZMO].visible = there and self._tool_too.value
 
     def show_shape(self, *, there: bool) -> None:
         """Show or hide the final joint positions, which planners take."""
@@ -189,10 +195,10 @@ class GoalEditor:
         GoalError
             A pose is not finite or its quaternion not of unit length.
         """
-        names = [_BASE]
+        names = [_BASE_GIZMO]
         if self._tool_too.visible and self._tool_too.value:
-            names.append(_TOOL)
-        shapes = {_BASE: self._final.positions}
+            names.append(_TOOL_GIZMO)
+        shapes = {_BASE_GIZMO: self._final.positions}
         return {
             _PART_OF[name]: Goal.checked(
                 self._poses[name][:3].tolist(), self._poses[name][3:].tolist(), shapes.get(name)
@@ -238,7 +244,7 @@ class GoalEditor:
     def _add_gizmo(self, name: str, scale: float) -> None:
         gizmo = self._server.scene.add_transform_controls(name, scale=scale, depth_test=False)
         self._gizmos[name] = gizmo
-        if name == _TOOL:
+        if name == _TOOL_GIZMO:
             self._server.scene.add_icosphere(
                 f"{name}/mark", 0.12 * scale, color=COLORS[Verdict.UNCHECKED], opacity=0.6,
                 cast_shadow=False, receive_shadow=False,
@@ -247,20 +253,20 @@ class GoalEditor:
         @gizmo.on_update
         async def _(event: Any) -> None:
             pose = np.concatenate([event.target.position, xyzw(event.target.wxyz)])
-            self._defer(lambda: self._drag(name, pose))
+            self._defer(lambda: self._on_gizmo_moved(name, pose))
 
     async def _on_field(self, event: Any) -> None:
         if event.client is not None:  # Else the page itself wrote the value.
             position, angles = self._position.value, self._angles.value
-            self._defer(lambda: self._type(position, angles))
+            self._defer(lambda: self._on_fields_typed(position, angles))
 
-    def _drag(self, name: str, pose: Array) -> None:
+    def _on_gizmo_moved(self, name: str, pose: Array) -> None:
         if name not in self._gizmos or not np.all(np.isfinite(pose)):
             return  # The gizmo of an earlier robot, or a pose that is not finite.
-        self._set(name, pose)
+        self._set_goal(name, pose)
         self._show_fields()
 
-    def _type(self, position: tuple[float, ...], angles: tuple[float, ...]) -> None:
+    def _on_fields_typed(self, position: tuple[float, ...], angles: tuple[float, ...]) -> None:
         if not self.placed:
             return
         try:
@@ -269,17 +275,17 @@ class GoalEditor:
             self._on_note(str(error))
             self._show_fields()
             return
-        self._set(_BASE, np.concatenate([goal.position, goal.quaternion]))
-        self._move(_BASE, self._poses[_BASE])
+        self._set_goal(_BASE_GIZMO, np.concatenate([goal.position, goal.quaternion]))
+        self._move_gizmo(_BASE_GIZMO, self._poses[_BASE_GIZMO])
 
-    def _set(self, name: str, pose: Array) -> None:
+    def _set_goal(self, name: str, pose: Array) -> None:
         before = self._poses.get(name, pose)
         self._poses[name] = pose
-        if name == _BASE and _TOOL in self._poses:
-            self._move(_TOOL, carried(self._poses[_TOOL], before, pose))
-        self._change()
+        if name == _BASE_GIZMO and _TOOL_GIZMO in self._poses:
+            self._move_gizmo(_TOOL_GIZMO, move_along(self._poses[_TOOL_GIZMO], before, pose))
+        self._mark_changed()
 
-    def _change(self) -> None:
+    def _mark_changed(self) -> None:
         """Note that the goal has changed."""
         if not self.placed:
             return
@@ -287,13 +293,13 @@ class GoalEditor:
         if self._check.verdict is not Verdict.UNCHECKED:
             self.show_check(Check(Verdict.PLANNING, "The goal is being moved."))
 
-    def _move(self, name: str, pose: Array) -> None:
+    def _move_gizmo(self, name: str, pose: Array) -> None:
         self._poses[name] = pose
         self._gizmos[name].position = pose[:3]
         self._gizmos[name].wxyz = wxyz(pose[3:])
 
     def _show_fields(self) -> None:
-        pose = self._poses.get(_BASE)
+        pose = self._poses.get(_BASE_GIZMO)
         if pose is not None:
             x, y, z = (round(float(each), 4) for each in pose[:3])
             self._position.value = (x, y, z)
@@ -315,24 +321,24 @@ class _FinalShape:
 
     def __init__(self, gui: viser.GuiApi, defer: Defer, on_change: Callable[[], None]) -> None:
         self._gui, self._defer, self._on_change = gui, defer, on_change
-        self._asked: Any = gui.add_checkbox(
+        self._enabled: Any = gui.add_checkbox(
             "Final joint positions",
             initial_value=False,
             hint="The planner ends in these joint positions, not in any.",
         )
-        self._asked.visible = False
+        self._enabled.visible = False
         self._folder = gui.add_folder("At the end", visible=False)
         self._fields: list[Any] = []
         self._q: Array = np.zeros(0)
 
-        @self._asked.on_update
+        @self._enabled.on_update
         async def _(event: Any) -> None:
-            defer(self._switch)
+            defer(self._update_folder)
 
     @property
     def positions(self) -> Array | None:
         """Final positions (n,) of the joints, m or rad; None: any."""
-        if not (self._asked.visible and self._asked.value):
+        if not (self._enabled.visible and self._enabled.value):
             return None
         return np.array([field.value for field in self._fields], float)
 
@@ -340,16 +346,16 @@ class _FinalShape:
         """Show a field for each joint of another robot."""
         for field in self._fields:
             field.remove()
-        self._fields, self._q, self._asked.value = [], np.zeros(0), False
+        self._fields, self._q, self._enabled.value = [], np.zeros(0), False
         joints = () if robot is None else robot.movable_joints
         with self._folder:
             for joint in joints:
-                field = self._field(joint)
+                field = self._add_joint_field(joint)
                 field.on_update(self._on_field)
                 self._fields.append(field)
-        self._switch()
+        self._update_folder()
 
-    def _field(self, joint: Joint) -> Any:
+    def _add_joint_field(self, joint: Joint) -> Any:
         """Return a slider between the limits of a joint, or a number field if it has none."""
         label, name = f"{shortened(joint.name)} ({joint.unit})", joint.name
         low, high = joint.limits.lower, joint.limits.upper
@@ -376,12 +382,12 @@ class _FinalShape:
     def show(self, *, visible: bool) -> None:
         """Show or hide these controls."""
         shown = visible and bool(self._fields)
-        if shown != self._asked.visible:
-            self._asked.visible = shown
-            self._switch()
+        if shown != self._enabled.visible:
+            self._enabled.visible = shown
+            self._update_folder()
 
-    def _switch(self) -> None:
-        shown = self._asked.visible and self._asked.value
+    def _update_folder(self) -> None:
+        shown = self._enabled.visible and self._enabled.value
         if shown and not self._folder.visible:
             self.fill()
         self._folder.visible = shown
@@ -392,7 +398,7 @@ class _FinalShape:
             self._defer(self._on_change)
 
 
-def carried(pose: Array, before: Array, after: Array) -> Array:
+def move_along(pose: Array, before: Array, after: Array) -> Array:
     """Return a pose (7,) rigidly moved along with another one, from ``before`` to ``after``."""
     turn = quaternion_multiply(after[3:], quaternion_inverse(before[3:]))
     position = after[:3] + matrix_from_quaternion(turn) @ (pose[:3] - before[:3])

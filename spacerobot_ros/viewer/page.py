@@ -38,17 +38,26 @@ if TYPE_CHECKING:
     import viser
 
 
-TakeAction = Callable[[Action], None]
+RequestAction = Callable[[Action], None]
 """Takes an action of a user."""
 
-_MOST_NOTICES = 200
-_SHOWN_NOTICES = 60
+_MAX_NOTICES = 200
+_MAX_SHOWN_NOTICES = 60
 
-_COLORS = ("#3c82f0", "#f0961a", "#2a9d5c", "#c04fb5", "#d23c3c", "#17a2b8", "#9a7d0a", "#8a8f98")
-_AXIS = "#8a8f98"
-_PLOT_HEIGHT = 170
+_CURVE_COLORS = (
+    "#3c82f0",
+    "#f0961a",
+    "#2a9d5c",
+    "#c04fb5",
+    "#d23c3c",
+    "#17a2b8",
+    "#9a7d0a",
+    "#8a8f98",
+)
+_AXIS_COLOR = "#8a8f98"
+_PLOT_PIXELS = 170
 
-_HANDS_OFF_S = 1.5
+_SLIDER_FREE_S = 1.5
 """Wall time for which the page does not move the time slider after a user has, s."""
 
 
@@ -56,7 +65,7 @@ class Buttons:
     """Buttons whose requests the stack carries out at once."""
 
     def __init__(
-        self, gui: viser.GuiApi, defer: Defer, act: TakeAction, fly: Callable[[], None]
+        self, gui: viser.GuiApi, defer: Defer, act: RequestAction, fly: Callable[[], None]
     ) -> None:
         self._fly = gui.add_button("Fly", color="green", hint="Send the goal that is shown.")
         self._goal = gui.add_button_group(
@@ -89,7 +98,7 @@ class Buttons:
 class TimeLine:
     """Controls of a replay: play, hold, and a time slider."""
 
-    def __init__(self, gui: viser.GuiApi, defer: Defer, act: TakeAction) -> None:
+    def __init__(self, gui: viser.GuiApi, defer: Defer, act: RequestAction) -> None:
         self._gui, self._defer, self._act = gui, defer, act
         self._folder = gui.add_folder("Replay", visible=False)
         with self._folder:
@@ -110,11 +119,11 @@ class TimeLine:
         if replay is None:
             return
         if self._slider is None or replay.duration_s != self._duration:
-            self._make(replay.duration_s)
+            self._add_slider(replay.duration_s)
         if now >= self._left_alone_until:
             self._slider.value = min(max(replay.position_s, 0.0), self._slider.max)
 
-    def _make(self, duration: float) -> None:
+    def _add_slider(self, duration: float) -> None:
         if self._slider is not None:
             self._slider.remove()
         self._duration = duration
@@ -131,7 +140,7 @@ class TimeLine:
                 self._defer(lambda: self._seek(seconds))
 
     def _seek(self, seconds: float) -> None:
-        self._left_alone_until = time.monotonic() + _HANDS_OFF_S
+        self._left_alone_until = time.monotonic() + _SLIDER_FREE_S
         self._act(Seek(seconds))
 
 
@@ -139,7 +148,7 @@ class Faults:
     """Menu of the faults that can be injected, and list of the active ones."""
 
     def __init__(
-        self, gui: viser.GuiApi, defer: Defer, act: TakeAction, on_note: Callable[[str], None]
+        self, gui: viser.GuiApi, defer: Defer, act: RequestAction, on_note: Callable[[str], None]
     ) -> None:
         self._act, self._on_note = act, on_note
         self._targets, self._now_s = Targets(), 0.0
@@ -312,12 +321,12 @@ class _Plot:
         self.history = History(len(names))
         series: list[Any] = [{"label": "t (s)"}]
         for i, name in enumerate(names):
-            turn, color = divmod(i, len(_COLORS))
-            look = {"label": content.shortened(name), "stroke": _COLORS[color], "width": 1.5}
+            turn, color = divmod(i, len(_CURVE_COLORS))
+            look = {"label": content.shortened(name), "stroke": _CURVE_COLORS[color], "width": 1.5}
             # Colours repeat with dashes, shorter each time.
             series.append(look | ({"dash": (max(12 // turn, 2), 4)} if turn else {}))
-        faint = {"stroke": f"{_AXIS}33"}
-        axis: dict[str, Any] = {"stroke": _AXIS, "grid": faint, "ticks": faint}
+        faint = {"stroke": f"{_AXIS_COLOR}33"}
+        axis: dict[str, Any] = {"stroke": _AXIS_COLOR, "grid": faint, "ticks": faint}
         # Mode 1 of uPlot's "soft limits": the axis ends there unless numbers go beyond.
         end = {"pad": 0.1, "mode": 1}
         ends = {"min": end | {"soft": -least if signed else 0.0}, "max": end | {"soft": least}}
@@ -327,7 +336,7 @@ class _Plot:
             title=title,
             scales={"x": {"time": False}, "y": {"range": ends}},
             axes=(axis | {"size": 34}, axis | {"size": 66}),  # type: ignore[arg-type]
-            height=_PLOT_HEIGHT,
+            height=_PLOT_PIXELS,
         )
         self._width = len(names)
 
@@ -345,7 +354,7 @@ class Log:
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._html = gui.add_html(content.log_html(()))
-        self._notices: deque[Notice] = deque(maxlen=_MOST_NOTICES)
+        self._notices: deque[Notice] = deque(maxlen=_MAX_NOTICES)
         self._changed = False
 
     def add(self, notice: Notice) -> None:
@@ -359,10 +368,10 @@ class Log:
         """Redraw the lines that have changed."""
         if self._changed:
             self._changed = False
-            self._html.content = content.log_html(list(self._notices)[:_SHOWN_NOTICES])
+            self._html.content = content.log_html(list(self._notices)[:_MAX_SHOWN_NOTICES])
 
 
-_ROBOT = "/robot"
+_ROBOT_PATH = "/robot"
 
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Period of drawing of the slower parts, wall s."""
@@ -405,7 +414,7 @@ class Page:
 
     def _build(self) -> None:
         gui, defer = self._server.gui, self._inbox.put
-        gui.configure_theme(**self._theme(dark=self._config.dark))
+        gui.configure_theme(**self._theme_options(dark=self._config.dark))
         # Buttons come first, so that a growing status text does not move them under the mouse.
         self._time_line = TimeLine(gui, defer, self._request)
         self._buttons = Buttons(gui, defer, self._request, self._fly)
@@ -422,7 +431,7 @@ class Page:
             self.faults = Faults(gui, defer, self._request, self._refuse)
         with tabs.add_tab("Log"):
             self._log = Log(gui)
-        self.editor.on_to_robot(self._goal_to_robot)
+        self.editor.on_goal_to_robot(self._goal_to_robot)
         look = gui.add_button(
             "Look at the robot", color="gray", hint="Turn the camera of this browser to the robot."
         )
@@ -430,7 +439,7 @@ class Page:
         @look.on_click
         async def _(event: Any) -> None:
             if event.client is not None:
-                defer(lambda: self._aim(event.client.camera))
+                defer(lambda: self._aim_camera(event.client.camera))
 
         self._style = gui.add_button("Dark or light", color="gray")
         themes: dict[int, bool] = {}
@@ -440,10 +449,10 @@ class Page:
             if event.client is not None:
                 dark = not themes.get(event.client.client_id, self._config.dark)
                 themes[event.client.client_id] = dark
-                event.client.gui.configure_theme(**self._theme(dark=dark))
+                event.client.gui.configure_theme(**self._theme_options(dark=dark))
 
     @staticmethod
-    def _theme(*, dark: bool) -> dict[str, Any]:
+    def _theme_options(*, dark: bool) -> dict[str, Any]:
         return {
             "dark_mode": dark,
             "control_width": "large",
@@ -465,7 +474,7 @@ class Page:
         if robot is None:
             return
         self._drawing = scene.RobotDrawing(
-            self._server.scene, _ROBOT, robot, on_note=lambda text: self.note(Notice(text, 1))
+            self._server.scene, _ROBOT_PATH, robot, on_note=lambda text: self.note(Notice(text, 1))
         )
         self._drawing.base.visible = False  # Until its first state comes.
 
@@ -510,10 +519,10 @@ class Page:
         self._last = measured
         if self._around is None:
             center = measured.pose[:3]
-            self._around = scene.Surroundings(self._server.scene, self._reach, _ROBOT, center)
-            self._aim(self._server.initial_camera)
+            self._around = scene.Surroundings(self._server.scene, self._reach, _ROBOT_PATH, center)
+            self._aim_camera(self._server.initial_camera)
             for client in self._server.get_clients().values():
-                self._aim(client.camera)
+                self._aim_camera(client.camera)
         drawing.base.visible = True
         drawing.place(measured.pose)
         drawing.set_joint_positions(measured.q)
@@ -557,7 +566,7 @@ class Page:
         self._due[part] = self._now + period
         return True
 
-    def _aim(self, camera: Any) -> None:
+    def _aim_camera(self, camera: Any) -> None:
         """Turn a camera to the robot; before its first state, to the origin."""
         at = np.zeros(3) if self._last is None else self._last.pose[:3]
         camera.position, camera.look_at = at + self._reach * CAMERA, at

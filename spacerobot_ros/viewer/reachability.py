@@ -49,20 +49,20 @@ from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorke
 from spacerobot_ros.termination import Terminated, end_child, guarded, start_child
 from spacerobot_ros.viewer.state import Part, StackState
 
-_STARTS = 8
+_SEARCH_STARTS = 8
 """Joint positions from which the search starts: the current ones, and random ones."""
 
-_EVALUATIONS = 30
+_MAX_EVALUATIONS = 30
 """Most evaluations of the error in each search."""
 
-_NEAR = 1e-4
+_REACHED_ERROR = 1e-4
 """Error below which an arm reaches its goal, m and rad."""
 
-_RADIAN = 0.5
+_RADIAN_LENGTH = 0.5
 """Weight of an error of one radian in the search, m."""
 
 
-def arm_shape(
+def reaching_positions(
     robot: RobotDescription, link: str, base: Goal, tool: Goal, q: Array
 ) -> tuple[Array, float, float]:
     """Return the joint positions (n,) that bring a link nearest to its goal, and the error, m, rad.
@@ -82,7 +82,7 @@ def arm_shape(
     def error(shape: Array) -> Array:
         R, r = kinematics.link_poses(shape)
         turn = rotvec_from_quaternion(quaternion_from_matrix(R[end].T @ goal_R))
-        return np.concatenate([goal_r - r[end], _RADIAN * turn])
+        return np.concatenate([goal_r - r[end], _RADIAN_LENGTH * turn])
 
     lower = np.where(np.isfinite(robot.limits("lower")), robot.limits("lower"), -math.pi)
     upper = np.where(np.isfinite(robot.limits("upper")), robot.limits("upper"), math.pi)
@@ -90,28 +90,28 @@ def arm_shape(
     lower, upper = np.minimum(lower, q) - 1e-9, np.maximum(upper, q) + 1e-9
     random = np.random.default_rng(0)
     best, least = q, error(q)
-    for number in range(_STARTS):
+    for number in range(_SEARCH_STARTS):
         start = q if number == 0 else random.uniform(lower, upper)
-        found = least_squares(error, start, bounds=(lower, upper), max_nfev=_EVALUATIONS)
+        found = least_squares(error, start, bounds=(lower, upper), max_nfev=_MAX_EVALUATIONS)
         if np.linalg.norm(found.fun) < np.linalg.norm(least):
             best, least = found.x, found.fun
-        if np.linalg.norm(least) < _NEAR:
+        if np.linalg.norm(least) < _REACHED_ERROR:
             break
-    return best, float(np.linalg.norm(least[:3])), float(np.linalg.norm(least[3:]) / _RADIAN)
+    return best, float(np.linalg.norm(least[:3])), float(np.linalg.norm(least[3:]) / _RADIAN_LENGTH)
 
 
-def is_near(distance: float, angle: float) -> bool:
+def is_reached(distance: float, angle: float) -> bool:
     """Whether an arm with such an error, m and rad, reaches its goal."""
-    return distance <= 2 * _NEAR and angle <= 4 * _NEAR
+    return distance <= 2 * _REACHED_ERROR and angle <= 4 * _REACHED_ERROR
 
 
-_NICE = 10
+_NICENESS = 10
 """Added to the niceness of the process, so that everything else runs first."""
 
-_LONGEST_CANCELLATION = 2.0
+_MAX_CANCELLATION_S = 2.0
 """Wall time after the cancellation of a plan at which the process is killed, s."""
 
-_MOST_POINTS = 200
+_MAX_PATH_POINTS = 200
 """Largest number of points of the path in an answer."""
 
 
@@ -220,7 +220,7 @@ class GoalChecker:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        self._reader: threading.Thread | None = None
+        self._answer_thread: threading.Thread | None = None
         self._number = self._begun = 0
         self._last: Question | None = None
         self._progress = ""
@@ -232,13 +232,13 @@ class GoalChecker:
 
     def ask(self, question: Question) -> None:
         """Cancel the check in progress and start this one."""
-        process = self._running()
+        process = self._running_process()
         self._number += 1
         if not self._answered and self._cancelled_at is None:
             self._cancelled_at = time.monotonic()
         self._answered, self._asked_at = False, time.monotonic()
         self._last = question
-        self._send(process, question)
+        self._send_question(process, question)
 
     def cancel(self) -> bool:
         """Cancel the check in progress; return whether there was one."""
@@ -247,10 +247,10 @@ class GoalChecker:
         self._number += 1
         self._cancelled_at = self._cancelled_at or time.monotonic()
         self._answered = True
-        self._send(self._process, None)
+        self._send_question(self._process, None)
         return True
 
-    def look(self) -> Check | None:
+    def latest_answer(self) -> Check | None:
         """Return the answer to the last question once; before that, the time spent on it."""
         if self._answered:
             return None
@@ -263,10 +263,10 @@ class GoalChecker:
         if self._process is not None and self._process.poll() is not None:
             self._answered = True
             return Check(Verdict.UNCHECKED, "The process that checks goals has ended.")
-        if self._stuck():
+        if self._cancellation_ignored():
             # A solver, or a compiler, that does not look for its cancellation.
             self.close()
-            self._send(self._running(), self._last)
+            self._send_question(self._running_process(), self._last)
         seconds, found = time.monotonic() - self._asked_at, self._progress
         return Check(Verdict.PLANNING, f"Planning for {seconds:.0f} s{found}.")
 
@@ -277,36 +277,36 @@ class GoalChecker:
         if process is not None:
             end_child(process, {})
 
-    def _stuck(self) -> bool:
+    def _cancellation_ignored(self) -> bool:
         since = self._cancelled_at
-        if since is None or time.monotonic() - since < _LONGEST_CANCELLATION:
+        if since is None or time.monotonic() - since < _MAX_CANCELLATION_S:
             return False
         with self._lock:
             begun = self._begun
         self._cancelled_at = None
         return begun != self._number
 
-    def _running(self) -> subprocess.Popen[bytes]:
+    def _running_process(self) -> subprocess.Popen[bytes]:
         if self._process is None or self._process.poll() is not None:
             self.close()
             self._begun = 0
             words = ["-c", f"from {__name__} import main; main()"]
             self._process = start_child(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
             assert self._process.stdout is not None
-            self._reader = threading.Thread(
-                target=self._read, args=(self._process.stdout,), daemon=True
+            self._answer_thread = threading.Thread(
+                target=self._receive_answers, args=(self._process.stdout,), daemon=True
             )
-            self._reader.start()
+            self._answer_thread.start()
         return self._process
 
-    def _send(self, process: subprocess.Popen[bytes], question: Question | None) -> None:
+    def _send_question(self, process: subprocess.Popen[bytes], question: Question | None) -> None:
         """Send a numbered question; None cancels the one before."""
         assert process.stdin is not None
-        with suppress(OSError):  # The process has ended, which the next call of look notices.
+        with suppress(OSError):  # The process has ended; latest_answer notices it.
             pickle.dump((self._number, question), process.stdin)
             process.stdin.flush()
 
-    def _read(self, answers: IO[bytes]) -> None:
+    def _receive_answers(self, answers: IO[bytes]) -> None:
         with suppress(ValueError, OSError, EOFError):  # Closed.
             while True:
                 number, answer = pickle.load(answers)
@@ -338,10 +338,10 @@ class Planner:
         """
         try:
             if question.tool is not None:
-                return _check_of_arm(question, question.tool)
+                return _check_arm(question, question.tool)
             built = question.urdf, question.parameters
             if built != self._built:
-                self._build(*built)
+                self._build_planner(*built)
                 self._built = built
             request = PlanRequest(question.state, question.goal, self._config.tolerance)
             schedule = self._worker.plan(PlanningTask(request), cancellation)
@@ -350,14 +350,14 @@ class Planner:
         except SpaceRobotError as error:
             return Check(Verdict.REFUSED, str(error))
         path = schedule.path.position
-        step = max(1, len(path) // _MOST_POINTS)
+        step = max(1, len(path) // _MAX_PATH_POINTS)
         duration = schedule.expected_duration
         message = f"Reachable in {duration:.4g} s by '{schedule.method}'."
-        message += _uncontrolled(schedule, question.goal, request.tolerance)
+        message += _uncontrolled_text(schedule, question.goal, request.tolerance)
         shown = np.vstack([path[:-1:step], path[-1:]])
         return Check(Verdict.REACHABLE, message, duration, schedule.positions[-1], shown)
 
-    def _build(self, urdf: str, parameters: Mapping[str, str]) -> None:
+    def _build_planner(self, urdf: str, parameters: Mapping[str, str]) -> None:
         self._built = None
         known = {each.name for each in declared(PlannerConfig)}
         values = {name: json.loads(text) for name, text in parameters.items() if name in known}
@@ -367,7 +367,7 @@ class Planner:
         self._worker = PlanningWorker(robot_from_text(urdf, self._config), self._config)
 
 
-def _uncontrolled(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance) -> str:
+def _uncontrolled_text(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance) -> str:
     """Return a sentence on each goal component the method does not control, with its error."""
     path, controls = schedule.path, schedule.controls
     error = PoseError.between(path.position[-1], path.quaternion[-1], goal)
@@ -386,12 +386,12 @@ def _uncontrolled(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance) -> s
     )
 
 
-def _check_of_arm(question: Question, tool: Goal) -> Check:
+def _check_arm(question: Question, tool: Goal) -> Check:
     """Return whether the arm reaches its goal."""
     robot = parse_robot(question.urdf)
     q = question.state.q
-    shape, distance, angle = arm_shape(robot, question.link, question.goal, tool, q)
-    if is_near(distance, angle):
+    shape, distance, angle = reaching_positions(robot, question.link, question.goal, tool, q)
+    if is_reached(distance, angle):
         message = "The end-effector can reach its goal there."
         return Check(Verdict.REACHABLE, message, shape=shape)
     message = (
@@ -428,28 +428,28 @@ class _LastQuestion:
 def main() -> None:
     """Answer questions until standard input ends."""
     with guarded(), suppress(Terminated):
-        os.nice(_NICE)
+        os.nice(_NICENESS)
         # Keep output of libraries out of the answers.
         answers = os.fdopen(os.dup(1), "wb")
         os.dup2(2, 1)
         last = _LastQuestion()
 
-        def read() -> None:
+        def receive_questions() -> None:
             with suppress(EOFError):
                 while True:
                     last.put(pickle.load(sys.stdin.buffer))
             os._exit(0)
 
-        def send(number: int, answer: Check | str | None) -> None:
+        def send_answer(number: int, answer: Check | str | None) -> None:
             pickle.dump((number, answer), answers)
             answers.flush()
 
-        threading.Thread(target=read, daemon=True).start()
+        threading.Thread(target=receive_questions, daemon=True).start()
         planner, number = Planner(), 0
-        with report_progress(lambda progress: send(number, progress.message)):
+        with report_progress(lambda progress: send_answer(number, progress.message)):
             while True:
                 (number, question), cancellation = last.take()
-                send(number, None)
+                send_answer(number, None)
                 if question is not None:
                     with suppress(PlanningCancelled):
-                        send(number, planner.answer(question, cancellation))
+                        send_answer(number, planner.answer(question, cancellation))

@@ -27,16 +27,16 @@ GHOST_OPACITY = 0.35
 _PLANNED: Color = (240, 150, 25)
 _FLOWN: Color = (60, 130, 240)
 _PLUME: Color = (255, 110, 40)
-_LINE = 3.0
+_LINE_WIDTH = 3.0
 """Pixels."""
 
-_LEAST_CAPACITY = 32
+_MIN_LINE_SEGMENTS = 32
 """Least capacity of a line, in segments."""
 
 _GRID: tuple[Color, Color] = (150, 150, 155), (120, 120, 128)
 """Colours of cells and sections, visible on white and on black."""
 
-_MOST_TRIANGLES = 20_000
+_MAX_MESH_TRIANGLES = 20_000
 """Largest number of triangles of a mesh; finer ones are simplified."""
 
 
@@ -79,7 +79,7 @@ class RobotDrawing:
         self._scene, self._path, self._color = scene, path, color
         self._kinematics = kinematics = ForwardKinematics(robot)
         self.base = scene.add_frame(path, show_axes=False)
-        paths = self._paths(robot)
+        paths = self._node_paths(robot)
         frames: dict[str, Any] = {}
         for pairs, poses in (
             (kinematics.moving, kinematics.transforms),
@@ -90,20 +90,20 @@ class RobotDrawing:
                     paths[child], show_axes=False, position=pose[:3], wxyz=wxyz(pose[3:])
                 )
         self._moving = [frames[child] for _, child in kinematics.moving]
-        meshes = meshes_from_files(robot, _MOST_TRIANGLES, on_note)
+        meshes = meshes_from_files(robot, _MAX_MESH_TRIANGLES, on_note)
         self._solids = [
-            self._solid(f"{paths[visual.link]}/{number}", visual)
-            for number, visual in enumerate(visuals_of(robot, meshes, _MOST_TRIANGLES))
+            self._add_visual(f"{paths[visual.link]}/{number}", visual)
+            for number, visual in enumerate(visuals_of(robot, meshes, _MAX_MESH_TRIANGLES))
         ]
 
-    def _paths(self, robot: RobotDescription) -> dict[str, str]:
+    def _node_paths(self, robot: RobotDescription) -> dict[str, str]:
         """Return the path of the scene node of every link."""
         paths = {robot.base_link: self._path}
         for joint in joints_outward(robot):
             paths[joint.child] = f"{paths[joint.parent]}/link{len(paths)}"
         return paths
 
-    def _solid(self, path: str, visual: Visual) -> Any:
+    def _add_visual(self, path: str, visual: Visual) -> Any:
         """Draw a visual in the frame of its link."""
         red, green, blue, alpha = visual.shape.rgba
         look: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
@@ -182,13 +182,13 @@ class Lines:
             return
         larger = len(segments) > self._capacity
         if larger:
-            self._capacity = max(_LEAST_CAPACITY, 2 ** (len(segments) - 1).bit_length())
+            self._capacity = max(_MIN_LINE_SEGMENTS, 2 ** (len(segments) - 1).bit_length())
         # Unused segments have zero length, at the end of the last one.
         filled = np.broadcast_to(segments[-1, 1], (self._capacity, 2, 3)).astype(np.float32)
         filled[: len(segments)] = segments
         if larger:
             self._handle = self._scene.add_line_segments(
-                self._path, filled, self._color, thickness=_LINE, thickness_units="screen"
+                self._path, filled, self._color, thickness=_LINE_WIDTH, thickness_units="screen"
             )
         else:
             self._handle.points = filled

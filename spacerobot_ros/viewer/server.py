@@ -51,15 +51,18 @@ class ViewerConfig(WatchdogConfig):
     )
 
 
-_MOST_PORTS = 100
+_PORTS_TRIED = 100
 """Number of ports that are tried, one after the other."""
 
-_NO_FRAMES = {"Content-Security-Policy": "frame-ancestors 'none'", "X-Frame-Options": "DENY"}
+_NO_FRAMING_HEADERS = {
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "X-Frame-Options": "DENY",
+}
 """HTTP headers that keep browsers from showing the page inside another one."""
 
-_LABEL = "spacerobot"
+_PAGE_TITLE = "spacerobot"
 
-_construction = threading.Lock()
+_server_start_lock = threading.Lock()
 """Held while a server starts, when a function of websockets is replaced."""
 
 
@@ -100,7 +103,7 @@ def free_port(host: str, port: int) -> int:
         raise ParameterError(
             f"Parameter 'host' is '{host}', which is not an address: {error}."
         ) from None
-    last = min(port + _MOST_PORTS, 65536) if port else 1
+    last = min(port + _PORTS_TRIED, 65536) if port else 1
     problem: OSError | None = None
     for each in range(port, last):
         with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -156,7 +159,7 @@ def _guarded_websockets(served: str) -> Iterator[None]:
                 return refusal
             answer: Response | None = process_request(connection, request)
             if answer is not None:
-                answer.headers.update(_NO_FRAMES)
+                answer.headers.update(_NO_FRAMING_HEADERS)
             return answer
 
         return serve(*given, process_request=process, **options)
@@ -189,8 +192,8 @@ def start_server(host: str, port: int) -> viser.ViserServer:
     # viser looks for a free port as well, but waits forever if an address is wrong.
     port = free_port(host, port)
     # It prints its address; so does the node, in the format of the other commands.
-    with _construction, _guarded_websockets(host), redirect_stdout(io.StringIO()):
-        server = LocalServer(host=host, port=port, label=_LABEL, verbose=False)
+    with _server_start_lock, _guarded_websockets(host), redirect_stdout(io.StringIO()):
+        server = LocalServer(host=host, port=port, label=_PAGE_TITLE, verbose=False)
     return server
 
 

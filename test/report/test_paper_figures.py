@@ -18,7 +18,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.report import write_figures, write_picture
 from spacerobot_ros.report.figures import PictureFormat
-from spacerobot_ros.report.figures_over_time import window_of
+from spacerobot_ros.report.figures_over_time import range_without_peaks
 
 MAGIC = {"png": b"\x89PNG", "pdf": b"%PDF-", "svg": b"<?xml"}
 
@@ -252,12 +252,12 @@ def test_an_axis_is_for_what_can_be_read_beside_a_peak() -> None:
     time = np.linspace(0.0, 10.0, 1001)
     calm = np.sin(time)
     peaked = calm + 70.0 * np.exp(-time / 0.01)
-    assert window_of(Signal(time, calm[:, np.newaxis])) is None
-    window = window_of(Signal(time, peaked[:, np.newaxis]))
+    assert range_without_peaks(Signal(time, calm[:, np.newaxis])) is None
+    window = range_without_peaks(Signal(time, peaked[:, np.newaxis]))
     assert window is not None
     assert window[0] == pytest.approx(-1.0, abs=0.01)
     assert 1.0 < window[1] < 2.0
     # A flight that is mostly rest has no peaks: what happens is what is to be seen.
     resting = np.where(np.abs(time - 5.0) < 0.05, 1.0, 1e-9 * calm)
-    assert window_of(Signal(time, resting[:, np.newaxis])) is None
-    assert window_of(Signal(time[:0], np.empty((0, 1)))) is None
+    assert range_without_peaks(Signal(time, resting[:, np.newaxis])) is None
+    assert range_without_peaks(Signal(time[:0], np.empty((0, 1)))) is None

@@ -16,7 +16,7 @@ from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.report import scene, write_report
 from spacerobot_ros.report.figures_over_time import shape_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
-from spacerobot_ros.report.page import charts_of, thinned
+from spacerobot_ros.report.page import charts_of, thin_out
 
 with_browser = pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
 
@@ -230,7 +230,7 @@ def test_licences_of_the_programs_are_with_them(window: Browser) -> None:
 
 def test_every_licence_is_there_once_with_its_words() -> None:
     """And not its name alone, with who has the copyright."""
-    found = scene._notices()
+    found = scene._licence_notices()
     assert len({name for name, _ in found}) == len(found) >= 9
     for name, licence in found:
         assert len(licence) > 600, name
@@ -243,13 +243,13 @@ def test_every_licence_is_there_once_with_its_words() -> None:
 def test_fewer_samples_look_alike() -> None:
     time = np.linspace(0.0, 100.0, 30_001)
     smooth = Signal(time, np.column_stack([np.sin(time), np.exp(-time)]))
-    few = thinned(smooth)
+    few = thin_out(smooth)
     assert len(few) < 2200
     for k in range(2):
         between = np.interp(time, few.time, few.values[:, k])
         assert np.abs(between - smooth.values[:, k]).max() < 2e-3
     noise = np.random.default_rng(1).normal(size=(30_001, 3))
-    few = thinned(Signal(time, noise))
+    few = thin_out(Signal(time, noise))
     assert len(few) < 5200
     assert (few.time[0], few.time[-1]) == (0.0, 100.0)
     np.testing.assert_array_equal(few.values.max(axis=0), noise.max(axis=0))
@@ -258,4 +258,4 @@ def test_fewer_samples_look_alike() -> None:
         part, all_of = few.between(low, low + 10).values, Signal(time, noise).between(low, low + 10)
         np.testing.assert_allclose(part.max(axis=0), all_of.values.max(axis=0), atol=0.6)
     short = Signal(time[:50], noise[:50])
-    assert thinned(short) is short
+    assert thin_out(short) is short

@@ -12,7 +12,7 @@ from support.flight_bags import TICK, cyclic_shapes, rates_of
 from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
-from spacerobot_ros.report.figures_space import _instants, _signed_area
+from spacerobot_ros.report.figures_space import _choose_instants, _signed_area
 from spacerobot_ros.report.signals import Cycles, envelope, find_cycles, rotvecs
 from spacerobot_ros.report.solids import Canvas, Edge, Face, View
 
@@ -98,9 +98,9 @@ def test_the_robot_is_drawn_at_six_instants_though_it_rests_at_the_end() -> None
 
     moving = np.arange(101.0)[:, np.newaxis] * [0.5, -0.25, 0.125]
     rest = np.repeat(moving[-1:], 40, axis=0)
-    found = _instants(flight(np.vstack([moving, rest])))
+    found = _choose_instants(flight(np.vstack([moving, rest])))
     np.testing.assert_allclose(found, [0, 20, 40, 60, 80, 140], atol=1)
-    assert _instants(flight(rest)) == [39]
+    assert _choose_instants(flight(rest)) == [39]
 
 
 def test_areas_are_positive_counter_clockwise() -> None:

@@ -69,9 +69,9 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     page = Editor(server, "sliding_masses")
     q = np.array([0.05, -0.1, 0.15])
     page.editor.place(POSE, None, q, 0.0)
-    assert not page.final._asked.visible, "no planner is there"
+    assert not page.final._enabled.visible, "no planner is there"
     page.editor.show_shape(there=True)
-    assert page.final._asked.visible
+    assert page.final._enabled.visible
     assert not page.final._folder.visible
     goal = page.editor.goals()["base"]
     np.testing.assert_array_equal(goal.position, POSE[:3])
@@ -79,7 +79,7 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     page.editor.goals_at_rest(LATER)
     # The fields begin where the robot is now.
     page.editor.robot_is_at(POSE, q + 0.02)
-    page.set(page.final._asked, True)
+    page.set(page.final._enabled, True)
     assert page.final._folder.visible
     shape = page.editor.goals()["base"].joint_positions
     assert shape is not None
@@ -130,7 +130,7 @@ def test_fields_of_joints_stay_within_their_limits(server: Any) -> None:
     page = Editor(server, "servicer")
     page.editor.show_shape(there=True)
     page.editor.place(POSE, None, np.full(6, 100.0), 0.0)
-    page.set(page.final._asked, True)
+    page.set(page.final._enabled, True)
     shape = page.editor.goals()["base"].joint_positions
     assert shape is not None
     upper = page.robot.limits("upper")

@@ -99,7 +99,7 @@ def looked(checker: GoalChecker, until: Callable[[Check], bool]) -> list[Check]:
     end = time.monotonic() + 60.0
     while not (found and until(found[-1])):
         assert time.monotonic() < end, found[-3:]
-        check = checker.look()
+        check = checker.latest_answer()
         if check is not None:
             found.append(check)
         Event().wait(0.005)  # The process needs the processor.
@@ -114,11 +114,11 @@ def test_the_last_goal_is_the_one_that_is_answered(checker: GoalChecker) -> None
     assert seen[-1].path is not None
     assert seen[-1].path[-1][0] == pytest.approx(0.05, abs=1e-3)
     assert {check.verdict for check in seen[:-1]} <= {Verdict.PLANNING}
-    assert checker.look() is None
+    assert checker.latest_answer() is None
     # One that is cancelled has no answer, and a process that is killed has a successor.
     checker.ask(question(0.1, 0.0, 0.0))
     checker.cancel()
-    assert checker.look() is None
+    assert checker.latest_answer() is None
     assert checker._process is not None
     checker._process.kill()
     checker._process.wait()

@@ -27,7 +27,7 @@ from spacerobot_ros.simulation.faults import Targets
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.content import History, Trail
-from spacerobot_ros.viewer.goal_editor import carried, rpy_from_quaternion
+from spacerobot_ros.viewer.goal_editor import move_along, rpy_from_quaternion
 from spacerobot_ros.viewer.reachability import Check, Verdict
 from spacerobot_ros.viewer.state import Measured, Momenta, Notice, StackState
 
@@ -161,8 +161,8 @@ def test_rates_and_efforts_stand_beside_their_own_limits() -> None:
     titles = re.findall("<th>(.*?)</th>", rows[1])
     for k, row in enumerate(rows[2:]):
         cells = dict(zip(titles, re.findall("<td>(.*?)</td>", row), strict=True))
-        assert cells["rate"] == f"{qdot[k]:.2f} of {rates[k]:g}"
-        assert cells["effort"] == f"{effort[k]:.2f} of {efforts[k]:g}"
+        assert cells["rate"] == f"{qdot[k]:.2f} of {rates[k]:g} rad/s"
+        assert cells["effort"] == f"{effort[k]:.2f} of {efforts[k]:g} N m"
 
 
 def test_errors_are_to_the_goal() -> None:
@@ -247,7 +247,7 @@ def test_a_goal_that_is_carried_along_stays_where_it_is_beside_the_base() -> Non
     before = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     after = np.concatenate([[5.0, 5.0, 5.0], quarter])
     tool = np.array([3.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
-    moved = carried(tool, before, after)
+    moved = move_along(tool, before, after)
     np.testing.assert_allclose(moved[:3], [5.0, 7.0, 5.5], atol=1e-12)
     np.testing.assert_allclose(moved[3:], quarter, atol=1e-12)
 

@@ -218,20 +218,20 @@ def test_a_goal_has_the_joint_positions_that_the_page_shows(harness: Harness) ->
         stack.press(stack.page._buttons._fly)
         stack.until(lambda: stack.probe.count("/goal_pose") == count, "a goal")
 
-    stack.until(lambda: stack.move(0.0, names) or final._asked.visible, "a planner is there")
+    stack.until(lambda: stack.move(0.0, names) or final._enabled.visible, "a planner is there")
     stack.until(lambda: stack.move(0.0, names) or stack.page.editor.placed, "a goal is shown")
     # Somebody may have had an earlier goal end in joint positions, which the page does not show.
     fly(1)
     stack.until(lambda: len(shapes) == 1, "any")
     assert list(shapes[0].name) == []
-    stack.press(final._asked, True)
+    stack.press(final._enabled, True)
     stack.until(lambda: final._folder.visible, "the fields")
     stack.press(final._fields[1], -0.25)
     fly(2)
     stack.until(lambda: len(shapes) == 2, "its shape")
     assert list(shapes[1].name) == list(names)
     assert list(shapes[1].position) == [0.0, -0.25, 0.0]
-    stack.press(final._asked, False)
+    stack.press(final._enabled, False)
     stack.until(lambda: not final._folder.visible, "no fields")
     fly(3)
     stack.until(lambda: len(shapes) == 3, "any again")

@@ -59,7 +59,7 @@ def test_links_are_drawn_where_pinocchio_has_them(server: Any, name: str) -> Non
     pin.framesForwardKinematics(model, data, full)
     drawing.place(full[:7])
     drawing.set_joint_positions(q)
-    paths = drawing._paths(robot)
+    paths = drawing._node_paths(robot)
     for link in robot.links:
         expected = data.oMf[model.getFrameId(link.name)].homogeneous
         np.testing.assert_allclose(pose_of(server, paths[link.name]), expected, atol=1e-6)
@@ -138,7 +138,7 @@ def test_a_robot_far_from_the_origin_is_looked_at_and_has_a_grid_below(server: A
     page.update(StackState(later, age_s=0.0), 2.0)
     np.testing.assert_allclose(server.initial_camera.look_at, at)
     camera = type("Camera", (), {})()
-    page._aim(camera)
+    page._aim_camera(camera)
     np.testing.assert_allclose(camera.look_at, at + onward)
 
 

@@ -226,7 +226,7 @@ class ViewerNode(FlightNode):
             else:
                 self._checker.cancel()
                 editor.show_check(Check(Verdict.UNCHECKED, question))
-        check = self._checker.look()
+        check = self._checker.latest_answer()
         if check is not None and not editor.moving:
             editor.show_check(check)
 
