@@ -27,15 +27,15 @@ from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
 _CONDITION_SHAPES = 300
-"""Shapes over which conditioning is summed up."""
+"""Number of sampled shapes of the condition numbers in an analysis."""
 
 _LOOP_EDGE = 1.0
-"""Edges of the loops for which the nominal shape is the best, m or rad: those of area_loop."""
+"""Length of loop edges for which the nominal shape is optimised, m or rad: those of area_loop."""
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """The findings about one robot.
+    """The controllability of one robot, and the gait methods that suit the robot.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Analysis:
 
 
 def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis:
-    """Return the findings about a robot, at a shape (n,) or the best one for loops.
+    """Return the analysis of a robot at a shape (n,), or at the best shape for loops.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def _check_shape(robot: SpaceRobot, shape: Sequence[float]) -> Array:
 def _condition_numbers(robot: SpaceRobot) -> Array:
     if robot.n < 3:
         return np.full(_CONDITION_SHAPES, np.inf)
-    # The matrices of all triples at once: the best one at each shape.
+    # One call for the matrices of all triples; each shape has its best conditioned triple.
     K = curvatures(robot, sample_shapes(robot, _CONDITION_SHAPES))
     i, j, k = np.array(list(itertools.combinations(range(robot.n), 3))).T
     M = np.stack([K[:, :, i, j], K[:, :, j, k], K[:, :, k, i]], axis=-1).transpose(0, 2, 1, 3)

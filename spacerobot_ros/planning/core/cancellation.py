@@ -12,14 +12,14 @@ class PlanningCancelled(PlanningError):  # noqa: N818 - a request, not a failure
 
 
 class Cancellation:
-    """A request to stop planning, made in one thread and looked for in another."""
+    """A request to stop planning, made in one thread and polled in another."""
 
     def __init__(self) -> None:
         self._requested = False
 
     @property
     def requested(self) -> bool:
-        """Whether the plan is no longer wanted."""
+        """Whether the plan was cancelled."""
         return self._requested
 
     def cancel(self) -> None:
@@ -27,7 +27,7 @@ class Cancellation:
         self._requested = True
 
     def raise_if_requested(self) -> None:
-        """Stop planning if that is requested.
+        """Raise an error if the plan was cancelled.
 
         Raises
         ------
@@ -39,12 +39,12 @@ class Cancellation:
 
 
 class _Never(Cancellation):
-    """The cancellation of a plan that cannot be cancelled."""
+    """A cancellation for plans that run to their end."""
 
     def cancel(self) -> NoReturn:
         """Refuse: every plan without a cancellation of its own shares this one."""
-        raise RuntimeError("NEVER is shared by all plans that are not to be cancelled.")
+        raise RuntimeError("NEVER cannot be cancelled: all plans that run to their end share it.")
 
 
 NEVER: Cancellation = _Never()
-"""The cancellation of plans that are never cancelled."""
+"""The cancellation for plans that run to their end."""

@@ -20,21 +20,22 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 
 MAX_CONDITION = 1e6
-"""Condition number from which on brackets do not span: rounding decides on their directions."""
+"""Condition number above which brackets count as linearly dependent: rounding decides on their
+directions."""
 
 NO_TURN = 1e-12
-"""Singular values of brackets below this, rad per unit area, are rounding."""
+"""Singular values of brackets below this, rad per unit area, count as zero."""
 
 _EXAMINED_SHAPES = 24
-"""Shapes at which a robot is examined; brackets that span anywhere span at almost all of them."""
+"""Number of sampled shapes; brackets that span at any shape span at almost all shapes."""
 
 _UNLIMITED_HALF_RANGE = {JointKind.PRISMATIC: 1.0}
-"""Half the range that is examined of a joint without limits, m; pi for joints that turn."""
+"""Half of the sampled range of a slider without limits, m; revolute joints have pi."""
 
 
 @dataclass(frozen=True)
 class Controllability:
-    """Findings about the brackets at one shape.
+    """The span of the Lie brackets at one shape.
 
     Attributes
     ----------
@@ -59,7 +60,7 @@ class Controllability:
 
     @property
     def controllable(self) -> bool:
-        """Whether the brackets span all axes that are needed."""
+        """Whether the brackets span all needed axes."""
         return self.rank >= self.needed
 
     def require(self) -> None:
@@ -75,13 +76,14 @@ class Controllability:
 
     @property
     def condition(self) -> float:
-        """Condition number of the best three brackets; infinite where they do not span."""
+        """Condition number of the best three brackets; infinite for linearly dependent brackets."""
         largest, _, smallest = self.singular_values
         return float(largest / smallest) if smallest > NO_TURN else np.inf
 
 
 def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
-    """Return finite bounds (n,), (n,) of the shape space: one turn for joints without limits."""
+    """Return finite bounds (n,), (n,) of the shape space: one turn for joints without
+    limits."""
     joints = robot.description.movable_joints
     half = np.array([_UNLIMITED_HALF_RANGE.get(joint.kind, np.pi) for joint in joints])
     lower = np.where(
@@ -92,7 +94,7 @@ def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
 
 
 def sample_shapes(robot: SpaceRobot, count: int) -> Array:
-    """Return shapes (count, n) all over the shape space, always the same ones."""
+    """Return shapes (count, n) spread evenly over the shape space, without a seed."""
     lower, upper = shape_box(robot)
     # Multiples of independent irrational numbers are evenly spread.
     fractions = np.outer(np.arange(1, count + 1), np.sqrt(_first_primes(robot.n))) % 1.0
@@ -103,7 +105,7 @@ def curvatures(robot: SpaceRobot, shapes: Array) -> Array:
     """Return the angular curvature (N, 3, n, n) at shapes (N, n); see `SpaceRobot.curvature`."""
     n = robot.n
     stacked = robot.function("curvature")(shapes.T).full()
-    # Columns: shape by shape, in each the second joint by the second, the first fastest.
+    # Columns run over the first joint fastest, then over the second joint, then over shapes.
     K = stacked.reshape(6, len(shapes), n, n)[3:]
     return np.asarray(K.transpose(1, 0, 3, 2))
 
@@ -134,18 +136,18 @@ def brackets_at(
 
 
 def brackets_anywhere(robot: SpaceRobot, among: Sequence[int] | None = None) -> Controllability:
-    """Return the span of the first-order brackets at the best of shapes all over the space."""
+    """Return the span of the first-order brackets at the best of many sampled shapes."""
     return _span_of_brackets(robot, sample_shapes(robot, _EXAMINED_SHAPES), among)
 
 
 def sliders_of(robot: SpaceRobot) -> list[int]:
-    """Return the indices of the joints that slide."""
+    """Return the indices of the prismatic joints."""
     joints = robot.description.movable_joints
     return [i for i, joint in enumerate(joints) if joint.kind is JointKind.PRISMATIC]
 
 
 def slot_matrix(robot: SpaceRobot, shape: Array, sliders: Sequence[int]) -> Array:
-    """Return the motion (3, s) of the centre of mass in the base with each slider, m/m.
+    """Return the motion (3, s) of the centre of mass, in B, per motion of each slider, m/m.
 
     It is linear in a slider, so a unit step is exact.
     """
@@ -172,17 +174,17 @@ def require_three_slots(robot: SpaceRobot, slots: Array) -> None:
 
 
 def tilted_goal(robot: SpaceRobot, axis: Array, tilt: float) -> UnreachableError:
-    """Return the refusal of an attitude ``tilt`` (rad) off the turns about an ``axis`` (3,)."""
+    """Return the error for a goal attitude tilted by ``tilt`` (rad) off the ``axis`` (3,)."""
     return UnreachableError(
         f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
         f"{(np.round(axis, 6) + 0.0).tolist()} of {robot.base_link}: planar robot "
-        f"'{robot.description.name}' turns about no other.",
+        f"'{robot.description.name}' turns about no other axis.",
         Proof.RANK,
     )
 
 
 def sliding_masses(robot: SpaceRobot) -> Controllability:
-    """Return the test of paper 1: three independent slots and spanning brackets of sliders."""
+    """Test a robot by paper 1: three independent slots and spanning brackets of sliders."""
     sliders = sliders_of(robot)
     try:
         require_three_slots(robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders))
@@ -195,7 +197,7 @@ def sliding_masses(robot: SpaceRobot) -> Controllability:
 def _span_of_brackets(
     robot: SpaceRobot, shapes: Array, among: Sequence[int] | None
 ) -> Controllability:
-    """Return the span of the brackets at that of the shapes (N, n) where three are best."""
+    """Return the span of the brackets at the best conditioned one of the shapes (N, n)."""
     joints = list(range(robot.n)) if among is None else list(among)
     name = robot.description.name
     if len(joints) < 2:
@@ -228,13 +230,13 @@ def _span_of_brackets(
     else:
         message = (
             f"First-order brackets of the joints of robot '{name}' span {rank} of the three axes "
-            f"of rotation {where}: small loops turn the base about no other."
+            f"of rotation {where}: small loops turn the base about no other axis."
         )
     return Controllability(rank, 3, singular[best], triple, shapes[best], message)
 
 
 def _numerical_rank(values: Array) -> int:
-    """Return the number of descending singular values that are not rounding."""
+    """Return the number of descending singular values above rounding errors."""
     return int(np.sum(values > max(NO_TURN, float(values[0]) / MAX_CONDITION)))
 
 

@@ -26,10 +26,10 @@ POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
 
 
 POSITION_SLACK = 0.5
-"""Share of its tolerance by which a plan may miss a position that is out of reach."""
+"""Share of the position tolerance by which a plan may miss an unreachable position."""
 
 _MAX_COORDINATE = 1e12
-"""Beyond it a float64 does not resolve a millimetre, m or rad."""
+"""Largest coordinate, m or rad; a float64 resolves a millimetre up to it."""
 
 _MAX_ANGLE = 2e6 * np.pi
 """A million turns, rad: beyond them an angle does not resolve its attitude."""
@@ -37,7 +37,7 @@ _MAX_ANGLE = 2e6 * np.pi
 
 @dataclass(frozen=True)
 class Goal:
-    """A pose of the base link in the world, and the shape to end in.
+    """A pose of the base link in the world, and the final shape of the joints.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ class Goal:
         return cls.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
     def equals(self, other: Goal) -> bool:
-        """Whether another goal is the same pose and shape, number by number."""
+        """Whether another goal has exactly the same pose and shape."""
         mine, others = self.joint_positions, other.joint_positions
         same_shape = (
             mine is others if mine is None or others is None else np.array_equal(mine, others)
@@ -172,7 +172,7 @@ class RobotState:
 
 @dataclass(frozen=True)
 class PoseError:
-    """The remaining error to a goal.
+    """The remaining error of a pose and a shape to a goal.
 
     Attributes
     ----------
@@ -210,7 +210,7 @@ class PoseError:
 
     @property
     def max_joint_error(self) -> float:
-        """Largest joint error, m or rad; zero where the goal has none."""
+        """Largest joint error, m or rad; zero for a goal without shape."""
         return float(np.abs(self.shape).max(initial=0.0))
 
 
@@ -223,7 +223,7 @@ class Tolerance:
     shape: float = 1e-3
 
     def admits(self, error: PoseError, controls: frozenset[Controlled] = POSE) -> bool:
-        """Whether the goal is reached, in the parts that are controlled."""
+        """Whether an error is within tolerance in all controlled parts of the goal."""
         return (
             ("position" not in controls or error.distance <= self.position)
             and ("attitude" not in controls or error.angle <= self.attitude)

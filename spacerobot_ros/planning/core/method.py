@@ -19,10 +19,10 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
 _REST_MOMENTUM = 1e-9
-"""Momenta below this times the mass count as zero, m/s and m^2/s."""
+"""Momenta per mass below this count as zero, m/s and m^2/s."""
 
 _LIMIT_SLACK = 1e-9
-"""Rounding by which a goal shape may exceed a limit, m or rad."""
+"""Rounding error by which a goal shape may exceed a joint limit, m or rad."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class InitialMotion:
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """Everything that a plan depends on, beside the robot and the options of the method.
+    """The arguments of a plan, beside the robot and the options of the method.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class PlanRequest:
 
 @dataclass(frozen=True)
 class NoOptions:
-    """The options of a method that has none."""
+    """The options class of a method without options."""
 
 
 class GaitMethod(ABC):
@@ -135,11 +135,11 @@ class GaitMethod(ABC):
         try:
             self._setup()
         except PlanningError as refusal:
-            # Planners exist before goals: an unsuitable robot is refused with the first one.
+            # A planner exists before its first goal, whose request refuses an unsuitable robot.
             self._setup_refusal = refusal
 
     def _setup(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
-        """Set up everything that depends on robot and options alone; called once.
+        """Compute all attributes that depend on robot and options alone; called once.
 
         A `PlanningError` refuses the robot: :meth:`_require_rest` raises it for every goal.
         """
@@ -151,7 +151,7 @@ class GaitMethod(ABC):
 
     @classmethod  # noqa: B027 - any robot is suitable by default
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse a robot of which the method can plan no goal, whatever the options.
+        """Refuse a robot for which the method plans no goal with any options.
 
         Raises
         ------
@@ -161,7 +161,7 @@ class GaitMethod(ABC):
 
     @abstractmethod
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Return a gait as requested that ends at rest: for equal requests, an equal one.
+        """Return the gait of a request; a gait ends at rest: for equal requests, an equal one.
 
         Raises
         ------
@@ -198,7 +198,7 @@ class GaitMethod(ABC):
         )
 
     def _goal_shape(self, goal: Goal) -> Array | None:
-        """Return the shape (n,) of the goal within the joint limits, None if it has none.
+        """Return the goal shape (n,) within the joint limits, None for a goal without shape.
 
         Raises
         ------
@@ -228,7 +228,7 @@ class GaitMethod(ABC):
         return np.clip(wanted, robot.lower, robot.upper)
 
     def _require_rest(self, state: RobotState) -> None:
-        """Refuse an unsuitable robot, and one whose total momentum is not zero."""
+        """Refuse an unsuitable robot, and a robot whose total momentum is not zero."""
         if self._setup_refusal is not None:
             raise PlanningError(str(self._setup_refusal))
         p, L = np.linalg.norm(state.linear_momentum), np.linalg.norm(state.angular_momentum)

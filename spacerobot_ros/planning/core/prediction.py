@@ -1,4 +1,4 @@
-"""The base motion that a piece of a gait will cause, as the plant integrates it."""
+"""The base motion of a gait, predicted by the plant's integration steps."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import BasePath
 
 _MIN_PATH_POSES = 200
-"""A predicted path has this many poses of the base, or up to twice as many."""
+"""Fewest poses of a predicted base path; a path has at most twice as many."""
 
 
 class BasePrediction:
-    """Attitude under held joint velocities, and the position that follows from it.
+    """Predicts attitude and position of the base under held joint velocities.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from spacerobot_ros.model.compilation import ANNOUNCEMENT
 
 _RECORD_ATTRIBUTE = "search_progress"
-"""The attribute of a log record that has it."""
+"""The attribute of log records that holds a SearchProgress."""
 
 _PACKAGE = "spacerobot_ros"
 
@@ -39,7 +39,7 @@ class SearchProgress:
 
     @property
     def message(self) -> str:
-        """The text for the user, without a full stop."""
+        """The progress as a message, without a full stop."""
         best = f"best {self.best_s:.4g} s" if math.isfinite(self.best_s) else "none found yet"
         return f"start {self.starts} of at most {self.max_starts}, {best}"
 
@@ -65,7 +65,7 @@ def report_progress(
     handler, logger = _ProgressHandler(show, announce), logging.getLogger(_PACKAGE)
     before = logger.level
     logger.addHandler(handler)
-    # Other handlers report as before: they have levels of their own.
+    # Other handlers keep their own levels, so their output does not change.
     logger.setLevel(logging.INFO if before == logging.NOTSET else min(before, logging.INFO))
     try:
         yield

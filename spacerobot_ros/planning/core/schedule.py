@@ -91,7 +91,7 @@ class GaitSchedule:
 
     @property
     def expected_duration(self) -> float:
-        """Time until the goal is reached, with the schedules that are expected after it, s."""
+        """Expected time until the goal is reached, with all later schedules for it, s."""
         return self.duration + self.remaining
 
     @cached_property
@@ -101,7 +101,7 @@ class GaitSchedule:
 
 
 _MIN_JOINT_MOTION = 1e-9
-"""A joint that is to move less than this, m or rad, rests."""
+"""A joint with a planned motion below this, m or rad, stays at rest."""
 
 
 def straight_motion(

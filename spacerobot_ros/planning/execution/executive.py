@@ -53,13 +53,14 @@ from spacerobot_ros.planning.execution.worker import (
 )
 
 _MAX_GAP, _MAX_GAP_PERIODS = 1.0, 10
-"""A longer time between two states, or a negative one, is a jump of time: s, control periods."""
+"""Times between two states above these, or below zero, are jumps of time: s, control periods."""
 
 _MAX_IN_MOTION_ATTEMPTS = 2
-"""Plans in motion that are tried for a goal: each takes over twice as late as the one before."""
+"""Largest number of plans in motion for one goal: each takes over twice as late as the one
+before."""
 
 _LATE_TIME_SHARE = 1 / 3
-"""A motion is late when this share of it is left, or less."""
+"""Share of a motion's duration that remains when the motion counts as late."""
 
 
 # -- phases and transitions -------------------------------------------------------------------
@@ -70,10 +71,10 @@ class Phase(Enum):
 
     IDLE = "idle"  # There is no goal; the joints rest.
     MEASURING = "measuring"  # A new goal waits for measured states to plan from; the joints rest.
-    PLANNING = "planning"  # A plan is being made.
+    PLANNING = "planning"  # The worker computes a plan.
     EXECUTING = "executing"  # A schedule is tracked.
-    REPLANNING = "replanning"  # A schedule is tracked; a plan is made that takes over in motion.
-    TAKING_OVER = "taking over"  # A schedule is tracked until the tick of the plan that follows.
+    REPLANNING = "replanning"  # A schedule is tracked; a plan that takes over is computed.
+    TAKING_OVER = "taking over"  # A schedule is tracked until its successor takes over.
     BRAKING = "braking"  # The joints brake along the planned path.
     EVALUATING = "evaluating"  # A schedule has ended; measured states are compared with the goal.
 
@@ -82,21 +83,21 @@ class Event(Enum):
     """Cause of a change of phase."""
 
     NEW_GOAL = "new goal"
-    PLAN_REQUESTED = "plan requested"  # The measured state is known, and a plan from it requested.
+    PLAN_REQUESTED = "plan requested"  # A plan from the measured state was requested.
     PLANNED = "planned"
     REFUSED = "refused"  # The method has found no plan.
-    PLAN_LATE = "plan late"  # The tick at which a plan was to take over has come without it.
+    PLAN_LATE = "plan late"  # The tick of a take-over has come, and its plan is not ready.
     TAKEN_OVER = "taken over"  # The tick has come at which a plan takes over.
     SCHEDULE_ENDED = "schedule ended"
     AT_REST = "at rest"  # The braking is over.
-    TRACKING_ERROR = "tracking error"  # The base is off its path, and plans are made from rest.
+    TRACKING_ERROR = "tracking error"  # The base is off its path; the method plans from rest only.
     JOINTS_STUCK = "joints stuck"
     TIME_JUMPED = "time jumped"  # The schedule does not cover the time of the states.
     REACHED = "reached"
-    FAILED = "failed"  # No correction is left, or the measured state is not finite.
+    FAILED = "failed"  # All corrections are used, or the measured state is not finite.
     ABORTED = "aborted"  # The goal is given up on request.
     PLANT_STOPPED = "plant stopped"  # The plant does not obey commands: the goal is given up.
-    PLANT_RESET = "plant reset"  # The robot is in another state than before.
+    PLANT_RESET = "plant reset"  # The plant was reset to another state.
     DEACTIVATED = "deactivated"
 
 
@@ -154,27 +155,27 @@ class IllegalTransitionError(RuntimeError):
 
 
 Output = PlannerStatus | ScheduleStart | Notice | Transition | FlightEvent
-"""An output of an executive beside its setpoints."""
+"""An output of an executive other than its setpoints."""
 
 
-# Python looks up the member of an enum as slowly as it calls a function; these are for every state.
+# Constants save the slow look-up of enum members for every state.
 _EXECUTING, _EVALUATING = Phase.EXECUTING, Phase.EVALUATING
 
 
 @dataclass
 class ActiveGoal:
-    """A goal that was accepted, its present schedule, and its corrections so far."""
+    """An accepted goal, its present schedule, and the number of corrections so far."""
 
     identified: IdentifiedGoal
     schedule: GaitSchedule
-    """The schedule that was executed last."""
+    """The latest executed schedule."""
     begins_ns: int
-    """Stamp of the state from which the first one was planned."""
+    """Stamp of the state from which the first schedule was planned, ns."""
     corrections: int = 0
     manoeuvre_time: float = 0.0
-    """Duration of all its schedules, s."""
+    """Duration of all schedules for the goal, s."""
     ends_at: float = 0.0
-    """Simulated time at which the last one ends, s."""
+    """Simulated time at which the latest schedule ends, s."""
     next_plan: PlanReason = PlanReason.CORRECTION
     """Reason of the next plan, if one is needed."""
     stuck_at: dict[str, float] = field(default_factory=dict)
@@ -184,7 +185,7 @@ class ActiveGoal:
 
 
 class Executive:
-    """Brings one robot to one goal after the other, and answers every state with a setpoint.
+    """Brings a robot to successive goals, and answers every state with a setpoint.
 
     With a worker that plans at once, the measured state waits for its plan, and a plan that is
     requested while the joints move begins with their braking. With one that plans in the
@@ -226,17 +227,17 @@ class Executive:
         self.phase = Phase.IDLE
         """The present phase; :meth:`_change_phase` alone changes it."""
         self.outputs: deque[Output] = deque()
-        """Outputs to publish and log, in order; the owner takes them out."""
+        """Outputs to publish and log, in order; the owner removes published outputs."""
         self.plant_rests = False
-        """Whether the plant reports that no command is in force; the owner sets it."""
+        """Whether the plant reports that no command is in force, as set by the owner."""
         self._stamp_ns = 0
-        """Stamp of the state that is answered, ns."""
+        """Stamp of the state that :meth:`update` answers, ns."""
         self._new_goal: IdentifiedGoal | None = None
-        """A new goal that waits to be planned for."""
+        """A new goal without a plan so far."""
         self._in_motion_attempts = 0
-        """Plans in motion for it that were late or refused."""
+        """Number of late or refused plans in motion for the new goal."""
         self._pending_plan: PlanJob | ReadyPlan | None = None
-        """The plan that is being made, or waits for its tick (``TAKING_OVER``)."""
+        """The requested plan, or the plan that waits for its tick (``TAKING_OVER``)."""
         self._active_goal: ActiveGoal | None = None
         """The goal that is executed or evaluated."""
         self._replan_ns = 0
@@ -252,7 +253,7 @@ class Executive:
 
     @property
     def measuring(self) -> bool:
-        """Whether the next measured base will be planned from, or evaluated."""
+        """Whether the executive will plan from the next measured base, or evaluate it."""
         return self._new_goal is not None or self.phase is _EVALUATING
 
     @property
@@ -263,7 +264,7 @@ class Executive:
     # -- requests of the owner ----------------------------------------------------------------
 
     def propose(self, identified: IdentifiedGoal) -> None:
-        """Plan for a goal from the states that are measured next; it replaces any other."""
+        """Plan for a goal from the next measured states; the goal replaces any other goal."""
         self._new_goal, self._in_motion_attempts = identified, 0
         self._average.restart()
         match self.phase:
@@ -348,9 +349,10 @@ class Executive:
         return commanded_until_ns >= since or rests_since_ns <= since
 
     def plant_reset(self) -> None:
-        """Plan again for the present goal, if any: the robot is in another state than before."""
+        """Plan again for the present goal, if any: the robot is in another state than
+        before."""
         self._average.forget()
-        # The shape that is held is one of before, like the schedule.
+        # The held shape and the schedule belong to the time before the reset.
         self._tracker.stop()
         if self._active_goal is not None:
             self._active_goal.next_plan = PlanReason.REPLAN
@@ -361,11 +363,11 @@ class Executive:
         self._add_notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
 
     def cancel_plan(self) -> None:
-        """Have a plan that is being made end without a result; may be called in any thread."""
+        """Cancel the plan that the worker computes; any thread may call this."""
         self._worker.cancel()
 
     def stop(self) -> None:
-        """Give up everything at once and wait for the worker to end; the goal file stays."""
+        """Give up all goals at once and wait for the worker to end; the goal file stays."""
         self._tracker.stop()
         self._forget_goals()
         self._worker.close()
@@ -374,10 +376,10 @@ class Executive:
     # -- measured states ----------------------------------------------------------------------
 
     def observe(self, measured: MeasuredState) -> None:
-        """Take note of a base that was measured for a state after it was answered."""
+        """Use a base measurement that arrives after its state was answered."""
         if self.measuring:
             if self._tracker.active:
-                # Of a robot that moves only the last state counts.
+                # A moving robot has no average: only its last state counts.
                 self._average.restart()
             self._add_to_average(measured)
 
@@ -425,7 +427,7 @@ class Executive:
         return True
 
     def _worker_is_free(self) -> bool:
-        """Whether a plan can be requested; one that was cancelled may still be ending."""
+        """Whether a plan can be requested: the thread of a cancelled plan may still run."""
         if self._worker.busy:
             self._worker.poll()
             return False
@@ -443,14 +445,14 @@ class Executive:
         if self.phase is Phase.MEASURING:
             assert self._new_goal is not None
             self._plan_new_goal(self._new_goal)
-        # Where that was refused the state is still known, unless it took time.
+        # A refused plan leaves the averaged state valid, unless planning took time.
         if self.phase is Phase.EVALUATING:
             assert self._active_goal is not None
             self._evaluate(self._active_goal)
         self._average.restart()
 
     def _evaluate(self, active: ActiveGoal) -> None:
-        """Compare the measured pose with the goal; plan the remaining motion, or be done."""
+        """Compare the measured pose with the goal; plan the remaining motion, or end the goal."""
         controls = active.schedule.controls
         try:
             state = self._average.state()
@@ -475,7 +477,7 @@ class Executive:
     # -- in motion: EXECUTING and BRAKING -----------------------------------------------------
 
     def _measure_in_motion(self, waiting: IdentifiedGoal, measured: MeasuredState) -> None:
-        """Plan for a new goal from the state now, or brake first if the plan will take time.
+        """Plan for a new goal from the present state, or brake first if planning takes time.
 
         A plan takes over in motion where the methods allow for it.
         """
@@ -517,7 +519,7 @@ class Executive:
         try:
             state = self._average.state()
         except PlanningError:
-            # The next state may be better; if none is, the schedule ends.
+            # A later state may allow a plan; otherwise the schedule ends first.
             return
         if averages:
             state = self._tracker.path_check.average_pose(state)
@@ -526,7 +528,7 @@ class Executive:
         self._request_plan(job, state)
 
     def _keep_schedule_for(self, identified: IdentifiedGoal, active: ActiveGoal) -> None:
-        """Make a goal with the same pose and shape the active one; its schedule goes on."""
+        """Make a goal with the same pose and shape the active goal; the schedule goes on."""
         self._new_goal = None
         left = active.ends_at - self._stamp_ns / 1e9
         active = replace(active, identified=identified, corrections=0, manoeuvre_time=left)
@@ -535,7 +537,7 @@ class Executive:
         self._add_status(PlannerState.EXECUTING, message, identified, active)
 
     def _check_path(self, active: ActiveGoal, measured: MeasuredState) -> None:
-        """Plan again when the base is too far off its predicted path, or periodically."""
+        """Plan the remaining motion periodically, and when the base is off its predicted path."""
         self._average.restart()
         corrected = active.corrections >= self.config.max_corrections
         if not self._worker_is_free():
@@ -572,7 +574,7 @@ class Executive:
         )
 
     def _replan_remaining(self, active: ActiveGoal, state: RobotState) -> None:
-        """Plan the remaining motion again from a state that is due, if it is time for it.
+        """Plan the remaining motion again from the present state, at most once a period.
 
         (Shrinking horizon.) It is not where the present motion leads near enough to the goal.
         """
@@ -605,7 +607,7 @@ class Executive:
     # -- in motion: REPLANNING and TAKING_OVER ------------------------------------------------
 
     def _await_take_over(self) -> None:
-        """Take the plan that is made in motion, and have it take over at its tick."""
+        """Take the finished plan in motion, and start its schedule at its tick."""
         if self.phase is Phase.REPLANNING:
             self._take_plan_result()
         match self._pending_plan:
@@ -615,7 +617,7 @@ class Executive:
                 self._handle_late_plan(job)
 
     def _switch_schedule(self, ready: ReadyPlan) -> None:
-        """Track the plan that is ready from its first tick on."""
+        """Track the ready plan from its first tick on."""
         job, schedule, begins_ns = ready.job, ready.schedule, ready.job.take_over.stamp_ns
         self._pending_plan = None
         if job.reason.for_new_goal:
@@ -632,7 +634,7 @@ class Executive:
         self._execute_schedule(schedule, take_over_ns=begins_ns)
 
     def _handle_late_plan(self, job: TakeOverJob) -> None:
-        """Continue along the present schedule; a new goal is planned for once more."""
+        """Continue along the present schedule; plan for a new goal once more."""
         self._drop_plan()
         self._in_motion_attempts += job.reason.for_new_goal
         self._change_phase(Event.PLAN_LATE, Phase.EXECUTING)
@@ -656,7 +658,7 @@ class Executive:
             self._request_plan(job, state)
 
     def _reset_plan_count(self) -> None:
-        """Count plans for the goal that waits, which is planned for now."""
+        """Reset the count of plans and commands for the waiting goal."""
         self._new_goal = None
         self._total_plan_time, self._plan_count = 0.0, 0
 
@@ -692,7 +694,7 @@ class Executive:
         self._take_plan_result()
 
     def _take_plan_result(self) -> None:
-        """Act on the result of the plan that is being made, if there is one."""
+        """Act on the result of the requested plan, once the worker has it."""
         result = self._worker.poll()
         if result is None:
             return
@@ -703,7 +705,7 @@ class Executive:
         self._plan_count += 1
         self._add_notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
         if isinstance(result, Planned):
-            # A plan may aim beside the goal; its result is judged by the goal.
+            # A plan may aim beside the goal; the report compares its end with the goal itself.
             schedule = replace(result.schedule, goal=job.identified.goal)
             result = replace(result, schedule=schedule)
             self._add_event(
@@ -716,7 +718,7 @@ class Executive:
         self._act_on_result(job, result)
 
     def _act_on_result(self, job: PlanJob, result: Planned | Refused) -> None:
-        """Execute a plan, or report the refusal, depending on the job alone."""
+        """Execute a plan, or report its refusal; the job alone decides on the next phase."""
         active = self._active_goal
         match job, result:
             case TakeOverJob() as takes_over, Planned(schedule=schedule):
@@ -759,7 +761,7 @@ class Executive:
                 self._change_phase(Event.REFUSED, self._phase_without_plan())
 
     def _accept_goal(self, active: ActiveGoal) -> None:
-        """Make a new goal the active one, to be flown to with all joints, and save it."""
+        """Make a new goal the active goal, for all joints, and save it."""
         self._active_goal, self._tracker.stuck = active, []
         self._add_event(EventKind.GOAL_ACCEPTED, "The goal is accepted.", active.identified)
         try:
@@ -807,7 +809,7 @@ class Executive:
 
     @staticmethod
     def _subtract_remainder(active: ActiveGoal, stamp_ns: int) -> None:
-        """Subtract the rest of the present schedule from the duration of the manoeuvre."""
+        """Subtract the remaining duration of the present schedule from the manoeuvre time."""
         remainder = active.ends_at - stamp_ns / 1e9
         if remainder > 0:
             active.manoeuvre_time -= min(remainder, active.schedule.duration)
@@ -829,7 +831,7 @@ class Executive:
         """End the schedule; its result is evaluated unless its goal was given up."""
         ready = self._pending_plan
         if isinstance(ready, ReadyPlan):
-            # No state was measured since the tick at which it takes over.
+            # No state arrived between the take-over tick and the end of the schedule.
             self._switch_schedule(ready)
             if not self._tracker.ended(stamp_ns, ready.schedule.positions[-1]):
                 return
@@ -859,7 +861,7 @@ class Executive:
         )
 
     def _handle_stuck_joints(self, active: ActiveGoal, stuck: Sequence[int]) -> None:
-        """Stop, and plan the remaining motion with the joints that are not stuck."""
+        """Stop the robot, and plan the remaining motion with the joints that are not stuck."""
         tracker = self._tracker
         tracker.stuck += stuck
         self._drop_plan()
@@ -875,7 +877,7 @@ class Executive:
         self._add_event(EventKind.STUCK_JOINT, message, active.identified, 1, joints=names)
 
     def _drop_plan(self) -> None:
-        """Drop the plan that is being made or ready; a new goal of it waits again."""
+        """Drop the requested or ready plan; its new goal, if any, waits again."""
         self._worker.cancel()
         plan, self._pending_plan = self._pending_plan, None
         job = plan.job if isinstance(plan, ReadyPlan) else plan
@@ -883,7 +885,7 @@ class Executive:
             self._new_goal = self._new_goal or job.identified
 
     def _phase_without_plan(self) -> Phase:
-        """Return the next phase where there is no plan."""
+        """Return the next phase without a plan."""
         if self._tracker.active:
             return Phase.BRAKING if self._tracker.braking else Phase.EXECUTING
         return self._phase_at_rest()
@@ -915,7 +917,7 @@ class Executive:
         self._new_goal = self._active_goal = None
 
     def _latest_goal(self) -> IdentifiedGoal | None:
-        """Return the goal that was proposed last, of those that are not decided."""
+        """Return the latest proposed goal that is not decided."""
         plan = (
             self._pending_plan.job
             if isinstance(self._pending_plan, ReadyPlan)
@@ -931,7 +933,7 @@ class Executive:
     # -- outputs ------------------------------------------------------------------------------
 
     def _change_phase(self, event: Event, target: Phase) -> None:
-        """Change the phase and report it; no other method does."""
+        """Change the phase and report the transition; all other methods call this one."""
         transition = Transition(self.phase, event, target)
         if transition not in TRANSITIONS:
             raise IllegalTransitionError(

@@ -1,4 +1,4 @@
-"""Goals with their ids, and the file that keeps them for a commander that is restarted."""
+"""Goals with ids, and the file from which a restarted commander reads its goals."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ BASE = "base"
 
 @dataclass(frozen=True)
 class IdentifiedGoal:
-    """A goal and the id under which statuses report on it; the id is empty if it is not known."""
+    """A goal and its id in statuses; the id is empty if unknown."""
 
     goal: Goal
     goal_id: str = ""
 
 
 class GoalIds:
-    """Gives the goal poses that a node receives their ids."""
+    """Assigns ids to the goal poses that a node receives."""
 
     def __init__(self) -> None:
         self._unstamped = 0
@@ -43,7 +43,7 @@ class GoalIds:
 
 
 class GoalFile:
-    """A file that holds the present goals of a commander until they are reached or given up.
+    """A file with the present goals of a commander; reached and abandoned goals are removed.
 
     A commander that is restarted loads them and continues.
 
@@ -60,7 +60,7 @@ class GoalFile:
         self._keys = keys
 
     def save(self, goals: Mapping[str, IdentifiedGoal]) -> None:
-        """Replace the content of the file by these goals, as a whole or not at all.
+        """Replace the content of the file by some goals, in one atomic step.
 
         Raises
         ------
@@ -71,7 +71,7 @@ class GoalFile:
             return
         text = json.dumps({key: _encode_goal(goal) for key, goal in goals.items()})
         try:
-            # Commanders wait for no disk while they fly.
+            # No fsync: a commander must not wait for the disk in flight.
             write_whole(self._path, text.encode(), durable=False)
         except OSError as error:
             raise ParameterError(
@@ -86,7 +86,7 @@ class GoalFile:
                 self._path.unlink()
 
     def load(self) -> dict[str, IdentifiedGoal]:
-        """Return the goals that were being pursued when the commander ended; empty if none were.
+        """Return the goals that a commander pursued at its end; empty without a file.
 
         Raises
         ------
@@ -106,7 +106,7 @@ class GoalFile:
         except (OSError, ValueError, RecursionError, PlanningError) as error:
             why = str(error).rstrip(".")
             raise ParameterError(
-                f"Parameter 'resume_file' is '{self._path}', which holds no goal: {why}."
+                f"Parameter 'resume_file' is '{self._path}', which holds no goals: {why}."
             ) from error
 
     def _parse_goals(self, text: str) -> dict[str, IdentifiedGoal]:
@@ -120,7 +120,7 @@ class GoalFile:
             return {
                 key: IdentifiedGoal(
                     Goal.checked(entry["position"], entry["quaternion"], entry["joint_positions"]),
-                    # Files of earlier versions have no id.
+                    # Files of earlier versions have no goal ids.
                     str(entry.get("id", "")),
                 )
                 for key, entry in entries.items()

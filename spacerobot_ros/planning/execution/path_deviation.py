@@ -36,18 +36,18 @@ _DIFFERENCE_STEP = 1e-6
 """Relative step of the finite differences."""
 
 _PRIOR_DEVIATION = 0.1
-"""Standard deviation of the relative errors of masses and inertias, before any measurement."""
+"""Prior standard deviation of the relative errors of masses and inertias."""
 
 _POSE_NOISE = 1e-3
 """Standard deviation of each component of a measured pose, m or rad."""
 
 _MAX_PLAUSIBLE_ERROR = 6 * _PRIOR_DEVIATION
-"""Relative errors beyond this have another cause, such as a jump of the measurements."""
+"""Largest relative error of a mass; larger estimates come from jumps of measurements."""
 
 _NEAR_SHARES, _AIM_SHARES = (0.6, 0.8), (0.4, 0.6)
-"""Shares of the tolerances, early and late in a motion: the remaining motion is planned again
-where its expected error exceeds the first, and the new plan may end within the second. Turns of
-the base that are left for late take long."""
+"""Two shares of the tolerances each, for early and late in a motion: the remaining motion is
+planned again where its expected error exceeds the first, and the new plan may end within the
+second. Turns of the base that are left for late take long."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class TrackingError:
 
 
 class PathCheck:
-    """Compares measured states with the predicted base path of a schedule, at its own instants.
+    """Compares measured states with the predicted base path of a schedule.
 
     The methods are for a state that is :meth:`due`.
 
@@ -103,7 +103,7 @@ class PathCheck:
         self._path_counts = config.drift_position > 0 or config.drift_attitude > 0 or average > 0
 
     def due(self, stamp_ns: int) -> bool:
-        """Whether the path predicts a pose for this time."""
+        """Whether the path has a predicted pose at a stamp."""
         if not self._path_counts:
             return False
         stamps = self._stamps
@@ -126,14 +126,14 @@ class PathCheck:
         return TrackingError(distance, angle) if too_far else None
 
     def average_pose(self, state: RobotState) -> RobotState:
-        """Add a state to the mean deviation; return it with its pose by the mean deviation."""
+        """Add a state to the mean deviation; return the state with the averaged pose."""
         k = self._next_pose
         self._deviation.add(k, state.position, state.quaternion, self._lag(state))
         position, quaternion = self._deviation.pose(k)
         return replace(state, position=position, quaternion=quaternion)
 
     def _lag(self, state: RobotState) -> Array:
-        """Return the deviation (6,) in W of the base that comes from joints which lag."""
+        """Return the deviation (6,) of the base in W by the lag of the joints."""
         lag = state.q - self._positions[round(self._path.time[self._next_pose] / self._period)]
         lag[np.abs(lag) <= self._deadband] = 0.0
         displacement_B = -self._robot.connection(state.q) @ lag
@@ -153,7 +153,7 @@ class PathCheck:
     def shift_goal(
         self, goal: Goal, within: Tolerance, controls: frozenset[Controlled], *, late: bool
     ) -> Goal | None:
-        """Return the goal for a plan of the remaining motion; None where its expected end is near.
+        """Return the goal of a new plan; None if the expected end of the path is near.
 
         Plans are made with the masses of the URDF. So the goal is shifted by the error that is
         expected from the estimated masses, as far as it exceeds a share of the tolerance.
@@ -170,12 +170,12 @@ class PathCheck:
 
 
 def _excess_share(error: float, allowed: float) -> float:
-    """Return the share of an error beyond the part that is allowed."""
+    """Return the excess of an error over its allowed size, as a share of the error."""
     return max(0.0, 1.0 - allowed / error) if error > 0 else 0.0
 
 
 class PathDeviation:
-    """Mean deviation of the measured base from a predicted path, over the last measurements.
+    """Mean deviation of the latest measured base poses from a predicted path.
 
     At zero momentum the base follows the path of the shape, seen from its own pose: a base that is
     off the predicted path by a rotation and a displacement keeps to that path, rotated and
@@ -224,11 +224,11 @@ class PathDeviation:
         self._masses.add(self._sensitivity[k], deviation)
 
     def pose(self, k: int) -> tuple[Array, Array]:
-        """Return where the base is at instant k: position (3,) and attitude (4,)."""
+        """Return the estimated base pose at instant k: position (3,) and attitude (4,)."""
         return self._displace_pose(k, self._mean_deviation(k) + self._lag)
 
     def end(self, k: int) -> tuple[Array, Array]:
-        """Return where the path leads to from instant k, if the base moves as predicted."""
+        """Return the pose at the end of the path, if the base moves as predicted from instant k."""
         mean = self._mean_deviation(k)
         position, quaternion = self._displace_pose(k, mean)
         turn = quaternion_from_rotvec(mean[3:])
@@ -240,7 +240,7 @@ class PathDeviation:
         )
 
     def expected_end(self, k: int) -> tuple[Array, Array]:
-        """Return where the path leads to with the estimated errors of masses: (3,) and (4,)."""
+        """Return the end of the path by the estimated errors of masses: (3,) and (4,)."""
         position, quaternion = self.end(k)
         more = self._deviation_by_masses(k, -1)
         turn = quaternion_from_rotvec(more[3:])
@@ -283,7 +283,7 @@ class PathSensitivity:
 
     @cached_property
     def _model(self) -> tuple[ca.Function, Array]:
-        """A function of shape and inertial arguments, and the arguments (k, 1 + P) of variants.
+        """A function of shape and inertial parameters, and the parameters (k, 1 + P) of variants.
 
         The function returns the angular velocity of the base per joint rate (3 n,) and the centre
         of mass (3,), both in base components. The variants are the model itself, then the model
@@ -344,7 +344,7 @@ class PathSensitivity:
 
 
 def _interpolate(at: Array, known: Array, values: Array) -> Array:
-    """Return values at instants, linearly between those (M, ...) at M known instants."""
+    """Interpolate the values (M, ...) at M known instants linearly to other instants."""
     place = np.interp(at, known, np.arange(len(known)))
     before = np.clip(place.astype(int), 0, max(len(known) - 2, 0))
     share = (place - before).reshape(-1, *[1] * (values.ndim - 1))
@@ -367,7 +367,7 @@ class MassEstimate:
     """
 
     def __init__(self, count: int) -> None:
-        # Information of the prior and of all earlier paths: matrix and vector.
+        # Information matrix and vector of the prior and of all earlier paths.
         self._information = (_POSE_NOISE / _PRIOR_DEVIATION) ** 2 * np.eye(count)
         self._vector = np.zeros(count)
         self._errors: Array | None = None
@@ -381,7 +381,7 @@ class MassEstimate:
         self._errors = None
 
     def next_path(self) -> None:
-        """Begin with another path; the information of the earlier ones is kept."""
+        """Begin another path, and keep the information of the earlier paths."""
         if self.errors.any():
             self._information, self._vector = self._normal_equations()
         self._clear_path()
@@ -405,7 +405,7 @@ class MassEstimate:
         return self._errors
 
     def _normal_equations(self) -> tuple[Array, Array]:
-        """Return their matrix and right side, without the part that a constant offset explains."""
+        """Return matrix and right side of the estimate, without the part of a constant offset."""
         n = max(self._poses, 1)
         squares = self._squares - self._sum_J.T @ self._sum_J / n
         products = self._products - self._sum_J.T @ self._sum_y / n

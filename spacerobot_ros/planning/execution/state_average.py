@@ -1,4 +1,4 @@
-"""Measured states, and the state of a robot at rest as their average."""
+"""Measured states, and the state of a robot at rest as the average of its measured states."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ _REST_RATE = 1e-9
 
 
 class BaseMeasurement(NamedTuple):
-    """The rest of a measured state: ``pose`` (7,), ``twist`` (6,) of the base, ``qdot`` (n,)."""
+    """The part of a measured state beside stamp and shape: ``pose`` (7,), ``twist`` (6,) of the
+    base, ``qdot`` (n,)."""
 
     pose: Array
     twist: Array
@@ -33,18 +34,18 @@ class MeasuredState(Protocol):
 
     @property
     def stamp_ns(self) -> int:
-        """When it was measured, ns."""
+        """Time of the measurement, ns."""
 
     @property
     def q(self) -> Array:
         """Shape (n,), m or rad."""
 
     def base(self) -> BaseMeasurement | None:
-        """Return the rest of the state; None where the base was not measured with the joints."""
+        """Return base and rates; None if the base was not measured with the joints."""
 
 
 class StateAverage:
-    """Averages measured states, and finds the total momenta from those at rest.
+    """Averages measured states, and estimates the total momenta from states at rest.
 
     While joints move, the momentum of a robot whose masses are not quite known is uncertain; at
     rest the base alone shows it, and without thrust it stays. So the momenta of a state are those
@@ -67,20 +68,20 @@ class StateAverage:
         self._rates: list[Array] = []
         self._shapes: list[Array] = []
         self._momenta: tuple[Array, Array] | None = None
-        """Those measured last at rest, (3,) each; None: none were."""
+        """Latest momenta measured at rest, (3,) each; None: none were."""
 
     @property
     def count(self) -> int:
-        """States since the last restart."""
+        """Number of states since the last restart."""
         return len(self._poses)
 
     @property
     def complete(self) -> bool:
-        """Whether there are as many as wanted."""
+        """Whether the average has as many states as requested."""
         return self.count >= self._full_count
 
     def restart(self) -> None:
-        """Forget the states, not the momenta."""
+        """Forget the states, but keep the momenta."""
         self._poses, self._rates, self._shapes = [], [], []
 
     def forget(self) -> None:
@@ -106,7 +107,8 @@ class StateAverage:
         rates = np.mean(self._rates, axis=0)
         if not (np.all(np.isfinite(poses)) and np.all(np.isfinite(np.concatenate([q, rates])))):
             raise PlanningError("The measured state is not finite; see odom and joint_states.")
-        # Attitudes differ by noise: the mean of their turns from the first.
+        # Attitudes differ by noise, so the mean of small turns from the first attitude is exact
+        # enough.
         first = poses[0, 3:]
         quaternion = first
         if len(poses) > 1:

@@ -15,7 +15,7 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 _NUMBER_KEYS = (
     *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "ends_at_s", "duration_s"),
 )
-"""Keys of the values that are one number each."""
+"""Keys of status values that are single numbers."""
 
 
 class PlannerState(str, Enum):
@@ -108,7 +108,7 @@ class PlannerStatus:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> PlannerStatus:
-        """Return the status that :meth:`to_values` has turned into these pairs.
+        """Return the status from the key-value pairs of :meth:`to_values`.
 
         Raises
         ------
@@ -151,7 +151,7 @@ class Notice:
 
 @dataclass(frozen=True)
 class ScheduleStart:
-    """A schedule that is tracked from a stamp on, ns."""
+    """The start of a schedule: the schedule, and the stamp of its first tick, ns."""
 
     schedule: GaitSchedule
     stamp_ns: int
@@ -216,7 +216,7 @@ def _parse_note(text: str) -> list[float] | float | str:
 
 
 def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
-    """Return the duration of the schedules for the last goal that were flown, s.
+    """Return the duration of the flown schedules for the last goal, s.
 
     As the planner counts it, less the rest of the last schedule where the flight was cut off; where
     the planner has not counted it, as after an abort, :func:`time_to_end`.
@@ -275,7 +275,7 @@ def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -
             case PlannerState.EXECUTING, True:
                 first = i
             case (PlannerState.PLANNING, _) | (PlannerState.REFUSED, False):
-                # A goal that is refused does not end the earlier one.
+                # A refused goal does not end the earlier goal.
                 pass
             case _:
                 break
@@ -288,6 +288,6 @@ def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -
 
 
 def _share_goal(first: PlannerStatus, second: PlannerStatus) -> bool:
-    """Whether two statuses are about one goal, or about two of the same pose."""
+    """Whether two statuses report on one goal, or on two goals with the same pose."""
     same_id = bool(first.goal_id) and first.goal_id == second.goal_id
     return same_id or first.goal == second.goal

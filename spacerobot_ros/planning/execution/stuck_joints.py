@@ -8,20 +8,20 @@ import numpy.typing as npt
 from spacerobot_ros.model.description import Array
 
 _STUCK_SHARE = 0.05
-"""A joint that moves over less than this share of its commanded range is stuck."""
+"""Share of the commanded range below which the motion of a joint counts as stuck."""
 
 _FOLLOWS_SHARE = 0.5
-"""A joint that moves over more than this share follows. In between it is slow, or noise hides
-its motion."""
+"""Share of the commanded range above which a joint counts as following its commands. In between it
+is slow, or noise hides its motion."""
 
 _PATIENCE_WINDOWS = 8
-"""Windows to wait for commands to arrive when no joint moves."""
+"""Number of windows without motion of any joint before joints count as stuck."""
 
 _CHECK_PERIOD = 16
 """Ticks between two checks of joints that have all followed so far: a check takes time."""
 
 _MIN_BAND = 1e-6
-"""Errors below this are rounding, m or rad."""
+"""Joint errors below this count as rounding, m or rad."""
 
 
 class StuckJointWatch:
@@ -53,7 +53,7 @@ class StuckJointWatch:
         self.restart()
 
     def restart(self) -> None:
-        """Begin with a new schedule."""
+        """Begin to watch the joints for a new schedule."""
         n = self._joints
         self._suspicious, self._ticks_without_check = False, 0
         self._moving_ticks = np.zeros(n, dtype=np.int64)
@@ -64,7 +64,7 @@ class StuckJointWatch:
         self._standstill_ticks = 0
 
     def find_stuck(self, q: Array, wanted: Array, velocity: Array) -> list[int]:
-        """Return the indices of the joints that are found stuck, mostly none.
+        """Return the indices of the joints that are stuck since this tick, mostly none.
 
         ``q`` and ``wanted`` (n,) are the measured and the wanted shape now, ``velocity`` (n,) the
         command until the next tick.
@@ -94,16 +94,16 @@ class StuckJointWatch:
         still = measured[moved] <= _STUCK_SHARE * commanded[moved]
         none_moves = (np.count_nonzero(moved) > 1 and still.all()) or self._at_standstill
         if none_moves and self._window[due].max() < self._max_window:
-            # Joints do not all jam at once: commands do not arrive, perhaps not for long.
+            # Joints do not all jam at once: perhaps commands do not arrive for a while.
             stuck[:] = False
         follows = due & (measured >= _FOLLOWS_SHARE * commanded)
-        # Those in between are looked at for longer.
+        # Joints between both shares are watched for another window.
         self._window[due] *= 2
         self._restart_joints(follows | stuck, q)
         return [int(i) for i in np.flatnonzero(stuck)]
 
     def _watch_standstill(self, q: Array, velocity: Array) -> None:
-        """Count the ticks without any motion, and sum the commanded motion of each joint since."""
+        """Count the ticks without any motion, and sum the commanded motion of each joint."""
         if np.abs(q - self._standstill_q).max(initial=0.0) > self._band:
             self._standstill_q[:] = q
             self._standstill_motion[:] = 0.0
@@ -113,7 +113,7 @@ class StuckJointWatch:
 
     @property
     def _at_standstill(self) -> bool:
-        """Whether several joints were commanded to move for a while in which none has moved."""
+        """Whether several joints had commands to move for a while, and no joint moved."""
         commanded = int(np.count_nonzero(self._standstill_motion > self._band))
         return commanded > 1 and 2 * self._standstill_ticks >= self._ticks
 

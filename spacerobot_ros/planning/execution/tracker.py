@@ -21,15 +21,15 @@ from spacerobot_ros.planning.execution.stuck_joints import StuckJointWatch
 from spacerobot_ros.times import SECOND
 
 _END_TOLERANCE = 1e-6
-"""A schedule has ended when every joint is this near its last position, m or rad."""
+"""Largest distance of the joints from their last positions at the end of a schedule, m or rad."""
 
 _MAX_SETTLING_TIME = 5.0
-"""A schedule has also ended this long after its last tick, s."""
+"""Time after its last tick at which a schedule ends in any case, s."""
 
 
 @dataclass(frozen=True)
 class Setpoint:
-    """Command of the joints; the arrays are the tracker's own and change in place.
+    """Command of the joints; the tracker changes the arrays in place.
 
     ``position`` (n,) is the wanted shape now, m or rad; ``velocity`` (n,) is held until the next
     tick, m/s or rad/s.
@@ -41,7 +41,7 @@ class Setpoint:
 
 @dataclass(frozen=True)
 class TakeOver:
-    """A tick of a schedule at which another one takes over.
+    """A tick of a schedule at which another schedule takes over.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class TakeOver:
 
 
 class ScheduleFollower:
-    """Follows one schedule by its stamps, so that a missed tick delays nothing that follows.
+    """Follows one schedule by stamps, so that a missed tick delays no later tick.
 
     Parameters
     ----------
@@ -83,14 +83,14 @@ class ScheduleFollower:
         self._end_ns = start_ns + self._last_tick * self._period_ns
         self._gain = min(shape_gain, 1.0 / schedule.control_period)
         self._positions = schedule.positions
-        # At rest after the last tick. The part of the feedback that is known beforehand is added
+        # The joints rest after the last tick. The part of the feedback known beforehand is added
         # here: qdot = qdot_k + gain (q_k - q), and q alone is measured.
         velocities = np.vstack([schedule.velocities, np.zeros(len(schedule.joint_names))])
         self._feedforward = velocities + self._gain * self._positions
         self._velocities, self._deadband = velocities, deadband
 
     def ended(self, stamp_ns: int, q: Array) -> bool:
-        """Whether the schedule is over and the shape ``q`` (n,) has reached its end."""
+        """Whether the schedule is over and the shape ``q`` (n,) has reached the last shape."""
         late = stamp_ns - self._end_ns
         if late < 0:
             return False
@@ -102,7 +102,7 @@ class ScheduleFollower:
         return self._start_ns <= stamp_ns <= self._end_ns + _MAX_SETTLING_TIME * SECOND
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
-        """Return the first tick ``after`` s from now or later; None after the last tick."""
+        """Return the first tick at least ``after`` s from now; None after the last tick."""
         now = max((stamp_ns - self._start_ns) // self._period_ns, 0)
         tick = now + max(1, math.ceil(after / self.schedule.control_period - 1e-9))
         if tick >= self._last_tick:
@@ -164,11 +164,11 @@ class BrakingFollower:
         self._gain = min(shape_gain, 1.0 / schedule.control_period)
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether the shape is on its way to rest at a time."""
+        """Whether the braking covers a time."""
         return 0 <= stamp_ns - self._stamp_ns <= self._duration * SECOND
 
     def ended(self, stamp_ns: int, q: Array) -> bool:
-        """Whether the shape is at rest."""
+        """Whether the joints have come to rest."""
         return (stamp_ns - self._stamp_ns) / SECOND >= self._duration
 
     def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
@@ -181,7 +181,7 @@ class BrakingFollower:
         )
 
     def shapes(self, stamp_ns: int) -> Array:
-        """Return the wanted shapes (N + 1, n) at the ticks from now until the rest."""
+        """Return the wanted shapes (N + 1, n) at the ticks from now until the joints rest."""
         tick = self.schedule.control_period
         since = (stamp_ns - self._stamp_ns) / SECOND
         ticks = max(1, math.ceil((self._duration - since) / tick - 1e-9))
@@ -197,7 +197,7 @@ class BrakingFollower:
 
 
 class TrajectoryTracker:
-    """Tracks one schedule after the other, and holds the shape in between.
+    """Tracks successive schedules, and holds the shape between schedules.
 
     Parameters
     ----------
@@ -210,9 +210,9 @@ class TrajectoryTracker:
     def __init__(self, robot: SpaceRobot, config: PlannerConfig) -> None:
         self.setpoint = Setpoint(np.zeros(robot.n), np.zeros(robot.n))
         self.stuck: list[int] = []
-        """Joints that do not follow; they are commanded to rest."""
+        """Stuck joints; their commands are zero."""
         self._robot, self._config = robot, config
-        # A controller closes its own loop round the reference.
+        # No feedback here: a controller closes its own loop around the reference.
         self._commands_plant = config.output == "commands"
         self._follower: ScheduleFollower | BrakingFollower | None = None
         self._holds_position = False
@@ -228,7 +228,7 @@ class TrajectoryTracker:
 
     @property
     def active(self) -> bool:
-        """Whether a schedule is tracked, or braked along."""
+        """Whether the tracker follows a schedule, or brakes along it."""
         return self._follower is not None
 
     @property
@@ -257,7 +257,7 @@ class TrajectoryTracker:
         self._follower = self._braking_from(stamp_ns)
 
     def braking_shapes(self, stamp_ns: int) -> Array | None:
-        """Return the shapes (N + 1, n) at the ticks of a braking from now on; None at rest."""
+        """Return the shapes (N + 1, n) at the ticks of a braking that starts now; None at rest."""
         follower = self._braking_from(stamp_ns)
         return None if follower is None else follower.shapes(stamp_ns)
 
@@ -267,7 +267,7 @@ class TrajectoryTracker:
         return self._follower
 
     def take_over(self, stamp_ns: int, q: Array, after: float) -> TakeOver | None:
-        """Return the tick ``after`` s from now or later at which a plan may take over.
+        """Return the tick, at least ``after`` s from now, at which a plan may take over.
 
         Its first shape is the wanted one, but for joints whose measured position in ``q`` (n,) is
         off by more than noise. None if no schedule is tracked, or it is over by then.
@@ -285,11 +285,11 @@ class TrajectoryTracker:
         return self._follower is not None and self._follower.covers(stamp_ns)
 
     def ended(self, stamp_ns: int, q: Array) -> bool:
-        """Whether the schedule is over, or the braking."""
+        """Whether the schedule or the braking is over."""
         return self._follower is not None and self._follower.ended(stamp_ns, q)
 
     def stop(self, *, at_last_shape: bool = False) -> None:
-        """Track nothing more; hold the schedule's last shape, or the one that is measured next."""
+        """Stop tracking; hold the schedule's last shape, or the next measured shape."""
         if at_last_shape and isinstance(self._follower, ScheduleFollower):
             self.setpoint.position[:] = self._follower.schedule.positions[-1]
             self._holds_position = True
@@ -298,11 +298,11 @@ class TrajectoryTracker:
         self._follower = None
 
     def check_due(self, stamp_ns: int) -> bool:
-        """Whether the pose at this time is to be compared with the predicted one."""
+        """Whether the schedule has a predicted pose to check at this time."""
         return isinstance(self._follower, ScheduleFollower) and self.path_check.due(stamp_ns)
 
     def track(self, stamp_ns: int, q: Array, *, obeyed: bool = True) -> list[int]:
-        """Write the setpoint for the shape ``q`` (n,) now; return which joints are found stuck.
+        """Write the setpoint for the present shape ``q`` (n,); return the stuck joints.
 
         For a shape that is not finite the setpoint is to rest. While no command is in force at the
         plant (``obeyed`` is false), joints that do not move prove nothing.
@@ -321,7 +321,7 @@ class TrajectoryTracker:
         return self._stuck_watch.find_stuck(q, position, velocity)
 
     def hold(self, q: Array, *, obeyed: bool = True) -> None:
-        """Write the setpoint that keeps the shape, where nothing is tracked."""
+        """Write the setpoint that keeps the shape without a schedule."""
         # The reference of a controller must not follow the measured shape; for a plant, rest is any
         # shape. Motions while no command is in force are not undone afterwards.
         if self._commands_plant or not self._holds_position or not obeyed:

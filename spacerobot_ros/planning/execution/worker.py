@@ -27,31 +27,31 @@ from spacerobot_ros.planning.methods.registry import METHODS, build_method
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 
 MAX_THREAD_END_TIME = 1.5
-"""Wall s that a thread may take to end after its cancellation."""
+"""Largest wall time for a planning thread to end after its cancellation, s."""
 
 
 class PlanReason(Enum):
-    """Reason of a request for a plan; the value is the word ``reason`` of events."""
+    """Reason of a request for a plan; events have its value under ``reason``."""
 
     NEW_GOAL = "new goal"  # A new goal, from rest.
-    BLEND = "blend"  # A new goal while the joints move: the plan begins with their braking.
-    IN_MOTION = "new goal in motion"  # A new goal; its plan takes over at a tick ahead.
-    SHRINKING_HORIZON = "shrinking horizon"  # The remaining motion again, from a tick ahead.
+    BLEND = "blend"  # A new goal while the joints move: the plan begins with braking.
+    IN_MOTION = "new goal in motion"  # A new goal; its plan takes over in motion.
+    SHRINKING_HORIZON = "shrinking horizon"  # The remaining motion, planned in motion.
     CORRECTION = "correction"  # The schedule has ended, and the goal is not reached.
-    CONTINUATION = "continuation"  # The schedule was partial on purpose: its next piece.
+    CONTINUATION = "continuation"  # The next piece of a manoeuvre in pieces.
     TRACKING_ERROR = "tracking error"  # The base is off its path; the plan begins with braking.
-    REPLAN = "replan"  # The schedule was braked, or does not apply any more.
-    STUCK_JOINTS = "stuck joints"  # Joints do not follow; the plan is made with the others.
+    REPLAN = "replan"  # The schedule ended by braking, or does not apply any more.
+    STUCK_JOINTS = "stuck joints"  # Some joints are stuck; the plan uses the other joints.
 
     @property
     def for_new_goal(self) -> bool:
-        """Whether the plan is for a goal that is not active yet."""
+        """Whether the plan is for a new goal, which is not active yet."""
         return self in (PlanReason.NEW_GOAL, PlanReason.BLEND, PlanReason.IN_MOTION)
 
 
 @dataclass(frozen=True)
 class PlanJob:
-    """A requested plan; of this class for a new goal from rest, or with braking first."""
+    """A requested plan; this base class serves new goals from rest or with braking first."""
 
     identified: IdentifiedGoal
     reason: PlanReason
@@ -59,7 +59,7 @@ class PlanJob:
 
 @dataclass(frozen=True)
 class RemainingJob(PlanJob):
-    """A plan from rest for the active goal, which is off by ``error``."""
+    """A plan from rest for the active goal, from which the robot is off by ``error``."""
 
     error: PoseError
 
@@ -116,7 +116,7 @@ class PlanningTask:
 
 @dataclass(frozen=True)
 class Planned:
-    """A plan that was made, and the wall time that this took, s."""
+    """A plan, and the wall time for planning, s."""
 
     schedule: GaitSchedule
     wall_time: float
@@ -124,7 +124,7 @@ class Planned:
 
 @dataclass(frozen=True)
 class Refused:
-    """The reason why no plan was made, as a message, and the wall time that this took, s."""
+    """The reason of a refused plan, as a message, and the wall time for planning, s."""
 
     reason: str
     wall_time: float = 0.0
@@ -170,7 +170,7 @@ class PlanningWorker:
             config.method_options,
         )
         self._remaining_joints: tuple[PlanningTask, GaitMethod] | None = None
-        """The method without some joints that was built last, and the task that needed it."""
+        """The latest method without stuck joints, and its task."""
         self._job: _PlanThread | None = None
 
     @property
@@ -180,7 +180,7 @@ class PlanningWorker:
 
     @property
     def busy(self) -> bool:
-        """Whether a plan is being made, or its result waits, or it has yet to end."""
+        """Whether a plan is in work, its result waits, or its thread still runs."""
         return self._job is not None
 
     def starts_in_motion(self, schedule: GaitSchedule) -> bool:
@@ -199,7 +199,7 @@ class PlanningWorker:
                 job.run()
 
     def poll(self) -> Planned | Refused | None:
-        """Return the result once it is there, None before and for a plan that was cancelled.
+        """Return the finished result; None before the end and for a cancelled plan.
 
         A defect of the method is raised here.
         """
@@ -212,20 +212,20 @@ class PlanningWorker:
         return None if job.cancellation.requested else job.result
 
     def cancel(self) -> None:
-        """Have the plan that is being made end without a result."""
-        job = self._job  # Another thread may take it meanwhile.
+        """Cancel the present plan, which then has no result."""
+        job = self._job  # Another thread may clear the attribute meanwhile.
         if job is not None:
             job.cancellation.cancel()
 
     def close(self) -> None:
-        """Cancel, and wait until the thread in the background has ended."""
+        """Cancel the present plan, and wait until its thread has ended."""
         self.cancel()
         if self._job is not None and self._job.is_alive():
-            # It would crash a process that ends, in the middle of CasADi.
+            # A thread inside CasADi would crash a process that ends.
             self._job.join(MAX_THREAD_END_TIME)
 
     def plan(self, task: PlanningTask, cancellation: Cancellation) -> GaitSchedule:
-        """Make a plan at once.
+        """Plan in the calling thread.
 
         Raises
         ------
@@ -285,7 +285,7 @@ class PlanningWorker:
         return replace(gait, positions=np.vstack([shapes[:-1], gait.positions]), path=path)
 
     def _predict_motion(self, state: RobotState, shapes: Array) -> tuple[RobotState, Array, Array]:
-        """Return the state after shapes (K + 1, n) at ticks, and the base poses at these.
+        """Return the state after shapes (K + 1, n) at ticks, and the base poses at the ticks.
 
         The positions are (K + 1, 3), the attitudes (K + 1, 4).
         """
@@ -301,7 +301,7 @@ class PlanningWorker:
 
 
 class _PlanThread(Thread):
-    """One plan that is being made, and its result."""
+    """A thread that makes one plan, and the plan's result."""
 
     def __init__(self, worker: PlanningWorker, task: PlanningTask) -> None:
         super().__init__(daemon=True)
@@ -312,7 +312,7 @@ class _PlanThread(Thread):
         self._worker, self._task = worker, task
 
     def run(self) -> None:
-        """Plan; an exception that is no refusal is kept for the thread that polls."""
+        """Make the plan; keep unexpected exceptions for the polling thread."""
         began = time.perf_counter()
         try:
             schedule = self._worker.plan(self._task, self.cancellation)

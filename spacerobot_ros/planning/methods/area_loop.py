@@ -34,13 +34,13 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes, straight_
 from spacerobot_ros.planning.methods.nominal_shape import PLANES, NominalChoice, NominalShape
 
 _MAX_CYCLE_TRIALS = 6
-"""A cycle that would not bring the base nearer is tried this often, each time half as large."""
+"""Attempts for a cycle that would not bring the base nearer, each half as large as before."""
 
 _MAX_CYCLE_SHARE = 1.0 - 1e-9
-"""A share k of the missing turn above this leaves nothing for the next cycle, but rounding."""
+"""Share k of the missing turn above which one cycle makes up for the whole turn."""
 
 _NEGLIGIBLE_AREA_SHARE = 1e-3
-"""An area below this share of the largest counts as zero: a later cycle makes up for it."""
+"""Share of the largest area below which an area counts as zero: a later cycle makes up for it."""
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -83,7 +83,7 @@ class AreaLoopOptions:
 
 @dataclass(frozen=True)
 class AreaLoopProgress:
-    """State from which the next schedule for the same goal continues.
+    """Progress of a goal, from which its next schedule continues.
 
     ``nominal`` is the chosen nominal shape, ``cycles`` the number of cycles flown at the end of
     the schedule.
@@ -94,7 +94,7 @@ class AreaLoopProgress:
 
 
 class AreaLoopGait(GaitMethod):
-    """Attitude of a base with three or more joints of any kind, and the shape to end in.
+    """Controls attitude and final shape of a robot with three or more joints of any kind.
 
     The base's position follows from both (the centre of mass rests) and cannot be chosen. A
     schedule is one cycle, or ``cycles_per_plan`` of them as predicted.
@@ -113,7 +113,7 @@ class AreaLoopGait(GaitMethod):
 
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots that loops of three joints cannot turn about three axes."""
+        """Refuse robots whose bases loops of three joints cannot turn about three axes."""
         if robot.n < 3:
             raise PlanningError(
                 f"area_loop needs three joints (paper 2); robot '{robot.description.name}' has "
@@ -142,7 +142,7 @@ class AreaLoopGait(GaitMethod):
         nominal = self._nominal.nearest_turn(chosen, state.q)
         flown = 0 if progress is None else progress.cycles
         gait = self._add_legs(gait, [(nominal.shape, self.options.edge_time)])
-        # The way from the nominal to the final shape turns the base too.
+        # The motion from the nominal to the final shape turns the base, too.
         aside = self._turn_to_final_shape(nominal, final)
         target = quaternion_multiply(goal.quaternion, quaternion_inverse(aside))
         remaining = 0.0
@@ -181,7 +181,7 @@ class AreaLoopGait(GaitMethod):
         Cycles go on until the attitude is off by ``enough`` (rad); ``flown`` are done.
         """
         S = self.options.k * np.linalg.solve(nominal.M, left).astype(float)
-        # Edges go as the root of areas.
+        # Edges scale with the square root of areas.
         share = min(1.0, edge_path(S, nominal.longest).excess ** -2)
         missing = float(np.linalg.norm(left))
         cycles = flown + self._count_cycles_left(missing, share, enough)
@@ -224,7 +224,7 @@ class AreaLoopGait(GaitMethod):
         )
 
     def _count_cycles_left(self, missing: float, share: float, enough: float) -> float:
-        """Return the number of cycles for a turn (rad) to first order, the first by a share of k.
+        """Return the number of cycles left for a missing turn (rad), to first order.
 
         While edges are as long as they may be, every cycle turns the base as far; then the
         missing turn shrinks by the factor 1 - k.
@@ -239,7 +239,7 @@ class AreaLoopGait(GaitMethod):
         return many + max(1.0, math.log(unbounded / enough) / factor)
 
     def _edge_ends(self, path: EdgePath, nominal: NominalShape) -> Ends:
-        """Return where the edges of a path end, from the nominal shape and back to it."""
+        """Return the ends of the edges of a path that begins and ends at the nominal shape."""
         chosen = list(nominal.joints)
         lower, upper = self.robot.lower[chosen], self.robot.upper[chosen]
         ends: Ends = []
@@ -249,7 +249,7 @@ class AreaLoopGait(GaitMethod):
             centre = np.maximum(np.minimum(nominal.shape[chosen], upper - half), lower + half)
             corners = np.tile(nominal.shape, (len(loop), 1))
             corners[:, chosen] = np.clip(centre + loop, lower, upper)
-            # From the middle of the box to a corner is half as far as an edge.
+            # The middle of a box is half an edge away from its sides.
             ends.append((corners[0], self.options.edge_time / 2))
             ends += [(corner, self.options.edge_time) for corner in corners[1:]]
             ends.append((nominal.shape, self.options.edge_time / 2))
@@ -266,7 +266,7 @@ class AreaLoopGait(GaitMethod):
         shapes = straight_motion(
             self.robot, gait.positions[-1], ends, self.control_period, self.options.longest
         )
-        # At rest there is no momentum: the attitudes depend on the shapes alone.
+        # A robot at rest has no momentum: its attitudes depend on its shapes alone.
         attitudes = self._prediction.attitudes(shapes, gait.attitudes[-1], np.zeros(3))
         return _PlannedMotion(
             np.vstack([gait.positions, shapes[1:]]), np.vstack([gait.attitudes, attitudes[1:]])
@@ -306,7 +306,7 @@ class _PlannedMotion:
 
 @dataclass(frozen=True)
 class EdgePath:
-    """Closed polygons, to be gone round one after the other.
+    """Closed polygons that the shape follows one after the other.
 
     Attributes
     ----------
@@ -329,7 +329,7 @@ class EdgePath:
 
 
 def edge_path(areas: Array, longest: Array) -> EdgePath:
-    """Return the path that encloses ``areas`` (3,), its edges at most ``longest`` (3,) if possible.
+    """Return the path that encloses ``areas`` (3,), with edges of at most ``longest`` (3,).
 
     The cube-like path is taken where its edges are short enough, or shorter than those of
     rectangles. Areas that are too large give a path with ``excess`` over 1: edges go as the root
@@ -373,7 +373,7 @@ def _rectangle_path(areas: Array, longest: Array) -> EdgePath:
     for area, (i, j) in zip(areas, PLANES, strict=True):
         if area == 0.0:
             continue
-        # Both edges are the same share of the longest.
+        # Both edges have the same ratio to the longest edges.
         share = np.sqrt(abs(area) / (longest[i] * longest[j]))
         excess = max(excess, float(share))
         loop = np.zeros((5, 3))

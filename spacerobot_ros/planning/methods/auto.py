@@ -23,14 +23,14 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule
 
 @dataclass(frozen=True)
 class Candidate:
-    """A method to choose, and how to build it for the robot, with its options, when it is tried."""
+    """A gait method to try, and a function that builds it with its options for the robot."""
 
     method: type[GaitMethod]
     build: Callable[[], GaitMethod]
 
 
 class AutoGait(GaitMethod):
-    """Plans by every method that suits the robot, and takes the shortest manoeuvre.
+    """Plans by all methods that suit the robot, and returns the shortest manoeuvre.
 
     Where a method that suits the robot controls the position, methods that do not are left out. A
     manoeuvre that ends off the goal, or controls less of it than another, is taken only if there
@@ -65,7 +65,7 @@ class AutoGait(GaitMethod):
         self._built_methods: dict[str, GaitMethod] = {}
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Plan by the methods that suit, and compare; see :meth:`GaitMethod.plan`.
+        """Plan by all suitable methods, and return the best plan; see :meth:`GaitMethod.plan`.
 
         ``notes`` name the method that is taken (``chosen``), the reason (``because``), and the
         results of all methods (``compared``).
@@ -106,8 +106,8 @@ class AutoGait(GaitMethod):
         return _add_notes(results[chosen].schedule, chosen, because, results, refusals)
 
     def _refuse_goal(self, refusals: Mapping[str, SpaceRobotError]) -> PlanningError:
-        """Return the refusal of a goal that no method plans: the proof of one, or all reasons."""
-        # Refusals of the robot say nothing about the goal.
+        """Return the error for a goal that no method plans: the proof of one, or all reasons."""
+        # Refusals of the robot do not depend on the goal.
         of_goal = [refusals[name] for name in self._candidates if name not in self._unsuitable]
         for refusal in of_goal:
             if isinstance(refusal, UnreachableError):
@@ -117,7 +117,7 @@ class AutoGait(GaitMethod):
         return refusal_of_all(message, of_goal)
 
     def _list_comparable(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
-        """Return the methods to compare; add the refusals of the others.
+        """Return the methods to compare; add the refusals of the other methods.
 
         The others do not control a part of the pose that one of the methods controls.
         """
@@ -145,7 +145,7 @@ class AutoGait(GaitMethod):
         refusals: dict[str, SpaceRobotError],
         cancellation: Cancellation,
     ) -> GaitSchedule | None:
-        """Return the schedule of one method, None if it refuses; the refusal is kept."""
+        """Return the schedule of one method; None for a refusal, which is added to ``refusals``."""
         try:
             return self._get_method(name).plan(request, cancellation)
         except PlanningCancelled:
@@ -194,7 +194,7 @@ class _Result:
 
     @property
     def message(self) -> str:
-        """The duration, and the objection to it if there is one."""
+        """The duration of the schedule as a message, with a reason against the schedule, if any."""
         about = "about " if self.schedule.partial else ""
         off = "" if self.reaches else ", which ends off the goal"
         return f"{about}{self.schedule.expected_duration:.6g} s{off}"
@@ -207,7 +207,7 @@ def _add_notes(
     results: Mapping[str, _Result],
     refusals: Mapping[str, SpaceRobotError],
 ) -> GaitSchedule:
-    """Return a schedule with notes on the manoeuvres that it was compared with."""
+    """Return a schedule with notes on all compared manoeuvres."""
     compared = [f"{name}: {result.message}." for name, result in results.items()]
     compared += [f"{name}: {refusal}" for name, refusal in refusals.items()]
     notes = {"chosen": chosen, "because": because, "compared": " ".join(compared)}

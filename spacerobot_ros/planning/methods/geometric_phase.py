@@ -26,11 +26,11 @@ from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.planning.core.controllability import NO_TURN, Controllability, shape_box
 
 _MAX_AXIS_TILT = 1e-5
-"""Largest tilt of an axis, and turn about other axes a radian of a joint, that counts as planar:
-as much as angles written with six digits leave."""
+"""Largest tilt of an axis of a planar robot, and turn about other axes per radian of a joint:
+the rounding error of angles with six digits."""
 
 _SAMPLED_SHAPES = 8
-"""Shapes at which it is tested whether a robot stays in its plane."""
+"""Number of sampled shapes in the test whether a robot stays in its plane."""
 
 _MAX_PANEL_ANGLE = 0.5
 """Longest piece of a leg that one Gauss rule integrates, rad."""
@@ -39,7 +39,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 _FITTED_ANGLES: Array = 2 * math.pi / 3 * np.arange(3.0)
-"""Three angles determine a trigonometric polynomial of degree one."""
+"""Three angles that determine a trigonometric polynomial of degree one, rad."""
 
 _HARMONIC_DERIVATIVE = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """``h @ _HARMONIC_DERIVATIVE`` is the derivative of ``h = [1, cos, sin]``."""
@@ -52,13 +52,13 @@ _GRID_REFINEMENTS = 8
 _MAX_PEAKS = 4
 
 _EQUAL_PEAK_TOLERANCE = 1e-4
-"""Peaks of the curvature that differ by less than this share are equally good, ..."""
+"""Relative difference below which peaks of the curvature count as equal."""
 
 _EQUAL_DISTANCE = 1e-2
 """Distances that differ by less than this count as equal, rad."""
 
 _NEIGHBOUR_OFFSETS = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -1.0, 1.0)])
-"""A point and its eight neighbours; the point itself comes first and wins a tie."""
+"""Offsets of a grid point and its eight neighbours; the first, of the point itself, wins ties."""
 
 
 def planar_axis(robot: SpaceRobot) -> Array:
@@ -86,7 +86,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
                 f"Robot '{name}' is not planar in the sense of paper 3: joint '{joint.name}' "
                 "slides, and all joints must turn about parallel axes."
             )
-        # Turns about parallel axes do not move the axes: one shape tells.
+        # Turns about parallel axes do not move the axes, so one shape suffices for the test.
         rotations.append(rotations[body.parent] @ body.origin.R)
         axes.append(rotations[-1] @ joint.axis)
         if np.linalg.norm(np.cross(axes[0], axes[-1])) > _MAX_AXIS_TILT:
@@ -102,7 +102,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
 def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
     """Refuse masses off the plane and products of inertia that tilt the base."""
     # The tilt is a ratio of trigonometric polynomials of the shape: it is zero everywhere or
-    # almost nowhere, and a few shapes in general position tell which.
+    # almost nowhere, so a few shapes in general position suffice for the test.
     shapes = np.outer(np.arange(1, _SAMPLED_SHAPES + 1), np.sqrt(np.arange(2, robot.n + 2)))
     A = robot.function("connection", compile=False)(shapes.T).full()[3:]
     tilts = np.linalg.norm(A - np.outer(axis, axis @ A), axis=0).reshape(_SAMPLED_SHAPES, robot.n)
@@ -117,7 +117,7 @@ def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
 
 
 def planar_chain(robot: SpaceRobot) -> Controllability:
-    """Return the test of paper 3: a planar robot of three or more links, with curvature."""
+    """Test a robot by paper 3: a planar robot of three or more links, with curvature."""
     names, rest = robot.joint_names, np.zeros(robot.n)
     try:
         phase = PlanarPhase(robot)
@@ -158,11 +158,11 @@ class PlanarPhase:
 
     def __init__(self, robot: SpaceRobot) -> None:
         self.axis = planar_axis(robot)
-        """Unit vector (3,) that positive angles turn about, base components."""
+        """Axis (3,) of positive turns, a unit vector in base components."""
         psi = ca.SX.sym("psi", robot.n)
         D, D_q = robot.function("locked_inertia", compile=False)(psi)
         axis = ca.DM(self.axis)
-        # A = D^-1 D_q where nothing couples the axis to the others.
+        # A = D^-1 D_q, as no inertia couples the axis to other axes.
         N_D = ca.vertcat((axis.T @ D_q).T, axis.T @ D @ axis)
         self._N_D = ca.Function("N_D", [psi], [ca.densify(N_D)])
 
@@ -185,7 +185,7 @@ class PlanarPhase:
 
 
 class PhasePlane:
-    """Turns of the base by two joints, in formulas.
+    """Turns of the base by two joints, in closed form.
 
     Each joint turns one rigid part of the robot against the other, and ``N_i``, ``N_j`` and ``D``
     are sums of products of two vectors, each fixed in some body. They are trigonometric polynomials
@@ -201,7 +201,7 @@ class PhasePlane:
         self._C = coefficients
 
     def curvature(self, points: Array) -> Array:
-        """Return the turn of the base an area of small loops, 1/rad, (...), at points (..., 2).
+        """Return the turn of the base per area of small loops, 1/rad, (...), at points (..., 2).
 
         Loops are counter-clockwise in the plane (psi_i, psi_j): it is ``-H``, eq. (10), with
         ``H = ds_j/dpsi_i - ds_i/dpsi_j``.
@@ -213,7 +213,7 @@ class PhasePlane:
         return np.asarray((N_i_j * D - N_i * D_j - N_j_i * D + N_j * D_i) / D**2)
 
     def squares(self, centres: Array, sides: Array) -> Array:
-        """Return the turns (R,) by squares gone round counter-clockwise, centres (R, 2)."""
+        """Return the turns (R,) of the base by counter-clockwise squares with centres (R, 2)."""
         corners = square_corners(centres, sides)
         ends = np.roll(corners, -1, axis=1)
         legs = _integrate_legs(self._s, corners.reshape(-1, 2), ends.reshape(-1, 2))
@@ -254,7 +254,7 @@ def _integrate_legs(s: Callable[[Array], Array], starts: Array, ends: Array) -> 
 
 
 def centre_box(at: Array, lower: Array, upper: Array) -> Array:
-    """Return the box in which every point within the limits (2,) is found once.
+    """Return the box that holds every different point within the limits (2,) once.
 
     Shapes repeat after a turn: a joint that goes further than once round has all its points within
     half a turn of ``at`` (2,), or of the end of its range that is nearest to that.
@@ -269,7 +269,7 @@ def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
 
     Of equally good points it is the one that is nearest to ``at`` (2,).
     """
-    # Joints without limits have the same box for squares of all sizes.
+    # Boxes of joints without limits do not depend on the size of the square.
     flat, row = np.unique(boxes.reshape(-1, 4), axis=0, return_inverse=True)
     boxes = flat.reshape(-1, 2, 2)
     tops = [_find_grid_maxima(plane, box) for box in boxes]
@@ -289,7 +289,7 @@ def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
         mine = np.flatnonzero(owner == k)
         good = mine[heights[mine] >= (1 - _EQUAL_PEAK_TOLERANCE) * heights[mine].max()]
         nearest = good[distances[good] <= distances[good].min() + _EQUAL_DISTANCE]
-        # The last one in order, so that rounding does not choose between mirror images.
+        # The last of equal peaks in order, so that rounding does not choose between mirror images.
         chosen.append(max(points[nearest].tolist()))
     return np.array(chosen)[row.ravel()]
 

@@ -43,7 +43,7 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 _MIN_CYCLE_TICKS = 12
 _MAX_REFINEMENTS = 20
 _PATH_POINTS = 100
-"""Poses of the predicted path in each step, up to twice as many."""
+"""Fewest poses of the predicted path in each step; a step has at most twice as many."""
 
 _NO_ROTATION = 1e-9
 _NO_MOTION = 1e-9
@@ -84,7 +84,7 @@ class LieBracketOptions:
 
 
 class LieBracketGait(GaitMethod):
-    """Position and attitude of a base with three or more sliders, whose slots may be offset."""
+    """Controls position and attitude of a base with three or more sliders with any slots."""
 
     name: ClassVar[str] = "lie_bracket"
     Options: ClassVar[type[LieBracketOptions]] = LieBracketOptions
@@ -92,7 +92,7 @@ class LieBracketGait(GaitMethod):
 
     def _setup(self) -> None:
         robot = self.robot
-        # Whole ticks a cycle: every cycle is then the same commands and the same rotation.
+        # A cycle is a whole number of ticks, so all cycles have the same commands and rotation.
         self.ticks_a_cycle = max(
             round(self.options.cycle_period / self.control_period), _MIN_CYCLE_TICKS
         )
@@ -100,7 +100,7 @@ class LieBracketGait(GaitMethod):
 
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots whose sliders do not fulfil the conditions of paper 1."""
+        """Refuse robots whose sliders violate the conditions of paper 1."""
         sliding_masses(robot).require()
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
@@ -136,7 +136,7 @@ class LieBracketGait(GaitMethod):
         robot = self.robot
         R0, Rf = matrix_from_quaternion(state.quaternion), matrix_from_quaternion(goal.quaternion)
         c0 = robot.center_of_mass(state.q)
-        # The system's mass centre stays: r_f + R_f c(zf) = r_0 + R_0 c(z0).
+        # The system's centre of mass is fixed: r_f + R_f c(zf) = r_0 + R_0 c(z0).
         shift = Rf.T @ (state.position + R0 @ c0 - goal.position) - c0
         P = slot_matrix(robot, state.q, self.sliders)
         require_three_slots(robot, P)
@@ -158,10 +158,11 @@ class LieBracketGait(GaitMethod):
         upper: Array,
         enough: float,
     ) -> Array:
-        """Spread the displacement over more than three sliders, or name the stroke too short."""
-        from scipy.optimize import lsq_linear  # Slow to import, and few goals need it.
+        """Spread a displacement over four or more sliders; name a slider of too short a stroke."""
+        from scipy.optimize import lsq_linear  # scipy is slow to import, and few goals need it.
 
-        # Bounds must differ for the solver; a slider at its end gets a hair of room.
+        # The solver needs different bounds, so the range of a slider at its end is widened
+        # slightly.
         room = 1e-12 * (1.0 + np.abs(upper - lower))
         bounded = lsq_linear(P, shift, (lower - z0 - room, upper - z0 + room), method="bvls")
         gap = float(np.linalg.norm(P @ bounded.x - shift))
@@ -180,7 +181,7 @@ class LieBracketGait(GaitMethod):
                 f"The goal is beyond stroke: {len(self.sliders)} sliders put the base no nearer "
                 f"than {gap:.3g} m to it."
             )
-        # Other joints move the centre of mass too, but not by this method.
+        # Other joints could move the centre of mass, but this method holds them.
         if len(self.sliders) < self.robot.n or self.robot.description.coupled:
             raise PlanningError(message)
         raise UnreachableError(message, Proof.LIMITS)
@@ -200,7 +201,7 @@ class LieBracketGait(GaitMethod):
         return shapes
 
     def _slide_time(self, displacement: Array) -> float:
-        """Return t1 (s), longer where a servo is slow: the peak speed is twice the mean."""
+        """Return t1 (s), longer for slow servos: the peak speed is twice the mean."""
         slowest, longest = self.options.t1, self.options.longest
         for name, distance, rate in zip(
             self.robot.joint_names, np.abs(displacement), self.robot.velocity_limit, strict=True
@@ -229,7 +230,7 @@ class LieBracketGait(GaitMethod):
             best.miss > enough
             and 2 * best.cycles * self.ticks_a_cycle * self.control_period <= self.options.longest
         ):
-            # The error of the first order goes as 1/sqrt(n).
+            # The error of the first-order theory decreases as 1/sqrt(n).
             best = self._refine_turn(wanted, brackets, triple, z_f, 2 * best.cycles, enough)
         names = [self.robot.joint_names[i] for i in triple]
         return (
@@ -254,7 +255,7 @@ class LieBracketGait(GaitMethod):
         least: int,
         enough: float,
     ) -> _Turn:
-        """Add the error of the first order to the wanted turn, until it is below ``enough`` (rad).
+        """Add the first-order error to the wanted turn until it is below ``enough`` (rad).
 
         The number of cycles is chosen once, from ``least`` up, so that the answer is smooth.
         """
@@ -276,9 +277,9 @@ class LieBracketGait(GaitMethod):
         return best
 
     def _best_triple(self, z_f: Array) -> tuple[tuple[int, int, int], Array]:
-        """The three sliders whose brackets ``[w12, w23, w13]`` at zf are best conditioned."""
+        """Return the three sliders with the best conditioned brackets at zf, and M."""
         triple, M = best_triple(self.robot.curvature(z_f)[3:], self.sliders)
-        # M holds the curvature of the pairs 12, 23 and 31, which brackets are the negative of.
+        # M holds the curvature of the pairs 12, 23 and 31; the brackets are its negative.
         brackets = M * np.array([-1.0, -1.0, 1.0])
         condition = float(np.linalg.cond(brackets))
         if not condition < MAX_CONDITION:
@@ -292,8 +293,8 @@ class LieBracketGait(GaitMethod):
     def _fit_to_limits(
         self, alpha: Array, triple: tuple[int, int, int], z_f: Array, least: int
     ) -> _Turn:
-        """Choose n, from ``least`` up, so that the cycle keeps rates and strokes; more cycles are
-        smaller ones. With ``least`` 0 it follows from ``loop_area``.
+        """Choose the smallest n >= ``least`` at which a cycle keeps rates and strokes. With
+        ``least`` 0 it follows from ``loop_area``.
         """
         n = least or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.options.loop_area))
         amplitudes = self._cycle_amplitudes(alpha)
@@ -336,7 +337,8 @@ class LieBracketGait(GaitMethod):
     def _cycle_shapes(
         self, amplitudes: Array, n: int, triple: tuple[int, int, int], z_f: Array
     ) -> Array:
-        """One cycle at its ticks: the integrals of v1, v2, v3 of step 3, from ``zf`` back to it."""
+        """Return the shapes of one cycle at its ticks: the integrals of v1, v2, v3 of step 3, from
+        ``zf`` back to it."""
         b11, b12, b21, a22, a31 = amplitudes / math.sqrt(n)
         phi = np.linspace(0.0, 2 * np.pi, self.ticks_a_cycle + 1)
         z1 = b11 * (1 - np.cos(phi)) + b12 * (1 - np.cos(2 * phi)) / 2
@@ -349,7 +351,7 @@ class LieBracketGait(GaitMethod):
         return shapes
 
     def _cycle_rotation(self, cycle: Array) -> Array:
-        """Rotation vector (3,) of the base over one cycle."""
+        """Return the rotation vector (3,) of the base over one cycle, rad."""
         identity = np.array([0.0, 0.0, 0.0, 1.0])
         return rotvec_from_quaternion(self._prediction.attitudes(cycle, identity, np.zeros(3))[-1])
 
@@ -378,7 +380,7 @@ class LieBracketGait(GaitMethod):
 
 @dataclass(frozen=True)
 class _Turn:
-    """Step 3 as chosen; ``miss`` is the angle (rad) that its n cycles leave to the wanted turn."""
+    """The chosen step 3; ``miss`` is its remaining error, rad."""
 
     shapes: Array
     cycles: int

@@ -30,27 +30,27 @@ PLANES = ((0, 1), (1, 2), (2, 0))
 """The planes of three joints in which loops enclose areas."""
 
 _GRID_POINTS = {1: 11, 2: 7}
-"""Points a joint of the first grid, by the number of triples; 5 with more."""
+"""Points per joint of the first grid, by the number of triples; 5 for more triples."""
 
 _MAX_TRIPLES, _SAMPLED_SHAPES = 8, 48
-"""Of more triples of joints the best of these are examined closely, at so many shapes."""
+"""Largest number of triples of joints to examine closely, and of shapes to choose them at."""
 
 _GRID_REFINEMENTS = 10
 _EQUAL_MEASURES = 1e-6
-"""Shapes whose measures differ by less than this share are equally good; the middle one wins."""
+"""Relative difference below which shapes are equally good; the most central shape wins."""
 
 _MIN_EDGE = 1e-4
-"""Edges shorter than this, m or rad, are none."""
+"""Shortest usable edge of a loop, m or rad."""
 
 _HELD_JOINT_TOLERANCE = 1e-3
-"""Held joints may have moved by this much, m or rad."""
+"""Motion of held joints up to which a chosen nominal shape still applies, m or rad."""
 
 _NEIGHBOUR_OFFSETS = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)))
 
 
 @dataclass(frozen=True)
 class NominalShape:
-    """A shape with the three joints that go round it.
+    """A shape, and the three joints whose loops go around it.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class NominalShape:
 
 
 class NominalChoice:
-    """The nominal shapes of one robot.
+    """Chooses the nominal shapes of one robot.
 
     Parameters
     ----------
@@ -115,7 +115,8 @@ class NominalChoice:
         self._repeating = turning & np.isinf(robot.lower) & np.isinf(robot.upper)
 
     def prepare(self) -> None:
-        """Choose beforehand where the choice depends on no shape: for robots with three joints."""
+        """Choose the nominal shape beforehand if it does not depend on the present shape: for
+        robots with three joints."""
         if self._robot.n == 3:
             with suppress(PlanningError):
                 self._only_choice = self._choose_nominal(np.zeros(3))
@@ -137,7 +138,7 @@ class NominalChoice:
         )
 
     def nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
-        """Return the nominal shape with joints without limits at their turn nearest to ``q``."""
+        """Return the nominal shape with unlimited joints moved by full turns to near ``q``."""
         turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
         return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
 
@@ -193,7 +194,7 @@ def given_nominal(
 def best_nominal(
     robot: SpaceRobot, held: Array, triples: Sequence[tuple[int, int, int]], largest_edge: float
 ) -> NominalShape:
-    """Return the best nominal shape of any of the triples; other joints stay as in ``held`` (n,).
+    """Return the best nominal shape over all triples; other joints stay as in ``held`` (n,).
 
     Boxes of the longest edges fit round it into the limits.
     """
@@ -208,7 +209,7 @@ def best_nominal(
 def _select_best_triples(
     robot: SpaceRobot, triples: Sequence[tuple[int, int, int]], largest_edge: float
 ) -> Sequence[tuple[int, int, int]]:
-    """Return the triples of joints that are best somewhere in the shape space."""
+    """Return the triples of joints with the best measures over sampled shapes."""
     if len(triples) <= _MAX_TRIPLES:
         return triples
     shapes = sample_shapes(robot, _SAMPLED_SHAPES)
@@ -234,7 +235,7 @@ def _best_of_triple(
         best = _most_central(at, _worst_axis_turn(matrices, longest), (lower + upper) / 2)
         step = step / 2
         at = np.clip(at[best] + step * _NEIGHBOUR_OFFSETS, lower, upper)
-    # The centre of the last neighbourhood is the best point.
+    # The search ends with the best point in the centre of its neighbourhood.
     shape = held.copy()
     shape[chosen] = at[0]
     return NominalShape(shape, triple, matrices[best], longest[best])
@@ -243,7 +244,7 @@ def _best_of_triple(
 def _matrices_and_edges(
     robot: SpaceRobot, held: Array, chosen: list[int], at: Array, largest_edge: float
 ) -> tuple[Array, Array]:
-    """Return M (N, 3, 3) and the longest centred edges (N, 3) with three joints at (N, 3)."""
+    """Return M (N, 3, 3) and the longest edges (N, 3) at positions (N, 3) of three joints."""
     shapes = np.tile(held, (len(at), 1))
     shapes[:, chosen] = at
     M = curvature_matrices(curvatures(robot, shapes), chosen)
@@ -251,13 +252,13 @@ def _matrices_and_edges(
 
 
 def _centred_edges(robot: SpaceRobot, chosen: list[int], at: Array, largest_edge: float) -> Array:
-    """Return the longest edges (N, 3) of boxes round (N, 3) that the limits leave room for."""
+    """Return the longest edges (N, 3) of boxes around points (N, 3) within the joint limits."""
     room = np.minimum(at - robot.lower[chosen], robot.upper[chosen] - at)
     return np.clip(2 * room, 0.0, largest_edge)
 
 
 def _worst_axis_turn(M: Array, longest: Array) -> Array:
-    """Return the turn (...) about the worst axis by the largest loops, rad."""
+    """Return the turn (...) of the base about the worst axis by the largest loops, rad."""
     areas = np.stack([longest[..., i] * longest[..., j] for i, j in PLANES], axis=-1)
     return np.asarray(np.linalg.svd(M * areas[..., np.newaxis, :], compute_uv=False)[..., 2])
 
@@ -268,7 +269,7 @@ def _most_central(at: Array, measures: Array, middle: Array) -> int:
 
 
 def _list_triples(robot: SpaceRobot, names: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Return the triples of joints to choose from; joints without speed are no choice."""
+    """Return the triples of joints to choose from, without joints of zero velocity limit."""
     if not names:
         movable = np.flatnonzero(robot.velocity_limit > 0).tolist()
         return list(itertools.combinations(movable, 3))

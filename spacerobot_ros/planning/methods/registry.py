@@ -17,7 +17,7 @@ from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.square_path import SquarePathGait
 
 METHODS: dict[str, type[GaitMethod]] = {
-    # Those made for a kind of robot first; of equally long manoeuvres `auto` takes the first.
+    # Specialised methods come first: `auto` takes the first of equally long manoeuvres.
     LieBracketGait.name: LieBracketGait,
     SquarePathGait.name: SquarePathGait,
     AreaLoopGait.name: AreaLoopGait,
@@ -59,7 +59,7 @@ def build_method(
 
 
 def method_options(name: str, values: Mapping[str, Any]) -> Any:
-    """Return the ``Options`` of a method with values by name; others have their defaults.
+    """Return the ``Options`` of a method from values by name, with defaults for missing names.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Plans with the joints that follow, where others are stuck."""
+"""Plans for robots with stuck joints by the other joints."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from spacerobot_ros.planning.methods.registry import build_method
 
 @dataclass(frozen=True)
 class _Progress:
-    """Progress of a schedule without the ``stuck`` joints, which the method ``planner`` made."""
+    """Progress of a schedule of the method ``planner`` without the ``stuck`` joints."""
 
     stuck: frozenset[str]
     planner: str
@@ -38,7 +38,7 @@ class _Progress:
 
 
 class RemainingJointsGait(GaitMethod):
-    """Plans with the joints that are not stuck; the others are part of the bodies they join.
+    """Plans for a robot with stuck joints, each of which welds two bodies together.
 
     Its schedules name every joint; the stuck ones rest in them.
 
@@ -82,7 +82,7 @@ class RemainingJointsGait(GaitMethod):
         self._methods: dict[str, GaitMethod] = {}
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Plan with the remaining joints; see :meth:`GaitMethod.plan`."""
+        """Plan with the joints that are not stuck; see :meth:`GaitMethod.plan`."""
         try:
             return self._plan(request, cancellation)
         except PlanningCancelled:
@@ -94,7 +94,8 @@ class RemainingJointsGait(GaitMethod):
         moving, state, shape = ~self._is_stuck, request.state, request.goal.joint_positions
         if not moving.any():
             raise PlanningError(
-                "no joint follows; /diagnostics says whether the plant refuses the commands."
+                "no joint follows its commands; see /diagnostics for commands that the plant "
+                "refuses."
             )
         names, previous = self._methods_to_try(request.previous)
         inner = replace(
@@ -134,7 +135,7 @@ class RemainingJointsGait(GaitMethod):
     def _methods_to_try(
         self, previous: GaitSchedule | None
     ) -> tuple[list[str], GaitSchedule | None]:
-        """Return the methods to try, and the previous schedule as theirs.
+        """Return the names of the methods to try, and the previous schedule for these methods.
 
         Progress with other joints does not count.
         """
@@ -173,8 +174,8 @@ class RemainingJointsGait(GaitMethod):
 
 
 def _options_of_remaining(options: Any, stuck: npt.NDArray[np.bool_], names: Sequence[str]) -> Any:
-    """Return options for the remaining joints: lists with a number a joint lose those of the stuck
-    ones, and names of joints are left to the method if one of them is stuck.
+    """Return options for the joints that are not stuck: lists with a number a joint lose those of
+    the stuck ones, and names of joints are left to the method if one of them is stuck.
     """
     gone = {name for name, is_stuck in zip(names, stuck, strict=True) if is_stuck}
     kept: dict[str, Any] = {}

@@ -44,7 +44,7 @@ from spacerobot_ros.planning.methods.geometric_phase import (
 )
 
 _MIN_CORRECTED_SHARE = 0.1
-"""A missing turn below this share of the tolerance is not corrected."""
+"""Share of the tolerance below which a missing turn is not corrected."""
 
 _NO_ROTATION = 1e-9
 
@@ -53,10 +53,11 @@ _LARGEST_SIDE = math.pi
 larger square adds curvature of the other sign."""
 
 _TRIED_SIDES = 8
-"""Sides that are tried between zero and the largest that fits."""
+"""Number of tried sides between zero and the largest side that fits."""
 
 _USED_ROOM = 1.0 - 1e-9
-"""Share of the room that the largest square takes: rounding must not put a corner beyond it."""
+"""Share of the free range that the largest square takes: rounding must not put a corner beyond
+it."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class SquarePathOptions:
 
 
 class SquarePathGait(GaitMethod):
-    """Attitude and shape of planar trees of three or more links with joints that turn.
+    """Controls attitude and shape of planar trees of three or more links with revolute joints.
 
     The base's position follows from both (the centre of mass rests) and cannot be chosen.
     """
@@ -126,7 +127,7 @@ class SquarePathGait(GaitMethod):
 
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Refuse robots that are not planar, or have too few links."""
+        """Refuse robots that are not planar, or have fewer than three links."""
         planar_axis(robot)
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
@@ -139,7 +140,7 @@ class SquarePathGait(GaitMethod):
         if psi_e is None:
             psi_e = np.clip(state.q, self.robot.lower, self.robot.upper)
         step_1 = float(self._phase.legs(state.q[np.newaxis], psi_e[np.newaxis])[0])
-        # Whole turns are no matter: the smaller of the two ways round.
+        # Full turns do not change the attitude, so the shorter way round is taken.
         wanted = math.remainder(turn - step_1, 2 * math.pi)
         loop = None
         if abs(wanted) > max(_NO_ROTATION, _MIN_CORRECTED_SHARE * tolerance.attitude):
@@ -170,7 +171,7 @@ class SquarePathGait(GaitMethod):
         return self._schedule_of(goal, positions, path, notes)
 
     def _requested_turn(self, request: PlanRequest) -> float:
-        """Return the angle in [-pi, pi] about the robot's axis from the present attitude."""
+        """Return the angle to the goal attitude about the robot's axis, in [-pi, pi]."""
         start, wanted = request.state.quaternion, request.goal.quaternion
         axis = self._phase.axis
         turn = quaternion_multiply(quaternion_inverse(start), wanted)
@@ -234,7 +235,8 @@ class SquareLoop:
 
 @dataclass(frozen=True)
 class _GrowingSquares:
-    """Growing squares of one pair: centres (R, 2), sides (R,), phases (R,) counter-clockwise."""
+    """Growing squares of one pair of joints: centres (R, 2), sides (R,), phases (R,)
+    counter-clockwise."""
 
     pair: tuple[int, int]
     plane: PhasePlane
@@ -270,14 +272,14 @@ class SquareSearch:
         self._phase = phase
         self._most_loops = most_loops
         self._centre = centre
-        # scipy.optimize loads slowly: with the method that needs it, before the first plan.
+        # scipy.optimize loads slowly, so it is loaded here and not during the first plan.
         from scipy.optimize import brentq
 
         self._root = brentq
         self._movable: list[int] = np.flatnonzero(robot.velocity_limit > 0).tolist()
 
     def loop(self, psi_e: Array, wanted: float) -> SquareLoop:
-        """Return the loop that turns the base by ``wanted`` (rad), other joints at ``psi_e`` (n,).
+        """Return the loop for a turn ``wanted`` (rad), with other joints at ``psi_e`` (n,).
 
         Of all pairs of joints it is the one that takes the fewest loops, and of those the one
         with the smallest square.
@@ -315,7 +317,7 @@ class SquareSearch:
         )
 
     def _describe_refusal(self, wanted: float, largest: _GrowingSquares | None) -> str:
-        """Return why no loop will do; ``largest`` is the best there is."""
+        """Return the message for a turn without a loop; ``largest`` turns the base farthest."""
         if len(self._movable) < 2:
             return (
                 f"Fewer than two joints of robot '{self._robot.description.name}' have a velocity "
@@ -343,7 +345,7 @@ class SquareSearch:
         )
 
     def _growing_squares(self, psi_e: Array, pair: tuple[int, int]) -> _GrowingSquares | None:
-        """Return squares of growing side within the limits; None if there is no room."""
+        """Return squares of growing side within the joint limits; None without room for any."""
         at, lower, upper = (x[list(pair)] for x in (psi_e, self._robot.lower, self._robot.upper))
         room = float(np.min(upper - lower))
         if self._centre is not None:
@@ -360,11 +362,11 @@ class SquareSearch:
         return _GrowingSquares(pair, plane, centres, sides, plane.squares(centres, sides))
 
     def _solve_for_side(self, candidates: _GrowingSquares, wanted: float) -> tuple[int, float]:
-        """Return the row of the smallest candidate that turns far enough, and its ``z*``.
+        """Return the row of the smallest square that turns the base far enough, and its ``z*``.
 
         ``wanted`` is the turn of one loop in either sense, rad, at most the largest there is.
         """
-        # Rounding must not leave the largest out.
+        # The slack keeps rounding from excluding the largest square.
         enough = np.abs(candidates.phases) >= min(wanted, candidates.largest)
         row = int(np.argmax(enough))
         centre, side = candidates.centres[[row]], float(candidates.sides[row])
@@ -373,7 +375,7 @@ class SquareSearch:
         def excess(z: float) -> float:
             return sign * float(candidates.plane.squares(centre, np.array([z]))[0]) - wanted
 
-        # The last digit of a phase depends on the number of legs that are integrated together.
+        # The last digit of a phase depends on the number of legs in one call of the integration.
         if excess(side) <= 0:
             return row, side
         return row, float(self._root(excess, 0.0, side, xtol=1e-13, rtol=1e-14))
