@@ -38,6 +38,12 @@ _NODES = {
 }
 """Nodes by the names of their configurations."""
 
+_COLUMNS = (
+    *("flight", "seed", "passed", "outcome", "reason", "draw"),
+    *("wall_time_s", "plan_time_s", "engine", "fallback", "versions"),
+)
+"""Columns of a campaign's dataset beside its metrics."""
+
 _applied = False
 
 
@@ -49,6 +55,7 @@ def apply() -> None:
     _applied = True
     _change_click()
     _change_parameters()
+    _change_columns()
 
 
 def _change_click() -> None:
@@ -100,6 +107,41 @@ def _change_parameters() -> None:
     parameters._reconfigured = reconfigured
 
 
+def _change_columns() -> None:
+    from dataclasses import replace
+
+    from spacerobot_ros import measures
+    from spacerobot_ros.campaign import dataset
+
+    lost = os.environ.get(LOSS, "")
+    for name, metric in measures.METRICS.items():
+        if lost == f"unit of column {name}":
+            measures.METRICS[name] = replace(metric, unit="lost")
+        if lost == f"column {name}":
+            evaluate = metric.evaluate
+            measures.METRICS[name] = replace(
+                metric, evaluate=lambda m, robot, evaluate=evaluate: 2 * evaluate(m, robot) + 1
+            )
+    record_of = dataset._record_of_row
+
+    def record_of_row(row: Any) -> dict[str, Any]:
+        record = record_of(row)
+        for column, value in record.items():
+            name = column.partition(".")[0]
+            _write_use(f"column {name}")
+            if lost == f"column {name}" and name not in measures.METRICS:
+                record[column] = _other_value(value)
+        return record
+
+    dataset._record_of_row = record_of_row
+
+
+def _other_value(value: Any) -> Any:
+    if isinstance(value, bool):
+        return not value
+    return value + "lost" if isinstance(value, str) else value * 2 + 1
+
+
 def _write_use(name: str) -> None:
     file, test = os.environ.get(USES), os.environ.get("PYTEST_CURRENT_TEST", "")
     if file and test:
@@ -131,12 +173,16 @@ def options() -> list[str]:
 def losses() -> list[str]:
     """Return every option of a command, and every parameter of a node that flies nothing."""
     from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
+    from spacerobot_ros.measures import METRICS
     from spacerobot_ros.parameters import declared
     from spacerobot_ros.viewer.server import ViewerConfig
 
     nodes = {"recorder": RecorderConfig, "replay": ReplayConfig, "viewer": ViewerConfig}
-    return [f"option {name}" for name in options()] + [
-        f"parameter {node}.{each.name}" for node, kind in nodes.items() for each in declared(kind)
+    return [
+        *(f"option {name}" for name in options()),
+        *(f"parameter {n}.{each.name}" for n, kind in nodes.items() for each in declared(kind)),
+        *(f"column {name}" for name in (*_COLUMNS, *METRICS)),
+        *(f"unit of column {name}" for name, metric in METRICS.items() if metric.unit),
     ]
 
 
