@@ -1,0 +1,213 @@
+"""Every trace of every figure has the numbers of the bag in the unit that its axis names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.report.figures import ReportFigure, TraceGroup
+from spacerobot_ros.report.flight import read_report
+from spacerobot_ros.report.writing import FIGURES
+
+BAGS = Path(__file__).resolve().parents[2] / "bags"
+
+NAMES = sorted(path.stem for path in BAGS.glob("*.mcap"))
+
+Messages = Mapping[str, list[Any]]
+
+
+@cache
+def messages_of(name: str) -> Messages:
+    """Return the messages of a bag by topic, read by other libraries."""
+    found: dict[str, list[Any]] = {}
+    with (BAGS / f"{name}.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append(message)
+    return found
+
+
+@cache
+def figures_of(name: str) -> dict[str, ReportFigure]:
+    flight = read_report(BAGS / f"{name}.mcap", None)
+    drawn = {key: draw(flight) for key, draw in FIGURES.items()}
+    return {key: figure for key, figure in drawn.items() if isinstance(figure, ReportFigure)}
+
+
+def vectors(parts: list[Any]) -> Array:
+    return np.array([[p.x, p.y, p.z] for p in parts])
+
+
+def quaternions(parts: list[Any]) -> Array:
+    return np.array([[p.x, p.y, p.z, p.w] for p in parts])
+
+
+def attitudes(messages: Messages) -> Rotation:
+    return Rotation.from_quat(quaternions([m.pose.pose.orientation for m in messages["/odom"]]))
+
+
+def joints(messages: Messages, field: str, names: list[str]) -> Array:
+    states = messages["/joint_states"]
+    return np.array([[getattr(m, field)[list(m.name).index(n)] for n in names] for m in states])
+
+
+def numbers(messages: list[Any]) -> Array:
+    return np.array([list(m.data) for m in messages])
+
+
+def pose_error(messages: Messages, figure_label: str) -> Array:
+    """Return goal minus pose in the world; the goal is the one that was sent."""
+    part, quantity = figure_label.split()
+    name = "" if part == "base" else "end_effector/"
+    (goal,) = messages[f"/{name}goal_pose"]
+    poses = [m.pose for m in messages["/base_pose" if part == "base" else "/end_effector_pose"]]
+    if quantity == "position":
+        return vectors([goal.pose.position]) - vectors([pose.position for pose in poses])
+    turns = Rotation.from_quat(quaternions([goal.pose.orientation]))
+    turns *= Rotation.from_quat(quaternions([pose.orientation for pose in poses])).inv()
+    return np.asarray(turns.as_rotvec())
+
+
+def thruster_numbers(group: TraceGroup, messages: Messages) -> Array:
+    states = messages["/thrusters"]
+    if group.unit == "share of each tick that they are on":
+        share = np.array([m.velocity for m in states])
+        assert share[:, share.any(axis=0)].max() <= 1.0
+        return share[:, share.any(axis=0)]
+    thrust = 10.0  # Of each thruster of the servicer, N.
+    on = np.array([m.position for m in states])
+    impulse = thrust * (on - on[0]).sum(axis=1, keepdims=True)
+    specific = 290.0 * 9.80665  # Specific impulse of its thrusters, N s/kg.
+    return {"N s": impulse, "g": 1000.0 * impulse / specific}[group.unit]
+
+
+def expected(figure: str, group: TraceGroup, messages: Messages) -> Array:
+    """Return the numbers of a group of traces, in its unit."""
+    names = list(group.names)
+    odom = messages["/odom"]
+    if figure in ("pose", "position") and group.label == "base position":
+        return vectors([m.pose.pose.position for m in odom])
+    if figure in ("pose", "attitude"):
+        return attitudes(messages).as_rotvec()
+    if figure in ("joints", "velocities"):
+        return joints(messages, "position" if figure == "joints" else "velocity", names)
+    if figure == "efforts" and group.label.startswith("thruster"):
+        part = group.label.removeprefix("thruster ")
+        return vectors([getattr(m.wrench, part) for m in messages["/base_wrench"]])
+    if figure == "efforts":
+        return joints(messages, "effort", names)[1:]  # Of the tick that ends with the state.
+    if figure == "twist":
+        part = "linear" if group.label == "velocity" else "angular"
+        return vectors([getattr(m.twist.twist, part) for m in odom])
+    if figure == "errors":
+        axes = ["xyz".index(name) for name in names]
+        return pose_error(messages, group.label)[:, axes]
+    if figure == "thrusters":
+        return thruster_numbers(group, messages)
+    assert figure == "momentum"
+    if names == ["energy"]:
+        return numbers(messages["/momentum"])[:, 6:7]
+    change = numbers(messages["/momentum"])[:, :6]
+    if "/momentum_expected" in messages:
+        change = change - numbers(messages["/momentum_expected"])
+    return np.linalg.norm((change - change[0]).reshape(-1, 2, 3), axis=2)
+
+
+def units_of_joints(name: str) -> str:
+    return "m" if name == "sliding_masses" else "rad"
+
+
+UNITS = {
+    "pose": {"base position": "m", "rotation vector": "rad"},
+    "position": {"base position": "m"},
+    "attitude": {"rotation vector": "rad"},
+    "twist": {"velocity": "m/s", "rate": "rad/s"},
+    "errors": {
+        "base position": "m",
+        "base attitude": "rad",
+        "end-effector position": "m",
+        "end-effector attitude": "rad",
+    },
+    "efforts": {"thruster force": "N", "thruster torque": "N m", "joint effort": "N m"},
+    "momentum": {"change of the total momenta": "kg m/s, kg m²/s", "kinetic energy": "J"},
+    "thrusters": {
+        "thrusters": "share of each tick that they are on",
+        "impulse given": "N s",
+        "propellant": "g",
+    },
+}
+"""The unit of each label of an axis, by figure; those of joints depend on their kind."""
+
+
+def unit_of(name: str, figure: str, label: str) -> str:
+    if figure == "joints":
+        return units_of_joints(name)
+    if figure == "velocities":
+        return f"{units_of_joints(name)}/s"
+    return UNITS[figure][label]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_trace_has_the_numbers_of_the_bag_in_the_unit_of_its_axis(name: str) -> None:
+    for figure, drawn in figures_of(name).items():
+        for group in drawn.groups:
+            about = f"{figure}: {group.label}"
+            assert group.unit == unit_of(name, figure, group.label), about
+            values, numbers = group.signal.values, expected(figure, group, messages_of(name))
+            if group.unit == "rad" and len(group.names) == 3 and "rotation" in group.label:
+                turns = Rotation.from_rotvec(values).inv() * Rotation.from_rotvec(numbers)
+                assert turns.magnitude().max() < 1e-12, about
+            else:
+                assert values.shape[1] == numbers.shape[1] == len(group.names), about
+                scale = np.abs(numbers).max()
+                last = numbers[len(numbers) - len(values) :]  # A goal comes after the first states.
+                np.testing.assert_allclose(values, last, rtol=0, atol=1e-9 * scale, err_msg=about)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_axes_name_their_quantity_and_its_unit(name: str) -> None:
+    for figure, drawn in figures_of(name).items():
+        axes = drawn.figure.axes
+        texts = [t for a in axes for t in (a.get_ylabel(), a.get_title(), a.get_title("left"))]
+        for group in drawn.groups:
+            unit = unit_of(name, figure, group.label)
+            both = {f"{group.label} ({unit})"}
+            title = f"{group.label} since the start" if "change" in group.label else group.label
+            assert both & set(texts) or {unit, title} <= set(texts), f"{figure}: {group.label}"
+        if drawn.groups:
+            assert axes[-1].get_xlabel() == "time (s)", figure
+
+
+AXES_BESIDE_TIME = {
+    "cycles": {("number of the cycle", "remaining angle (rad)"), ("", "rotation vector (rad)")},
+    "path": {("x (m)", "y (m)"), ("x (m)", "z (m)"), ("y (m)", "z (m)")},
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_axes_of_space_and_of_shapes_have_units(name: str) -> None:
+    unit = units_of_joints(name)
+    for figure in ("cycles", "path", "loops"):
+        drawn = figures_of(name).get(figure)
+        if drawn is None:
+            continue
+        labels = {(a.get_xlabel(), a.get_ylabel()) for a in drawn.figure.axes if a.lines}
+        if figure == "loops":
+            assert all(text.endswith(f" ({unit})") for pair in labels for text in pair)
+        else:
+            assert labels <= AXES_BESIDE_TIME[figure], labels
+
+
+def test_every_figure_is_drawn_from_one_of_the_bags_or_named_here() -> None:
+    drawn = {figure for name in NAMES for figure in figures_of(name)}
+    # Sensors of the reference flights have no errors: test/report/test_report_numbers.py.
+    assert drawn | {"sensors"} == set(FIGURES)
