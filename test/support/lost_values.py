@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -117,11 +118,8 @@ def _change_columns() -> None:
     for name, metric in measures.METRICS.items():
         if lost == f"unit of column {name}":
             measures.METRICS[name] = replace(metric, unit="lost")
-        if lost == f"column {name}":
-            evaluate = metric.evaluate
-            measures.METRICS[name] = replace(
-                metric, evaluate=lambda m, robot, evaluate=evaluate: 2 * evaluate(m, robot) + 1
-            )
+        evaluate = partial(_evaluate_metric, name, metric.evaluate)
+        measures.METRICS[name] = replace(measures.METRICS[name], evaluate=evaluate)
     record_of = dataset._record_of_row
 
     def record_of_row(row: Any) -> dict[str, Any]:
@@ -134,6 +132,12 @@ def _change_columns() -> None:
         return record
 
     dataset._record_of_row = record_of_row
+
+
+def _evaluate_metric(name: str, evaluate: Any, *arguments: Any) -> Any:
+    _write_use(f"column {name}")
+    value = evaluate(*arguments)
+    return 2 * value + 1 if os.environ.get(LOSS) == f"column {name}" else value
 
 
 def _other_value(value: Any) -> Any:
