@@ -44,6 +44,15 @@ def test_a_new_robot_gets_a_scenario_that_reaches_its_goal(robot: Path) -> None:
     assert scenario.parameters("plant")["robot"] == str(robot)
 
 
+def test_the_scenario_stands_where_it_is_wanted_and_finds_its_robot(robot: Path) -> None:
+    out = robot.parent / "scenarios" / "turn.yaml"
+    out.parent.mkdir()
+    result = CliRunner().invoke(main, ["new", robot.name, "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert load_scenario(str(out)).parameters("plant")["robot"] == str(robot)
+    assert not (robot.parent / "mine.yaml").exists()
+
+
 def test_no_scenario_is_overwritten(robot: Path) -> None:
     Path("mine.yaml").write_text("of the user", "utf-8")
     result = CliRunner().invoke(main, ["new", str(robot), "--out", "mine.yaml"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from support.lost_values import losses
 from support.passage import FLIGHTS, Case, cases, table
 
 from spacerobot_ros.parameters import declared
@@ -13,15 +14,6 @@ from spacerobot_ros.scenario import CONFIGS
 TESTS = Path(__file__).resolve().parents[1]
 
 NODES = ("plant", "planner", "coordinated_control")
-
-NOT_HELD = {
-    "plant.tf_period",
-    "plant.tf_links",
-    *(f"{node}.stop_when_decided" for node in NODES[1:]),
-    *(f"{node}.watchdog_timeout" for node in NODES[1:]),
-    "coordinated_control.world_frame",
-}
-"""Parameters of which no test shows yet that they reach anything."""
 
 _QUICK = ("hand", "square", "loops")
 """Flights that need no solver and take a few tenths of a second."""
@@ -41,7 +33,8 @@ _LONG = {
 
 def test_every_parameter_has_a_flight_or_a_test() -> None:
     every = {f"{node}.{p.name}" for node in NODES for p in declared(CONFIGS[node])}
-    assert every - NOT_HELD == set(table())
+    lost = {loss.removeprefix("parameter ") for loss in losses()}
+    assert every - lost == set(table())
 
 
 def test_named_tests_name_the_parameter() -> None:

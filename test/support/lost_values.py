@@ -29,6 +29,16 @@ USES = "SPACEROBOT_TEST_USES"
 TESTS = Path(__file__).resolve().parents[1]
 FILE = TESTS / "passage" / "lost_values.yaml"
 
+_OF_OTHER_NODES = (
+    *("plant.tf_period", "plant.tf_links", "coordinated_control.world_frame"),
+    *(
+        f"{n}.{p}"
+        for n in ("planner", "coordinated_control")
+        for p in ("stop_when_decided", "watchdog_timeout")
+    ),
+)
+"""Parameters of nodes that fly, which no flight without ROS shows; the others: support.passage."""
+
 _NODES = {
     "PlantConfig": "plant",
     "PlannerConfig": "planner",
@@ -185,6 +195,7 @@ def losses() -> list[str]:
     return [
         *(f"option {name}" for name in options()),
         *(f"parameter {n}.{each.name}" for n, kind in nodes.items() for each in declared(kind)),
+        *(f"parameter {name}" for name in _OF_OTHER_NODES),
         *(f"column {name}" for name in (*_COLUMNS, *METRICS)),
         *(f"unit of column {name}" for name, metric in METRICS.items() if metric.unit),
     ]

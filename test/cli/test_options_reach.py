@@ -1,0 +1,167 @@
+"""Options of commands reach the functions that they are for, in the right units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.command_line import CliRunner, Result
+
+import spacerobot_ros.cli.bags as bags
+import spacerobot_ros.nodes
+import spacerobot_ros.nodes.common.process as process
+import spacerobot_ros.report
+import spacerobot_ros.session.run as session
+from spacerobot_ros.cli.main import main
+from spacerobot_ros.measures import Outcome
+from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.methods.optimal.method import OptimalGait
+from spacerobot_ros.scenario import load_scenario
+
+RPY = (20.0, -35.0, 50.0)
+"""Roll, pitch and yaw whose order matters, deg."""
+
+
+def call(*words: object) -> Result:
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def attitude_of_rpy() -> Rotation:
+    """Turns about the fixed axes x, y, z in this order."""
+    x, y, z = (Rotation.from_rotvec(np.radians(a) * e) for a, e in zip(RPY, np.eye(3), strict=True))
+    return z * y * x
+
+
+# -- goals --------------------------------------------------------------------------------------
+
+
+def test_the_attitude_of_a_goal_that_is_sent_is_given_in_degrees(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sent: list[Any] = []
+
+    def send_goal(goal: Any, show: Callable[[str], None], **named: Any) -> Outcome:
+        sent.append((goal, named))
+        return Outcome.REACHED if len(sent) == 1 else Outcome.FAILED
+
+    monkeypatch.setattr(session, "send_goal", send_goal)
+    words = ("goal", 0.1, -0.2, 0.3, "--goal-rpy-deg", *RPY, "--namespace", "left")
+    assert call(*words, "--timeout", 2.5).exit_code == 0
+    ((goal, named),) = sent
+    np.testing.assert_array_equal(goal.position, [0.1, -0.2, 0.3])
+    assert (Rotation.from_quat(goal.quaternion).inv() * attitude_of_rpy()).magnitude() < 1e-12
+    assert named == {"namespace": "left", "timeout": 2.5}
+    assert call("goal", 0.1, -0.2, 0.3).exit_code == 1
+    assert sent[1][1] == {"namespace": "", "timeout": 0.0}
+
+
+@pytest.mark.parametrize("command", ["plan", "run"])
+def test_the_attitude_of_a_scenario_is_given_in_degrees(
+    command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found: list[Any] = []
+    scenario = load_scenario("arm_attitude")
+    with_goal = type(scenario).with_goal
+
+    def noted(self: Any, *arguments: Any, **named: Any) -> Any:
+        found.append(with_goal(self, *arguments, **named))
+        raise ValueError("enough")
+
+    monkeypatch.setattr(type(scenario), "with_goal", noted)
+    call(command, "arm_attitude", "--goal-rpy-deg", *RPY)
+    attitude = Rotation.from_quat(found[0].problem().goal.quaternion)
+    assert (attitude.inv() * attitude_of_rpy()).magnitude() < 1e-12
+
+
+# -- libraries of manoeuvres --------------------------------------------------------------------
+
+
+def test_a_library_is_of_as_many_goals_within_the_bounds_by_a_method_with_the_settings(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[OptimalGait, list[PlanRequest]]] = []
+    monkeypatch.setattr(
+        OptimalGait, "build_library", lambda self, requests: asked.append((self, list(requests)))
+    )
+    words = ("library", "sliding_masses", "--count", 40, "--within", 0.02, 7.0)
+    result = call(*words, "--set", "planner.optimal.answers=3")
+    assert result.exit_code == 1  # There is no library.
+    ((method, requests),) = asked
+    assert method.options.answers == 3
+    assert len(requests) == 40
+    start = requests[0].state
+    distances = [np.linalg.norm(each.goal.position - start.position) for each in requests]
+    at = Rotation.from_quat(start.quaternion).inv()
+    turns = [(at * Rotation.from_quat(each.goal.quaternion)).magnitude() for each in requests]
+    assert 0.015 < max(distances) <= 0.02
+    assert np.radians(5.0) < max(turns) <= np.radians(7.0)
+
+
+# -- bags ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def replayed(monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, Any]]:
+    """Return the parameters of the nodes that are to replay, and whether a page is served."""
+    found: list[Mapping[str, Any]] = []
+    views: list[bool] = []
+
+    @contextmanager
+    def viewing_if(view: bool, parameters: Mapping[str, Any]) -> Iterator[None]:
+        views.append(view)
+        yield
+
+    def node(*, parameter_overrides: list[Any]) -> None:
+        found.append({each.name: each.value for each in parameter_overrides} | {"view": views[-1]})
+
+    def run_node(make: Callable[[], None], words: list[str]) -> int:
+        make()
+        return 3
+
+    monkeypatch.setattr(bags, "viewing_if", viewing_if)
+    monkeypatch.setattr(spacerobot_ros.nodes, "ReplayNode", node)
+    monkeypatch.setattr(process, "run_node", run_node)
+    return found
+
+
+def test_options_of_a_replay_are_parameters_of_its_node(replayed: list[Mapping[str, Any]]) -> None:
+    line = "replay a.mcap --rate 2.5 --start 1.5 --duration 4 --loop --topic /odom --topic /tf"
+    line += " --remap /odom:=/old --remap /tf:=/tf_old --clock 30 --paused --view --wait 0.5"
+    assert call(*line.split()).exit_code == 3
+    assert call("replay", "b.mcap").exit_code == 3
+    assert call("replay", "b.mcap", "--clock").exit_code == 3
+    given, usual, clock = replayed
+    assert given == {
+        **{"bag": "a.mcap", "rate": 2.5, "start": 1.5, "duration": 4.0, "loop": True},
+        **{"topics": "/odom /tf", "remap": "/odom:=/old /tf:=/tf_old", "clock": 30.0},
+        **{"paused": True, "hold": True, "view": True, "wait": 0.5},
+    }
+    assert usual == {
+        **{"bag": "b.mcap", "rate": 1.0, "start": 0.0, "duration": 0.0, "loop": False},
+        **{"topics": "", "remap": "", "clock": 0.0},
+        **{"paused": False, "hold": False, "view": False, "wait": 3.0},
+    }
+    assert clock == {**usual, "clock": 100.0}
+
+
+def test_options_of_a_report_reach_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    for name in ("write_report", "write_picture"):
+        monkeypatch.setattr(
+            spacerobot_ros.report,
+            name,
+            lambda *arguments, _name=name, **named: made.append((_name, arguments, named)),
+        )
+    line = "report a.mcap --out r.html --picture p.svg --beside b.mcap --beside c.mcap"
+    assert call(*line.split(), "--namespace", "left").exit_code == 0
+    others = (Path("b.mcap"), Path("c.mcap"))
+    assert made == [
+        ("write_report", (Path("a.mcap"), Path("r.html"), others), {"namespace": "left"}),
+        ("write_picture", (Path("a.mcap"), Path("p.svg")), {"namespace": "left"}),
+    ]
