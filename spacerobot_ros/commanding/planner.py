@@ -16,7 +16,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive, Transition
-from spacerobot_ros.planning.execution.goal_file import BASE, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.planning.execution.status import (
     Notice,
@@ -83,7 +83,7 @@ class PlannerCommander(Commander):
         long_work: Callable[[], AbstractContextManager[None]] = nullcontext,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        super().__init__(config, host, (BASE,), pose_required=False, clock=clock)
+        super().__init__(config, host, (BASE_GOAL_KEY,), pose_required=False, clock=clock)
         self._method, self._long_work = method, long_work
 
     def _make_status(self, state: str, message: str, goal_id: str) -> PlannerStatus:
@@ -124,16 +124,16 @@ class PlannerCommander(Commander):
         self._pass_on_outputs()
 
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
-        goal = saved.get(BASE)
+        goal = saved.get(BASE_GOAL_KEY)
         if goal is None:
             self._publish_status(PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose."))
             return
-        self._accept_goal(BASE, goal)
+        self._accept_goal(BASE_GOAL_KEY, goal)
         self._report_waiting(goal, "Resuming an earlier goal.")
 
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None
-        self.executive.propose(goal)
+        self.executive.propose_goal(goal)
 
     def _report_waiting(self, goal: IdentifiedGoal, message: str) -> None:
         values = goal_values(goal.goal)
@@ -179,7 +179,7 @@ class PlannerCommander(Commander):
             return
         if pairing is _LATE_POSE:
             # The state was answered without it, and is planned from when the next joints come.
-            executive.observe(measured)
+            executive.add_base_measurement(measured)
         else:
             executive.update(measured)
             if executive.outputs:

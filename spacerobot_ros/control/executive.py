@@ -17,13 +17,13 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Goal
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
 from spacerobot_ros.times import SECOND
 
 END_EFFECTOR = "end_effector"
 """Key of the goal of the end-effector; that of the base is ``base``."""
 
-GOAL_KEYS = (BASE, END_EFFECTOR)
+GOAL_KEYS = (BASE_GOAL_KEY, END_EFFECTOR)
 """Keys of goals: frames of the robot that goal poses are for."""
 
 
@@ -358,7 +358,7 @@ class ControlExecutive:
         self.controller.set_goals(
             time,
             state,
-            base=poses.get(BASE),
+            base=poses.get(BASE_GOAL_KEY),
             end_effector=poses.get(END_EFFECTOR),
             joints=shapes[0] if shapes else None,
         )
@@ -376,7 +376,7 @@ class ControlExecutive:
         """Return the goals of all controlled poses, to resume with."""
         goal, selection = self.controller.goal, self.controller.law.outputs.selection
         shape = goal.joints.q if goal.joints is not None and selection.joints else None
-        poses = {BASE: goal.base, END_EFFECTOR: goal.end_effector}
+        poses = {BASE_GOAL_KEY: goal.base, END_EFFECTOR: goal.end_effector}
         return {
             key: IdentifiedGoal(Goal(pose.position, pose.quaternion, shape), self._goal_id)
             for key, pose in poses.items()

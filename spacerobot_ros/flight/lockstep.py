@@ -40,7 +40,7 @@ from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text, robot_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.method import GaitMethod
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalIds
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus, ScheduleStart
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
@@ -385,10 +385,10 @@ class _LockstepFlight:
         # A pose is checked, and its quaternion scaled, where it is received.
         given = Goal.checked(goal.position, goal.quaternion, goal.joint_positions)
         if self._planner is not None:
-            self._planner.receive_goal(BASE, *_GOAL_STAMP, lambda: given)
+            self._planner.receive_goal(BASE_GOAL_KEY, *_GOAL_STAMP, lambda: given)
         if self._controller is not None:
             unshaped = replace(given, joint_positions=None)
-            self._controller.receive_goal(BASE, *_GOAL_STAMP, lambda: unshaped)
+            self._controller.receive_goal(BASE_GOAL_KEY, *_GOAL_STAMP, lambda: unshaped)
             tool = scenario.end_effector_goal
             if tool is not None:
                 self._controller.receive_goal(

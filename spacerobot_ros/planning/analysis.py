@@ -13,23 +13,23 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.controllability import (
     Controllability,
-    brackets_anywhere,
+    best_sampled_brackets,
     brackets_at,
+    check_sliding_masses,
     curvatures,
     sample_shapes,
-    sliding_masses,
 )
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.methods.auto import AutoGait
-from spacerobot_ros.planning.methods.geometric_phase import planar_chain
+from spacerobot_ros.planning.methods.geometric_phase import check_planar_chain
 from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nominal, given_nominal
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
-_CONDITION_SHAPES = 300
+_CONDITION_SAMPLE_COUNT = 300
 """Number of sampled shapes of the condition numbers in an analysis."""
 
-_LOOP_EDGE = 1.0
+_LOOP_EDGE_LENGTH = 1.0
 """Length of loop edges for which the nominal shape is optimised, m or rad: those of area_loop."""
 
 
@@ -82,16 +82,16 @@ def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis
         The shape is none of this robot.
     """
     given = None if shape is None else _check_shape(robot, shape)
-    anywhere = brackets_anywhere(robot)
+    anywhere = best_sampled_brackets(robot)
     nominal = None
     if robot.n >= 3 and anywhere.controllable:
         triples = list(itertools.combinations(range(robot.n), 3))
         if given is None:
             middle = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
-            nominal = best_nominal(robot, middle, triples, _LOOP_EDGE)
+            nominal = best_nominal(robot, middle, triples, _LOOP_EDGE_LENGTH)
         else:
-            nominal = given_nominal(robot, given, triples, _LOOP_EDGE)
-    planar = planar_chain(robot)
+            nominal = given_nominal(robot, given, triples, _LOOP_EDGE_LENGTH)
+    planar = check_planar_chain(robot)
     if given is None:
         best = planar if planar.controllable else anywhere
         given = best.shape if nominal is None else nominal.shape
@@ -103,7 +103,7 @@ def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis
         anywhere,
         _condition_numbers(robot),
         planar,
-        sliding_masses(robot),
+        check_sliding_masses(robot),
         {
             name: _find_objection(method, robot)
             for name, method in METHODS.items()
@@ -133,9 +133,9 @@ def _check_shape(robot: SpaceRobot, shape: Sequence[float]) -> Array:
 
 def _condition_numbers(robot: SpaceRobot) -> Array:
     if robot.n < 3:
-        return np.full(_CONDITION_SHAPES, np.inf)
+        return np.full(_CONDITION_SAMPLE_COUNT, np.inf)
     # One call for the matrices of all triples; each shape has its best conditioned triple.
-    K = curvatures(robot, sample_shapes(robot, _CONDITION_SHAPES))
+    K = curvatures(robot, sample_shapes(robot, _CONDITION_SAMPLE_COUNT))
     i, j, k = np.array(list(itertools.combinations(range(robot.n), 3))).T
     M = np.stack([K[:, :, i, j], K[:, :, j, k], K[:, :, k, i]], axis=-1).transpose(0, 2, 1, 3)
     values = np.linalg.svd(M, compute_uv=False)

@@ -20,7 +20,7 @@ from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_
 from spacerobot_ros.planning.analysis import Analysis
 from spacerobot_ros.planning.core.controllability import curvature_matrices, curvatures, shape_box
 from spacerobot_ros.planning.methods.geometric_phase import PhasePlane, PlanarPhase, curvature_peaks
-from spacerobot_ros.planning.methods.nominal_shape import PLANES
+from spacerobot_ros.planning.methods.nominal_shape import JOINT_PLANES
 from spacerobot_ros.report.figures import (
     FAINT,
     INK,
@@ -111,7 +111,7 @@ def _planar_figure(found: Analysis) -> Figure:
 def _draw_square_turns(axes: Axes, plane: PhasePlane, centre: Array, room: float) -> None:
     """Draw the turn by a square round a centre against its side (paper 3, figure 3)."""
     sides = np.linspace(0.0, min(np.pi, room), _SQUARE_COUNT)
-    turns = np.abs(plane.squares(np.tile(centre, (_SQUARE_COUNT, 1)), sides))
+    turns = np.abs(plane.square_turns(np.tile(centre, (_SQUARE_COUNT, 1)), sides))
     small = abs(float(plane.curvature(centre))) * sides**2
     axes.plot(sides, turns, color=PALETTE[0], label="round the best centre")
     axes.plot(sides, small, color=MUTED, dashes=(4, 3), lw=0.9, label="|H| z², small squares")
@@ -136,9 +136,9 @@ def _spatial_figure(found: Analysis) -> Figure:
     high, gap = (2.35, 0.75) if sliding else (1.95, 0.72)
     figure = new_figure(0.35 + rows * (high + gap) + (2.1 if sliding else 0.0))
     width, across = 2.2, 0.62
-    maps = [_curvature_over_plane(found, pair) for pair in PLANES]
+    maps = [_curvature_over_plane(found, pair) for pair in JOINT_PLANES]
     bottom = float(figure.get_size_inches()[1]) - 0.35
-    for row, (pair, (x, y, K, _)) in enumerate(zip(PLANES, maps, strict=True)):
+    for row, (pair, (x, y, K, _)) in enumerate(zip(JOINT_PLANES, maps, strict=True)):
         if sliding:
             break
         bottom -= high + (gap if row else 0.0)
@@ -158,7 +158,7 @@ def _spatial_figure(found: Analysis) -> Figure:
         )
     bottom -= high + (0.0 if sliding else gap)
     poor = BoundaryNorm(_CONDITION_LEVELS, 256, extend="max")
-    for column, (pair, (x, y, _, condition)) in enumerate(zip(PLANES, maps, strict=True)):
+    for column, (pair, (x, y, _, condition)) in enumerate(zip(JOINT_PLANES, maps, strict=True)):
         axes = panel(figure, 0.7 + column * (width + across), bottom, width, high)
         axes.contourf(x, y, condition, _CONDITION_LEVELS, norm=poor, cmap="viridis_r", extend="max")
         _mark_shape(axes, found, pair)

@@ -23,7 +23,7 @@ from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
@@ -129,7 +129,7 @@ class Rig:
         self.joints(tick)
 
     def goal(self, sec: int = 7, goal: Goal = GOAL) -> Any:
-        return self.commander.receive_goal(BASE, sec, 0, lambda: goal)
+        return self.commander.receive_goal(BASE_GOAL_KEY, sec, 0, lambda: goal)
 
     def use(self, robot: SpaceRobot) -> None:
         self.commander.use_robot(robot, OneRobotDecoder(self.n))
@@ -301,7 +301,7 @@ def test_a_goal_is_never_lost_without_a_word(planner: Rig, controller: Rig) -> N
 
     for rig in (planner, controller):
         commander, host = rig.commander, rig.host
-        commander.receive_goal(BASE, 1, 0, unreadable)
+        commander.receive_goal(BASE_GOAL_KEY, 1, 0, unreadable)
         commander.deactivate()
         rig.goal(sec=2)
         commander.activate()
@@ -355,7 +355,7 @@ def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
     robot: SpaceRobot, tmp_path: Path
 ) -> None:
     path = tmp_path / "goal.json"
-    GoalFile(str(path)).save({BASE: IdentifiedGoal(GOAL, "9.000000000")})
+    GoalFile(str(path)).save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "9.000000000")})
     rig = Rig(PlannerCommander, config(PlannerConfig, resume_file=str(path), **METHOD), robot.n)
     rig.commander.activate()
     assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("planning", "9.000000000")

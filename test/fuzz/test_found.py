@@ -29,7 +29,7 @@ from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import load_scenario
 
 CHUNK = 6
-ORIGIN, NO_TURN = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+ORIGIN, ZERO_TURN_PER_AREA = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 
 
 def reader() -> TemplateReader:
@@ -64,7 +64,7 @@ def test_a_large_quaternion_is_scaled_without_overflow() -> None:
 @pytest.mark.parametrize("position", [[1e200, 0.0, 0.0], ["", 0, 0], {"x": 1}, [10**400, 0, 0]])
 def test_a_position_that_is_no_place_is_refused(position: Any) -> None:
     with pytest.raises(PlanningError) as caught:
-        Goal.checked(position, NO_TURN)
+        Goal.checked(position, ZERO_TURN_PER_AREA)
     assert_one_sentence(str(caught.value), "goal position")
 
 

@@ -11,7 +11,7 @@ from support.planner_flight import NEAR, TURNED, Flight, goal_at, values_of
 from support.ros_harness import Harness
 
 from spacerobot_ros.nodes.common.messages import goal_of
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("one_plant")
 def interrupted(harness: Harness, path: Path) -> Flight:
     """Start a planner whose predecessor was flying to a goal; time stands still."""
     goal = goal_of(goal_at(TURNED), "world")
-    GoalFile(str(path)).save({BASE: IdentifiedGoal(goal, "7.000000000")})
+    GoalFile(str(path)).save({BASE_GOAL_KEY: IdentifiedGoal(goal, "7.000000000")})
     flight = Flight(harness, {"robot": "", "resume_file": str(path)})
     status = flight.wait("planning")
     assert values_of(status)["goal_id"] == "7.000000000"
@@ -72,7 +72,7 @@ def test_a_goal_has_the_shape_that_was_wanted_before_it(harness: Harness, tmp_pa
     flight.send(NEAR)
     flight.start()
     harness.spin_until(path.exists, "the goal is pursued")
-    goal = GoalFile(str(path)).load()[BASE].goal
+    goal = GoalFile(str(path)).load()[BASE_GOAL_KEY].goal
     assert goal.joint_positions is not None
     assert goal.joint_positions.tolist() == [0.1, 0.2, 0.3]
     # A message without joints lets later goals end in any.

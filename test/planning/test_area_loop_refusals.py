@@ -17,7 +17,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS, Goal, PlanRequest, RobotState, Tolerance
 from spacerobot_ros.planning.methods import area_loop
 from spacerobot_ros.planning.methods.area_loop import EdgePath, edge_path
-from spacerobot_ros.planning.methods.nominal_shape import NominalChoice, NominalShape
+from spacerobot_ros.planning.methods.nominal_shape import NominalShape, NominalShapeChooser
 
 Array = npt.NDArray[np.float64]
 
@@ -156,9 +156,9 @@ def test_loops_that_turn_the_wrong_way_are_given_up_however_small(
 ) -> None:
     """The method believes in the opposite of the true curvature."""
     method = METHODS["area_loop"](arm, 0.25, 0.05)
-    choose = NominalChoice.at
+    choose = NominalShapeChooser.at
 
-    def opposite(self: NominalChoice, *args: Any) -> NominalShape:
+    def opposite(self: NominalShapeChooser, *args: Any) -> NominalShape:
         chosen = choose(self, *args)
         return replace(chosen, M=-chosen.M)
 
@@ -169,7 +169,7 @@ def test_loops_that_turn_the_wrong_way_are_given_up_however_small(
         assert len(tried) < 20, "it goes on for ever"
         return edge_path(areas, longest)
 
-    monkeypatch.setattr(NominalChoice, "at", opposite)
+    monkeypatch.setattr(NominalShapeChooser, "at", opposite)
     monkeypatch.setattr(area_loop, "edge_path", counted)
     with pytest.raises(PlanningError, match=r"None of 6 cycles .* brings the base nearer"):
         method.plan(PlanRequest(at(NOMINAL), GOAL, Tolerance(1.0, 1e-3)))

@@ -30,7 +30,7 @@ from spacerobot_ros.planning import (
     method_options,
 )
 from spacerobot_ros.planning.core.method import InitialMotion
-from spacerobot_ros.planning.methods.auto import AutoGait, Candidate
+from spacerobot_ros.planning.methods.auto import AutoGait, CandidateMethod
 
 FOLDER = Path(__file__).parents[2] / "urdf"
 PERIOD = 0.25
@@ -190,7 +190,7 @@ def choice_of(*methods: type[Made]) -> tuple[Planner, list[str]]:
         built.append(method.name)
         return method(robot, PERIOD)
 
-    candidates = {entry.name: Candidate(entry, partial(build, entry)) for entry in methods}
+    candidates = {entry.name: CandidateMethod(entry, partial(build, entry)) for entry in methods}
     return Planner(AutoGait(robot, PERIOD, candidates=candidates), TOLERANCE), built
 
 

@@ -17,16 +17,16 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS, GaitMethod
 from spacerobot_ros.planning.core.controllability import (
+    best_sampled_brackets,
     best_triple,
-    brackets_anywhere,
     brackets_at,
+    check_sliding_masses,
     curvature_matrices,
     curvatures,
     require_three_slots,
     sample_shapes,
-    sliding_masses,
 )
-from spacerobot_ros.planning.methods.geometric_phase import planar_chain
+from spacerobot_ros.planning.methods.geometric_phase import check_planar_chain
 
 Array = npt.NDArray[np.float64]
 
@@ -101,13 +101,13 @@ def test_the_papers_sliding_masses() -> None:
     at_rest = brackets_at(robot_named("sliding_masses"), np.zeros(3))
     assert at_rest.controllable
     np.testing.assert_allclose(at_rest.singular_values, 0.5 / np.array([1, 1.5, 1.5]), rtol=1e-9)
-    assert sliding_masses(robot_named("sliding_masses")).controllable
+    assert check_sliding_masses(robot_named("sliding_masses")).controllable
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_almost_all_offsets_are_controllable(seed: int) -> None:
     robot = random_sliding_robot(np.random.default_rng(seed), 3)
-    found = sliding_masses(SpaceRobot.from_urdf(robot.urdf))
+    found = check_sliding_masses(SpaceRobot.from_urdf(robot.urdf))
     assert (found.rank, found.needed, found.controllable) == (3, 3, True)
 
 
@@ -117,26 +117,26 @@ def test_sliders_in_a_plane_or_too_few_are_not() -> None:
     level = replace(whole.sliders[2], direction=np.array([0.6, 0.8, 0.0]))
     flat = replace(whole, sliders=(*whole.sliders[:2], level))
     for robot, count in ((two, 2), (flat, 3)):
-        found = sliding_masses(SpaceRobot.from_urdf(robot.urdf))
+        found = check_sliding_masses(SpaceRobot.from_urdf(robot.urdf))
         assert not found.controllable
         assert f"{count} slider(s) of rank 2" in found.message
 
 
 def test_planar_robots_turn_about_one_axis() -> None:
-    chain = planar_chain(robot_named("planar_chain"))
+    chain = check_planar_chain(robot_named("planar_chain"))
     assert (chain.rank, chain.needed, chain.controllable) == (1, 1, True)
     # At the paper's peak, the entries of its pair in the right order.
     assert chain.singular_values[0] == pytest.approx(0.5376, abs=5e-5)
     np.testing.assert_allclose(np.degrees(np.abs(chain.shape)), [153, 121], atol=0.6)
-    assert brackets_anywhere(robot_named("planar_chain")).rank == 1
-    arm = planar_chain(robot_named("three_joint_arm"))
+    assert best_sampled_brackets(robot_named("planar_chain")).rank == 1
+    arm = check_planar_chain(robot_named("three_joint_arm"))
     assert not arm.controllable
     assert "not planar" in arm.message
 
 
 def test_a_robot_of_one_joint_encloses_no_area() -> None:
     one = SpaceRobot.from_urdf(random_robot_urdf(np.random.default_rng(0), 1))
-    found = brackets_anywhere(one)
+    found = best_sampled_brackets(one)
     assert (found.rank, found.controllable, found.condition) == (0, False, np.inf)
     assert "no loop encloses an area" in found.message
 
@@ -170,7 +170,7 @@ def test_which_methods_suit_the_robots_of_the_papers(name: str, suits: set[str])
 
 @pytest.mark.parametrize("robot", ["planar_chain", "sliding_masses"])
 def test_with_one_joint_none_of_the_three_axes_is_spanned(robot: str) -> None:
-    found = brackets_anywhere(robot_named(robot), among=[1])
+    found = best_sampled_brackets(robot_named(robot), among=[1])
     assert (found.rank, found.needed, found.joints) == (0, 3, ())
     assert not found.controllable
     assert found.singular_values.tolist() == [0.0, 0.0, 0.0]
@@ -226,4 +226,4 @@ def test_brackets_say_where_they_were_looked_at() -> None:
     robot = robot_named("three_joint_arm")
     shape = np.array([0.1, -0.8, 1.5])
     assert "at the shape [0.1, -0.8, 1.5]" in brackets_at(robot, shape).message
-    assert "at the best of 24 shapes" in brackets_anywhere(robot).message
+    assert "at the best of 24 shapes" in best_sampled_brackets(robot).message

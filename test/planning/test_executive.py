@@ -54,8 +54,8 @@ PAGE = Path(__file__).parents[2] / "docs" / "planner_state_machine.md"
 P, E = Phase, Event
 
 
-def propose(place: Place) -> Act:
-    return lambda loop: loop.propose(place)
+def propose_goal(place: Place) -> Act:
+    return lambda loop: loop.propose_goal(place)
 
 
 def tick(loop: Loop) -> None:
@@ -115,28 +115,28 @@ def without_base(act: Callable[..., object]) -> Act:
 
 HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
     (P.IDLE, E.NEW_GOAL, P.MEASURING): (measuring,),
-    (P.MEASURING, E.NEW_GOAL, P.MEASURING): (measuring, propose(OTHER)),
+    (P.MEASURING, E.NEW_GOAL, P.MEASURING): (measuring, propose_goal(OTHER)),
     (P.MEASURING, E.PLAN_REQUESTED, P.PLANNING): (planning,),
     (P.MEASURING, E.ABORTED, P.IDLE): (measuring, abort),
     (P.PLANNING, E.PLANNED, P.EXECUTING): (executing,),
-    (P.PLANNING, E.REFUSED, P.IDLE): (resting, propose(FAR), tick),
-    (P.PLANNING, E.REFUSED, P.MEASURING): (lambda: planning(FAR), propose(NEAR), release),
-    (P.PLANNING, E.REFUSED, P.EXECUTING): (executing, propose(FAR), tick),
-    (P.PLANNING, E.REFUSED, P.BRAKING): (braking, propose(FAR), tick),
+    (P.PLANNING, E.REFUSED, P.IDLE): (resting, propose_goal(FAR), tick),
+    (P.PLANNING, E.REFUSED, P.MEASURING): (lambda: planning(FAR), propose_goal(NEAR), release),
+    (P.PLANNING, E.REFUSED, P.EXECUTING): (executing, propose_goal(FAR), tick),
+    (P.PLANNING, E.REFUSED, P.BRAKING): (braking, propose_goal(FAR), tick),
     (P.PLANNING, E.REFUSED, P.EVALUATING): (
-        *(lambda: executing(held=True), propose(FAR), to(P.PLANNING), release),
+        *(lambda: executing(held=True), propose_goal(FAR), to(P.PLANNING), release),
     ),
     (P.PLANNING, E.ABORTED, P.IDLE): (planning, abort),
-    (P.EXECUTING, E.NEW_GOAL, P.BRAKING): (lambda: executing(held=True), propose(OTHER), tick),
-    (P.EXECUTING, E.PLAN_REQUESTED, P.PLANNING): (executing, propose(OTHER), tick),
+    (P.EXECUTING, E.NEW_GOAL, P.BRAKING): (lambda: executing(held=True), propose_goal(OTHER), tick),
+    (P.EXECUTING, E.PLAN_REQUESTED, P.PLANNING): (executing, propose_goal(OTHER), tick),
     (P.EXECUTING, E.SCHEDULE_ENDED, P.EVALUATING): (executing, to(P.IDLE)),
     (P.EXECUTING, E.SCHEDULE_ENDED, P.MEASURING): (
-        *(executing, propose(OTHER), to(P.MEASURING, base=False)),
+        *(executing, propose_goal(OTHER), to(P.MEASURING, base=False)),
     ),
     (P.EXECUTING, E.TRACKING_ERROR, P.BRAKING): (braking_off_path,),
     (P.EXECUTING, E.JOINTS_STUCK, P.EVALUATING): (long_flight, stuck),
     (P.EXECUTING, E.JOINTS_STUCK, P.MEASURING): (
-        *(long_flight, propose(OTHER), without_base(stuck)),
+        *(long_flight, propose_goal(OTHER), without_base(stuck)),
     ),
     (P.EXECUTING, E.ABORTED, P.BRAKING): (braking,),
     (P.EXECUTING, E.PLAN_REQUESTED, P.REPLANNING): (flying_on,),
@@ -152,7 +152,7 @@ HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
         (phase, event, target): story
         for phase, start in ((P.REPLANNING, flying_on), (P.TAKING_OVER, taking_over))
         for event, target, story in (
-            (E.NEW_GOAL, P.EXECUTING, (start, propose(HERE))),
+            (E.NEW_GOAL, P.EXECUTING, (start, propose_goal(HERE))),
             (E.JOINTS_STUCK, P.MEASURING, (long_before(start), stuck)),
             (E.JOINTS_STUCK, P.EVALUATING, (again(long_before(start)), stuck)),
             (E.TIME_JUMPED, P.MEASURING, (start, jump(1e6))),
@@ -164,14 +164,16 @@ HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
             (E.DEACTIVATED, P.IDLE, (start, stop)),
         )
     },
-    (P.BRAKING, E.PLAN_REQUESTED, P.PLANNING): (braking, propose(OTHER), tick),
+    (P.BRAKING, E.PLAN_REQUESTED, P.PLANNING): (braking, propose_goal(OTHER), tick),
     (P.BRAKING, E.AT_REST, P.IDLE): (braking, to(P.IDLE)),
-    (P.BRAKING, E.AT_REST, P.MEASURING): (*(braking, propose(OTHER), to(P.MEASURING, base=False)),),
+    (P.BRAKING, E.AT_REST, P.MEASURING): (
+        *(braking, propose_goal(OTHER), to(P.MEASURING, base=False)),
+    ),
     (P.BRAKING, E.AT_REST, P.EVALUATING): (braking_off_path, to(P.PLANNING)),
     (P.BRAKING, E.JOINTS_STUCK, P.EVALUATING): (long_braking, stuck),
-    (P.BRAKING, E.JOINTS_STUCK, P.MEASURING): (long_braking, propose(OTHER), stuck),
+    (P.BRAKING, E.JOINTS_STUCK, P.MEASURING): (long_braking, propose_goal(OTHER), stuck),
     (P.BRAKING, E.ABORTED, P.BRAKING): (braking, abort),
-    (P.EVALUATING, E.NEW_GOAL, P.MEASURING): (evaluating, propose(OTHER)),
+    (P.EVALUATING, E.NEW_GOAL, P.MEASURING): (evaluating, propose_goal(OTHER)),
     (P.EVALUATING, E.PLAN_REQUESTED, P.PLANNING): (lambda: evaluating(overshoot=0.5), tick),
     (P.EVALUATING, E.REACHED, P.IDLE): (evaluating, tick),
     (P.EVALUATING, E.FAILED, P.IDLE): (
@@ -186,14 +188,14 @@ HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
     (P.PLANNING, E.PLANT_RESET, P.MEASURING): (planning, reset_plant),
     (P.PLANNING, E.PLANT_RESET, P.EVALUATING): (*(braking_off_path, to(P.PLANNING), reset_plant),),
     (P.EXECUTING, E.PLANT_RESET, P.EVALUATING): (executing, reset_plant),
-    (P.EXECUTING, E.PLANT_RESET, P.MEASURING): (executing, propose(OTHER), reset_plant),
+    (P.EXECUTING, E.PLANT_RESET, P.MEASURING): (executing, propose_goal(OTHER), reset_plant),
     (P.BRAKING, E.PLANT_RESET, P.IDLE): (braking, reset_plant),
-    (P.BRAKING, E.PLANT_RESET, P.MEASURING): (braking, propose(OTHER), reset_plant),
+    (P.BRAKING, E.PLANT_RESET, P.MEASURING): (braking, propose_goal(OTHER), reset_plant),
     (P.BRAKING, E.PLANT_RESET, P.EVALUATING): (long_braking, reset_plant),
     (P.EXECUTING, E.TIME_JUMPED, P.EVALUATING): (long_flight, jump(1e6)),
-    (P.EXECUTING, E.TIME_JUMPED, P.MEASURING): (long_flight, propose(OTHER), jump(-1.0)),
+    (P.EXECUTING, E.TIME_JUMPED, P.MEASURING): (long_flight, propose_goal(OTHER), jump(-1.0)),
     (P.BRAKING, E.TIME_JUMPED, P.IDLE): (braking, jump(-100.0)),
-    (P.BRAKING, E.TIME_JUMPED, P.MEASURING): (braking, propose(OTHER), jump(1e6)),
+    (P.BRAKING, E.TIME_JUMPED, P.MEASURING): (braking, propose_goal(OTHER), jump(1e6)),
     (P.BRAKING, E.TIME_JUMPED, P.EVALUATING): (long_braking, jump(1e6)),
     (P.IDLE, E.DEACTIVATED, P.IDLE): (resting, stop),
     (P.MEASURING, E.DEACTIVATED, P.IDLE): (measuring, stop),
@@ -260,10 +262,10 @@ def test_the_state_machine_needs_no_ros() -> None:
 # -- whatever happens -------------------------------------------------------------------------
 
 ACTIONS: dict[str, Callable[[Loop], object]] = {
-    "near": lambda loop: loop.propose(NEAR),
-    "other": lambda loop: loop.propose(OTHER),
-    "here": lambda loop: loop.propose(HERE),
-    "far": lambda loop: loop.propose(FAR),
+    "near": lambda loop: loop.propose_goal(NEAR),
+    "other": lambda loop: loop.propose_goal(OTHER),
+    "here": lambda loop: loop.propose_goal(HERE),
+    "far": lambda loop: loop.propose_goal(FAR),
     "abort": lambda loop: loop.abort(),
     "stop": lambda loop: loop.stop(),
     "latch": stopped_plant,
@@ -321,7 +323,7 @@ def test_no_sequence_of_events_leads_astray(
     for action in actions:
         ACTIONS[action](loop)  # A tick asserts that its command is finite.
         phase = loop.executive.phase
-        assert loop.executive._tracker.active == (phase in IN_MOTION)
+        assert loop.executive._tracker.is_active == (phase in IN_MOTION)
         assert held or phase not in (Phase.PLANNING, Phase.REPLANNING)
     check_chain(loop)
     # Whatever happened, it can be stopped, and the next goal is reached.
@@ -331,7 +333,7 @@ def test_no_sequence_of_events_leads_astray(
     method.refusing = method.partial = False
     method.overshoot = method.wrong_path = 0.0
     loop.set(position_tolerance=1e-3)
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     for _ in range(250):
         loop.held.release()
         loop.tick()

@@ -30,7 +30,7 @@ from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.planning import RobotState
 from spacerobot_ros.planning.execution.executive import Phase
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.worker import PlanJob, PlanReason
 from spacerobot_ros.simulation import InitialState, VelocityPlant
@@ -54,9 +54,9 @@ def reasons(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> list[PlanReason]:
 def test_a_goal_is_planned_from_rest_or_blended_into(monkeypatch: pytest.MonkeyPatch) -> None:
     loop = resting(ticks=40)
     requested = reasons(loop, monkeypatch)
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(10)
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     loop.tick()
     assert requested == [PlanReason.NEW_GOAL, PlanReason.BLEND]
     first, second = stub_of(loop).requests
@@ -147,7 +147,7 @@ def test_a_goal_is_planned_for_without_the_joints_that_are_stuck(
     assert any("Stuck: slider_1." in notice for notice in loop.notices)
     # All joints are planned with for the next goal, and again without for this one if that is
     # refused.
-    loop.propose(FAR)
+    loop.propose_goal(FAR)
     loop.held.release()
     loop.tick(2)
     until(loop, Phase.PLANNING)
@@ -162,7 +162,7 @@ def test_the_next_goal_takes_the_result_of_a_refused_one_along() -> None:
     """In the background: braked for a goal that is refused, the earlier one is planned again."""
     loop = executing(held=True, ticks=40)
     loop.tick(5)
-    loop.propose(FAR)
+    loop.propose_goal(FAR)
     until(loop, Phase.PLANNING)
     loop.held.release()
     loop.tick()
@@ -184,7 +184,7 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
 ) -> None:
     loop = start()
     loop.executive._goal_file = GoalFile(str(tmp_path / "goal.json"))
-    loop.executive._goal_file.save({BASE: IdentifiedGoal(goal_at(NEAR), "goal-1")})
+    loop.executive._goal_file.save({BASE_GOAL_KEY: IdentifiedGoal(goal_at(NEAR), "goal-1")})
     assert loop.executive.plant_stopped("The plant is latched: a fuse is blown.")
     loop.tick()
     status = loop.statuses[-1]
@@ -197,7 +197,7 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
     assert not any(loop.speeds[-60:])
     assert loop.statuses[-1] is status
     assert not loop.executive.plant_stopped("The plant is latched still.")
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     for _ in range(250):
         loop.held.release()
         loop.tick()
@@ -217,14 +217,14 @@ def test_a_plant_that_rested_before_the_goal_was_commanded_ends_nothing() -> Non
     """While a plan is made at once no command comes, and a plant in real time rests."""
     loop = resting(ticks=40)
     loop.tick(10)
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick()
     (start,) = loop.starts
     assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS, 10**12)
     assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS, 0)
     assert loop.executive.plant_stopped("Too late.", start.stamp_ns, 10**12)
     # A goal that nothing was commanded for is not touched.
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     assert not loop.executive.plant_stopped("Too late.", loop.measured.stamp_ns, 10**12)
     assert loop.executive.phase is Phase.MEASURING
 
@@ -246,7 +246,7 @@ def test_a_plant_that_rested_before_joints_were_taken_for_stuck_tells_why(
 def test_a_time_without_a_plan_is_no_end_of_a_schedule(seconds: float) -> None:
     loop = resting(ticks=40, max_corrections=0)
     loop.tick(60)
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(20)
     jump(seconds)(loop)
     assert not any(loop.speeds[-1:])
@@ -293,7 +293,7 @@ def test_momenta_of_before_a_reset_are_not_planned_for() -> None:
     loop = resting()
     spin = InitialState(angular_momentum=np.array([0.0, 0.0, 0.25]))
     loop.measured = PlantState(VelocityPlant(loop.plant.robot, TICK, spin))
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick()
     (request,) = stub_of(loop).requests
     np.testing.assert_allclose(request.state.angular_momentum, [0.0, 0.0, 0.25], atol=1e-12)
@@ -302,7 +302,7 @@ def test_momenta_of_before_a_reset_are_not_planned_for() -> None:
     loop.plant.step(np.array([0.1, 0.0, 0.0]))
     loop.measured = PlantState(loop.plant)
     loop.executive.plant_reset()
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     assert loop.plant.qdot.any()
     loop.tick()
     np.testing.assert_allclose(stub_of(loop).requests[1].state.angular_momentum, 0.0, atol=1e-12)
@@ -323,12 +323,12 @@ def test_after_a_reset_the_shape_of_before_is_not_held() -> None:
 
 def test_statuses_speak_of_a_goal_by_its_id() -> None:
     loop = resting(ticks=40)
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(5)
-    loop.propose(FAR)
+    loop.propose_goal(FAR)
     loop.tick()
     loop.until(PlannerState.REACHED)
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     loop.tick(3)
     loop.abort()
     assert [(s.state.value, s.goal_id) for s in loop.statuses] == [
@@ -351,9 +351,9 @@ def test_times_and_corrections_are_those_of_the_goal() -> None:
     assert loop.executive.statistics.commands_published == len(loop.commands)
     # A goal that is refused in flight takes nothing from the one that is pursued.
     stub_of(loop).overshoot = 0.0
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     loop.tick(2)
-    loop.propose(FAR)
+    loop.propose_goal(FAR)
     status = loop.until(PlannerState.REACHED)
     assert status.manoeuvre_time_s == pytest.approx(8 * 0.05)
 
@@ -382,7 +382,7 @@ def test_a_state_that_is_not_finite_ends_no_goal_silently() -> None:
     loop.measured.broken = False
     assert loop.decide(NEAR).state is PlannerState.REACHED
     # Measured in flight, the joints are commanded to rest as long as nothing is known of them.
-    loop.propose(HERE)
+    loop.propose_goal(HERE)
     loop.tick(3)
     loop.measured.broken = True
     loop.tick()

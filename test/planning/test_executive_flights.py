@@ -16,7 +16,7 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.method import PlanRequest
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.resources import share_directory
@@ -67,9 +67,9 @@ def test_the_measured_error_is_reported() -> None:
 
 def test_a_goal_that_is_refused_in_flight_does_not_disturb_the_earlier_one() -> None:
     loop = Loop()
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(10)
-    loop.propose(BEYOND_STROKE)
+    loop.propose_goal(BEYOND_STROKE)
     loop.until(PlannerState.REACHED)
     assert loop.states == ["executing", "refused", "reached"]
     assert "beyond stroke" in loop.statuses[1].message
@@ -103,7 +103,7 @@ def test_a_robot_that_the_method_cannot_steer_is_refused() -> None:
 
 def test_a_goal_that_is_missed_fails_with_a_sentence() -> None:
     loop = Loop({**COARSE, "max_corrections": 0})
-    loop.propose(TURNED)
+    loop.propose_goal(TURNED)
     loop.tick()
     loop.set(attitude_tolerance=1e-9)
     status = loop.until(PlannerState.FAILED)
@@ -115,14 +115,14 @@ def test_a_goal_that_is_missed_fails_with_a_sentence() -> None:
 def test_the_goal_is_on_file_as_long_as_it_is_pursued(tmp_path: Path) -> None:
     file = GoalFile(str(tmp_path / "goal.json"))
     loop = Loop(goal_file=file)
-    goal_id = loop.propose(NEAR)
+    goal_id = loop.propose_goal(NEAR)
     loop.tick(5)
-    assert file.load()[BASE].goal_id == goal_id
+    assert file.load()[BASE_GOAL_KEY].goal_id == goal_id
     loop.stop()
-    assert file.load()[BASE].goal_id == goal_id, "it is resumed after a restart"
+    assert file.load()[BASE_GOAL_KEY].goal_id == goal_id, "it is resumed after a restart"
     loop.decide(NEAR)
     assert file.load() == {}
-    loop.propose(HERE)
+    loop.propose_goal(HERE)
     loop.tick(5)
     loop.abort()
     assert file.load() == {}
@@ -139,7 +139,7 @@ def test_a_goal_that_cannot_be_saved_is_pursued(tmp_path: Path) -> None:
 
 def test_a_new_goal_replaces_the_one_that_is_pursued() -> None:
     loop = Loop()
-    loop.propose(([-0.1, 0.0, 0.05], [0.0, 0.0, 0.0]))
+    loop.propose_goal(([-0.1, 0.0, 0.05], [0.0, 0.0, 0.0]))
     loop.tick(15)
     assert loop.speeds[-1] > 0.0
     assert loop.decide(TURNED).state is PlannerState.REACHED
@@ -194,7 +194,7 @@ def distance_from(path: Array, shape: Array) -> float:
 
 def test_abortion_brings_the_joints_to_rest_on_their_path() -> None:
     loop = Loop()
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(15)
     assert loop.abort() == "The joints brake along the planned path within 1 s."
     assert_one_sentence(loop.statuses[-1].message, "Aborted on request.")
@@ -214,7 +214,7 @@ def test_abortion_brings_the_joints_to_rest_on_their_path() -> None:
 
 def test_a_goal_that_waits_for_a_state_can_be_aborted() -> None:
     loop = Loop()
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.abort()
     loop.tick(10)
     assert not loop.starts
@@ -230,7 +230,7 @@ def held(**parameters: Any) -> Loop:
 def wait_for_plan(loop: Loop) -> None:
     """Tick until a plan is being made."""
     for _ in range(100):
-        if loop.held.busy:
+        if loop.held.is_busy:
             return
         loop.tick()
     raise AssertionError("nothing is planned")
@@ -238,7 +238,7 @@ def wait_for_plan(loop: Loop) -> None:
 
 def test_states_are_answered_at_rest_until_the_plan_is_there() -> None:
     loop = held()
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(40)
     assert not loop.statuses
     assert not any(loop.speeds)
@@ -250,11 +250,11 @@ def test_states_are_answered_at_rest_until_the_plan_is_there() -> None:
 
 def test_a_new_goal_in_flight_is_planned_from_rest() -> None:
     loop = held()
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick()
     loop.held.release()
     loop.tick(15)
-    loop.propose(TURNED)
+    loop.propose_goal(TURNED)
     wait_for_plan(loop)
     resting = len(loop.commands)
     loop.tick(20)
@@ -270,12 +270,12 @@ def test_a_new_goal_in_flight_is_planned_from_rest() -> None:
 
 def test_an_abort_cancels_what_is_being_planned() -> None:
     loop = held()
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(3)
     assert loop.abort() == "The joints rest."
     assert loop.held.cancelled
     # Another goal waits until the cancelled plan has ended.
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(10)
     assert len(loop.held.tasks) == 1
     loop.held.release()
@@ -321,7 +321,7 @@ def wait(loop: Loop, goal_id: str, state: PlannerState = PlannerState.REACHED) -
 def test_a_thread_plans_while_states_are_answered() -> None:
     loop = threaded(searching())
     for place in (NEAR, HERE):
-        wait(loop, loop.propose(place))
+        wait(loop, loop.propose_goal(place))
         assert loop.error_to(place)[0] < 1e-3
 
 
@@ -330,7 +330,7 @@ def test_a_worker_that_is_closed_has_its_search_end_soon() -> None:
     method.gate = threading.Event()
     loop = threaded(method)
     before = threading.active_count()
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(200)
     assert threading.active_count() == before + 1
     assert not loop.statuses, "it searches still"
@@ -338,15 +338,15 @@ def test_a_worker_that_is_closed_has_its_search_end_soon() -> None:
     assert threading.active_count() == before
     # It plans again when it is wanted again.
     method.gate.set()
-    wait(loop, loop.propose(NEAR))
+    wait(loop, loop.propose_goal(NEAR))
 
 
 @pytest.mark.parametrize("background", [False, True])
 def test_a_plan_after_an_abort_is_not_cancelled(background: bool) -> None:
     loop = Loop({"plan_in_background": background, "abort_time": 0.5}, method=searching())
-    wait(loop, loop.propose(NEAR), PlannerState.EXECUTING)
+    wait(loop, loop.propose_goal(NEAR), PlannerState.EXECUTING)
     assert loop.abort() is not None
-    wait(loop, loop.propose(NEAR))
+    wait(loop, loop.propose_goal(NEAR))
 
 
 @pytest.mark.parametrize("background", [False, True])
@@ -356,7 +356,7 @@ def test_a_defect_of_a_method_is_seen(background: bool) -> None:
             raise ZeroDivisionError("a defect")
 
     loop = Loop({"plan_in_background": background}, method=Broken())
-    goal_id = loop.propose(NEAR)
+    goal_id = loop.propose_goal(NEAR)
     with pytest.raises(ZeroDivisionError, match="a defect"):
         wait(loop, goal_id)
 

@@ -62,7 +62,7 @@ def test_sensitivities_are_those_of_integrated_paths(name: str, ticks: int) -> N
     sensitivity = PathSensitivity(robot)
     errors = 1e-4 * np.random.default_rng(3).normal(size=sensitivity.count)
     expected = deviations(flown(weighing(robot, errors), schedule.positions), schedule.path)
-    found = sensitivity.along(schedule) @ errors
+    found = sensitivity.path_derivatives(schedule) @ errors
     assert np.abs(expected[:, :3]).max() > 1e-6
     np.testing.assert_allclose(found, expected, atol=0.05 * np.abs(expected).max())
 
@@ -72,7 +72,7 @@ def test_half_of_a_path_tells_where_it_ends() -> None:
     robot = robot_of("three_joint_arm")
     schedule = schedule_of(robot, shapes_of(robot, 120))
     sensitivity = PathSensitivity(robot)
-    derivatives = sensitivity.along(schedule)
+    derivatives = sensitivity.path_derivatives(schedule)
     missed: list[float] = []
     known: list[float] = []
     for seed in range(10):
@@ -97,7 +97,7 @@ def test_what_was_learnt_on_one_path_counts_on_the_next() -> None:
     robot = robot_of("three_joint_arm")
     sensitivity = PathSensitivity(robot)
     schedule = schedule_of(robot, shapes_of(robot, 100))
-    derivatives, masses = sensitivity.along(schedule), MassEstimate(sensitivity.count)
+    derivatives, masses = sensitivity.path_derivatives(schedule), MassEstimate(sensitivity.count)
     true = weighing(robot, np.random.default_rng(8).uniform(-0.1, 0.1, sensitivity.count))
     path = flown(true, schedule.positions)
     first = PathDeviation(schedule.path, 1, derivatives, masses)
@@ -120,7 +120,7 @@ def test_an_offset_of_all_poses_tells_nothing_of_masses(name: str, size: float) 
     robot = robot_of(name)
     sensitivity = PathSensitivity(robot)
     schedule = schedule_of(robot, shapes_of(robot, 60))
-    derivatives = sensitivity.along(schedule)
+    derivatives = sensitivity.path_derivatives(schedule)
     true = 0.02 * np.random.default_rng(5).normal(size=sensitivity.count)
     offset = size * np.array([0.01, -0.02, 0.03, 0.02, 0.01, -0.01])
     plain, shifted = MassEstimate(sensitivity.count), MassEstimate(sensitivity.count)
@@ -143,7 +143,7 @@ def test_a_jump_of_what_is_measured_tells_nothing_of_masses(name: str, step: lis
     robot = robot_of(name)
     sensitivity = PathSensitivity(robot)
     schedule = schedule_of(robot, shapes_of(robot, 120))
-    derivatives, masses = sensitivity.along(schedule), MassEstimate(sensitivity.count)
+    derivatives, masses = sensitivity.path_derivatives(schedule), MassEstimate(sensitivity.count)
     true = weighing(robot, np.random.default_rng(8).uniform(-0.1, 0.1, sensitivity.count))
     path = flown(true, schedule.positions)
 

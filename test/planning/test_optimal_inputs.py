@@ -190,16 +190,16 @@ def test_a_motion_is_late_in_its_last_third(
 
     monkeypatch.setattr(PathCheck, "aim", aim)
     loop = Loop({"takeover_time": 0.3, "replan_period": 0.1}, method=MovingStub(90))
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(ticks_flown + 2)
     assert told[-1] is late
 
 
 def test_a_goal_that_takes_over_a_schedule_counts_what_is_left_of_it() -> None:
     loop = Loop({"takeover_time": 0.3}, method=MovingStub(40))
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(11)
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick()
     status = loop.statuses[-1]
     assert status.goal_id == "goal-2"

@@ -14,7 +14,12 @@ from hypothesis import strategies as st
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.planning import Goal, PoseError
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, GoalIds, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    BASE_GOAL_KEY,
+    GoalFile,
+    GoalIds,
+    IdentifiedGoal,
+)
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatistics,
@@ -132,8 +137,8 @@ def test_goal_ids_are_the_stamps() -> None:
 def test_a_goal_survives_its_file(tmp_path: Path, goal_id: str) -> None:
     file = GoalFile(str(tmp_path / "goal.json"))
     assert file.load() == {}
-    file.save({BASE: IdentifiedGoal(GOAL, goal_id)})
-    loaded = file.load()[BASE]
+    file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, goal_id)})
+    loaded = file.load()[BASE_GOAL_KEY]
     assert loaded.goal_id == goal_id
     np.testing.assert_array_equal(loaded.goal.position, GOAL.position)
     np.testing.assert_allclose(loaded.goal.quaternion, GOAL.quaternion, rtol=0, atol=1e-16)
@@ -146,8 +151,8 @@ def test_a_goal_survives_its_file(tmp_path: Path, goal_id: str) -> None:
 def test_a_goal_file_without_ids_is_read(tmp_path: Path) -> None:
     path = tmp_path / "goal.json"
     entry = {"position": [1, 2, 3], "quaternion": [0, 0, 0, 1], "joint_positions": None}
-    path.write_text(json.dumps({BASE: entry}))
-    loaded = GoalFile(str(path)).load()[BASE]
+    path.write_text(json.dumps({BASE_GOAL_KEY: entry}))
+    loaded = GoalFile(str(path)).load()[BASE_GOAL_KEY]
     assert loaded.goal_id == ""
     assert loaded.goal.joint_positions is None
 
@@ -164,7 +169,7 @@ def test_a_file_that_holds_no_goal_is_refused(tmp_path: Path, text: str) -> None
 
 def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="cannot be written"):
-        GoalFile(str(tmp_path / "none" / "goal.json")).save({BASE: IdentifiedGoal(GOAL)})
+        GoalFile(str(tmp_path / "none" / "goal.json")).save({BASE_GOAL_KEY: IdentifiedGoal(GOAL)})
 
 
 def test_a_goal_that_others_could_have_written_is_not_flown_to(
@@ -174,7 +179,7 @@ def test_a_goal_that_others_could_have_written_is_not_flown_to(
     file = GoalFile(str(path))
     before = os.umask(0)
     try:
-        file.save({BASE: IdentifiedGoal(GOAL)})
+        file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL)})
     finally:
         os.umask(before)
     assert path.stat().st_mode & 0o777 == 0o600
@@ -184,13 +189,13 @@ def test_a_goal_that_others_could_have_written_is_not_flown_to(
             file.load()
         assert f"chmod go-w '{path}'" in str(refusal.value)
     path.chmod(0o644)
-    assert BASE in file.load()
+    assert BASE_GOAL_KEY in file.load()
     path.unlink()
     os.mkfifo(path)
     with pytest.raises(ParameterError, match="is not a regular file"):
         file.load()
     path.unlink()
-    file.save({BASE: IdentifiedGoal(GOAL)})
+    file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL)})
     if os.geteuid() == 0:
         os.chown(path, 12345, 12345)
     else:
@@ -205,7 +210,7 @@ def test_a_goal_file_is_replaced_as_a_whole(
     """Nobody foresees the name that it is written under, and a failure leaves the goal before."""
     path = tmp_path / "goal.json"
     file = GoalFile(str(path))
-    file.save({BASE: IdentifiedGoal(GOAL, "1.0")})
+    file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "1.0")})
     (tmp_path / "goal.json.new").symlink_to(tmp_path / "victim")
 
     def failing(*_: object) -> None:
@@ -214,10 +219,10 @@ def test_a_goal_file_is_replaced_as_a_whole(
     with monkeypatch.context() as broken:
         broken.setattr("os.replace", failing)
         with pytest.raises(ParameterError, match="No space left"):
-            file.save({BASE: IdentifiedGoal(GOAL, "2.0")})
-    assert file.load()[BASE].goal_id == "1.0"
-    file.save({BASE: IdentifiedGoal(GOAL, "2.0")})
-    assert file.load()[BASE].goal_id == "2.0"
+            file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "2.0")})
+    assert file.load()[BASE_GOAL_KEY].goal_id == "1.0"
+    file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "2.0")})
+    assert file.load()[BASE_GOAL_KEY].goal_id == "2.0"
     assert {each.name for each in tmp_path.iterdir()} == {"goal.json", "goal.json.new"}
 
 

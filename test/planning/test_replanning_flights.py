@@ -96,12 +96,12 @@ def loop_of(robot: str, method: GaitMethod | None, **parameters: Any) -> Balance
 
 def flown(loop: Loop, first: Goal, changed: Goal) -> float:
     """Change the goal halfway; return the time from then until it is reached, s."""
-    loop.propose(first)
+    loop.propose_goal(first)
     while loop.executive.phase is not Phase.EXECUTING:
         loop.tick()
     loop.tick(loop.starts[0].schedule.ticks // 2)
     before = len(loop.commands)
-    loop.propose(changed)
+    loop.propose_goal(changed)
     assert loop.until(PlannerState.REACHED, PlannerState.FAILED).state is PlannerState.REACHED
     return TICK * (len(loop.commands) - before)
 
@@ -233,7 +233,7 @@ def with_wrong_masses(
     rng = np.random.default_rng(seed)
     axis = np.array([0.0, 0.0, 1.0]) if robot == "planar_chain" else rng.normal(size=3)
     turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(*trial.turns))
-    loop.propose(Goal.checked(np.zeros(3), turn.as_quat()))
+    loop.propose_goal(Goal.checked(np.zeros(3), turn.as_quat()))
     loop.until(PlannerState.REACHED, PlannerState.FAILED)
     first, last = loop.starts[0], loop.starts[-1]
     took = (last.stamp_ns - first.stamp_ns) / 1e9 + last.schedule.duration
@@ -283,11 +283,11 @@ def test_no_momentum_arises_where_a_plan_takes_over() -> None:
     first = Goal.checked(np.zeros(3), Rotation.from_rotvec([0, 0, 0.8]).as_quat(), SHAPES[robot])
     other = Goal.checked(np.zeros(3), Rotation.from_rotvec([0, 0, 0.9]).as_quat(), SHAPES[robot])
     loop = loop_of(robot, None, takeover_time=0.3, **{"optimal.answers": 1})
-    loop.propose(first)
+    loop.propose_goal(first)
     while loop.executive.phase is not Phase.EXECUTING:
         loop.tick()
     loop.tick(loop.starts[0].schedule.ticks // 2)
-    loop.propose(other)
+    loop.propose_goal(other)
     slowest = np.inf
     for _ in range(25):
         loop.tick()

@@ -113,16 +113,16 @@ def test_corrections_of_one_goal_are_not_counted_for_the_next() -> None:
 def test_a_goal_that_takes_over_a_schedule_begins_with_no_correction() -> None:
     loop = Loop({"takeover_time": 0.3}, method=MovingStub(40))
     stub_of(loop).overshoot = 0.1
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     while not loop.statuses or loop.statuses[-1].corrections == 0:
         loop.tick()
     assert loop.executive.phase is Phase.EXECUTING
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick()
     last = loop.statuses[-1]
     assert (last.goal_id, last.corrections) == ("goal-2", 0)
     # Another goal in motion: its plan takes over, and nothing of the first is counted for it.
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     while loop.statuses[-1].goal_id != "goal-3":
         loop.tick()
     assert loop.statuses[-1].corrections == 0
@@ -162,7 +162,7 @@ def test_a_second_stuck_joint_is_planned_without_beside_the_first() -> None:
     ]
     # The next goal is planned for with all joints again.
     loop.plant.hold(np.zeros(3, dtype=np.bool_))
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     until(loop, Phase.PLANNING)
     assert not loop.held.tasks[-1].stuck
     assert not loop.held.tasks[-1].required

@@ -26,14 +26,14 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
-from spacerobot_ros.planning.methods.auto import _Result
+from spacerobot_ros.planning.methods.auto import _MethodResult
 from spacerobot_ros.planning.methods.geometric_phase import (
     PlanarPhase,
+    check_planar_chain,
     curvature_peaks,
-    planar_chain,
 )
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
-from spacerobot_ros.planning.methods.nominal_shape import _most_central
+from spacerobot_ros.planning.methods.nominal_shape import _most_central_index
 
 FOLDER = Path(__file__).parents[2] / "urdf"
 
@@ -101,7 +101,7 @@ def test_the_path_of_many_cycles_is_predicted_at_the_end_of_some() -> None:
 
 
 def test_a_planar_robot_is_described_by_its_links_and_by_its_largest_curvature() -> None:
-    found = planar_chain(SpaceRobot.from_file(FOLDER / "planar_chain.urdf"))
+    found = check_planar_chain(SpaceRobot.from_file(FOLDER / "planar_chain.urdf"))
     words = found.message
     assert words.startswith("3 links in a plane: loops of joints 'pin_1' and 'pin_2' turn")
     shapes = np.stack(np.meshgrid(*2 * [np.linspace(-np.pi, np.pi, 181)]), axis=-1)
@@ -149,7 +149,7 @@ def test_the_last_cycle_that_a_goal_may_take_is_flown() -> None:
 def test_a_jump_of_time_is_reported_with_both_times(jump: float, after: str) -> None:
     loop = Loop(method=StubMethod(ticks=20))
     loop.measured.stamp_ns = 1_000_000_000
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(2)
     before = f"{loop.measured.stamp_ns / 1e9 - TICK:.9g}"
     assert loop.executive.phase is Phase.EXECUTING
@@ -161,7 +161,7 @@ def test_a_jump_of_time_is_reported_with_both_times(jump: float, after: str) -> 
 
 def test_plan_and_execution_are_reported_with_the_duration_of_the_gait() -> None:
     loop = Loop(method=StubMethod(ticks=13))
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     status = loop.until(PlannerState.EXECUTING)
     assert status.message == "Executing a stub gait of 0.65 s."
     reported = [output.message for output in loop.outputs if isinstance(output, Event)]
@@ -197,8 +197,8 @@ def test_a_joint_with_limits_is_not_turned_round_to_a_nominal_shape() -> None:
 
 def test_of_equally_good_shapes_the_one_nearest_to_the_middle_is_taken() -> None:
     at = np.array([[-1.0, 0.2], [1.0, 0.2], [0.9, -0.1], [0.95, 0.1]])
-    assert _most_central(at, np.array([1.0, 1.0, 0.5, 1.0]), np.array([0.9, 0.0])) == 3
-    assert _most_central(at, np.array([1.0, 1.0, 0.5, 1.0]), np.array([-0.9, 0.0])) == 0
+    assert _most_central_index(at, np.array([1.0, 1.0, 0.5, 1.0]), np.array([0.9, 0.0])) == 3
+    assert _most_central_index(at, np.array([1.0, 1.0, 0.5, 1.0]), np.array([-0.9, 0.0])) == 0
 
 
 def test_whether_a_plan_reaches_a_shape_is_told_by_where_it_ends() -> None:
@@ -210,4 +210,4 @@ def test_whether_a_plan_reaches_a_shape_is_told_by_where_it_ends() -> None:
         goal = replace(aim, joint_positions=shape)
         request = PlanRequest(state, goal, Tolerance(1e-6, 1e-6, 1e-3))
         schedule = replace(StubMethod().plan(request), controls=controls)
-        assert _Result.of(schedule, request).reaches is reaches
+        assert _MethodResult.of(schedule, request).reaches is reaches

@@ -26,7 +26,7 @@ from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.planning import BasePath, RobotState
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Phase
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
 from spacerobot_ros.planning.execution.path_deviation import PathDeviation
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.tracker import TrajectoryTracker
@@ -43,7 +43,7 @@ def flying(ticks: int = 40, *, held: bool = False, **parameters: Any) -> Loop:
     """Fly to NEAR for ten ticks."""
     times = {"takeover_time": AHEAD * TICK, "abort_time": 0.5}
     loop = Loop({**times, **parameters}, method=MovingStub(ticks), held=held)
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick()
     if held:
         loop.held.release()
@@ -72,7 +72,7 @@ def events_of(loop: Loop) -> list[tuple[str, str]]:
 def test_a_plan_takes_over_at_its_tick_from_the_state_of_the_plant_then() -> None:
     loop = flying()
     now = len(loop.commands)
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     loop.tick(AHEAD)
     first = loop.starts[0].schedule
     assert len(loop.starts) == 1, "it is not there yet"
@@ -102,7 +102,7 @@ def test_nothing_but_parameters_decides_when_a_plan_takes_over() -> None:
     flights = []
     for released_after in (0, 2, AHEAD):
         loop = flying(held=True)
-        loop.propose(OTHER)
+        loop.propose_goal(OTHER)
         loop.tick(released_after + 1 if released_after < AHEAD else AHEAD)
         loop.held.release()
         loop.until(PlannerState.REACHED)
@@ -111,14 +111,14 @@ def test_nothing_but_parameters_decides_when_a_plan_takes_over() -> None:
     np.testing.assert_array_equal(flights[0], flights[2])
     # In lockstep the first plan is there a tick earlier.
     lockstep = flying()
-    lockstep.propose(OTHER)
+    lockstep.propose_goal(OTHER)
     lockstep.until(PlannerState.REACHED)
     np.testing.assert_array_equal(np.array(lockstep.commands[:57]), flights[0][1:58])
 
 
 def test_a_late_plan_is_tried_for_once_more_and_then_from_rest() -> None:
     loop = flying(ticks=80, held=True)
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     loop.tick(AHEAD)
     for attempt in (1, 2):
         assert phase_of(loop) is Phase.REPLANNING
@@ -152,7 +152,7 @@ def test_a_goal_that_is_refused_in_motion_is_planned_for_from_rest(
         return plan(self, request, *rest)
 
     monkeypatch.setattr(MovingStub, "plan", from_rest_only)
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     status = loop.until(PlannerState.REACHED)
     assert (status.goal_id, loop.error_to(OTHER)[0] < 1e-3) == ("goal-2", True)
     begin = "No plan begins in motion, so the goal is planned for from"
@@ -175,7 +175,7 @@ def test_a_goal_that_is_refused_in_motion_is_planned_for_from_a_later_tick(
         return plan(self, request, *rest)
 
     monkeypatch.setattr(MovingStub, "plan", later_only)
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
     begins = [round(start.stamp_ns / TICK_NS) for start in loop.starts]
     assert begins[1] == asked[1] + 2 * AHEAD
@@ -184,7 +184,7 @@ def test_a_goal_that_is_refused_in_motion_is_planned_for_from_a_later_tick(
 
 def test_a_goal_out_of_reach_leaves_the_earlier_one_as_it_is() -> None:
     loop = flying()
-    loop.propose(FAR)
+    loop.propose_goal(FAR)
     assert loop.until(PlannerState.REACHED).goal_id == "goal-1"
     assert loop.states == ["executing", "refused", "reached"]
     assert len(loop.starts) == 1
@@ -195,11 +195,11 @@ def test_a_goal_out_of_reach_leaves_the_earlier_one_as_it_is() -> None:
 def test_of_many_goals_only_the_newest_is_planned_for(held: bool) -> None:
     loop = flying(held=held, ticks=80)
     for k in range(8):
-        loop.propose(([0.01 * k, 0.02, 0.0], [0.0, 0.0, 0.0]))
+        loop.propose_goal(([0.01 * k, 0.02, 0.0], [0.0, 0.0, 0.0]))
         loop.tick(2)
         loop.held.release()
         loop.tick(k % 2)
-    newest = loop.propose(OTHER)
+    newest = loop.propose_goal(OTHER)
     for _ in range(200):
         loop.tick()
         loop.held.release()
@@ -212,20 +212,20 @@ def test_of_many_goals_only_the_newest_is_planned_for(held: bool) -> None:
 
 def test_a_plan_for_an_earlier_goal_is_cancelled_at_once() -> None:
     loop = flying(held=True, ticks=80)
-    loop.propose(([0.01, 0.02, 0.0], [0.0, 0.0, 0.0]))
+    loop.propose_goal(([0.01, 0.02, 0.0], [0.0, 0.0, 0.0]))
     loop.tick(2)
     assert loop.executive.phase is Phase.REPLANNING
     assert not loop.held.cancelled
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     assert loop.held.cancelled
 
 
 def test_the_present_goal_once_more_goes_on_under_its_new_id(tmp_path: Path) -> None:
     loop = flying()
     loop.executive._goal_file = GoalFile(str(tmp_path / "goal.json"))
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick()
-    assert loop.executive._goal_file.load()[BASE].goal_id == "goal-2"
+    assert loop.executive._goal_file.load()[BASE_GOAL_KEY].goal_id == "goal-2"
     assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
     assert len(loop.starts) == 1
     assert [(s.state.value, s.goal_id) for s in loop.statuses] == [
@@ -240,7 +240,7 @@ def test_what_is_planned_for_another_goal_is_aborted_with_all_goals(tmp_path: Pa
     for ticks in (1, 4):
         loop = flying(held=True)
         loop.executive._goal_file = GoalFile(str(tmp_path / "goal.json"))
-        loop.propose(OTHER)
+        loop.propose_goal(OTHER)
         loop.tick()
         if ticks > 1:
             loop.held.release()
@@ -261,7 +261,7 @@ def test_what_is_planned_for_another_goal_is_aborted_with_all_goals(tmp_path: Pa
 
 def test_joints_that_stick_before_the_take_over_have_the_new_goal_planned_from_rest() -> None:
     loop = flying(ticks=200, stuck_ticks=3, takeover_time=3.0)
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     loop.tick()
     assert phase_of(loop) is Phase.TAKING_OVER
     loop.plant.hold(np.array([True, False, False]))
@@ -276,7 +276,7 @@ def test_joints_that_stick_before_the_take_over_have_the_new_goal_planned_from_r
 
 def test_a_gap_in_the_states_over_the_take_over_tick_delays_nothing_that_follows() -> None:
     loop = flying(ticks=80)
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     loop.tick()
     loop.measured.stamp_ns += (AHEAD + 3) * TICK_NS
     loop.tick()
@@ -293,7 +293,7 @@ def test_a_gap_in_the_states_over_the_take_over_tick_delays_nothing_that_follows
 def test_where_no_plan_can_take_over_the_joints_brake(parameters: dict[str, Any]) -> None:
     for held in (False, True):
         loop = flying(held=held, **parameters)
-        loop.propose(OTHER)
+        loop.propose_goal(OTHER)
         for _ in range(30):
             loop.tick()
             loop.held.release()
@@ -303,9 +303,9 @@ def test_where_no_plan_can_take_over_the_joints_brake(parameters: dict[str, Any]
 
 def test_methods_that_plan_from_rest_are_not_asked_in_motion() -> None:
     loop = Loop({"takeover_time": AHEAD * TICK}, method=StubMethod(40))
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(10)
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     loop.until(PlannerState.REACHED)
     assert isinstance(loop.method, StubMethod)
     assert [request.motion for request in loop.method.requests] == [None, None]
@@ -317,7 +317,7 @@ def test_methods_that_plan_from_rest_are_not_asked_in_motion() -> None:
 def test_a_take_over_is_one_event() -> None:
     loop = flying()
     loop.outputs.clear()
-    loop.propose(OTHER)
+    loop.propose_goal(OTHER)
     loop.until(PlannerState.REACHED)
     assert events_of(loop) == [
         ("plan_started", "goal-2"),
@@ -341,7 +341,7 @@ def test_the_remaining_motion_is_planned_again_where_it_leads_beside_the_goal() 
     """The plant's base goes by half of what the plan says: with each plan less is left."""
     loop = flying(ticks=40, replan_period=0.5, max_corrections=0)
     stub_of(loop).wrong_path = 0.05
-    loop.propose(([0.05, 0.0, 0.0], [0.0, 0.0, 0.0]))
+    loop.propose_goal(([0.05, 0.0, 0.0], [0.0, 0.0, 0.0]))
     loop.tick(200)
     reasons = [
         output.about["reason"]
@@ -450,6 +450,6 @@ def test_measured_poses_are_averaged_where_they_are_needed(
         lambda tracker, schedule, stamp_ns, average: wanted.append(average),
     )
     loop = Loop({"takeover_time": AHEAD * TICK, **parameters}, method=MovingStub())
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick(parameters["averaging"])
     assert wanted == [averaged]

@@ -87,12 +87,12 @@ def test_a_schedule_has_ended_when_its_last_shape_is_reached_or_long_over() -> N
     for deadband, near in ((0.0, 1e-6), (0.004, 0.004)):
         follower = ScheduleFollower(schedule_of(), START_NS, 1.0, deadband)
         last = RAMP[-1]
-        assert not follower.ended(end - 1, last)
-        assert follower.ended(end, last + 0.99 * near)
+        assert not follower.has_ended(end - 1, last)
+        assert follower.has_ended(end, last + 0.99 * near)
         far = last + np.array([0.0, 0.0, 1.01 * near])
-        assert not follower.ended(end, far)
-        assert not follower.ended(end + 5_000_000_000, far)
-        assert follower.ended(end + 5_000_000_001, far)
+        assert not follower.has_ended(end, far)
+        assert not follower.has_ended(end + 5_000_000_000, far)
+        assert follower.has_ended(end + 5_000_000_001, far)
 
 
 # -- braking ----------------------------------------------------------------------------------
@@ -101,7 +101,7 @@ def test_a_schedule_has_ended_when_its_last_shape_is_reached_or_long_over() -> N
 def test_braking_takes_half_of_the_way_that_the_time_would_have_taken() -> None:
     """The time of the gait runs at the rate 1 - t/T: after t it is at t - t^2 / (2 T)."""
     follower = ScheduleFollower(schedule_of(), START_NS, 2.0)
-    braking = follower.braking(START_NS + 4 * PERIOD_NS, 1.2)
+    braking = follower.braking_follower(START_NS + 4 * PERIOD_NS, 1.2)
     for ticks in (0.0, 3.0, 7.5, 12.0, 40.0):
         t = min(ticks * PERIOD, 1.2)
         way = 0.4 + t - t**2 / (2 * 1.2)
@@ -112,20 +112,20 @@ def test_braking_takes_half_of_the_way_that_the_time_would_have_taken() -> None:
         expected = rate * np.array([0.1, -0.2, 0.0]) + 2.0 * position
         np.testing.assert_allclose(velocity, expected, atol=1e-12)
     begin = START_NS + 4 * PERIOD_NS
-    assert not braking.ended(begin + 1_199_999_999, np.zeros(3))
-    assert braking.ended(begin + 1_200_000_000, np.zeros(3))
+    assert not braking.has_ended(begin + 1_199_999_999, np.zeros(3))
+    assert braking.has_ended(begin + 1_200_000_000, np.zeros(3))
 
 
 def test_braking_near_the_end_of_a_schedule_stays_on_it() -> None:
     follower = ScheduleFollower(schedule_of(), START_NS, 2.0)
-    braking = follower.braking(START_NS + 19 * PERIOD_NS, 1.0)
+    braking = follower.braking_follower(START_NS + 19 * PERIOD_NS, 1.0)
     np.testing.assert_allclose(commanded(braking, 30, RAMP[20])[0], RAMP[20])
 
 
 @pytest.mark.parametrize("since", [0, 3, 9, 40])
 def test_the_shapes_of_braking_are_those_that_will_be_commanded(since: int) -> None:
     follower = ScheduleFollower(schedule_of(), START_NS, 2.0)
-    braking = follower.braking(START_NS + 4 * PERIOD_NS, 1.0)
+    braking = follower.braking_follower(START_NS + 4 * PERIOD_NS, 1.0)
     shapes = braking.shapes(START_NS + (4 + since) * PERIOD_NS)
     assert len(shapes) == max(1, 10 - since) + 1
     for k, shape in enumerate(shapes):
@@ -211,7 +211,7 @@ def test_a_tracker_holds_the_last_shape_of_a_schedule_or_the_measured_one() -> N
     tracker = TrajectoryTracker(robot_of(), config)
     measured = RAMP[20] + 0.003
     tracker.start(schedule_of(), START_NS)
-    assert (tracker.active, tracker.braking) == (True, False)
+    assert (tracker.is_active, tracker.is_braking) == (True, False)
     assert tracker.track(START_NS + 3 * PERIOD_NS, measured) == []
     np.testing.assert_allclose(tracker.setpoint.velocity, [0.1, -0.2, 0.0], atol=1e-12)
     tracker.stop(at_last_shape=True)
@@ -219,7 +219,7 @@ def test_a_tracker_holds_the_last_shape_of_a_schedule_or_the_measured_one() -> N
     np.testing.assert_array_equal(tracker.setpoint.position, RAMP[20])
     tracker.start(schedule_of(), START_NS)
     tracker.brake(START_NS)
-    assert tracker.braking
+    assert tracker.is_braking
     tracker.stop(at_last_shape=False)
     tracker.hold(measured)
     np.testing.assert_array_equal(tracker.setpoint.position, measured)
@@ -260,7 +260,7 @@ def test_a_plan_in_flight_begins_where_the_momenta_bring_the_base_meanwhile() ->
     worker = PlanningWorker(robot, PlannerConfig(tick_rate=1 / PERIOD), method)
     resting = np.zeros((40, 3))
     follower = ScheduleFollower(schedule_of(resting), START_NS, 1.0)
-    braking = follower.braking(START_NS, 2.0).shapes(START_NS)
+    braking = follower.braking_follower(START_NS, 2.0).shapes(START_NS)
     inertia = robot.inertia_matrix(np.zeros(3))[3:6, 3:6]
     np.testing.assert_allclose(inertia, np.diag(np.diag(inertia)), atol=1e-12)
     p, L = np.array([0.3, -0.2, 0.1]), np.array([0.05, 0.0, 0.0])

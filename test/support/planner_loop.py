@@ -128,7 +128,7 @@ class MovingStub(StubMethod):
 class HeldWorker(PlanningWorker):
     """A worker in the background whose plans are there when a test says so: no thread."""
 
-    background = True
+    plans_in_background = True
 
     def __init__(
         self, robot: SpaceRobot, config: PlannerConfig, method: GaitMethod | None = None
@@ -139,7 +139,7 @@ class HeldWorker(PlanningWorker):
         self.tasks: list[PlanningTask] = []
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         return self.task is not None
 
     def submit(self, task: PlanningTask) -> None:
@@ -236,11 +236,11 @@ class Loop:
 
     # -- acting -------------------------------------------------------------------------------
 
-    def propose(self, place: Place | Goal) -> str:
+    def propose_goal(self, place: Place | Goal) -> str:
         """Propose a goal; return its id."""
         self._goals += 1
         goal = place if isinstance(place, Goal) else goal_at(place)
-        self.executive.propose(IdentifiedGoal(goal, f"goal-{self._goals}"))
+        self.executive.propose_goal(IdentifiedGoal(goal, f"goal-{self._goals}"))
         self._take()
         return f"goal-{self._goals}"
 
@@ -256,7 +256,7 @@ class Loop:
     def late(self) -> None:
         """Show the base of the state that was answered last."""
         self.measured.seen = True
-        self.executive.observe(self.measured)
+        self.executive.add_base_measurement(self.measured)
         self._take()
 
     def set(self, **parameters: Any) -> None:
@@ -289,7 +289,7 @@ class Loop:
     def decide(self, place: Place | Goal) -> PlannerStatus:
         """Propose a goal and tick until it is decided; return the status that decides it."""
         before = len(self.statuses)
-        self.propose(place)
+        self.propose_goal(place)
         for _ in range(4000):
             self.tick()
             decided = [s for s in self.statuses[before:] if s.state.decided]

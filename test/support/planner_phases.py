@@ -27,13 +27,13 @@ def stub_of(loop: Loop) -> StubMethod:
 
 def measuring(**options: Any) -> Loop:
     loop = resting(**options)
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     return loop
 
 
 def planning(place: Place = NEAR) -> Loop:
     loop = resting(held=True)
-    loop.propose(place)
+    loop.propose_goal(place)
     loop.tick()
     return loop
 
@@ -41,9 +41,9 @@ def planning(place: Place = NEAR) -> Loop:
 def executing(*, wrong_path: float = 0.0, overshoot: float = 0.0, **options: Any) -> Loop:
     loop = resting(**options)
     stub_of(loop).wrong_path, stub_of(loop).overshoot = wrong_path, overshoot
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick()
-    if loop.held.busy:
+    if loop.held.is_busy:
         loop.held.release()
         loop.tick()
     return loop
@@ -76,12 +76,12 @@ def flying_on(*, again: bool = False, **parameters: Any) -> Loop:
     parameters = {"takeover_time": 0.5, **parameters}
     loop = Loop(parameters, method=MovingStub(80), held=True)
     stub_of(loop).wrong_path = 0.1
-    loop.propose(NEAR)
+    loop.propose_goal(NEAR)
     loop.tick()
     loop.held.release()
     loop.tick(5)
     if not again:
-        loop.propose(OTHER)
+        loop.propose_goal(OTHER)
         loop.tick()
     return until(loop, Phase.REPLANNING)
 

@@ -42,7 +42,7 @@ from spacerobot_ros.nodes.common.streams import with_information
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.goal_file import BASE
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND, first_time_ns, set_stamp
 
@@ -121,7 +121,7 @@ class CommanderNode(FlightNode):
         else:
             self.use(robot)
 
-    def take_goals(self, topic: str, key: str = BASE) -> None:
+    def take_goals(self, topic: str, key: str = BASE_GOAL_KEY) -> None:
         """Subscribe to goal poses for the base or another part of the robot."""
         self.create_subscription(
             PoseStamped, topic, lambda message: self._on_goal(key, message), STREAM

@@ -23,10 +23,10 @@ MAX_CONDITION = 1e6
 """Condition number above which brackets count as linearly dependent: rounding decides on their
 directions."""
 
-NO_TURN = 1e-12
+ZERO_TURN_PER_AREA = 1e-12
 """Singular values of brackets below this, rad per unit area, count as zero."""
 
-_EXAMINED_SHAPES = 24
+_SAMPLED_SHAPE_COUNT = 24
 """Number of sampled shapes; brackets that span at any shape span at almost all shapes."""
 
 _UNLIMITED_HALF_RANGE = {JointKind.PRISMATIC: 1.0}
@@ -78,7 +78,7 @@ class Controllability:
     def condition(self) -> float:
         """Condition number of the best three brackets; infinite for linearly dependent brackets."""
         largest, _, smallest = self.singular_values
-        return float(largest / smallest) if smallest > NO_TURN else np.inf
+        return float(largest / smallest) if smallest > ZERO_TURN_PER_AREA else np.inf
 
 
 def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
@@ -124,7 +124,7 @@ def best_triple(K: Array, among: Sequence[int]) -> tuple[tuple[int, int, int], A
     triples = list(itertools.combinations(among, 3))
     matrices = np.array([curvature_matrices(K, triple) for triple in triples])
     values = np.linalg.svd(matrices, compute_uv=False)
-    best = int(np.argmax(values[:, 2] / np.maximum(values[:, 0], NO_TURN)))
+    best = int(np.argmax(values[:, 2] / np.maximum(values[:, 0], ZERO_TURN_PER_AREA)))
     return triples[best], matrices[best]
 
 
@@ -135,9 +135,9 @@ def brackets_at(
     return _span_of_brackets(robot, shape[np.newaxis], among)
 
 
-def brackets_anywhere(robot: SpaceRobot, among: Sequence[int] | None = None) -> Controllability:
+def best_sampled_brackets(robot: SpaceRobot, among: Sequence[int] | None = None) -> Controllability:
     """Return the span of the first-order brackets at the best of many sampled shapes."""
-    return _span_of_brackets(robot, sample_shapes(robot, _EXAMINED_SHAPES), among)
+    return _span_of_brackets(robot, sample_shapes(robot, _SAMPLED_SHAPE_COUNT), among)
 
 
 def sliders_of(robot: SpaceRobot) -> list[int]:
@@ -173,7 +173,7 @@ def require_three_slots(robot: SpaceRobot, slots: Array) -> None:
     )
 
 
-def tilted_goal(robot: SpaceRobot, axis: Array, tilt: float) -> UnreachableError:
+def tilted_goal_error(robot: SpaceRobot, axis: Array, tilt: float) -> UnreachableError:
     """Return the error for a goal attitude tilted by ``tilt`` (rad) off the ``axis`` (3,)."""
     return UnreachableError(
         f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
@@ -183,7 +183,7 @@ def tilted_goal(robot: SpaceRobot, axis: Array, tilt: float) -> UnreachableError
     )
 
 
-def sliding_masses(robot: SpaceRobot) -> Controllability:
+def check_sliding_masses(robot: SpaceRobot) -> Controllability:
     """Test a robot by paper 1: three independent slots and spanning brackets of sliders."""
     sliders = sliders_of(robot)
     try:
@@ -191,7 +191,7 @@ def sliding_masses(robot: SpaceRobot) -> Controllability:
     except PlanningError as refusal:
         names = tuple(robot.joint_names[i] for i in sliders)
         return Controllability(0, 3, np.zeros(3), names, np.zeros(robot.n), str(refusal))
-    return brackets_anywhere(robot, sliders)
+    return best_sampled_brackets(robot, sliders)
 
 
 def _span_of_brackets(
@@ -216,7 +216,7 @@ def _span_of_brackets(
         )
     found = [best_triple(at, joints) for at in K]
     singular = np.linalg.svd(np.array([M for _, M in found]), compute_uv=False)
-    best = int(np.argmax(singular[:, 2] / np.maximum(singular[:, 0], NO_TURN)))
+    best = int(np.argmax(singular[:, 2] / np.maximum(singular[:, 0], ZERO_TURN_PER_AREA)))
     triple = tuple(names[i] for i in found[best][0])
     rank = min(rank, _numerical_rank(singular[best]))
     if len(shapes) == 1:
@@ -237,7 +237,7 @@ def _span_of_brackets(
 
 def _numerical_rank(values: Array) -> int:
     """Return the number of descending singular values above rounding errors."""
-    return int(np.sum(values > max(NO_TURN, float(values[0]) / MAX_CONDITION)))
+    return int(np.sum(values > max(ZERO_TURN_PER_AREA, float(values[0]) / MAX_CONDITION)))
 
 
 def _first_primes(count: int) -> Array:

@@ -75,7 +75,7 @@ class PlanRequest:
 
 
 @dataclass(frozen=True)
-class NoOptions:
+class EmptyOptions:
     """The options class of a method without options."""
 
 
@@ -117,7 +117,7 @@ class GaitMethod(ABC):
     name: ClassVar[str]
     controls: frozenset[Controlled] = POSE
     starts_in_motion: ClassVar[bool] = False
-    Options: ClassVar[type[Any]] = NoOptions
+    Options: ClassVar[type[Any]] = EmptyOptions
     options: Any
 
     def __init__(

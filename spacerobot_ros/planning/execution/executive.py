@@ -25,7 +25,7 @@ from spacerobot_ros.planning.core.goal import POSE, Controlled, PoseError, Robot
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.goal_file import BASE, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
 from spacerobot_ros.planning.execution.path_deviation import TrackingError
 from spacerobot_ros.planning.execution.state_average import MeasuredState, StateAverage
 from spacerobot_ros.planning.execution.status import (
@@ -178,7 +178,7 @@ class ActiveGoal:
     """Simulated time at which the latest schedule ends, s."""
     next_plan: PlanReason = PlanReason.CORRECTION
     """Reason of the next plan, if one is needed."""
-    stuck_at: dict[str, float] = field(default_factory=dict)
+    stuck_positions: dict[str, float] = field(default_factory=dict)
     """Positions of the stuck joints, m or rad, as measured for the last plan."""
     required: frozenset[Controlled] = frozenset()
     """Parts of the goal that plans without the stuck joints must control."""
@@ -263,7 +263,7 @@ class Executive:
 
     # -- requests of the owner ----------------------------------------------------------------
 
-    def propose(self, identified: IdentifiedGoal) -> None:
+    def propose_goal(self, identified: IdentifiedGoal) -> None:
         """Plan for a goal from the next measured states; the goal replaces any other goal."""
         self._new_goal, self._in_motion_attempts = identified, 0
         self._average.restart()
@@ -375,10 +375,10 @@ class Executive:
 
     # -- measured states ----------------------------------------------------------------------
 
-    def observe(self, measured: MeasuredState) -> None:
+    def add_base_measurement(self, measured: MeasuredState) -> None:
         """Use a base measurement that arrives after its state was answered."""
         if self.measuring:
-            if self._tracker.active:
+            if self._tracker.is_active:
                 # A moving robot has no average: only its last state counts.
                 self._average.restart()
             self._add_to_average(measured)
@@ -386,19 +386,23 @@ class Executive:
     def update(self, measured: MeasuredState) -> Setpoint:
         """Return the setpoint for a measured state; see :attr:`setpoint`."""
         stamp, q, tracker = measured.stamp_ns, measured.q, self._tracker
-        if not 0 <= stamp - self._stamp_ns <= self._max_gap_ns and tracker.active:
+        if not 0 <= stamp - self._stamp_ns <= self._max_gap_ns and tracker.is_active:
             self._handle_time_jump(stamp)
         self._stamp_ns = stamp
-        if tracker.ended(stamp, q):
+        if tracker.has_ended(stamp, q):
             self._end_schedule(stamp)
         # While a schedule is tracked, most states need nothing but a command.
-        if self.phase is not _EXECUTING or self._new_goal is not None or tracker.check_due(stamp):
+        if (
+            self.phase is not _EXECUTING
+            or self._new_goal is not None
+            or tracker.is_check_due(stamp)
+        ):
             self._do_phase_work(measured)
-        if tracker.active:
+        if tracker.is_active:
             stuck = tracker.track(stamp, q, obeyed=not self.plant_rests)
             if stuck and self._active_goal is not None:
                 self._handle_stuck_joints(self._active_goal, stuck)
-        if not tracker.active:
+        if not tracker.is_active:
             tracker.hold(q, obeyed=not self.plant_rests)
         self._command_count += 1
         return tracker.setpoint
@@ -428,7 +432,7 @@ class Executive:
 
     def _worker_is_free(self) -> bool:
         """Whether a plan can be requested: the thread of a cancelled plan may still run."""
-        if self._worker.busy:
+        if self._worker.is_busy:
             self._worker.poll()
             return False
         return True
@@ -489,7 +493,7 @@ class Executive:
         ):
             after = self.config.takeover_time * 2**self._in_motion_attempts
             take_over = self._tracker.take_over(self._stamp_ns, measured.q, after)
-        if take_over is None and self._worker.background:
+        if take_over is None and self._worker.plans_in_background:
             if self.phase is Phase.EXECUTING:
                 self._brake_for_replan(Event.NEW_GOAL)
             return
@@ -514,7 +518,7 @@ class Executive:
             self._keep_schedule_for(waiting, self._active_goal)
             return
         averages = self.config.averaging > 1
-        if averages and not self._tracker.check_due(self._stamp_ns):
+        if averages and not self._tracker.is_check_due(self._stamp_ns):
             return
         try:
             state = self._average.state()
@@ -556,7 +560,7 @@ class Executive:
         if error is None:
             if replans:
                 self._replan_remaining(active, state)
-        elif self._worker.background:
+        elif self._worker.plans_in_background:
             self._report_path_correction(active, error)
             self._brake_for_replan(Event.TRACKING_ERROR)
         else:
@@ -646,7 +650,7 @@ class Executive:
 
     def _plan_new_goal(self, waiting: IdentifiedGoal) -> None:
         """Request a plan for a new goal that begins at rest, or with braking."""
-        reason = PlanReason.BLEND if self._tracker.active else PlanReason.NEW_GOAL
+        reason = PlanReason.BLEND if self._tracker.is_active else PlanReason.NEW_GOAL
         job = PlanJob(waiting, reason)
         self._reset_plan_count()
         try:
@@ -665,9 +669,9 @@ class Executive:
     def _request_plan(self, job: PlanJob, state: RobotState) -> None:
         """Request a plan from a measured state; unless it is to take over, the joints brake."""
         goal, active = job.identified.goal, None if job.reason.for_new_goal else self._active_goal
-        if active is not None and len(active.stuck_at) != len(self._tracker.stuck):
+        if active is not None and len(active.stuck_positions) != len(self._tracker.stuck):
             names = self._robot.joint_names
-            active.stuck_at = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
+            active.stuck_positions = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
         braking, take_over = None, None
         if isinstance(job, TakeOverJob):
             goal, take_over = job.aim, job.take_over
@@ -688,7 +692,7 @@ class Executive:
         self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
         task = PlanningTask(request, braking=braking, take_over=take_over)
         if active is not None:
-            task = replace(task, stuck=active.stuck_at, required=active.required)
+            task = replace(task, stuck=active.stuck_positions, required=active.required)
         self._pending_plan = job
         self._worker.submit(task)
         self._take_plan_result()
@@ -765,7 +769,7 @@ class Executive:
         self._active_goal, self._tracker.stuck = active, []
         self._add_event(EventKind.GOAL_ACCEPTED, "The goal is accepted.", active.identified)
         try:
-            self._goal_file.save({BASE: active.identified})
+            self._goal_file.save({BASE_GOAL_KEY: active.identified})
         except ParameterError as error:
             message = f"{error} The goal is pursued, but would not be resumed."
             self._add_notice(Severity.ERROR, message)
@@ -833,7 +837,7 @@ class Executive:
         if isinstance(ready, ReadyPlan):
             # No state arrived between the take-over tick and the end of the schedule.
             self._switch_schedule(ready)
-            if not self._tracker.ended(stamp_ns, ready.schedule.positions[-1]):
+            if not self._tracker.has_ended(stamp_ns, ready.schedule.positions[-1]):
                 return
         self._drop_plan()
         at_rest = self.phase is Phase.BRAKING
@@ -886,8 +890,8 @@ class Executive:
 
     def _phase_without_plan(self) -> Phase:
         """Return the next phase without a plan."""
-        if self._tracker.active:
-            return Phase.BRAKING if self._tracker.braking else Phase.EXECUTING
+        if self._tracker.is_active:
+            return Phase.BRAKING if self._tracker.is_braking else Phase.EXECUTING
         return self._phase_at_rest()
 
     def _phase_at_rest(self) -> Phase:

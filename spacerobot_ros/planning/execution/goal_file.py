@@ -12,7 +12,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.files import UntrustedFileError, read_private, write_whole
 from spacerobot_ros.planning.core.goal import Goal
 
-BASE = "base"
+BASE_GOAL_KEY = "base"
 """Key of the goal of the base in the file."""
 
 
@@ -55,7 +55,7 @@ class GoalFile:
         Allowed keys of goals; a file with other keys is refused.
     """
 
-    def __init__(self, path: str, keys: tuple[str, ...] = (BASE,)) -> None:
+    def __init__(self, path: str, keys: tuple[str, ...] = (BASE_GOAL_KEY,)) -> None:
         self._path = Path(path) if path else None
         self._keys = keys
 

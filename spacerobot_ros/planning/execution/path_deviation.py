@@ -128,11 +128,11 @@ class PathCheck:
     def average_pose(self, state: RobotState) -> RobotState:
         """Add a state to the mean deviation; return the state with the averaged pose."""
         k = self._next_pose
-        self._deviation.add(k, state.position, state.quaternion, self._lag(state))
+        self._deviation.add(k, state.position, state.quaternion, self._joint_lag_deviation(state))
         position, quaternion = self._deviation.pose(k)
         return replace(state, position=position, quaternion=quaternion)
 
-    def _lag(self, state: RobotState) -> Array:
+    def _joint_lag_deviation(self, state: RobotState) -> Array:
         """Return the deviation (6,) of the base in W by the lag of the joints."""
         lag = state.q - self._positions[round(self._path.time[self._next_pose] / self._period)]
         lag[np.abs(lag) <= self._deadband] = 0.0
@@ -203,11 +203,11 @@ class PathDeviation:
     ) -> None:
         self._path = path
         self._recent_deviations: deque[tuple[int, Array]] = deque(maxlen=count)
-        self._lag = np.zeros(6)
+        self._joint_lag_deviation = np.zeros(6)
         if sensitivity is None or masses is None:
             sensitivity, masses = np.zeros((len(path.time), 6, 0)), MassEstimate(0)
         self._sensitivity, self._masses = sensitivity, masses
-        masses.next_path()
+        masses.begin_path()
 
     def add(self, k: int, position: Array, quaternion: Array, lag: Array | float = 0.0) -> None:
         """Add a measured position (3,) and attitude (4,) at instant k of the path.
@@ -219,13 +219,13 @@ class PathDeviation:
         predicted = self._path.quaternion[k]
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
         deviation = np.concatenate([position - self._path.position[k], turn]) - lag
-        self._lag[:] = lag
+        self._joint_lag_deviation[:] = lag
         self._recent_deviations.append((k, deviation))
         self._masses.add(self._sensitivity[k], deviation)
 
     def pose(self, k: int) -> tuple[Array, Array]:
         """Return the estimated base pose at instant k: position (3,) and attitude (4,)."""
-        return self._displace_pose(k, self._mean_deviation(k) + self._lag)
+        return self._displace_pose(k, self._mean_deviation(k) + self._joint_lag_deviation)
 
     def end(self, k: int) -> tuple[Array, Array]:
         """Return the pose at the end of the path, if the base moves as predicted from instant k."""
@@ -315,7 +315,7 @@ class PathSensitivity:
         )
         return by_turn.reshape(len(shapes), self._robot.n, 3, self.count), by_center
 
-    def along(self, schedule: GaitSchedule) -> Array:
+    def path_derivatives(self, schedule: GaitSchedule) -> Array:
         """Return the derivatives (K, 6, P) of the K poses of a schedule's predicted path.
 
         The first three components are those of the position, m, the others those of the attitude
@@ -380,7 +380,7 @@ class MassEstimate:
         self._squares, self._products = np.zeros((count, count)), np.zeros(count)
         self._errors = None
 
-    def next_path(self) -> None:
+    def begin_path(self) -> None:
         """Begin another path, and keep the information of the earlier paths."""
         if self.errors.any():
             self._information, self._vector = self._normal_equations()

@@ -127,7 +127,7 @@ class PlannerStatus:
                 corrections=int(given.pop("corrections", "0")),
                 method=given.pop("method", ""),
                 **numbers,
-                notes={name: _parse_note(text) for name, text in given.items()},
+                notes={name: _note_from_text(text) for name, text in given.items()},
             )
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"This is no status of a planner: {error}.") from error
@@ -207,7 +207,7 @@ def _format_note(note: list[float] | Array | float | str) -> str:
     return " ".join(f"{x:.9g}" if isinstance(x, float) else str(x) for x in numbers)
 
 
-def _parse_note(text: str) -> list[float] | float | str:
+def _note_from_text(text: str) -> list[float] | float | str:
     try:
         numbers = [float(word) for word in text.split()]
     except ValueError:
@@ -271,7 +271,7 @@ def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -
     first = last = schedules[-1]
     for i in reversed(range(last)):
         before = given[i][1]
-        match before.state, _share_goal(before, given[last][1]):
+        match before.state, _have_same_goal(before, given[last][1]):
             case PlannerState.EXECUTING, True:
                 first = i
             case (PlannerState.PLANNING, _) | (PlannerState.REFUSED, False):
@@ -287,7 +287,7 @@ def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -
     return (ended[0] if ended else end_s) - given[first][0]
 
 
-def _share_goal(first: PlannerStatus, second: PlannerStatus) -> bool:
+def _have_same_goal(first: PlannerStatus, second: PlannerStatus) -> bool:
     """Whether two statuses report on one goal, or on two goals with the same pose."""
     same_id = bool(first.goal_id) and first.goal_id == second.goal_id
     return same_id or first.goal == second.goal

@@ -14,13 +14,13 @@ _FOLLOWS_SHARE = 0.5
 """Share of the commanded range above which a joint counts as following its commands. In between it
 is slow, or noise hides its motion."""
 
-_PATIENCE_WINDOWS = 8
+_MAX_STANDSTILL_WINDOWS = 8
 """Number of windows without motion of any joint before joints count as stuck."""
 
 _CHECK_PERIOD = 16
 """Ticks between two checks of joints that have all followed so far: a check takes time."""
 
-_MIN_BAND = 1e-6
+_MIN_JOINT_ERROR = 1e-6
 """Joint errors below this count as rounding, m or rad."""
 
 
@@ -48,8 +48,8 @@ class StuckJointWatch:
 
     def __init__(self, joints: int, ticks: int, control_period: float, band: float = 0.0) -> None:
         self._ticks, self._control_period = ticks, control_period
-        self._band = max(band, _MIN_BAND)
-        self._joints, self._max_window = joints, _PATIENCE_WINDOWS * ticks
+        self._band = max(band, _MIN_JOINT_ERROR)
+        self._joints, self._max_window = joints, _MAX_STANDSTILL_WINDOWS * ticks
         self.restart()
 
     def restart(self) -> None:
@@ -77,11 +77,13 @@ class StuckJointWatch:
                 return []
             self._suspicious = True
             self._restart_joints(np.ones(self._joints, dtype=np.bool_), q)
-        self._watch_standstill(q, velocity)
+        self._count_standstill(q, velocity)
         _widen_ranges(self._measured_range, q)
         self._commanded += velocity * self._control_period
         _widen_ranges(self._commanded_range, self._commanded)
-        self._moving_ticks += np.abs(velocity) * self._control_period > _MIN_BAND * _STUCK_SHARE
+        self._moving_ticks += (
+            np.abs(velocity) * self._control_period > _MIN_JOINT_ERROR * _STUCK_SHARE
+        )
         due = self._moving_ticks >= self._window
         if not due.any():
             return []
@@ -92,7 +94,7 @@ class StuckJointWatch:
         stuck = due & (measured <= _STUCK_SHARE * commanded) & (commanded > self._band)
         moved = commanded > self._band
         still = measured[moved] <= _STUCK_SHARE * commanded[moved]
-        none_moves = (np.count_nonzero(moved) > 1 and still.all()) or self._at_standstill
+        none_moves = (np.count_nonzero(moved) > 1 and still.all()) or self._is_at_standstill
         if none_moves and self._window[due].max() < self._max_window:
             # Joints do not all jam at once: perhaps commands do not arrive for a while.
             stuck[:] = False
@@ -102,7 +104,7 @@ class StuckJointWatch:
         self._restart_joints(follows | stuck, q)
         return [int(i) for i in np.flatnonzero(stuck)]
 
-    def _watch_standstill(self, q: Array, velocity: Array) -> None:
+    def _count_standstill(self, q: Array, velocity: Array) -> None:
         """Count the ticks without any motion, and sum the commanded motion of each joint."""
         if np.abs(q - self._standstill_q).max(initial=0.0) > self._band:
             self._standstill_q[:] = q
@@ -112,7 +114,7 @@ class StuckJointWatch:
         self._standstill_ticks += 1
 
     @property
-    def _at_standstill(self) -> bool:
+    def _is_at_standstill(self) -> bool:
         """Whether several joints had commands to move for a while, and no joint moved."""
         commanded = int(np.count_nonzero(self._standstill_motion > self._band))
         return commanded > 1 and 2 * self._standstill_ticks >= self._ticks

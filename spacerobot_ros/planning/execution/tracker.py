@@ -89,7 +89,7 @@ class ScheduleFollower:
         self._feedforward = velocities + self._gain * self._positions
         self._velocities, self._deadband = velocities, deadband
 
-    def ended(self, stamp_ns: int, q: Array) -> bool:
+    def has_ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the schedule is over and the shape ``q`` (n,) has reached the last shape."""
         late = stamp_ns - self._end_ns
         if late < 0:
@@ -112,7 +112,7 @@ class ScheduleFollower:
         shapes = positions[now : tick + 1].copy()
         return TakeOver(self._start_ns + tick * self._period_ns, shapes, motion)
 
-    def braking(self, stamp_ns: int, duration: float) -> BrakingFollower:
+    def braking_follower(self, stamp_ns: int, duration: float) -> BrakingFollower:
         """Return a follower that brakes along this schedule to rest within ``duration`` s."""
         return BrakingFollower(self.schedule, self._start_ns, stamp_ns, duration, self._gain)
 
@@ -167,7 +167,7 @@ class BrakingFollower:
         """Whether the braking covers a time."""
         return 0 <= stamp_ns - self._stamp_ns <= self._duration * SECOND
 
-    def ended(self, stamp_ns: int, q: Array) -> bool:
+    def has_ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the joints have come to rest."""
         return (stamp_ns - self._stamp_ns) / SECOND >= self._duration
 
@@ -227,12 +227,12 @@ class TrajectoryTracker:
         )
 
     @property
-    def active(self) -> bool:
+    def is_active(self) -> bool:
         """Whether the tracker follows a schedule, or brakes along it."""
         return self._follower is not None
 
     @property
-    def braking(self) -> bool:
+    def is_braking(self) -> bool:
         """Whether the joints brake along a schedule."""
         return isinstance(self._follower, BrakingFollower)
 
@@ -246,7 +246,7 @@ class TrajectoryTracker:
         self._follower = ScheduleFollower(schedule, stamp_ns, gain, config.shape_deadband)
         sensitivity = None
         if average and self._sensitivity is not None:
-            sensitivity = self._sensitivity.along(schedule)
+            sensitivity = self._sensitivity.path_derivatives(schedule)
         self.path_check = PathCheck(
             self._robot, schedule, stamp_ns, config, average, sensitivity, self._mass_estimate
         )
@@ -254,16 +254,16 @@ class TrajectoryTracker:
 
     def brake(self, stamp_ns: int) -> None:
         """Brake along the planned path from now on."""
-        self._follower = self._braking_from(stamp_ns)
+        self._follower = self._begin_braking(stamp_ns)
 
     def braking_shapes(self, stamp_ns: int) -> Array | None:
         """Return the shapes (N + 1, n) at the ticks of a braking that starts now; None at rest."""
-        follower = self._braking_from(stamp_ns)
+        follower = self._begin_braking(stamp_ns)
         return None if follower is None else follower.shapes(stamp_ns)
 
-    def _braking_from(self, stamp_ns: int) -> BrakingFollower | None:
+    def _begin_braking(self, stamp_ns: int) -> BrakingFollower | None:
         if isinstance(self._follower, ScheduleFollower):
-            return self._follower.braking(stamp_ns, self._config.abort_time)
+            return self._follower.braking_follower(stamp_ns, self._config.abort_time)
         return self._follower
 
     def take_over(self, stamp_ns: int, q: Array, after: float) -> TakeOver | None:
@@ -284,9 +284,9 @@ class TrajectoryTracker:
         """Whether the schedule or braking covers a time."""
         return self._follower is not None and self._follower.covers(stamp_ns)
 
-    def ended(self, stamp_ns: int, q: Array) -> bool:
+    def has_ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the schedule or the braking is over."""
-        return self._follower is not None and self._follower.ended(stamp_ns, q)
+        return self._follower is not None and self._follower.has_ended(stamp_ns, q)
 
     def stop(self, *, at_last_shape: bool = False) -> None:
         """Stop tracking; hold the schedule's last shape, or the next measured shape."""
@@ -297,7 +297,7 @@ class TrajectoryTracker:
             self._holds_position = False
         self._follower = None
 
-    def check_due(self, stamp_ns: int) -> bool:
+    def is_check_due(self, stamp_ns: int) -> bool:
         """Whether the schedule has a predicted pose to check at this time."""
         return isinstance(self._follower, ScheduleFollower) and self.path_check.due(stamp_ns)
 

@@ -174,12 +174,12 @@ class PlanningWorker:
         self._job: _PlanThread | None = None
 
     @property
-    def background(self) -> bool:
+    def plans_in_background(self) -> bool:
         """Whether plans are made in a thread."""
         return self._config.plan_in_background
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         """Whether a plan is in work, its result waits, or its thread still runs."""
         return self._job is not None
 
@@ -192,7 +192,7 @@ class PlanningWorker:
         """Make a plan: at once, or in a thread."""
         assert self._job is None, "one plan at a time"
         self._job = job = _PlanThread(self, task)
-        if self.background:
+        if self.plans_in_background:
             job.start()
         else:
             with self._long_work():

@@ -27,11 +27,15 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, quaternion_inverse, quaternion_multiply
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
-from spacerobot_ros.planning.core.controllability import brackets_anywhere
+from spacerobot_ros.planning.core.controllability import best_sampled_brackets
 from spacerobot_ros.planning.core.goal import Controlled, PoseError
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes, straight_motion
-from spacerobot_ros.planning.methods.nominal_shape import PLANES, NominalChoice, NominalShape
+from spacerobot_ros.planning.methods.nominal_shape import (
+    JOINT_PLANES,
+    NominalShape,
+    NominalShapeChooser,
+)
 
 _MAX_CYCLE_TRIALS = 6
 """Attempts for a cycle that would not bring the base nearer, each half as large as before."""
@@ -44,8 +48,8 @@ _NEGLIGIBLE_AREA_SHARE = 1e-3
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
-Ends = list[tuple[Array, float]]
-"""Ends (n,) of straight legs, and the durations of these, s."""
+LegEnds = list[tuple[Array, float]]
+"""LegEnds (n,) of straight legs, and the durations of these, s."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +111,9 @@ class AreaLoopGait(GaitMethod):
 
     def _setup(self) -> None:
         robot, chosen = self.robot, self.options
-        self._nominal = NominalChoice(robot, chosen.largest_edge, chosen.joints, chosen.nominal)
+        self._nominal = NominalShapeChooser(
+            robot, chosen.largest_edge, chosen.joints, chosen.nominal
+        )
         self.require_suitable(robot)
         self._nominal.prepare()
 
@@ -119,7 +125,7 @@ class AreaLoopGait(GaitMethod):
                 f"area_loop needs three joints (paper 2); robot '{robot.description.name}' has "
                 f"{robot.n}."
             )
-        brackets_anywhere(robot).require()
+        best_sampled_brackets(robot).require()
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan the way to the nominal shape and the next cycle; see :meth:`GaitMethod.plan`.
@@ -139,7 +145,7 @@ class AreaLoopGait(GaitMethod):
         if tolerance.admits(error, self.controls):
             return self._build_schedule(gait, request, notes, progress)
         chosen = self._nominal.at(state.q, None if progress is None else progress.nominal)
-        nominal = self._nominal.nearest_turn(chosen, state.q)
+        nominal = self._nominal.move_to_nearest_turn(chosen, state.q)
         flown = 0 if progress is None else progress.cycles
         gait = self._add_legs(gait, [(nominal.shape, self.options.edge_time)])
         # The motion from the nominal to the final shape turns the base, too.
@@ -238,11 +244,11 @@ class AreaLoopGait(GaitMethod):
         factor = -math.log1p(-min(self.options.k, _MAX_CYCLE_SHARE))
         return many + max(1.0, math.log(unbounded / enough) / factor)
 
-    def _edge_ends(self, path: EdgePath, nominal: NominalShape) -> Ends:
+    def _edge_ends(self, path: EdgePath, nominal: NominalShape) -> LegEnds:
         """Return the ends of the edges of a path that begins and ends at the nominal shape."""
         chosen = list(nominal.joints)
         lower, upper = self.robot.lower[chosen], self.robot.upper[chosen]
-        ends: Ends = []
+        ends: LegEnds = []
         for loop in path.loops:
             half = np.abs(loop).max(axis=0)
             # A box that does not fit round the nominal shape is moved into the limits.
@@ -261,7 +267,7 @@ class AreaLoopGait(GaitMethod):
         ends = [] if final is None else [(final, self.options.edge_time)]
         return self._add_legs(start, ends).attitudes[-1]
 
-    def _add_legs(self, gait: _PlannedMotion, ends: Ends) -> _PlannedMotion:
+    def _add_legs(self, gait: _PlannedMotion, ends: LegEnds) -> _PlannedMotion:
         """Return the gait with straight legs added."""
         shapes = straight_motion(
             self.robot, gait.positions[-1], ends, self.control_period, self.options.longest
@@ -370,7 +376,7 @@ def _cube_path(areas: Array, longest: Array) -> EdgePath:
 
 def _rectangle_path(areas: Array, longest: Array) -> EdgePath:
     loops, excess = [], 0.0
-    for area, (i, j) in zip(areas, PLANES, strict=True):
+    for area, (i, j) in zip(areas, JOINT_PLANES, strict=True):
         if area == 0.0:
             continue
         # Both edges have the same ratio to the longest edges.

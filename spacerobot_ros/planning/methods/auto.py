@@ -22,7 +22,7 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule
 
 
 @dataclass(frozen=True)
-class Candidate:
+class CandidateMethod:
     """A gait method to try, and a function that builds it with its options for the robot."""
 
     method: type[GaitMethod]
@@ -52,7 +52,7 @@ class AutoGait(GaitMethod):
         control_period: float,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
         *,
-        candidates: Mapping[str, Candidate],
+        candidates: Mapping[str, CandidateMethod],
     ) -> None:
         super().__init__(robot, control_period, integration_step)
         self._candidates = candidates
@@ -88,13 +88,13 @@ class AutoGait(GaitMethod):
             names.remove(flying)
             kept = self._plan_by_method(flying, request, refusals, cancellation)
             if kept is not None:
-                result = {flying: _Result.of(kept, request)}
+                result = {flying: _MethodResult.of(kept, request)}
                 return _add_notes(kept, flying, f"{flying} planned this goal before.", result, {})
-        results: dict[str, _Result] = {}
+        results: dict[str, _MethodResult] = {}
         for name in names:
             schedule = self._plan_by_method(name, request, refusals, cancellation)
             if schedule is not None:
-                results[name] = _Result.of(schedule, request)
+                results[name] = _MethodResult.of(schedule, request)
         if not results:
             raise self._refuse_goal(refusals)
         chosen = min(results, key=lambda name: results[name].rank(results.values()))
@@ -161,7 +161,7 @@ class AutoGait(GaitMethod):
 
 
 @dataclass(frozen=True)
-class _Result:
+class _MethodResult:
     """Result of a method.
 
     Attributes
@@ -179,7 +179,7 @@ class _Result:
     reaches: bool
 
     @classmethod
-    def of(cls, schedule: GaitSchedule, request: PlanRequest) -> _Result:
+    def of(cls, schedule: GaitSchedule, request: PlanRequest) -> _MethodResult:
         goal, path = request.goal, schedule.path
         asked = POSE if goal.joint_positions is None else POSE | {"shape"}
         q = schedule.positions[-1]
@@ -187,7 +187,7 @@ class _Result:
         reaches = schedule.partial or request.tolerance.admits(error, schedule.controls)
         return cls(schedule, schedule.controls & asked, reaches)
 
-    def rank(self, others: Collection[_Result]) -> tuple[bool, bool, float]:
+    def rank(self, others: Collection[_MethodResult]) -> tuple[bool, bool, float]:
         """Return the key to sort by: the better one of two results has the smaller key."""
         less = any(self.parts < other.parts and other.reaches for other in others)
         return not self.reaches, less, self.schedule.expected_duration
@@ -204,7 +204,7 @@ def _add_notes(
     schedule: GaitSchedule,
     chosen: str,
     because: str,
-    results: Mapping[str, _Result],
+    results: Mapping[str, _MethodResult],
     refusals: Mapping[str, SpaceRobotError],
 ) -> GaitSchedule:
     """Return a schedule with notes on all compared manoeuvres."""

@@ -23,20 +23,24 @@ import numpy as np
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
-from spacerobot_ros.planning.core.controllability import NO_TURN, Controllability, shape_box
+from spacerobot_ros.planning.core.controllability import (
+    ZERO_TURN_PER_AREA,
+    Controllability,
+    shape_box,
+)
 
 _MAX_AXIS_TILT = 1e-5
 """Largest tilt of an axis of a planar robot, and turn about other axes per radian of a joint:
 the rounding error of angles with six digits."""
 
-_SAMPLED_SHAPES = 8
+_SAMPLED_SHAPE_COUNT = 8
 """Number of sampled shapes in the test whether a robot stays in its plane."""
 
 _MAX_PANEL_ANGLE = 0.5
 """Longest piece of a leg that one Gauss rule integrates, rad."""
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
-_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
+_GAUSS_NODES, _GAUSS_WEIGHTS = (_GAUSS_NODES + 1) / 2, _GAUSS_WEIGHTS / 2
 
 _FITTED_ANGLES: Array = 2 * math.pi / 3 * np.arange(3.0)
 """Three angles that determine a trigonometric polynomial of degree one, rad."""
@@ -54,7 +58,7 @@ _MAX_PEAKS = 4
 _EQUAL_PEAK_TOLERANCE = 1e-4
 """Relative difference below which peaks of the curvature count as equal."""
 
-_EQUAL_DISTANCE = 1e-2
+_EQUAL_DISTANCE_TOLERANCE = 1e-2
 """Distances that differ by less than this count as equal, rad."""
 
 _NEIGHBOUR_OFFSETS = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -1.0, 1.0)])
@@ -103,9 +107,11 @@ def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
     """Refuse masses off the plane and products of inertia that tilt the base."""
     # The tilt is a ratio of trigonometric polynomials of the shape: it is zero everywhere or
     # almost nowhere, so a few shapes in general position suffice for the test.
-    shapes = np.outer(np.arange(1, _SAMPLED_SHAPES + 1), np.sqrt(np.arange(2, robot.n + 2)))
+    shapes = np.outer(np.arange(1, _SAMPLED_SHAPE_COUNT + 1), np.sqrt(np.arange(2, robot.n + 2)))
     A = robot.function("connection", compile=False)(shapes.T).full()[3:]
-    tilts = np.linalg.norm(A - np.outer(axis, axis @ A), axis=0).reshape(_SAMPLED_SHAPES, robot.n)
+    tilts = np.linalg.norm(A - np.outer(axis, axis @ A), axis=0).reshape(
+        _SAMPLED_SHAPE_COUNT, robot.n
+    )
     worst = np.unravel_index(np.argmax(tilts), tilts.shape)
     if tilts[worst] > _MAX_AXIS_TILT:
         raise PlanningError(
@@ -116,7 +122,7 @@ def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
         )
 
 
-def planar_chain(robot: SpaceRobot) -> Controllability:
+def check_planar_chain(robot: SpaceRobot) -> Controllability:
     """Test a robot by paper 3: a planar robot of three or more links, with curvature."""
     names, rest = robot.joint_names, np.zeros(robot.n)
     try:
@@ -136,10 +142,10 @@ def planar_chain(robot: SpaceRobot) -> Controllability:
         f"base by up to {largest:.3g} rad a unit of area, round {np.round(shape, 3).tolist()} "
         "(paper 3)."
     )
-    if largest <= NO_TURN:
+    if largest <= ZERO_TURN_PER_AREA:
         message = f"Loops of the joints of robot '{robot.description.name}' do not turn its base."
     values = np.array([largest, 0.0, 0.0])
-    return Controllability(int(largest > NO_TURN), 1, values, pair, shape, message)
+    return Controllability(int(largest > ZERO_TURN_PER_AREA), 1, values, pair, shape, message)
 
 
 class PlanarPhase:
@@ -166,9 +172,9 @@ class PlanarPhase:
         N_D = ca.vertcat((axis.T @ D_q).T, axis.T @ D @ axis)
         self._N_D = ca.Function("N_D", [psi], [ca.densify(N_D)])
 
-    def legs(self, starts: Array, ends: Array) -> Array:
+    def leg_turns(self, starts: Array, ends: Array) -> Array:
         """Return the turns (L,) along straight legs of the shape, starts and ends (L, n)."""
-        return _integrate_legs(self._s, starts, ends)
+        return _integrate_legs(self._connection_row, starts, ends)
 
     def plane(self, psi: Array, i: int, j: int) -> PhasePlane:
         """Return the phase in the plane of joints i and j, the others at rest in ``psi`` (n,)."""
@@ -178,7 +184,7 @@ class PlanarPhase:
         fit: Array = np.linalg.inv(_harmonics(_FITTED_ANGLES)).astype(float)
         return PhasePlane(fit @ samples @ fit.T)
 
-    def _s(self, shapes: Array) -> Array:
+    def _connection_row(self, shapes: Array) -> Array:
         """Return ``s`` (..., n) at shapes (..., n)."""
         N_D = self._N_D(shapes.reshape(-1, shapes.shape[-1]).T).full()
         return np.asarray((N_D[:-1] / N_D[-1]).T).reshape(shapes.shape)
@@ -212,14 +218,14 @@ class PhasePlane:
         N_i_j, _, D_j = self._polynomials(left, right @ _HARMONIC_DERIVATIVE)
         return np.asarray((N_i_j * D - N_i * D_j - N_j_i * D + N_j * D_i) / D**2)
 
-    def squares(self, centres: Array, sides: Array) -> Array:
+    def square_turns(self, centres: Array, sides: Array) -> Array:
         """Return the turns (R,) of the base by counter-clockwise squares with centres (R, 2)."""
         corners = square_corners(centres, sides)
         ends = np.roll(corners, -1, axis=1)
-        legs = _integrate_legs(self._s, corners.reshape(-1, 2), ends.reshape(-1, 2))
+        legs = _integrate_legs(self._connection_row, corners.reshape(-1, 2), ends.reshape(-1, 2))
         return legs.reshape(-1, 4).sum(axis=1)
 
-    def _s(self, points: Array) -> Array:
+    def _connection_row(self, points: Array) -> Array:
         """Return ``(s_i, s_j)`` (..., 2) at points (..., 2)."""
         N_i, N_j, D = self._polynomials(_harmonics(points[..., 0]), _harmonics(points[..., 1]))
         return np.stack([N_i / D, N_j / D], axis=-1)
@@ -247,8 +253,8 @@ def _integrate_legs(s: Callable[[Array], Array], starts: Array, ends: Array) -> 
     """
     moves = ends - starts
     count = max(1, math.ceil(np.abs(moves).max(initial=0.0) / _MAX_PANEL_ANGLE))
-    along = ((np.arange(count)[:, np.newaxis] + _NODES) / count).ravel()
-    weights = np.tile(_WEIGHTS, count) / count
+    along = ((np.arange(count)[:, np.newaxis] + _GAUSS_NODES) / count).ravel()
+    weights = np.tile(_GAUSS_WEIGHTS, count) / count
     shapes = starts[:, np.newaxis] + along[:, np.newaxis] * moves[:, np.newaxis]
     return np.asarray(-np.einsum("p,lpn,ln->l", weights, s(shapes), moves))
 
@@ -288,7 +294,7 @@ def curvature_peaks(plane: PhasePlane, at: Array, boxes: Array) -> Array:
     for k in range(len(boxes)):
         mine = np.flatnonzero(owner == k)
         good = mine[heights[mine] >= (1 - _EQUAL_PEAK_TOLERANCE) * heights[mine].max()]
-        nearest = good[distances[good] <= distances[good].min() + _EQUAL_DISTANCE]
+        nearest = good[distances[good] <= distances[good].min() + _EQUAL_DISTANCE_TOLERANCE]
         # The last of equal peaks in order, so that rounding does not choose between mirror images.
         chosen.append(max(points[nearest].tolist()))
     return np.array(chosen)[row.ravel()]

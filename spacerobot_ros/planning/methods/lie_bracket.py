@@ -31,9 +31,9 @@ from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import (
     MAX_CONDITION,
     best_triple,
+    check_sliding_masses,
     require_three_slots,
     sliders_of,
-    sliding_masses,
     slot_matrix,
 )
 from spacerobot_ros.planning.core.goal import POSITION_SLACK, Goal, RobotState
@@ -42,11 +42,11 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
 _MIN_CYCLE_TICKS = 12
 _MAX_REFINEMENTS = 20
-_PATH_POINTS = 100
+_PATH_POSES_PER_STEP = 100
 """Fewest poses of the predicted path in each step; a step has at most twice as many."""
 
-_NO_ROTATION = 1e-9
-_NO_MOTION = 1e-9
+_ZERO_ROTATION_ANGLE = 1e-9
+_ZERO_MOTION = 1e-9
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class LieBracketGait(GaitMethod):
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:
         """Refuse robots whose sliders violate the conditions of paper 1."""
-        sliding_masses(robot).require()
+        check_sliding_masses(robot).require()
 
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan steps 1 to 3; see :meth:`GaitMethod.plan`."""
@@ -143,12 +143,12 @@ class LieBracketGait(GaitMethod):
         z0, lower, upper = (x[self.sliders] for x in (state.q, robot.lower, robot.upper))
         dz: Array = np.linalg.lstsq(P, shift, rcond=None)[0].astype(float)
         if np.any(z0 + dz < lower) or np.any(z0 + dz > upper):
-            dz = self._keep_to_strokes(P, shift, z0, dz, lower, upper, enough)
+            dz = self._keep_strokes(P, shift, z0, dz, lower, upper, enough)
         z_f = state.q.copy()
         z_f[self.sliders] = np.clip(z0 + dz, lower, upper)
         return z_f
 
-    def _keep_to_strokes(
+    def _keep_strokes(
         self,
         P: Array,
         shift: Array,
@@ -189,7 +189,7 @@ class LieBracketGait(GaitMethod):
     def _slide_shapes(self, z0: Array, z_f: Array) -> Array:
         """Step 2: shapes (N + 1, n) under ``v_i = c_i sin^2(2 pi n1 t / t1)``, eq. (10)."""
         displacement = z_f - z0
-        if np.abs(displacement).max() <= _NO_MOTION:
+        if np.abs(displacement).max() <= _ZERO_MOTION:
             return z_f[np.newaxis].copy()
         t1 = self._slide_time(displacement)
         ticks = max(math.ceil(t1 / self.control_period - 1e-9), 4 * self.options.n1)
@@ -206,12 +206,12 @@ class LieBracketGait(GaitMethod):
         for name, distance, rate in zip(
             self.robot.joint_names, np.abs(displacement), self.robot.velocity_limit, strict=True
         ):
-            if distance > _NO_MOTION and 2 * distance > rate * longest:
+            if distance > _ZERO_MOTION and 2 * distance > rate * longest:
                 raise PlanningError(
                     f"The slide would take more than {longest:.6g} s: joint '{name}' is to "
                     f"move {distance:.4g} m at no more than {rate:.4g} m/s."
                 )
-            if distance > _NO_MOTION:
+            if distance > _ZERO_MOTION:
                 slowest = max(slowest, 2 * distance / rate)
         return float(slowest)
 
@@ -221,7 +221,7 @@ class LieBracketGait(GaitMethod):
         """Step 3: one cycle of shapes (m + 1, n), the number of cycles, and the paper's symbols."""
         wanted = attitude_error(quaternion, request.goal.quaternion)
         enough = request.tolerance.attitude
-        if np.linalg.norm(wanted) <= _NO_ROTATION:
+        if np.linalg.norm(wanted) <= _ZERO_ROTATION_ANGLE:
             return z_f[np.newaxis].copy(), 0, {"cycles": 0.0}
         triple, brackets = self._best_triple(z_f)
         least = 0 if request.correction else self.options.cycles
@@ -254,7 +254,7 @@ class LieBracketGait(GaitMethod):
         z_f: Array,
         least: int,
         enough: float,
-    ) -> _Turn:
+    ) -> _TurnStep:
         """Add the first-order error to the wanted turn until it is below ``enough`` (rad).
 
         The number of cycles is chosen once, from ``least`` up, so that the answer is smooth.
@@ -292,7 +292,7 @@ class LieBracketGait(GaitMethod):
 
     def _fit_to_limits(
         self, alpha: Array, triple: tuple[int, int, int], z_f: Array, least: int
-    ) -> _Turn:
+    ) -> _TurnStep:
         """Choose the smallest n >= ``least`` at which a cycle keeps rates and strokes. With
         ``least`` 0 it follows from ``loop_area``.
         """
@@ -317,7 +317,7 @@ class LieBracketGait(GaitMethod):
                     float(np.max(rate[active] / robot.velocity_limit[active], initial=0.0)),
                 )
             if excess <= 1.0:
-                return _Turn(shapes, n, alpha, amplitudes)
+                return _TurnStep(shapes, n, alpha, amplitudes)
             # Amplitudes go as 1/sqrt(n).
             n = math.ceil(min(n * min(excess, 1e6) ** 2 * 1.001, 1e12)) + 1
 
@@ -359,11 +359,11 @@ class LieBracketGait(GaitMethod):
         self, state: RobotState, slide: Array, attitudes: Array, cycle: Array, n: int
     ) -> BasePath:
         """Base path: step 2 as it goes, step 3 at the ends of some cycles."""
-        stride = max(1, len(slide) // _PATH_POINTS)
+        stride = max(1, len(slide) // _PATH_POSES_PER_STEP)
         chosen = np.unique(np.append(np.arange(0, len(slide), stride), len(slide) - 1))
         time, shapes, quaternions = chosen * self.control_period, slide[chosen], attitudes[chosen]
         if n:
-            done = np.unique(np.append(np.arange(0, n, max(1, n // _PATH_POINTS))[1:], n))
+            done = np.unique(np.append(np.arange(0, n, max(1, n // _PATH_POSES_PER_STEP))[1:], n))
             rotation = self._cycle_rotation(cycle)
             turned = [
                 quaternion_multiply(attitudes[-1], quaternion_from_rotvec(k * rotation))
@@ -379,7 +379,7 @@ class LieBracketGait(GaitMethod):
 
 
 @dataclass(frozen=True)
-class _Turn:
+class _TurnStep:
     """The chosen step 3; ``miss`` is its remaining error, rad."""
 
     shapes: Array

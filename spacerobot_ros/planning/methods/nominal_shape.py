@@ -26,17 +26,17 @@ from spacerobot_ros.planning.core.controllability import (
     shape_box,
 )
 
-PLANES = ((0, 1), (1, 2), (2, 0))
+JOINT_PLANES = ((0, 1), (1, 2), (2, 0))
 """The planes of three joints in which loops enclose areas."""
 
 _GRID_POINTS = {1: 11, 2: 7}
 """Points per joint of the first grid, by the number of triples; 5 for more triples."""
 
-_MAX_TRIPLES, _SAMPLED_SHAPES = 8, 48
+_MAX_TRIPLES, _SAMPLED_SHAPE_COUNT = 8, 48
 """Largest number of triples of joints to examine closely, and of shapes to choose them at."""
 
 _GRID_REFINEMENTS = 10
-_EQUAL_MEASURES = 1e-6
+_EQUAL_MEASURE_TOLERANCE = 1e-6
 """Relative difference below which shapes are equally good; the most central shape wins."""
 
 _MIN_EDGE = 1e-4
@@ -80,7 +80,7 @@ class NominalShape:
         return float(np.linalg.cond(self.M))
 
 
-class NominalChoice:
+class NominalShapeChooser:
     """Chooses the nominal shapes of one robot.
 
     Parameters
@@ -137,7 +137,7 @@ class NominalChoice:
             kept if kept is not None and self._still_applies(kept, q) else self._choose_nominal(q)
         )
 
-    def nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
+    def move_to_nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
         """Return the nominal shape with unlimited joints moved by full turns to near ``q``."""
         turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
         return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
@@ -201,7 +201,7 @@ def best_nominal(
     triples = _select_best_triples(robot, triples, largest_edge)
     points = _GRID_POINTS.get(len(triples), 5)
     return max(
-        (_best_of_triple(robot, held, triple, largest_edge, points) for triple in triples),
+        (_best_shape_of_triple(robot, held, triple, largest_edge, points) for triple in triples),
         key=lambda nominal: float(_worst_axis_turn(nominal.M, nominal.longest)),
     )
 
@@ -212,7 +212,7 @@ def _select_best_triples(
     """Return the triples of joints with the best measures over sampled shapes."""
     if len(triples) <= _MAX_TRIPLES:
         return triples
-    shapes = sample_shapes(robot, _SAMPLED_SHAPES)
+    shapes = sample_shapes(robot, _SAMPLED_SHAPE_COUNT)
     K = curvatures(robot, shapes)
 
     def best(triple: tuple[int, int, int]) -> float:
@@ -222,7 +222,7 @@ def _select_best_triples(
     return sorted(triples, key=best, reverse=True)[:_MAX_TRIPLES]
 
 
-def _best_of_triple(
+def _best_shape_of_triple(
     robot: SpaceRobot, held: Array, triple: tuple[int, int, int], largest_edge: float, points: int
 ) -> NominalShape:
     chosen = list(triple)
@@ -232,7 +232,7 @@ def _best_of_triple(
     at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     for _ in range(_GRID_REFINEMENTS):
         matrices, longest = _matrices_and_edges(robot, held, chosen, at, largest_edge)
-        best = _most_central(at, _worst_axis_turn(matrices, longest), (lower + upper) / 2)
+        best = _most_central_index(at, _worst_axis_turn(matrices, longest), (lower + upper) / 2)
         step = step / 2
         at = np.clip(at[best] + step * _NEIGHBOUR_OFFSETS, lower, upper)
     # The search ends with the best point in the centre of its neighbourhood.
@@ -259,12 +259,12 @@ def _centred_edges(robot: SpaceRobot, chosen: list[int], at: Array, largest_edge
 
 def _worst_axis_turn(M: Array, longest: Array) -> Array:
     """Return the turn (...) of the base about the worst axis by the largest loops, rad."""
-    areas = np.stack([longest[..., i] * longest[..., j] for i, j in PLANES], axis=-1)
+    areas = np.stack([longest[..., i] * longest[..., j] for i, j in JOINT_PLANES], axis=-1)
     return np.asarray(np.linalg.svd(M * areas[..., np.newaxis, :], compute_uv=False)[..., 2])
 
 
-def _most_central(at: Array, measures: Array, middle: Array) -> int:
-    good = np.flatnonzero(measures >= (1 - _EQUAL_MEASURES) * measures.max())
+def _most_central_index(at: Array, measures: Array, middle: Array) -> int:
+    good = np.flatnonzero(measures >= (1 - _EQUAL_MEASURE_TOLERANCE) * measures.max())
     return int(good[np.argmin(np.linalg.norm(at[good] - middle, axis=1))])
 
 

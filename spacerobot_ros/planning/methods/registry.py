@@ -11,7 +11,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured, require_known
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
-from spacerobot_ros.planning.methods.auto import AutoGait, Candidate
+from spacerobot_ros.planning.methods.auto import AutoGait, CandidateMethod
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.square_path import SquarePathGait
@@ -48,7 +48,7 @@ def build_method(
     if method is not AutoGait:
         return method(robot, control_period, integration_step, options.get(name))
     candidates = {
-        other: Candidate(
+        other: CandidateMethod(
             entry,
             partial(build_method, other, robot, control_period, integration_step, options),
         )

@@ -29,7 +29,7 @@ from spacerobot_ros.planning.methods.registry import build_method
 
 
 @dataclass(frozen=True)
-class _Progress:
+class _RemainingProgress:
     """Progress of a schedule of the method ``planner`` without the ``stuck`` joints."""
 
     stuck: frozenset[str]
@@ -84,13 +84,13 @@ class RemainingJointsGait(GaitMethod):
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan with the joints that are not stuck; see :meth:`GaitMethod.plan`."""
         try:
-            return self._plan(request, cancellation)
+            return self._plan_without_stuck(request, cancellation)
         except PlanningCancelled:
             raise
         except PlanningError as refusal:
             raise refusal_of_all(f"{self._describe_stuck_joints()}; {refusal}", [refusal]) from None
 
-    def _plan(self, request: PlanRequest, cancellation: Cancellation) -> GaitSchedule:
+    def _plan_without_stuck(self, request: PlanRequest, cancellation: Cancellation) -> GaitSchedule:
         moving, state, shape = ~self._is_stuck, request.state, request.goal.joint_positions
         if not moving.any():
             raise PlanningError(
@@ -127,7 +127,7 @@ class RemainingJointsGait(GaitMethod):
                 joint_names=self.robot.joint_names,
                 positions=positions,
                 goal=request.goal,
-                progress=_Progress(frozenset(self._stuck), name, schedule.progress),
+                progress=_RemainingProgress(frozenset(self._stuck), name, schedule.progress),
             )
         sentences = " ".join(dict.fromkeys(map(str, reasons)))
         raise refusal_of_all(f"with the remaining joints: {sentences}", reasons)
@@ -140,7 +140,7 @@ class RemainingJointsGait(GaitMethod):
         Progress with other joints does not count.
         """
         progress = None if previous is None else previous.progress
-        if previous is None or not isinstance(progress, _Progress):
+        if previous is None or not isinstance(progress, _RemainingProgress):
             return self._names, None
         if progress.stuck != self._stuck.keys():
             return self._names, None

@@ -30,7 +30,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_inverse, quaternion_multiply, swing_angle
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
-from spacerobot_ros.planning.core.controllability import tilted_goal
+from spacerobot_ros.planning.core.controllability import tilted_goal_error
 from spacerobot_ros.planning.core.goal import Controlled, PoseError
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes, straight_motion
@@ -46,16 +46,16 @@ from spacerobot_ros.planning.methods.geometric_phase import (
 _MIN_CORRECTED_SHARE = 0.1
 """Share of the tolerance below which a missing turn is not corrected."""
 
-_NO_ROTATION = 1e-9
+_ZERO_ROTATION_ANGLE = 1e-9
 
-_LARGEST_SIDE = math.pi
+_MAX_SIDE = math.pi
 """rad. Over a whole turn of both joints the curvature has mean zero: beyond about half a turn a
 larger square adds curvature of the other sign."""
 
-_TRIED_SIDES = 8
+_TRIED_SIDE_COUNT = 8
 """Number of tried sides between zero and the largest side that fits."""
 
-_USED_ROOM = 1.0 - 1e-9
+_USED_RANGE_SHARE = 1.0 - 1e-9
 """Share of the free range that the largest square takes: rounding must not put a corner beyond
 it."""
 
@@ -139,12 +139,12 @@ class SquarePathGait(GaitMethod):
         psi_e = self._goal_shape(goal)
         if psi_e is None:
             psi_e = np.clip(state.q, self.robot.lower, self.robot.upper)
-        step_1 = float(self._phase.legs(state.q[np.newaxis], psi_e[np.newaxis])[0])
+        step_1 = float(self._phase.leg_turns(state.q[np.newaxis], psi_e[np.newaxis])[0])
         # Full turns do not change the attitude, so the shorter way round is taken.
         wanted = math.remainder(turn - step_1, 2 * math.pi)
         loop = None
-        if abs(wanted) > max(_NO_ROTATION, _MIN_CORRECTED_SHARE * tolerance.attitude):
-            loop = self._search.loop(psi_e, wanted)
+        if abs(wanted) > max(_ZERO_ROTATION_ANGLE, _MIN_CORRECTED_SHARE * tolerance.attitude):
+            loop = self._search.find_loop(psi_e, wanted)
         positions = straight_motion(
             self.robot,
             state.q,
@@ -176,8 +176,8 @@ class SquarePathGait(GaitMethod):
         axis = self._phase.axis
         turn = quaternion_multiply(quaternion_inverse(start), wanted)
         tilt = swing_angle(turn, axis[np.newaxis])
-        if tilt > max(request.tolerance.attitude, _NO_ROTATION):
-            raise tilted_goal(self.robot, axis, tilt)
+        if tilt > max(request.tolerance.attitude, _ZERO_ROTATION_ANGLE):
+            raise tilted_goal_error(self.robot, axis, tilt)
         twist = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
         return math.remainder(twist, 2 * math.pi)
 
@@ -234,7 +234,7 @@ class SquareLoop:
 
 
 @dataclass(frozen=True)
-class _GrowingSquares:
+class _SquareFamily:
     """Growing squares of one pair of joints: centres (R, 2), sides (R,), phases (R,)
     counter-clockwise."""
 
@@ -278,7 +278,7 @@ class SquareSearch:
         self._root = brentq
         self._movable: list[int] = np.flatnonzero(robot.velocity_limit > 0).tolist()
 
-    def loop(self, psi_e: Array, wanted: float) -> SquareLoop:
+    def find_loop(self, psi_e: Array, wanted: float) -> SquareLoop:
         """Return the loop for a turn ``wanted`` (rad), with other joints at ``psi_e`` (n,).
 
         Of all pairs of joints it is the one that takes the fewest loops, and of those the one
@@ -316,7 +316,7 @@ class SquareSearch:
             np.roll(corners, -nearest, axis=0),
         )
 
-    def _describe_refusal(self, wanted: float, largest: _GrowingSquares | None) -> str:
+    def _describe_refusal(self, wanted: float, largest: _SquareFamily | None) -> str:
         """Return the message for a turn without a loop; ``largest`` turns the base farthest."""
         if len(self._movable) < 2:
             return (
@@ -334,9 +334,9 @@ class SquareSearch:
             f"square loops of joints '{names[i]}' and '{names[j]}'{given} turn it by at most about "
             f"{largest.largest:.3g} rad each"
         )
-        if largest.sides[-1] < _LARGEST_SIDE * _USED_ROOM:
+        if largest.sides[-1] < _MAX_SIDE * _USED_RANGE_SHARE:
             most += f", with sides of up to {largest.sides[-1]:.3g} rad within the joint limits"
-        if largest.largest < _NO_ROTATION:
+        if largest.largest < _ZERO_ROTATION_ANGLE:
             return f"The base cannot be turned by {wanted:.4g} rad by square loops: {most}."
         return (
             f"A turn of the base by {wanted:.4g} rad takes "
@@ -344,7 +344,7 @@ class SquareSearch:
             f"{self._most_loops}: {most}."
         )
 
-    def _growing_squares(self, psi_e: Array, pair: tuple[int, int]) -> _GrowingSquares | None:
+    def _growing_squares(self, psi_e: Array, pair: tuple[int, int]) -> _SquareFamily | None:
         """Return squares of growing side within the joint limits; None without room for any."""
         at, lower, upper = (x[list(pair)] for x in (psi_e, self._robot.lower, self._robot.upper))
         room = float(np.min(upper - lower))
@@ -353,15 +353,17 @@ class SquareSearch:
         if room <= 0:
             return None
         plane = self._phase.plane(psi_e, *pair)
-        sides = np.linspace(0.0, min(room, _LARGEST_SIDE) * _USED_ROOM, _TRIED_SIDES + 1)[1:]
+        sides = np.linspace(0.0, min(room, _MAX_SIDE) * _USED_RANGE_SHARE, _TRIED_SIDE_COUNT + 1)[
+            1:
+        ]
         if self._centre is not None:
-            centres = np.tile(self._centre, (_TRIED_SIDES, 1))
+            centres = np.tile(self._centre, (_TRIED_SIDE_COUNT, 1))
         else:
             boxes = [centre_box(at, lower + side / 2, upper - side / 2) for side in sides]
             centres = curvature_peaks(plane, at, np.array(boxes))
-        return _GrowingSquares(pair, plane, centres, sides, plane.squares(centres, sides))
+        return _SquareFamily(pair, plane, centres, sides, plane.square_turns(centres, sides))
 
-    def _solve_for_side(self, candidates: _GrowingSquares, wanted: float) -> tuple[int, float]:
+    def _solve_for_side(self, candidates: _SquareFamily, wanted: float) -> tuple[int, float]:
         """Return the row of the smallest square that turns the base far enough, and its ``z*``.
 
         ``wanted`` is the turn of one loop in either sense, rad, at most the largest there is.
@@ -373,7 +375,7 @@ class SquareSearch:
         sign = math.copysign(1.0, candidates.phases[row])
 
         def excess(z: float) -> float:
-            return sign * float(candidates.plane.squares(centre, np.array([z]))[0]) - wanted
+            return sign * float(candidates.plane.square_turns(centre, np.array([z]))[0]) - wanted
 
         # The last digit of a phase depends on the number of legs in one call of the integration.
         if excess(side) <= 0:

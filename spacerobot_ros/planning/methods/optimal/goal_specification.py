@@ -37,7 +37,7 @@ from spacerobot_ros.planning.core.controllability import (
     shape_box,
     sliders_of,
     slot_matrix,
-    tilted_goal,
+    tilted_goal_error,
 )
 from spacerobot_ros.planning.core.goal import POSITION_SLACK, Controlled
 from spacerobot_ros.planning.core.method import PlanRequest
@@ -47,9 +47,9 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     OptimalOptions,
 )
 
-_NO_ROTATION = 1e-9
+_ZERO_ROTATION_ANGLE = 1e-9
 
-_SAMPLED_SHAPES = 12
+_SAMPLED_SHAPE_COUNT = 12
 """Shapes in general position at which a robot is tested."""
 
 _SINGULAR_VALUE_TOLERANCE = 1e-7
@@ -218,14 +218,14 @@ class GoalSpecification:
         """Refuse attitudes that the joints cannot bring about."""
         axes, name = self.turning.axes, robot.description.name
         tilt = swing_angle(turn, axes)
-        if tilt > max(tolerance, _NO_ROTATION):
+        if tilt > max(tolerance, _ZERO_ROTATION_ANGLE):
             if not len(axes):
                 raise UnreachableError(
                     f"The attitude of robot '{name}' is uncontrollable: its joints do not turn its "
                     f"base, and the goal is turned by {tilt:.4g} rad.",
                     Proof.RANK,
                 )
-            raise tilted_goal(robot, axes[0], tilt)
+            raise tilted_goal_error(robot, axes[0], tilt)
 
     def _turn_on_way_to_shape(
         self, robot: SpaceRobot, turn: Array, start: Array, shape: Array, tolerance: float
@@ -242,7 +242,7 @@ class GoalSpecification:
         rates = [-axis @ robot.connection(start + (1 + node) / 2 * way)[3:] @ way for node in nodes]
         angle = float(weights @ np.array(rates)) / 2
         wanted = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
-        if abs(math.remainder(wanted - angle, 2 * math.pi)) > max(tolerance, _NO_ROTATION):
+        if abs(math.remainder(wanted - angle, 2 * math.pi)) > max(tolerance, _ZERO_ROTATION_ANGLE):
             raise UnreachableError(
                 f"The attitude of robot '{robot.description.name}' is uncontrollable where the "
                 "final shape is given: loops of its joints do not turn its base, and the way to "
@@ -278,7 +278,7 @@ class Turning:
         none = np.zeros((0, 3))
         if robot.n == 0:
             return cls(none, moves=False, loops=False)
-        shapes = sample_shapes(robot, _SAMPLED_SHAPES)
+        shapes = sample_shapes(robot, _SAMPLED_SHAPE_COUNT)
         A = robot.function("connection", compile=False)(shapes.T).full()[3:]
         U, sizes, _ = np.linalg.svd(A, full_matrices=False)
         if sizes[0] <= _MIN_BASE_TURN:
