@@ -23,14 +23,14 @@ _MODULES = {
     "plan": "spacerobot_ros.flight.api",
     "read_bag": "spacerobot_ros.bag",
 }
-"""Modules of the names that are imported when first asked for: the package itself is light."""
+"""Module of each public name, imported on first use so that importing the package stays fast."""
 
 _MIN_SHARED_MEMORY = 16 * 2**10
-"""Bytes of shared memory without which libraries of ROS end the process that loads them."""
+"""Smallest free shared memory, bytes: with less, loading ROS ends the process."""
 
 
 def _warn_of_full_shared_memory() -> None:
-    """Warn of full shared memory: tracing in ROS takes a page of it, or ends with SIGBUS."""
+    """Warn of full shared memory, in which the tracing of ROS ends the process with SIGBUS."""
     try:
         facts = os.statvfs("/dev/shm")
     except OSError:

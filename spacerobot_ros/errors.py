@@ -7,7 +7,7 @@ _LONGEST_MESSAGE = 2000
 
 
 def printable(text: str) -> str:
-    """Return a text of unknown origin in one line and without control characters.
+    """Return a text as one line without control characters.
 
     Terminals act on control characters: texts from topics and bags pass through here before they
     are shown or logged.
@@ -33,32 +33,32 @@ class SpaceRobotError(Exception):
 
 
 class RobotDescriptionError(SpaceRobotError):
-    """A URDF that does not describe a free-floating robot; the message names the element."""
+    """A URDF does not describe a free-floating robot; the message names the element."""
 
 
 class MeshError(SpaceRobotError):
-    """A mesh that is not found or cannot be read; the message says why, and what to do."""
+    """A mesh is missing or cannot be read; the message states the reason and a remedy."""
 
 
 class ParameterError(SpaceRobotError):
-    """A parameter or option whose value is refused; the message names it."""
+    """The value of a parameter or option is refused; the message names the parameter."""
 
 
 class PlanningError(SpaceRobotError):
-    """A goal that is refused or cannot be reached; the message says why."""
+    """A goal is refused or cannot be reached; the message states the reason."""
 
 
 class Proof(Enum):
     """Kinds of proofs that a goal cannot be reached."""
 
     LIMITS = "joint limits"
-    """No shape within them is that of the goal."""
+    """No joint positions within the joint limits put the robot at the goal."""
 
     MOMENTUM = "momentum"
-    """At zero momentum the centre of mass rests, and the goal would move it."""
+    """The goal needs the centre of mass to move, which it cannot do at zero momentum."""
 
     RANK = "rank"
-    """No motion of the joints turns the base so."""
+    """No motion of the joints rotates the base as the goal requires."""
 
 
 class UnreachableError(PlanningError):
@@ -73,16 +73,17 @@ class UnreachableError(PlanningError):
 
 
 class NotFoundError(PlanningError):
-    """A goal to which no manoeuvre was found, which proves nothing.
+    """No manoeuvre to the goal was found; the goal may still be reachable.
 
-    The message says how hard it was tried, and what may help.
+    The message states the extent of the search and a remedy.
     """
 
 
 def refusal_of_all(message: str, refusals: Iterable[Exception]) -> PlanningError:
     """Return one refusal of a goal that several methods have refused.
 
-    A proof of one holds for all; where there is none, one that searched may search longer.
+    A proof by one method holds for all. Without a proof the result is a NotFoundError if one is
+    given.
     """
     refusals = list(refusals)
     for refusal in refusals:
@@ -98,8 +99,8 @@ class GoalError(PlanningError):
 
 
 class RecordingError(SpaceRobotError):
-    """A bag that cannot be written or read; the message says which, where and what to do."""
+    """A bag cannot be written or read; the message names the bag and a remedy."""
 
 
 class CommandError(SpaceRobotError):
-    """A joint command that the plant refuses; the message says why."""
+    """The plant refuses a command; the message states the reason."""

@@ -1,4 +1,4 @@
-"""Events of a flight: one record for each change of state of a node, as the topic events has it."""
+"""Events of a flight: one record for each change of a node's state, as on the topic ``events``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class EventKind(str, Enum):
     CLEANED_UP = "cleaned_up"
     SHUT_DOWN = "shut_down"
     FAILED = "failed"
-    """A node has met an error and works no more until it is configured or activated again."""
+    """A node has failed and does nothing until it is configured or activated again."""
 
     RUNNING = "running"
     RESTING = "resting"
@@ -42,7 +42,7 @@ class EventKind(str, Enum):
     PLAN_TAKEN_OVER = "plan_taken_over"
     """A plan takes over from another one while the joints move."""
     PLAN_LATE = "plan_late"
-    """A plan was not ready at the time at which it was to take over."""
+    """A plan was not ready at the start time of its schedule."""
     CORRECTION = "correction"
     STUCK_JOINT = "stuck_joint"
 
@@ -57,7 +57,7 @@ class EventKind(str, Enum):
 
 @dataclass(frozen=True)
 class Event:
-    """One change of state.
+    """One change of a node's state.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Event:
         Parameters
         ----------
         wall_time_s
-            When it is sent, s since the epoch; None leaves it out.
+            Wall time of the publication, s since the epoch; None leaves the entry out.
         """
         values = {"event": self.kind.value}
         if self.time_s is not None:
@@ -106,13 +106,13 @@ class Event:
         Raises
         ------
         SpaceRobotError
-            They are no event.
+            The pairs are no event.
         """
         given = dict(values)
         try:
             kind, time = EventKind(given.pop("event")), given.pop("time", None)
             time_s = None if time is None else float(time)
         except (KeyError, ValueError) as error:
-            raise SpaceRobotError(f"This is no event of a flight: {error}.") from error
+            raise SpaceRobotError(f"The message is no event of a flight: {error}.") from error
         given.pop("wall_time", None)
         return cls(kind, message, level, time_s, given.pop("goal_id", ""), given)

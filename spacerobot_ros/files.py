@@ -26,7 +26,7 @@ _LOG = logging.getLogger(__name__)
 _OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 _CACHE_MAGIC = b"spacerobot_ros cache 2"
-"""Begins the last line of a file of the cache; the number is that of the format."""
+"""Beginning of the last line of a cache file, with the number of the file format."""
 
 _MAX_PRIVATE_FILE_SIZE = 256 * 2**20
 """Largest file that :func:`read_private` reads, bytes."""
@@ -47,7 +47,7 @@ _logged_warnings: set[str] = set()
 
 
 class UntrustedFileError(SpaceRobotError):
-    """A file or folder that other users may have altered; the message says how to mend it."""
+    """Other users may have altered a file or folder; the message states a remedy."""
 
 
 def warn_once(message: str) -> None:
@@ -76,7 +76,7 @@ def write_whole(path: Path, content: bytes, *, durable: bool = True, mode: int =
     Raises
     ------
     OSError
-        It cannot be written; an older file stays.
+        The file cannot be written; an older file stays.
     """
     new_file = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.new")
     try:
@@ -214,9 +214,9 @@ def read_private(path: Path) -> bytes:
     UntrustedFileError
         It belongs to another user, or others may write it, or it is too large.
     """
-    # A pipe that another user has put there would block the open.
+    # Opening a pipe of another user would block.
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-        # Of the open file, whatever its name stands for by now.
+        # The open file is checked, because its name may stand for another file by now.
         facts = os.fstat(file.fileno())
         if not stat.S_ISREG(facts.st_mode):
             raise UntrustedFileError(f"'{path}' is not a regular file; remove it.")
@@ -242,7 +242,7 @@ def trusted_folder(folder: Path) -> Path:
     _require_own_path(real, real.stat())
     for parent in real.parents:
         mode = parent.stat().st_mode
-        # In a folder with the sticky bit, as /tmp, no user renames files of another.
+        # In a folder with the sticky bit, such as /tmp, users cannot rename each other's files.
         if mode & _OTHERS_MAY_WRITE and not mode & stat.S_ISVTX:
             raise UntrustedFileError(_writable_by_others(parent, mode))
     return real
@@ -272,7 +272,7 @@ def _user_name(number: int) -> str:
 
 
 class Cache:
-    """A folder of files that can be made again. Its methods raise nothing: they warn.
+    """A folder of files that can be computed again. Its methods log warnings instead of raising.
 
     The last line of a file holds its key, length and SHA-256, against disks that get full and
     processes that are killed. The folder and the file must belong to this user, and no other user
@@ -288,7 +288,7 @@ class Cache:
         self.folder = folder
 
     def load(self, name: str, key: str) -> tuple[Path, bytes] | None:
-        """Return path and content of a file that was stored under this key, or None."""
+        """Return path and content of a file stored under this key; None without one."""
         try:
             path = trusted_folder(self.folder) / name
         except UntrustedFileError as error:
@@ -307,7 +307,7 @@ class Cache:
             return None
 
     def store(self, name: str, key: str, content: bytes) -> Path | None:
-        """Store a content under a key; return its path, None if it cannot be stored."""
+        """Store content under a key; return its path, None if storing failed."""
         try:
             _make_private_folder(self.folder)
             path = trusted_folder(self.folder) / name
@@ -323,9 +323,9 @@ class Cache:
         return path
 
     def discard(self, name: str, reason: str) -> None:
-        """Delete a file, and warn with the reason."""
+        """Delete a cached file and log the reason as a warning."""
         path = self.folder / name
-        warn_once(f"'{path}' is thrown away and made anew: {reason.rstrip('.')}.")
+        warn_once(f"'{path}' is deleted and computed again: {reason.rstrip('.')}.")
         with suppress(OSError):
             path.unlink()
 
@@ -354,8 +354,8 @@ def _trailer(content: bytes, key: str) -> bytes:
 
 
 def _content_of_entry(whole: bytes, key: str) -> bytes:
-    """Return the content of a file without its last line; ValueError if that is of another."""
+    """Return a cached file without its last line; ValueError if the line does not match."""
     content = whole[: whole.rfind(b"\n" + _CACHE_MAGIC + b" ")]
     if not whole.endswith(_trailer(content, key)):
-        raise ValueError("it is damaged, or of something else")
+        raise ValueError("it is damaged, or stored under another key")
     return content

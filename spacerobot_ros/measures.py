@@ -21,7 +21,7 @@ from spacerobot_ros.planning.execution.status import PlannerStatus, manoeuvre_ti
 
 
 class Outcome(str, Enum):
-    """The end of a goal; all values but the last are those of ``state`` in a status."""
+    """Outcome of a goal; all values but the last also occur as ``state`` in a status message."""
 
     REACHED = "reached"
     FAILED = "failed"
@@ -38,7 +38,7 @@ class Measures:
     Attributes
     ----------
     outcome, message
-        The end of the goal, and the same for people.
+        Outcome of the goal, and a sentence about it.
     duration
         Simulated time, s.
     manoeuvre_time
@@ -160,12 +160,11 @@ def flown_time(
 
 @dataclass(frozen=True)
 class Metric:
-    """A measure as a column of numbers.
+    """A measure of a flight as a number with a unit.
 
     Attributes
     ----------
-    unit, description
-        For people.
+    ###
     evaluate
         Function of the measures and the robot: a number, NaN where a flight has none; or a number
         for each joint.
@@ -210,14 +209,17 @@ METRICS: dict[str, Metric] = {
         "error", "angle", "rad", "angle between the last true attitude of the base and the goal"
     ),
     "end_effector_position_error_m": _error_metric(
-        "end_effector_error", "distance", "m", "likewise, of the end-effector"
+        "end_effector_error",
+        "distance",
+        "m",
+        "last distance of the end-effector from its goal",
     ),
     "end_effector_attitude_error_rad": _error_metric(
-        "end_effector_error", "angle", "rad", "likewise, of the end-effector"
+        "end_effector_error", "angle", "rad", "last angle of the end-effector from its goal"
     ),
     "duration_s": Metric("s", "simulated time of the flight", lambda m, _: m.duration),
-    "manoeuvre_time_s": Metric("s", "duration of all schedules", lambda m, _: m.manoeuvre_time),
-    "corrections": Metric("", "plans after the first", lambda m, _: float(m.corrections)),
+    "manoeuvre_time_s": Metric("s", "time flown for the last goal", lambda m, _: m.manoeuvre_time),
+    "corrections": Metric("", "corrections by a new plan", lambda m, _: float(m.corrections)),
     "propellant_kg": Metric("kg", "propellant of the thrusters", lambda m, _: m.propellant),
     "peak_rate": Metric(
         "m/s or rad/s", "largest rate of a joint", lambda m, _: m.peak_rate, by_joint=True
@@ -233,7 +235,7 @@ METRICS: dict[str, Metric] = {
     ),
     "joint_margin": Metric(
         "m or rad",
-        "least distance of a joint from its ends",
+        "smallest distance of a joint position from its limits",
         _joint_margin,
         by_joint=True,
         smallest_is_worst=True,

@@ -24,7 +24,7 @@ Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 C = TypeVar("C")
 
 _PARAMETER, _GROUP, _REGISTERED = "parameter", "group", "registered"
-"""Keys of the metadata of a dataclass field: how it was made."""
+"""Metadata keys of dataclass fields: one for each function that makes a field."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,12 @@ class Parameter:
     name
         Full name, with the groups that it is in: ``sensors.joint_noise``.
     default
-        Its value where none is given.
-    unit, description
-        For people.
+        Value when none is set.
+    ###
     minimum, maximum
         Bounds of a number, or of every entry of an array.
     choices
-        The texts that are allowed; empty: any.
+        Allowed texts; empty: any text.
     length
         Entries of an array that is not empty; None: any number of them.
     read_only
@@ -67,12 +66,12 @@ class Parameter:
     of_joints: bool = False
 
     def checked(self, value: Any) -> Value:
-        """Return the value in the parameter's own type.
+        """Return a value converted to the parameter's type.
 
         Raises
         ------
         ParameterError
-            It has another type, is out of range, or is not one of the choices.
+            The value has another type, is out of range, or is not one of the choices.
         """
         default = self.default
         if isinstance(default, bool):
@@ -92,11 +91,11 @@ class Parameter:
     def _check_number(self, value: Any, whole: bool) -> int | float:
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             raise self._refusal(value, "a number")
-        if not -sys.float_info.max <= value <= sys.float_info.max:  # Whole numbers are larger.
+        if not -sys.float_info.max <= value <= sys.float_info.max:  # An int may be larger.
             raise self._refusal(value, "a finite number")
         if whole and value != int(value):
             raise self._refusal(value, "a whole number")
-        if whole and not -(2**63) <= value < 2**63:  # The range of a ROS parameter.
+        if whole and not -(2**63) <= value < 2**63:  # ROS parameters have 64 bits.
             raise self._refusal(float(value), "a whole number of 64 bits")
         if not self.minimum <= value <= self.maximum:
             raise self._refusal(value, f"a number{self._range_text()}")
@@ -170,7 +169,7 @@ def declared(config: type[Any] | Any) -> tuple[Parameter, ...]:
 
 
 def _registered_options(config: Any) -> tuple[tuple[str, type[Any]], ...]:
-    """Return names and option classes of the present registries, to which users add their own."""
+    """Return names and option classes of a configuration's registries, which users may extend."""
     return tuple(
         (entry, type(options))
         for each in fields(config)
@@ -183,7 +182,7 @@ def _registered_options(config: Any) -> tuple[tuple[str, type[Any]], ...]:
 def _declared_in_class(
     config: type[Any], registered_options: tuple[tuple[str, type[Any]], ...]
 ) -> tuple[Parameter, ...]:
-    """Return the parameters of a class; the registries are part of the cache's key."""
+    """Return the parameters of a class; the registry contents are part of the cache key."""
     return declared(config())
 
 
@@ -203,7 +202,7 @@ def configured(kind: type[C], values: Mapping[str, Any]) -> C:
 def reconfigured(config: C, values: Mapping[str, Any]) -> C:
     """Return a configuration with other values by full name; those left out stay as they are.
 
-    Parts that nothing is changed of are the same objects.
+    Unchanged groups stay the same objects.
 
     Raises
     ------
@@ -219,12 +218,12 @@ def values_of(config: Any) -> dict[str, Value]:
 
 
 def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
-    """Refuse names that are no parameter of a configuration.
+    """Raise an error for names that are no parameter of a configuration.
 
     Raises
     ------
     ParameterError
-        There is one; ``owner`` has no such option.
+        A name is unknown; the message says that ``owner`` has no such option.
     """
     unknown = sorted(set(names) - {parameter.name for parameter in declared(config)})
     if unknown:

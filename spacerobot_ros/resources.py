@@ -34,7 +34,7 @@ def share_directory() -> Path:
 
         candidates.insert(0, Path(get_package_share_directory(_PACKAGE)))
     except (ImportError, LookupError, OSError):
-        pass  # Without an ament index (plain pip), the prefix is the place.
+        pass  # Without an ament index (plain pip), the data files are below the prefix.
     for candidate in candidates:
         if (candidate / "urdf").is_dir():
             return candidate
@@ -88,11 +88,11 @@ def robot_file(name: str, beside: Path | None = None) -> Path:
 
 
 def is_path(name: str) -> bool:
-    """Whether a name of a robot is that of a file, by its suffix or folder."""
+    """Whether the name of a robot is a file path: it has a suffix or a folder."""
     return Path(name).suffix in _ROBOT_SUFFIXES or len(Path(name).parts) > 1
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return a sentence, after a blank, that asks for the known name most like this one."""
+    """Return `` Did you mean ...?`` with the most similar known name; empty without one."""
     found = get_close_matches(name, list(known), n=1)
     return f" Did you mean '{found[0]}'?" if found else ""

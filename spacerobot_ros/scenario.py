@@ -42,15 +42,15 @@ CONFIGS: Mapping[str, type[Any]] = {
     "recorder": RecorderConfig,
     "viewer": ViewerConfig,
 }
-"""The nodes that a scenario may set parameters of, and what declares these parameters."""
+"""Configuration class of each node whose parameters a scenario may set."""
 
 NODES = tuple(CONFIGS)
 
 COMMANDERS = ("planner", "coordinated_control")
-"""The nodes that take goals; a scenario runs those that its file has a section for."""
+"""Nodes that accept goals; a scenario runs those that have a section in its file."""
 
 _PARAMETERS_OF_EVERY_NODE = ("autostart", "use_sim_time")
-"""Parameters of every node, beside those of its configuration."""
+"""Parameters that every node has besides those of its configuration."""
 
 _GOAL_NAMES = ("goal", "end_effector_goal")
 _SCENARIO_KEYS = (
@@ -99,9 +99,9 @@ class Scenario:
     name, path, description
         Name, path and description of the parameter file.
     goal, end_effector_goal
-        Goal poses of the base and of the end-effector.
+        ###
     commanders
-        The nodes that fly to them.
+        Nodes that command the robot to the goals.
     published, published_method
         Figures of a publication, and the gait method that they hold for; empty: any.
     kills
@@ -127,11 +127,11 @@ class Scenario:
     )
     has_goal: bool = True
     _configs: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """Results of :meth:`config`, by node."""
+    """Cached results of :meth:`config` by node."""
     _changes: dict[str, tuple[Any, dict[str, Any]]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
-    """By node, a configuration of another scenario and the parameters that differ in this one."""
+    """For each node: configuration of the original scenario, and parameters changed since."""
 
     def config(self, node: str) -> Any:
         """Return the configuration of a node: defaults, the file's parameters, the overrides.
@@ -162,7 +162,7 @@ class Scenario:
             raise ParameterError(f"Node '{node}': {error}") from error
 
     def _parameters_as_written(self, node: str) -> dict[str, Any]:
-        """Return the parameters of a node in the file and the overrides, as written there."""
+        """Return the parameters of a node in the file and the overrides, before type conversion."""
         return {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
 
     @property
@@ -200,7 +200,7 @@ class Scenario:
         """
         values = values_of(self.config(node))
         written = self._parameters_as_written(node)
-        # An empty list is every list's default, and has no type that ROS could know it by.
+        # ROS cannot infer the type of an empty list, which is the default of every list anyway.
         typed = {name: values[name] for name in written if values.get(name, ()) != ()}
         if "use_sim_time" in written:
             typed["use_sim_time"] = bool(written["use_sim_time"])
@@ -283,19 +283,19 @@ class Scenario:
         return self._replace_fields(goal=goal, end_effector_goal=end_effector_goal)
 
     def _replace_fields(self, **changes: Any) -> Scenario:
-        """Return another scenario with the configurations that are known of this one."""
+        """Return a changed copy of the scenario, which reuses the configurations already made."""
         made = replace(self, **changes)
         made._configs.update(self._configs)
         made._changes.update(self._changes)
         return made
 
     def in_real_time(self, factor: float) -> Scenario:
-        """Return the scenario in real time, a factor faster, with planning in the background."""
+        """Return the scenario in real time times a factor, with planning in the background."""
         pace = {"time_mode": "realtime", "real_time_factor": factor}
         scenario = self.with_overrides("plant", pace)
         if "planner" in self.commanders:
             scenario = scenario.with_overrides("planner", {"plan_in_background": True})
-        # Viewers follow wall time; the plant adapts its own topics to that.
+        # Viewers need transforms at a rate in wall time, as the plant already publishes its topics.
         shown = {"diagnostics_period": 1.0}
         period = self.config("recorder").tf_period
         if period:
@@ -367,7 +367,7 @@ class Scenario:
         return replace(self, goal=goal, published=(), has_goal=True)
 
     def require_goal(self) -> None:
-        """Refuse a scenario without a goal, as that of a robot alone.
+        """Raise an error if the scenario has no goal, such as one made from a robot file.
 
         Raises
         ------
@@ -450,7 +450,7 @@ def load_scenario(name: str) -> Scenario:
 
 
 def _with_robot_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Return parameters of a scenario file, with a robot that is a file beside it by its path."""
+    """Return the parameters of a scenario file; a robot file beside it is named by its path."""
     robot = values.get("robot")
     if isinstance(robot, str) and is_path(robot) and (path.parent / robot).is_file():
         return {**values, "robot": str((path.parent / robot).resolve())}
@@ -476,7 +476,7 @@ def scenario_or_robot(name: str) -> Scenario:
     if name in scenario_names() or not is_robot:
         return load_scenario(name)
     path = path if path.is_file() else robot_file(name)
-    load_robot(path)  # Another file is refused before a goal is asked for.
+    load_robot(path)  # A file that is no robot is refused before its missing goal.
     robot = {"robot": str(path.resolve()) if path == Path(name) else name}
     return _scenario_without_goal(path.name.split(".")[0], path, robot)
 
@@ -504,12 +504,12 @@ def scenario_names() -> list[str]:
 
 
 def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
-    """Read ``NODE at SECONDS [until SECONDS]``, a list of such lines, by time.
+    """Return the kills in lines ``NODE at SECONDS [until SECONDS]``, sorted by time.
 
     Raises
     ------
     ParameterError
-        A line is none, its node is none that may be killed, or its times are not in order.
+        A line has another form, its node cannot be killed, or its times are not in order.
     """
     if not isinstance(lines, list):
         raise ParameterError(
@@ -638,7 +638,7 @@ def parse_setting(text: str) -> tuple[str, str, Any]:
 
 
 def number_in(text: str) -> float | str:
-    """Return the number in a text, if it is one: YAML wants a dot in 1e-3, people do not."""
+    """Return the number that a text states, else the text; unlike YAML, 1e-3 counts as a number."""
     try:
         return float(text)
     except ValueError:
@@ -646,7 +646,7 @@ def number_in(text: str) -> float | str:
 
 
 def _flatten_section(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return parameters by full name: a map within a section is a group of them."""
+    """Return parameters by full name; a mapping within a section is a parameter group."""
     flat: dict[str, Any] = {}
     for key, value in section.items():
         if isinstance(value, dict):

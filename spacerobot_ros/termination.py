@@ -34,22 +34,22 @@ _MESSAGE_BY_SIGNAL = {
 }
 
 _UNWINDING_TIME = 1.2
-"""Wall time that the main thread has to end after the exception of a signal, s."""
+"""Wall time within which the main thread must end after a signal's exception, s."""
 
 _NOTICE_TIME = 5.0
 """Wall time in which work must notice a request, s: a plan may have to end first."""
 
 _TIME_WITHOUT_PARENT = 1.7
-"""Wall time that a process has to end without its parent, s."""
+"""Wall time within which a process must end after its parent has ended, s."""
 
 _SAME_SIGNAL_TIME = 0.5
-"""Signals closer together count as one, wall s: launchers and terminals both send them."""
+"""Wall time between signals that count as one, s: launcher and terminal both send a signal."""
 
 _KILL_WAIT = 0.3
 """Longest wait for the end of killed processes, wall s."""
 
 _LIFELINE_VARIABLE = "SPACEROBOT_LIFELINE"
-"""Environment variable of a child: the pipe that its parent holds open, and who that is."""
+"""Environment variable of a child: process id of its parent, and a pipe held open by the parent."""
 
 _PARENT_ENDED_SIGNAL = signal.SIGUSR2
 """Signal of the kernel to a child whose parent has ended (Linux)."""
@@ -79,7 +79,7 @@ class Terminated(KeyboardInterrupt):
 
 
 class _Request(NamedTuple):
-    """Functions to call on a signal: in the main thread, and at once in the guard's thread."""
+    """Functions called on a signal: one in the main thread, one at once in the guard's thread."""
 
     main: Callable[[], None]
     at_once: Callable[[], None]
@@ -90,7 +90,7 @@ class _Guard:
 
     def __init__(self, *, announcing: bool) -> None:
         self.number: int | None = None
-        """The signal that ends the process."""
+        """###"""
         self.request: _Request | None = None
         self.tools: set[subprocess.Popen[bytes]] = set()
         self._announcing = announcing
@@ -118,7 +118,7 @@ class _Guard:
             self._on_parent_end()
 
     def remove(self) -> None:
-        """Restore the signal handlers from before."""
+        """Restore the earlier signal handlers."""
         self.restore_stderr()
         signal.set_wakeup_fd(self._wakeup)
         for number, handler in self._handlers.items():
@@ -135,14 +135,14 @@ class _Guard:
         return self.number is not None
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        """Python's handler, in the main thread as soon as that runs Python again."""
+        """Handle a signal in the main thread, as soon as it executes Python code."""
         self._note_signal(number)
         if self.request is not None:
             self.request.main()
         elif not self._raised:
             self._raised = True
             if self._announcing:
-                # Libraries that the exception passes, such as a solver, write warnings.
+                # Libraries such as a solver print warnings when the exception passes through them.
                 self._errors, sys.stderr = sys.stderr, io.StringIO()
             raise Terminated(number)
 
@@ -295,7 +295,7 @@ def announce(ending: Terminated) -> None:
     """Write the signal that ends this process to standard error, if that is still open."""
     if _guard is not None:
         _guard.restore_stderr()
-    with suppress(OSError):  # The terminal may be gone.
+    with suppress(OSError):  # The terminal may be closed.
         sys.stderr.write(f"{ending}\n")
         sys.stderr.flush()
 
@@ -316,7 +316,7 @@ def child_options(environment: Mapping[str, str] | None = None) -> dict[str, Any
 def start_child(
     words: Sequence[str], environment: Mapping[str, str] | None = None, **options: Any
 ) -> subprocess.Popen[bytes]:
-    """Start Python with these words, in a session of its own; it ends with this process.
+    """Start Python with arguments ``words`` as a new session, which ends with this process.
 
     ``options`` are those of ``subprocess.Popen``; see :func:`child_options` for ``environment``.
     """
@@ -329,7 +329,7 @@ def start_child(
 def run_child(
     words: Sequence[str], environment: Mapping[str, str] | None = None, **options: Any
 ) -> subprocess.CompletedProcess[str]:
-    """Run Python with these words to its end, or to that of this process; return its output."""
+    """Run Python with arguments ``words`` until it or this process ends; return its output."""
     import subprocess
 
     own = child_options(environment)
@@ -418,7 +418,7 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
 
 def _kill_tool(process: subprocess.Popen[bytes]) -> None:
     """Kill a tool and its children."""
-    # Its session may not be there yet; closing the pipe then does the rest.
+    # If the session does not exist yet, closing the pipe ends the tool.
     with suppress(OSError):
         os.killpg(process.pid, signal.SIGKILL)
     process.kill()
@@ -454,13 +454,13 @@ os._exit(code)
 
 @cache
 def _lifeline() -> int:
-    """Return the end of a pipe that children read; the other end is closed with this process."""
+    """Return the read end of a pipe for children; its write end closes when this process ends."""
     reader, _ = os.pipe()
     return reader
 
 
 def _own_lifeline() -> tuple[int | None, int]:
-    """Return the pipe that a parent of ours holds open, None without one, and the parent."""
+    """Return the pipe (None: no pipe) that the parent process holds open, and the parent's id."""
     text = os.environ.pop(_LIFELINE_VARIABLE, "")
     if not text:
         return None, 0
@@ -470,7 +470,7 @@ def _own_lifeline() -> tuple[int | None, int]:
 
 
 def _die_with_parent() -> None:
-    """Have the kernel send a signal when the parent ends, where it can."""
+    """Let the kernel (Linux) send a signal to this process when its parent ends."""
     with suppress(ImportError, OSError, AttributeError):
         import ctypes
 

@@ -42,7 +42,7 @@ def first_time_ns(raw: bytes) -> int:
     """Return the time at the beginning of a serialised message, limited to 0 ... LATEST_NS, ns."""
     seconds, nanoseconds = unpack_stamp(raw)
     time_ns: int = seconds * SECOND + nanoseconds
-    # Once for every message: three comparisons take less time than min and max.
+    # This runs for every message: three comparisons take less time than min and max.
     return time_ns if 0 <= time_ns <= LATEST_NS else 0 if time_ns < 0 else LATEST_NS
 
 
@@ -52,5 +52,5 @@ def stamp_to_ns(stamp: Any) -> int:
 
 
 def set_stamp(stamp: Any, time_ns: int) -> None:
-    """Set a builtin_interfaces/Time or Duration object to a time; later ones become the latest."""
+    """Set a builtin_interfaces/Time or Duration object to a time, at most ``LATEST_NS``."""
     stamp.sec, stamp.nanosec = divmod(min(time_ns, LATEST_NS), SECOND)

@@ -1,6 +1,6 @@
 """Table of all topics, from which publishers, reports and documents are made.
 
-Of the topics on which the plant publishes its state the table also says which numbers they carry:
+For the plant's state topics the table also lists the numbers in their messages:
 the plant's publisher and the re-simulation of a bag read it. A new one is an entry here and a
 quantity in :mod:`spacerobot_ros.simulation.sensors`.
 """
@@ -41,7 +41,7 @@ class StateField:
 
     @property
     def columns(self) -> list[str]:
-        """Paths of the numbers in a message, or that of the array."""
+        """Paths of the numbers in a message, or the path of an array."""
         return [f"{self.path}.{member}" for member in self.members] or [self.path]
 
     def labels(self, names: Sequence[str]) -> list[str]:
@@ -66,7 +66,7 @@ class Topic:
     Attributes
     ----------
     name
-        Below the namespace of its robot, or absolute.
+        Name of the topic, relative to the namespace of its robot or absolute.
     type
         Name of the message type, such as ``nav_msgs/msg/Odometry``.
     publishers
@@ -364,7 +364,7 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TOPIC_TABLE}
 """Every topic of the stack by its name; those of the plant in the order of publication."""
 
 GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
-"""Absolute names; where a stack is in a namespace they are put into it, so that it has its own."""
+"""Topics with absolute names; a stack in a namespace remaps them into the namespace."""
 
 NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/heartbeat")
 """Endings of topics that are recorded only on request."""

@@ -15,12 +15,12 @@ class RecorderConfig(WatchdogConfig):
     bag: str = parameter("", "file to write; '': spacerobot-<date>-<time>.mcap here")
     when_exists: str = parameter(
         "next",
-        "where a bag of that name is there: take the next free name (NAME-1, NAME-2, ...), or "
-        "refuse to start; it is never written over",
+        "if a bag of this name exists: take the next free name (NAME-1, NAME-2, ...), or "
+        "refuse to start; no bag is ever overwritten",
         choices=("next", "refuse"),
     )
     topics: str = parameter("", "names to record, separated by spaces; '': all of the stack")
-    compression: str = parameter("zstd", "of the bag's chunks", choices=("zstd", "lz4", "none"))
+    compression: str = parameter("zstd", "compression of chunks", choices=("zstd", "lz4", "none"))
     clock_wait: float = parameter(
         2.0, "wall time to wait for a clock before using the wall's", unit="s"
     )
@@ -36,13 +36,16 @@ class RecorderConfig(WatchdogConfig):
         minimum=0.0,
     )
     flush_period: float = parameter(
-        0.5, "wall time that a kill can lose at most", unit="s", minimum=0.01
+        0.5, "longest wall time of messages that a killed recorder loses", unit="s", minimum=0.01
     )
     max_size: float = parameter(
-        0.0, "begin the next file (NAME_0, NAME_1, ...) at; 0: never", unit="MB", minimum=0.0
+        0.0,
+        "size of a file at which NAME_0, NAME_1, ... are split; 0: never",
+        unit="MB",
+        minimum=0.0,
     )
     max_duration: float = parameter(
-        0.0, "bag time in a file, likewise; 0: never", unit="s", minimum=0.0
+        0.0, "bag time after which the next file begins; 0: never", unit="s", minimum=0.0
     )
 
 
@@ -52,9 +55,9 @@ class ReplayConfig:
 
     bag: str = parameter("", "MCAP file to replay, or a folder with one")
     rate: float = parameter(1.0, "bag time over wall time", minimum=0.001, maximum=1000000.0)
-    start: float = parameter(0.0, "where to begin, from the first message", unit="s", minimum=0.0)
+    start: float = parameter(0.0, "start, from the first message", unit="s", minimum=0.0)
     duration: float = parameter(0.0, "how much of the bag to replay; 0: all", unit="s", minimum=0.0)
-    loop: bool = parameter(False, "begin again at the end")
+    loop: bool = parameter(False, "repeat the replay when it ends")
     topics: str = parameter("", "names to replay, separated by spaces; '': all")
     remap: str = parameter("", "other names for topics: 'old:=new', separated by spaces")
     clock: float = parameter(

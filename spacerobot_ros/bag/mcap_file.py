@@ -180,11 +180,11 @@ def _duration_lines(name: str, nanoseconds: int) -> tuple[str, str, str]:
 
 _MAX_YAML_CHARACTERS = 65_536
 _MAX_YAML_DEPTH = 8
-"""Levels of lists and mappings: a list of profiles, each with durations, has three."""
+"""Deepest YAML nesting read: a list of profiles with durations has three levels."""
 
 
 def _require_flat_yaml(text: str) -> None:
-    """Raise ValueError for YAML that is deeply nested, or multiplies itself by references."""
+    """Raise ValueError for YAML that is deeply nested or repeats parts of itself by references."""
     if len(text) > _MAX_YAML_CHARACTERS:
         raise ValueError(f"it is longer than {_MAX_YAML_CHARACTERS} characters")
     depth = 0
@@ -221,12 +221,12 @@ METADATA_NAME = "rosbag2"
 """Name of the MCAP Metadata record that ``ros2 bag info`` and ``ros2 bag play`` read first."""
 
 _METADATA_KEY = "serialized_metadata"
-"""Its only key."""
+"""Only key of the rosbag2 metadata record."""
 
-# The first one whose QoS policies are words; a reader that finds no version takes them for numbers.
+# First version with QoS policies as words; without a version readers expect numbers.
 _METADATA_VERSION = 9
 
-# What every YAML reader takes for a string without quotes: such words, but for these.
+# Strings that every YAML reader accepts without quotes, except for YAML's keywords.
 _UNQUOTED_STRING = re.compile(r"[A-Za-z/][\w./-]*", re.ASCII)
 _YAML_KEYWORDS = {"false", "n", "no", "null", "off", "on", "true", "y", "yes"}
 
@@ -296,14 +296,14 @@ def _yaml_string(text: str) -> str:
 
 
 _COMPRESSIONS = {"zstd": "zstd", "lz4": "lz4", "none": ""}
-"""Our name of each compression -> its name in the file."""
+"""Name of each compression in this package -> its name in the MCAP file."""
 
 _MESSAGE_INDEX_HEADER = struct.Struct("<BQHI")
 
 
 def _compression_function(compression: str) -> Callable[[bytes | bytearray], bytes]:
     if compression == "zstd":
-        # One for each file, because two threads must not share one. Level -1 makes
+        # Each file has its own compressor, because two threads must not share one. Level -1 makes
         # telemetry 1 to 4 % larger than level 1 and 3 to 8 % larger than level 3, in half the
         # time of level 3.
         return zstandard.ZstdCompressor(level=-1).compress
@@ -311,11 +311,11 @@ def _compression_function(compression: str) -> Callable[[bytes | bytearray], byt
 
 
 class BagExistsError(RecordingError):
-    """A bag that exists and is not to be overwritten."""
+    """The bag file exists and must not be overwritten."""
 
 
 def _create_locked_file(path: Path, overwrite: bool) -> io.FileIO:
-    """Open a regular, empty, locked file; BagExistsError where it is not to be overwritten."""
+    """Create an empty, locked, regular file; BagExistsError if the file must not be overwritten."""
     with suppress(FileNotFoundError):
         require_regular(os.stat(path).st_mode, path, "make")
     flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
@@ -334,7 +334,7 @@ def _create_locked_file(path: Path, overwrite: bool) -> io.FileIO:
         raw.close()
         raise BagExistsError(f"The bag {path} is being written by another recorder.") from error
     except OSError as error:
-        # Some file systems of networks have no locks; a file that was there is refused there.
+        # Some network file systems have no locks: an existing file is then refused.
         if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
             raw.close()
             raise
@@ -346,7 +346,7 @@ def _create_locked_file(path: Path, overwrite: bool) -> io.FileIO:
 
 
 def encode(record: McapRecord) -> bytes:
-    """Return the bytes of one record."""
+    """Return an MCAP record as bytes."""
     builder = RecordBuilder()
     record.write(builder)
     return bytes(builder.end())
@@ -384,7 +384,7 @@ class McapFile:
         self.end_ns: int | None = None
         self._compression = _COMPRESSIONS[compression]
         self._compress = _compression_function(compression)
-        self._chunk_indexes: list[bytes] = []  # Encoded: a long flight has many.
+        self._chunk_indexes: list[bytes] = []  # Encoded, because a long flight has many.
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._size = 0
@@ -402,11 +402,11 @@ class McapFile:
 
     @property
     def size(self) -> int:
-        """How many bytes the file has."""
+        """Size of the file, bytes."""
         return self._size
 
     def check(self) -> None:
-        """Check that the path still leads to this file, uncut; RecordingError where it does not."""
+        """Check that the path still names this file, uncut; else raise RecordingError."""
         problem = ""
         try:
             ours, theirs = os.fstat(self._raw.fileno()), os.stat(self.path)

@@ -46,19 +46,19 @@ INFLATED_SIZE_VARIABLE = "SPACEROBOT_BAG_LIMIT"
 """Environment variable: how many MB a bag may inflate to, however small its file is."""
 
 _DEFAULT_LIMIT_MB = 32.0
-"""Its default, MB."""
+"""Default limit of the inflated size of a bag, MB."""
 
 _MAX_INFLATION_RATIO = 200
-"""Largest ratio of the inflated size of a bag to its file, beyond the limit above. Telemetry has
+"""Largest ratio of inflated size to file size of a bag above the limit in MB. Telemetry has
 3 to 40, bags made to fill the memory 1000 and more."""
 
 RECORD_HEADER = struct.Struct("<BQ")
-"""Opcode, and the length of the body."""
+"""Head of an MCAP record: opcode and length of the body in bytes."""
 
 _UINT64 = struct.Struct("<Q")
 
 _CHUNK_HEAD = struct.Struct("<QQQI")
-"""The head of a chunk: times, size and checksum of its content."""
+"""Head of an MCAP chunk: times, size and checksum of its content."""
 
 DAMAGE_ERRORS = (
     McapError,
@@ -84,7 +84,7 @@ _FILE_KINDS = (
 
 
 def require_regular(mode: int, path: Path, action: str = "read") -> None:
-    """Raise RecordingError for what is no regular file: a pipe blocks, a device takes harm."""
+    """Raise RecordingError unless a file is regular: pipes block, devices may be damaged."""
     if not stat.S_ISREG(mode):
         kind = next((words for test, words in _FILE_KINDS if test(mode)), "no file")
         raise RecordingError(f"Cannot {action} the bag {path}: it is {kind}.")
@@ -101,7 +101,7 @@ def open_file(path: Path) -> Iterator[BinaryIO]:
     """
     try:
         require_regular(os.stat(path).st_mode, path)
-        # It may have become a pipe meanwhile.
+        # A pipe may have replaced the file since the first check.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with open(descriptor, "rb") as file:
             require_regular(os.fstat(descriptor).st_mode, path)
@@ -153,7 +153,7 @@ def _require_both_ends(path: Path, file: BinaryIO) -> None:
 
 
 def file_size(file: BinaryIO) -> int:
-    """Return how many bytes a file has; where it is read next stays."""
+    """Return the size of an open file in bytes, leaving its read position."""
     place = file.tell()
     size = file.seek(0, os.SEEK_END)
     file.seek(place)
@@ -184,21 +184,21 @@ def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int, int]]:
         if end > size:
             raise ValueError(f"a record reaches out of the chunk at byte {place}")
         if not opcode:
-            # Or a chunk of zeros would be millions of them.
+            # Otherwise a chunk of zeros would count as millions of records.
             raise ValueError(f"the chunk at byte {place} has records of no kind")
         yield opcode, position, end
         position = end
 
 
 def read_record(file: BinaryIO, place: int, expected: Opcode) -> bytes:
-    """Return the body of the record of a kind that begins at a byte of a file."""
+    """Return the body of the record at byte ``place`` of a file, which must be of a kind."""
     end = file_size(file)
     if place + RECORD_HEADER.size > end:
         raise ValueError(f"its index names byte {place}, and it has {end} bytes")
     file.seek(place)
     opcode, length = _read_record_header(file, place, end)
     if opcode != expected:
-        raise ValueError(f"there is no {expected.name.lower()} at byte {place}")
+        raise ValueError(f"the file has no {expected.name.lower()} at byte {place}")
     return file.read(length)
 
 
@@ -238,7 +238,7 @@ class InflationLimit:
 
     def __init__(self, compressed: int) -> None:
         self.max_bytes = max(round(1e6 * _limit_mb()), _MAX_INFLATION_RATIO * compressed)
-        """In bytes."""
+        """Largest inflated size of all chunks together, bytes."""
         self._inflated_size = 0
 
     def count(self, size: int, place: int) -> None:
@@ -261,7 +261,7 @@ def _limit_mb() -> float:
 
 
 def chunk_size(body: bytes) -> int:
-    """Return how many bytes a chunk claims to hold; struct.error where it is too short for one."""
+    """Return the inflated size stated in a chunk, bytes; struct.error for a truncated chunk."""
     return int(_CHUNK_HEAD.unpack_from(body)[2])
 
 
@@ -305,7 +305,7 @@ def _unpack_zstd(data: bytes, size: int) -> bytes:
 def _unpack_lz4(data: bytes, size: int) -> bytes:
     if not data and not size:
         return b""
-    # One byte more shows that there is more.
+    # One more byte shows whether the chunk is larger than stated.
     return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
 
 
@@ -314,11 +314,11 @@ _DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
     "lz4": _unpack_lz4,
     "": lambda data, _: data,
 }
-"""Each takes the compressed data and how large they were, and returns at most one byte more."""
+"""Decompressor by name: it takes the data and their stated size; returns one byte more at most."""
 
 
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
-"""Opcode, length of the rest, channel, sequence, log time, publish time."""
+"""Head of a message record: opcode, length, channel, sequence, log time, publish time."""
 
 _MESSAGE_BODY = struct.Struct("<HIQQ")
 _MESSAGE_INDEX_HEAD = struct.Struct("<HI")
@@ -333,10 +333,10 @@ _SUMMARY_PARSERS: dict[int, Callable[[ReadDataStream], Any]] = {
     Opcode.CHUNK_INDEX: ChunkIndex.read,
     Opcode.METADATA_INDEX: MetadataIndex.read,
 }
-"""Records of a summary that are read; its offsets would save no time."""
+"""Parser of each record kind that is read from a summary."""
 
 RawMessage = tuple[int, int, int, bytes]
-"""Channel, log time and publish time in nanoseconds, serialised message."""
+"""A recorded message: channel, log time and publish time in ns, serialised bytes."""
 
 
 # -- summary ----------------------------------------------------------------------------------
@@ -450,13 +450,13 @@ def messages_in_time_order(
     summary
         Summary of the bag, where that was read before.
     """
-    # The largest time that the columns of this package hold: the year 2262.
+    # Latest time that an int64 of nanoseconds holds: the year 2262.
     start_ns, end_ns = min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS)
     with open_bag(Path(path)) as file:
         summary = summary or read_summary(Path(path), file)
         indexes = summary.chunk_indexes
         if not indexes or not all(index.message_index_offsets for index in indexes):
-            # Written without chunks or without message indexes.
+            # The bag has no chunks or no message indexes.
             wanted = [
                 message
                 for message in messages_in_file_order(file)
@@ -471,7 +471,7 @@ def messages_in_time_order(
 def _overlapping_chunks(
     summary: Summary, channel_ids: set[int], start_ns: int, end_ns: int
 ) -> Iterator[list[ChunkIndex]]:
-    """Group the chunks that hold these messages: those of a group overlap in time."""
+    """Group the chunks that hold the selected messages; the chunks of a group overlap in time."""
     selected = [
         index
         for index in summary.chunk_indexes
@@ -483,7 +483,7 @@ def _overlapping_chunks(
     latest = farthest = 0
     for index in sorted(selected, key=lambda i: (i.message_start_time, i.chunk_start_offset)):
         start = index.message_start_time, index.chunk_start_offset
-        # Of equal times the messages of chunks that were written before come first.
+        # Among messages of equal time, those of earlier chunks come first.
         if cluster and start >= (latest, farthest):
             yield cluster
             cluster = []
@@ -520,7 +520,7 @@ def _messages_in_chunks(
 def _chunk_and_entries(
     file: BinaryIO, index: ChunkIndex, channel_ids: set[int]
 ) -> tuple[bytes, NDArray[np.uint64]]:
-    """Return the records of a chunk; log time and offset in it of each selected message (N, 2)."""
+    """Return a chunk's records, and the log time and offset of each selected message (N, 2)."""
     place = index.chunk_start_offset
     body = read_record(file, place, Opcode.CHUNK)
     if chunk_size(body) != index.uncompressed_size:
@@ -542,7 +542,7 @@ def _chunk_and_entries(
 
 
 def _check_entries(chunk: bytes, positions: NDArray[np.uint64], place: int) -> None:
-    """Check that offsets in a chunk (N,) are those of messages that do not overlap."""
+    """Check that the offsets (N,) in a chunk begin messages that do not overlap."""
     if not len(positions):
         return
     wrong = f"the message indexes of the chunk at byte {place} do not fit it"

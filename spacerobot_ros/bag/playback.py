@@ -13,10 +13,10 @@ from spacerobot_ros.times import SECOND
 
 _LATEST_TIME_NS = 2**63 - 1
 _SHOWN_AFTER_JUMP_NS = SECOND
-"""How old a message may be that is shown again after a jump."""
+"""Greatest age of a message that is published again after a jump of the replay, ns."""
 
 _MAX_REPLAYED_TOPICS = 1000
-"""Against bags made to harm: each topic takes a publisher, memory and discovery."""
+"""Largest number of replayed topics: each one needs a publisher, memory and discovery."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class ReplayStatus:
     Attributes
     ----------
     position_s, duration_s
-        Time since the first message that is replayed, and from there to the last, s.
+        Time of the replay since its first message, and time from its first to its last message, s.
     paused, ended
-        Whether it stands still, and whether nothing is left.
+        Whether the replay is paused, and whether all messages have been published.
     rate
         Seconds of the bag in a second of the wall clock.
     """
@@ -76,7 +76,7 @@ class ReplayStatus:
             position, duration = float(values["position_s"]), float(values["duration_s"])
             rate = float(values["rate"])
         except (KeyError, ValueError) as error:
-            raise SpaceRobotError(f"This is no status of a replay: {error}.") from error
+            raise SpaceRobotError(f"The message is no status of a replay: {error}.") from error
         return cls(position, duration, state != "playing", state == "ended", rate)
 
 
@@ -155,7 +155,7 @@ class ReaderWait:
         self._waited = self._quiet = 0.0
 
     def check(self, matched: Sequence[int], known: Sequence[int]) -> bool:
-        """Return whether to begin, given the readers of each topic: matched ones, and all known."""
+        """Return whether to begin, given the counts of matched and known readers by topic."""
         readers = sum(matched)
         self._waited += self._period
         self._quiet = self._quiet + self._period if readers == self._readers else 0.0
@@ -255,7 +255,7 @@ class Playback:
 
     @property
     def ended(self) -> bool:
-        """Whether no message is left."""
+        """Whether all messages have been replayed."""
         return self._next_message is None
 
     @property
@@ -268,7 +268,7 @@ class Playback:
         now = self._timeline.bag_time(clock_ns)
         if self._next_message is None:
             return now
-        # Messages still to come are late, not skipped.
+        # Pending messages are published late, not skipped.
         return min(now, max(self._next_message.log_time_ns, self._start_ns))
 
     def run(self, clock_ns: int) -> None:
@@ -295,13 +295,13 @@ class Playback:
         return taken
 
     def next_due_time(self) -> int | None:
-        """Return the clock's time of the next message; None when there is none, or time stands."""
+        """Return the clock time of the next message, ns; None at the end or during a pause."""
         if self._next_message is None or not self._timeline.running:
             return None
         return self._timeline.clock_time(self._next_message.log_time_ns)
 
     def step(self, clock_ns: int) -> ReplayMessage | None:
-        """Take the next message now, whenever it is due; None at the end."""
+        """Return the next message before it is due; None at the end of the replay."""
         if self._next_message is None:
             return None
         self._timeline.seek(max(self._next_message.log_time_ns, self._start_ns), clock_ns)
@@ -333,7 +333,7 @@ class Playback:
         )
         self._timeline.seek(at, clock_ns)
         self._next_message = next(self._remaining_messages, None)
-        # In the order in which they were published, and no later than what comes next.
+        # Sorted by publication; none is later than the next message of the replay.
         ordered = sorted(last.values(), key=lambda message: message.log_time_ns)
         return [replace(message, log_time_ns=at) for message in ordered]
 
@@ -344,11 +344,11 @@ class Playback:
 
     @property
     def duration_s(self) -> float:
-        """From there to the last message, s."""
+        """Time from the first to the last replayed message, s."""
         return (self._last_ns - self._start_ns) / SECOND
 
     def close(self) -> None:
-        """Close the bag; nothing is left to play."""
+        """Close the bag; the replay has no more messages."""
         self._remaining_messages.close()
         self._next_message = None
 
@@ -357,7 +357,7 @@ class Playback:
         assert message is not None
         self._next_message = next(self._remaining_messages, None)
         if self._next_message is None and self._loop:
-            # The next turn begins at the very time of the last message.
+            # A repeated replay begins at the log time of the last message.
             last = max(message.log_time_ns, self._start_ns)
             self._timeline.seek(self._start_ns, self._timeline.clock_time(last))
             self._remaining_messages = self._messages(self._start_ns)

@@ -1,4 +1,4 @@
-"""Reads a bag as time series, and of these the topics of one robot."""
+"""Reads a bag as time series: all topics, or the topics of one robot."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _DefaultT = TypeVar("_DefaultT")
 _STRING_TYPE = "std_msgs/msg/String"
 
 _DECODABLE_BYTES, _DECODABLE_RATIO = 16_000_000, 50
-"""Bytes of a topic that may become objects, which take ten times as much: so many, or so many times
+"""Largest size of a decoded topic, whose objects take ten times as much: bytes, or how many times
 the size of the file."""
 
 
@@ -118,7 +118,7 @@ class Bag:
 
     @cached_property
     def topics(self) -> dict[str, str]:
-        """Name and type of every topic, with messages or without."""
+        """Type of every recorded topic by its name, including topics without messages."""
         channels = self._summary.channels.values()
         return {c.topic: _type_name(self._summary.schemas, c) for c in channels}
 
@@ -187,7 +187,7 @@ class Bag:
         ]
 
     def _recorded_name(self, topic: str) -> str:
-        """Return the name as recorded of a topic named with or without the slash before it."""
+        """Return the recorded name of a topic, which may be given without its leading slash."""
         if not isinstance(topic, str):
             raise TypeError(f"A topic is named by a text, such as 'odom', and not by {topic!r}.")
         other = topic[1:] if topic.startswith("/") else f"/{topic}"
@@ -195,7 +195,7 @@ class Bag:
 
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Keys and values of every metadata record by its name; the last of several of one name."""
+        """Keys and values of every metadata record by its name; of equal names the last counts."""
         with open_bag(self.path) as file:
             found = indexed_records(file, self._summary.metadata_indexes, Opcode.METADATA)
             read = (parse_record(Metadata.read, body, place) for place, body in found)
@@ -203,7 +203,7 @@ class Bag:
 
     @cached_property
     def attachments(self) -> dict[str, bytes]:
-        """Content of every attachment by its name; the last of several of one name."""
+        """Content of every attachment by its name; of equal names the last counts."""
         with open_bag(self.path) as file:
             found = indexed_records(file, self._summary.attachment_indexes, Opcode.ATTACHMENT)
             read = (parse_record(Attachment.read, body, place) for place, body in found)
@@ -237,7 +237,7 @@ class Bag:
         return sum(counts.get(channel.id, 0) for channel in self._channels(topic))
 
     def channel_ids(self, topic: str) -> set[int]:
-        """Return the numbers under which a topic's messages are in the file."""
+        """Return the MCAP channel numbers of a topic's messages."""
         return {channel.id for channel in self._channels(topic)}
 
     def raw_messages(
@@ -298,14 +298,15 @@ class Bag:
         return {name: to_xarray(self.table(name)) for name in self}
 
     def table(self, topic: str) -> TopicTable:
-        """Return a topic as a table; the units of joints are those of the robot in the bag."""
+        """Return a topic as a table; the units of joints follow the URDF in the bag."""
         series = self[topic]
         return table_of(series, self._prismatic_joints(series.topic.rpartition("/")[0]))
 
     def robot_descriptions(self, namespace: str = "") -> list[bytes]:
-        """Return what may be the URDF of the robot in a namespace, the likeliest first.
+        """Return texts that may be the URDF of the robot in a namespace, the likeliest first.
 
-        That is the file attached for it, then the last message about it, then all other files.
+        The file attached for the robot comes first, then its last robot_description, then other
+        files.
         """
         topic = f"{namespace}/robot_description"
         attached = {n: text for n, text in self.attachments.items() if n.endswith(".urdf")}
@@ -318,7 +319,7 @@ class Bag:
     def _prismatic_joints(self, namespace: str) -> dict[str, bool]:
         """Whether each joint of the robot in a namespace is prismatic."""
         if namespace not in self._prismatic_by_namespace:
-            # The model takes as long to import as everything else here.
+            # Importing the robot model doubles the import time of this module.
             from spacerobot_ros.model.description import JointKind
             from spacerobot_ros.model.urdf import parse_robot
 
@@ -412,7 +413,7 @@ def _bag_file(path: str | os.PathLike[str]) -> Path:
 
 
 def columns(topic: str, path: str) -> list[str]:
-    """Return the paths of the numbers of a state topic below a path, for ``TopicSeries.table``."""
+    """Return the paths of a state topic's numbers below a path of its message."""
     return next(field.columns for field in TOPICS[topic].state if field.path == path)
 
 
@@ -432,11 +433,11 @@ class RecordedRobot:
         self.namespace = namespace
 
     def get(self, name: str) -> TopicSeries | None:
-        """Return a topic of the stack; None where it has no message, or is of another type."""
+        """Return a topic of the stack; None if it has no message or another type."""
         topic = f"{self.namespace}/{name}"
         if self.bag.topics.get(topic) != TOPICS[name].type or not self.bag.message_count(topic):
             return None
-        # A damaged bag may lack messages that its summary counts.
+        # The summary of a damaged bag may count messages that are missing.
         return self.bag[topic] if len(self.bag[topic]) else None
 
     def __getitem__(self, name: str) -> TopicSeries:
@@ -471,11 +472,11 @@ class RecordedRobot:
 
     @property
     def joint_names(self) -> list[str]:
-        """Names of the joints in the order of ``joint_states``; none where that is missing."""
+        """Names of the joints in the order of ``joint_states``; empty without that topic."""
         return self.names("joint_states")
 
     def names(self, topic: str) -> list[str]:
-        """Return the names in the first joint states of a topic; none where it is missing."""
+        """Return the joint names in the first message of a topic; empty without that topic."""
         series = self.get(topic)
         return list(map(str, next(series.messages())[1].name)) if series is not None else []
 

@@ -15,25 +15,25 @@ from spacerobot_ros.times import SECOND
 
 
 class RecordingState(Enum):
-    """Treatment of messages that arrive."""
+    """Treatment of messages that arrive at a recorder."""
 
     PAUSED = "paused"
-    """Dropped, except that the last one of a latched topic is kept until recording starts."""
+    """Messages are dropped; the last one of each latched topic is kept until recording starts."""
 
     WAITING = "waiting"
-    """Kept in memory: whether a clock is published is not known yet."""
+    """Messages are kept in memory until it is known whether a clock is published."""
 
     ON_CLOCK = "on clock"
-    """Written with the time of the clock."""
+    """Messages are written with the time of the published clock."""
 
     ON_WALL_TIME = "on wall time"
-    """Written with the wall time of arrival."""
+    """Messages are written with the wall time of their arrival."""
 
     FAILED = "failed"
-    """Dropped: the disk is full or gone. Messages written before stay."""
+    """Messages are dropped because the disk is full or gone; messages written before stay."""
 
     CLOSED = "closed"
-    """Dropped: the bag is complete."""
+    """Messages are dropped because the bag is complete."""
 
 
 # Names of the module are found faster than members of an enum: they are needed for every message.
@@ -46,7 +46,7 @@ _DROPPING = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED
 
 
 class _EarlyMessage(NamedTuple):
-    """A message from before the time base was chosen."""
+    """A message received before the bag's time base was chosen."""
 
     channel: int
     message: bytes
@@ -85,13 +85,13 @@ class Recording:
         self.now_ns = 0
         """The latest time of the clock, or the arrival of the latest message."""
         self.messages = 0
-        """How many messages were written."""
+        """Number of messages written to the bag."""
         self.lost: Counter[str] = Counter()
-        """How many messages of each topic were published and never arrived."""
+        """Number of messages of each topic that were published but never received."""
         self.attached: set[str] = set()
         """Names of the files in the bag."""
         self.latched: dict[int, _EarlyMessage | None] = {}
-        """Channels of latched topics, and the last message that each has sent during a pause."""
+        """Last message received during a pause, by the channel of its latched topic."""
         self.failure: RecordingError | None = None
         self._clock_wait_ns = clock_wait * SECOND
         self._on_failure = on_failure
@@ -107,11 +107,11 @@ class Recording:
 
     @property
     def messages_waiting(self) -> int:
-        """How many messages wait for the start, or for the time base of the bag."""
+        """Number of messages that wait for the start or for the time base of the bag."""
         return len(self._early_messages) + sum(last is not None for last in self.latched.values())
 
     def start(self) -> None:
-        """Record from now on, and the last messages of latched topics before that."""
+        """Start recording, with the last earlier message of every latched topic."""
         if self.state is not RecordingState.PAUSED:
             return
         self.state = self._time_base or _WAITING
@@ -121,12 +121,12 @@ class Recording:
                 self.record(channel, last.message, last.published_ns)
 
     def pause(self) -> None:
-        """Record nothing until the next start."""
+        """Pause recording until the next start."""
         if self.running:
             self.state = RecordingState.PAUSED
 
     def set_clock(self, time_ns: int) -> None:
-        """Set the time that the clock shows; without effect once wall time was decided on."""
+        """Set the time of the clock; without effect once the bag uses wall time."""
         if self._time_base is _ON_WALL_TIME:
             return
         self.now_ns = time_ns
@@ -160,7 +160,7 @@ class Recording:
         self.messages += 1
 
     def flush(self, clock_is_published: bool) -> None:
-        """Hand the data in memory to the operating system if the period of wall time is over."""
+        """Write data in memory to the file once per flush period of wall time."""
         if self._early_messages and not clock_is_published:
             waited_ns = self._wall_time() - self._early_messages[0].arrival_ns
             if waited_ns > self._clock_wait_ns:
@@ -168,7 +168,7 @@ class Recording:
         self._fail_on_error(self.writer.flush)
 
     def check(self) -> None:
-        """Check that the file is still in its place, with its full size."""
+        """Check that the bag file still exists with its full size."""
         self._fail_on_error(self.writer.check)
 
     def describe(self, name: str, values: dict[str, str]) -> None:
@@ -176,8 +176,8 @@ class Recording:
         self._fail_on_error(lambda: self.writer.add_metadata(name, values))
 
     def attach_robot(self, name: str, urdf: bytes) -> None:
-        """Attach the description of a robot, and the meshes in it that are found here."""
-        # The model takes as long to import as everything else here.
+        """Attach a robot description, and those of its meshes that exist on this machine."""
+        # Importing the robot model doubles the import time of this module.
         from spacerobot_ros.model.urdf import parse_robot
         from spacerobot_ros.model.visuals import carried_meshes
 

@@ -45,7 +45,7 @@ from spacerobot_ros.times import SECOND
 _STATE_TOPICS = ("odom", "joint_states", "momentum")
 _CHUNK_SIZE = 65536
 _CHANNEL_AND_TIME = struct.Struct("<H4xQ")
-"""Channel and log time at the head of a message; between them is its sequence number."""
+"""Head of a message: channel, sequence number (skipped) and log time."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class Salvaged:
     lost_chunks
         Chunks that could not be read.
     lost_because
-        Why the first of them could not; empty without any.
+        Why the first lost chunk could not be read; empty if no chunk is lost.
     lost_bytes
-        Bytes behind the last whole record, which remain in the old bag alone.
+        Bytes after the last complete record, which only the old bag has.
     """
 
     path: Path
@@ -120,7 +120,7 @@ def salvage_bag(
 
 
 def is_complete(path: Path) -> bool:
-    """Whether every message of a bag can be read and counted as it is."""
+    """Whether every message of a bag can be read without a repair."""
     try:
         with open_bag(path) as file:
             summary = read_summary(path, file)
@@ -131,20 +131,20 @@ def is_complete(path: Path) -> bool:
 
 
 def _whole_records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
-    """Iterate over the records between two places, up to the first that is not whole."""
-    # Exceptions of consumers do not pass through here.
+    """Iterate over the records between two bytes of a file, up to the first incomplete one."""
+    # Only reading is inside the try: errors of the caller must not be caught.
     with suppress(ValueError):
         yield from records(file, start, end)
 
 
 class _ReadableRecords:
-    """Opcodes and bodies of a bag's records as far as they can be read, chunks unpacked."""
+    """The readable records of a bag, with those in chunks."""
 
     def __init__(self, path: Path) -> None:
         self.profile = "ros2"
         self.lost_chunks = self.lost_bytes = 0
         self.reason = ""
-        """Why the first of the lost chunks cannot be read."""
+        """Reason why the first lost chunk cannot be read."""
         self._path = path
         self.records = self._read_records()
 
@@ -165,7 +165,7 @@ class _ReadableRecords:
                 elif opcode == Opcode.CHUNK:
                     yield from self._chunk(body, place, allowance)
                 elif opcode == Opcode.DATA_END:
-                    # The summary says nothing new.
+                    # The summary repeats earlier records.
                     return
                 else:
                     yield opcode, body
@@ -187,7 +187,7 @@ class _ReadableRecords:
 
 
 class _SalvagedBag:
-    """A bag that is written from the records of another."""
+    """A bag written from the readable records of another bag."""
 
     def __init__(self, file: McapFile) -> None:
         self._file = file
@@ -197,7 +197,7 @@ class _SalvagedBag:
         self._entries: dict[int, list[int]] = {}
 
     def add(self, opcode: int, body: bytes) -> None:
-        """Take a record; one that cannot be read is left out."""
+        """Add a record; an unreadable record is left out."""
         with suppress(*DAMAGE_ERRORS):
             if opcode == Opcode.MESSAGE:
                 self._add_message(body)
@@ -275,9 +275,9 @@ class LastState:
     Attributes
     ----------
     time_ns
-        Its stamp.
+        Stamp of the state.
     position, quaternion
-        Of the base link in the world: (3,) m and (x, y, z, w).
+        Pose of the base link in the world: (3,) m and (x, y, z, w).
     joint_names, joints, rates
         Names, positions and velocities (n,) of the joints.
     momenta
@@ -294,9 +294,9 @@ class LastState:
 
 
 def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
-    """Read the last state whose parts were all recorded.
+    """Read the last state of which pose, joints and momenta were recorded.
 
-    Of a bag that was cut off, the readable part counts; ``namespace`` is that of the plant.
+    A bag that was cut off is read as far as possible. ``namespace`` is the plant's.
 
     Raises
     ------
@@ -314,12 +314,10 @@ def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
 
 def _last_state(robot: RecordedRobot) -> LastState:
     odom, joints, momentum = (robot[name] for name in _STATE_TOPICS)
-    # Momenta have no stamp; a state is published momenta first, and logged at its time.
+    # Momenta have no stamp: their log time is the time of their state.
     common = np.intersect1d(odom.stamp_ns, joints.stamp_ns)
     if not len(common):
-        raise RecordingError(
-            f"The bag {robot.bag.path} holds no state of which all parts are there."
-        )
+        raise RecordingError(f"The bag {robot.bag.path} holds no state with all its parts.")
     k, j = (int(np.flatnonzero(series.stamp_ns == common[-1])[-1]) for series in (odom, joints))
     pose = odom.table(columns("odom", "pose.pose"))[k]
     names = robot.joint_names

@@ -52,7 +52,7 @@ class TopicSeries:
         self.topic = topic
         self.type_name = type_name
         self.time_ns = time_ns
-        # Those who would change it in place would change it for all.
+        # A change in place would change the array for every reader.
         self.time_ns.flags.writeable = False
         self.data = data
         self._fields = fields
@@ -70,7 +70,7 @@ class TopicSeries:
 
     @property
     def paths(self) -> list[str]:
-        """Paths of the fields, for :meth:`field`; of lists of messages, that of the list."""
+        """Paths of the fields, for :meth:`field`; a list of messages has one path."""
         return list(self._leaf_paths(self.type_name, ""))
 
     def _leaf_paths(self, type_name: str, prefix: str) -> Iterator[str]:
@@ -81,7 +81,7 @@ class TopicSeries:
                 yield prefix + name
 
     def element_type(self, path: str) -> str:
-        """Return the type of the messages in a list of them, or of one; empty for all else.
+        """Return the type of a message field or of a list's messages; else empty.
 
         Raises
         ------
@@ -102,7 +102,7 @@ class TopicSeries:
 
     @cached_property
     def stamp_ns(self) -> NDArray[np.int64]:
-        """The same in nanoseconds, read-only."""
+        """Stamps of the headers in nanoseconds (N,), read-only; log times without headers."""
         if not self.stamped:
             return self.time_ns
         seconds, nanoseconds = self.field("header.stamp.sec"), self.field("header.stamp.nanosec")
@@ -141,7 +141,7 @@ class TopicSeries:
                 return self._columns[path]
             except UnicodeDecodeError as error:
                 raise self._damage_error(error) from error
-        # Callers get copies, which they may change.
+        # Callers receive copies, because they may change the arrays.
         fresh = in_list or type_name is not None
         messages = [m for _, m in self.messages()] if fresh else self._messages
         if in_list:
@@ -161,7 +161,7 @@ class TopicSeries:
         return self._columns is not None and self._columns.constant(path)
 
     def table(self, fields: Sequence[str], width: int | None = None) -> NDArray[np.float64]:
-        """Return numbers of all messages side by side, a row each.
+        """Return number fields of all messages as a matrix with one row for each message.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class TopicSeries:
         return read_columns(self.data, self.type_name, self._fields)
 
     def _require_decodable(self) -> None:
-        """Refuse to make objects of much more than the file is large."""
+        """Refuse to decode a topic that is much larger than the bag's file."""
         size = sum(map(len, self.data))
         if size > self._max_decoded_bytes:
             raise RecordingError(
@@ -229,8 +229,8 @@ class TopicSeries:
         return RecordingError(f"A message on {self.topic} is no {self.type_name}: {reason}.")
 
     def _resolve_path(self, path: str) -> tuple[np.dtype[Any] | None, bool, bool, str | None]:
-        """Follow a path: type of its numbers if any, whether an array, whether inside of a list,
-        type of its messages if any.
+        """Resolve a field's path: type of its numbers if any, whether it is an array, whether it is
+        inside of a list, type of its messages if any.
         """
         type_name: str | None = self.type_name
         dtype, is_array, in_list = None, False, False
@@ -252,7 +252,7 @@ class TopicSeries:
 
 
 def _field_matrix(values: Any, width: int) -> NDArray[np.float64]:
-    """Return a field as (N, width), nan where a message has another number of values."""
+    """Return a field's values (N, width); nan for messages with another number of values."""
     if isinstance(values, np.ndarray) and values.size == len(values) * width:
         return np.asarray(values, dtype=float).reshape(len(values), width)
     rows = [np.asarray(value, dtype=float).reshape(-1) for value in values]

@@ -34,17 +34,17 @@ _KEY_VALUES = "diagnostic_msgs/msg/KeyValue"
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _HEADER_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 _TIME_COLUMNS = ("time", "time_ns", "stamp", "stamp_ns")
-"""Columns of every table; a field of these names is below ``message``."""
+"""Time columns of every table; a message field of such a name is put below ``message``."""
 
 _MAX_ARRAY_COLUMNS = 1000
-"""Longest array that becomes columns; longer ones, such as the bytes of an image, do not."""
+"""Largest number of entries of an array that becomes columns; images, for example, do not."""
 
 _JOINT_UNITS = {
     "position": ("m", "rad"),
     "velocity": ("m/s", "rad/s"),
     "effort": ("N", "N m"),
 }
-"""Units of a prismatic joint and of a turning one."""
+"""Units of joint states: of a prismatic joint, and of a revolute one."""
 
 _THRUSTER_UNITS = {"position": "s", "velocity": "1", "effort": "N"}
 _MOMENTUM_UNITS = {"linear": "kg m/s", "angular": "kg m^2/s", "kinetic": "J"}
@@ -60,7 +60,7 @@ _UNITS_BY_PATH_ENDING = tuple(
         (r"torque\.[xyz]", "N m"),
     )
 )
-"""By the ends of paths: ROS has SI units (REP 103), and no field for them."""
+"""SI unit (REP 103) of a field by the end of its path, because messages have no units."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def table_of(series: TopicSeries, prismatic: Mapping[str, bool] | None = None) -
 
 
 def _joint_state_names(series: TopicSeries) -> tuple[str, ...]:
-    """Return the names in joint states, where all messages have the same."""
+    """Return the joint names of a topic of joint states; empty if they differ between messages."""
     if series.type_name != _JOINT_STATE or not len(series):
         return ()
     found = {tuple(names) for names in series.field("name")}
@@ -235,7 +235,7 @@ def _object_array(values: list[str]) -> NDArray[Any]:
 
 
 def _json_value(value: Any) -> Any:
-    """Return a part of a message as JSON has it."""
+    """Return a part of a message as JSON values."""
     if is_dataclass(value):
         # Constants are in capitals, and fields never are.
         names = (each.name for each in fields(value) if not each.name.isupper())
@@ -287,7 +287,7 @@ class Export:
 
 
 def to_pandas(table: TopicTable) -> pandas.DataFrame:
-    """Return a table as pandas has it, a copy; :meth:`Bag.to_pandas` says more.
+    """Return a table as a new pandas DataFrame; see :meth:`Bag.to_pandas`.
 
     Raises
     ------
@@ -302,7 +302,7 @@ def to_pandas(table: TopicTable) -> pandas.DataFrame:
 
 
 def to_xarray(table: TopicTable) -> xarray.Dataset:
-    """Return a table as xarray has it, a copy; :meth:`Bag.to_xarray` says more.
+    """Return a table as a new xarray Dataset; see :meth:`Bag.to_xarray`.
 
     Raises
     ------
@@ -353,7 +353,7 @@ def export(
     target = Path(path)
     _require_suffix(target, format)
     if os.path.lexists(target):
-        raise RecordingError(f"There is something at {target} already: name another place.")
+        raise RecordingError(f"{target} exists already: name another file or folder.")
     write = {
         ExportFormat.CSV: _write_csv,
         ExportFormat.PARQUET: _write_parquet,
@@ -375,7 +375,7 @@ def export(
 
 
 def _require_suffix(target: Path, format: ExportFormat) -> None:
-    """Refuse names that belong to another format."""
+    """Refuse an output name whose suffix belongs to another format."""
     suffix = target.suffix.lower()
     if format is ExportFormat.MAT:
         if suffix not in ("", ".mat"):
@@ -392,10 +392,10 @@ def _require_suffix(target: Path, format: ExportFormat) -> None:
 def _move_into_place(made: Path, target: Path) -> None:
     """Rename the finished file or folder, unless its name has been taken meanwhile."""
     if made.is_dir():
-        # Takes the place of an empty folder at most.
+        # A rename replaces an empty folder at most.
         made.rename(target)
     else:
-        # Links would do with one call, but no USB stick has them.
+        # A hard link would need one call, but FAT file systems have none.
         os.close(os.open(target, os.O_CREAT | os.O_EXCL))
         made.replace(target)
 
@@ -419,7 +419,7 @@ def _tables_by_file_name(tables: Iterable[TopicTable]) -> dict[str, TopicTable]:
 
 
 def _unused_name(name: str, taken: Mapping[str, Any]) -> str:
-    """Return a name that no other differs from by case alone."""
+    """Return a file name that is unique even where case is ignored."""
     others = {each.lower() for each in taken}
     names = (name, *(f"{name}_{number}" for number in range(2, len(others) + 3)))
     return next(each for each in names if each.lower() not in others)
@@ -449,7 +449,7 @@ def _write_csv(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
 
 
 def _csv_text(text: str) -> str:
-    """Return a text as CSV has it (RFC 4180); a lone carriage return ends a row for readers too."""
+    """Return a text quoted for CSV (RFC 4180), also if it has a lone carriage return."""
     return '"' + text.replace('"', '""') + '"' if _QUOTED_CHARACTERS.search(text) else text
 
 
@@ -469,7 +469,7 @@ def _write_parquet(tables: dict[str, TopicTable], folder: Path) -> dict[str, int
 
 
 def _write_mat(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
-    # Takes a tenth of a second, and only this format needs it.
+    # Importing scipy.io takes 0.1 s, and only this format needs it.
     from scipy.io import savemat
     from scipy.io.matlab import MatWriteError
 
@@ -493,7 +493,7 @@ def _write_mat(tables: dict[str, TopicTable], folder: Path) -> dict[str, int]:
 
 
 def _matlab_struct(table: TopicTable) -> dict[str, Any]:
-    """Return a topic as MATLAB has it: its fields (N, k) in structs of structs."""
+    """Return a topic as MATLAB structs: fields (N, k), nested by their paths."""
     struct: dict[str, Any] = {"time": table.time[:, np.newaxis]}
     places: dict[tuple[str, ...], dict[str, Any]] = {(): struct}
     for field in table.fields:
@@ -502,7 +502,7 @@ def _matlab_struct(table: TopicTable) -> dict[str, Any]:
         for depth, part in enumerate(way, 1):
             inner = places.setdefault(tuple(way[:depth]), {})
             if not inner:
-                # Keys have dots too, and one may be called as a part of another is.
+                # Keys contain dots, and one key may equal the beginning of another key.
                 place[_matlab_variable(part, place)] = inner
             place = inner
         values = field.values[:, np.newaxis] if field.values.ndim == 1 else field.values
@@ -511,7 +511,7 @@ def _matlab_struct(table: TopicTable) -> dict[str, Any]:
 
 
 def _matlab_variable(name: str, taken: Mapping[str, Any]) -> str:
-    """Return a name of a variable for MATLAB that is not taken."""
+    """Return an unused name of a MATLAB variable."""
     made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
     made = f"x{made}" if _MATLAB_KEYWORD.fullmatch(made) or not made[:1].isalpha() else made
     return _unused_name(made[: _MAX_VARIABLE_NAME - 4], taken)
@@ -531,6 +531,6 @@ def _import_library(name: str) -> Any:
         if error.name is None or error.name.split(".")[0] != name.split(".")[0]:
             raise
         raise RecordingError(
-            f"This takes {name.split('.')[0]}, which is not installed: "
+            f"The export needs {name.split('.')[0]}, which is not installed: "
             "pip install 'spacerobot_ros[data]'."
         ) from error

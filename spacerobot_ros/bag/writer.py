@@ -25,7 +25,7 @@ from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.messages.definitions import message_definition, type_hash
 
 _MESSAGE_HEADER = struct.Struct("<BQHIQQ")
-"""Opcode, length of the rest, channel, sequence, log time, publish time."""
+"""Head of a message record: opcode, length, channel, sequence, log time, publish time."""
 
 _pack_header = _MESSAGE_HEADER.pack
 _HEADER_LENGTH = _MESSAGE_HEADER.size - 9
@@ -33,7 +33,7 @@ _MESSAGE = int(Opcode.MESSAGE)
 
 
 def free_name(path: Path, first: int = 0) -> Path:
-    """Return a path, or the first of ``NAME-1``, ``NAME-2``, ... at which nothing is."""
+    """Return a path, or the first of ``NAME-1``, ``NAME-2``, ... that does not exist."""
     number = first
     while True:
         name = path.with_name(f"{path.stem}-{number}{path.suffix}") if number else path
@@ -98,13 +98,13 @@ class BagWriter:
         self._compression, self._overwrite = compression, overwrite and not next_free
         self._next_free = next_free
         self.splits = 0
-        """How many files were begun after the first."""
+        """Number of files begun after the first one."""
         self._earlier_counts: Counter[str] = Counter()
         self._repeated_records: list[Attachment | Metadata] = []
         self._file = self._open_first_file()
         self._chunk_size = chunk_size
         self._chunk = bytearray()
-        # Of each channel, log time and offset in the chunk of each message. Empty as soon as
+        # For each channel: log time of each message and its offset in the chunk. Empty as soon as
         # nothing more can be written, so that `write` needs no test of its own for that.
         self._entries: dict[int, list[int]] = {}
         self._topics: dict[str, tuple[int, str, QosProfile]] = {}
@@ -121,12 +121,12 @@ class BagWriter:
 
     @property
     def path(self) -> Path:
-        """Where the bag is, or the file of it that is being written."""
+        """Path of the bag, or of its file that is being written."""
         return self._file.path
 
     @property
     def message_counts(self) -> dict[str, int]:
-        """How many messages of each topic are in the bag or in the chunk in progress."""
+        """Number of messages of each topic in the bag, with the chunk in progress."""
         return {
             name: self._earlier_counts[name] + self._message_count(channel)
             for name, (channel, _, _) in self._topics.items()
@@ -134,30 +134,30 @@ class BagWriter:
 
     @property
     def bytes_written(self) -> int:
-        """How large the present file is, compressed."""
+        """Size of the present file after compression, bytes."""
         return self._file.size
 
     @property
     def bytes_waiting(self) -> int:
-        """How much of the chunk in progress is not handed to the operating system yet."""
+        """Size of the chunk in progress, which is not in the file yet, bytes."""
         return len(self._chunk)
 
     @property
     def messages_written(self) -> int:
-        """How many messages are in the bag or in the chunk in progress."""
+        """Number of messages in the bag, with the chunk in progress."""
         return sum(self.message_counts.values())
 
     def add_topic(self, name: str, type_name: str, qos: QosProfile | None = None) -> int:
-        """Make a topic known, before its first message.
+        """Register a topic before its first message is written.
 
         Parameters
         ----------
         name
             Full name of the topic, such as ``/odom``.
         type_name
-            Such as ``nav_msgs/msg/Odometry``.
+            Message type, such as ``nav_msgs/msg/Odometry``.
         qos
-            What its publisher offers; reliable, volatile and depth 10 unless given.
+            QoS that its publisher offers; reliable, volatile and depth 10 unless given.
 
         Returns
         -------
@@ -260,7 +260,7 @@ class BagWriter:
         self._finish_chunk()
 
     def close(self) -> None:
-        """Write the rest and the summary, and close the file; a second call does nothing.
+        """Write pending messages and the summary, and close the file; a second call does nothing.
 
         Raises
         ------
@@ -324,7 +324,7 @@ class BagWriter:
         return 0 < max_size <= self._file.size or 0 < max_duration_ns <= span
 
     def _open_first_file(self) -> McapFile:
-        """Make the file, or the first of several; names of one bag are not mixed with another's."""
+        """Create the first file; files of one bag are not mixed with files of another."""
         asked, number = self._unsplit_path, 0
         while True:
             try:
@@ -338,7 +338,7 @@ class BagWriter:
             self._unsplit_path = asked.with_name(f"{asked.stem}-{number}{asked.suffix}")
 
     def _require_no_parts(self) -> None:
-        """Raise BagExistsError for a name of which there are files of a bag that was split."""
+        """Raise BagExistsError if numbered files of another bag with this name exist."""
         whole = self._unsplit_path
         pattern = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
         with suppress(OSError):
@@ -350,12 +350,12 @@ class BagWriter:
                     )
 
     def check(self) -> None:
-        """Check that the file is still in its place, with its full size.
+        """Check that the bag file still exists with its full size.
 
         Raises
         ------
         RecordingError
-            It is not; nothing more is written.
+            The file is gone or shorter; nothing more is written.
         """
         self._require_open()
         with self._refusing_after_failure():
@@ -368,7 +368,7 @@ class BagWriter:
         return McapFile(path, compression=self._compression, overwrite=self._overwrite)
 
     def _begin_next_file(self) -> None:
-        """Complete a file and go on in the next, with the same schemas and channels."""
+        """Complete the present file and begin the next one, with the same schemas and channels."""
         self._append_rosbag2_metadata()
         self._file.finish()
         self._file.close()
@@ -394,7 +394,7 @@ class BagWriter:
             try:
                 return self._open_numbered_file()
             except BagExistsError:
-                # Not ours. Refused at the start, it is stepped over in flight.
+                # A file of another bag has this number: in flight, the next number is taken.
                 if self._overwrite:
                     raise
 
@@ -436,5 +436,5 @@ class BagWriter:
                 f"The bag {self.path} has no channel {channel_id}: add_topic gives the channels."
             )
         return RecordingError(
-            f"The bag {self.path} takes times as whole numbers of nanoseconds, not negative."
+            f"The bag {self.path} takes times only as whole, non-negative numbers of nanoseconds."
         )

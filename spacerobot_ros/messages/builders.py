@@ -25,7 +25,7 @@ from spacerobot_ros.topics import Topic
 
 TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 TRANSFORMS, STATIC_TRANSFORMS = "/tf", "/tf_static"
-"""Names of the topics where no remap moves them."""
+"""Names of the transform topics before remaps."""
 
 _NUMBERS_PER_POSE = 7
 _POSE_PATH = "pose.pose.position.x"
@@ -78,7 +78,7 @@ class RobotTransforms:
     prefix
         Goes before the names of the links, as robot_state_publisher's ``frame_prefix``.
     links
-        Whether all links are in it, or the base link alone.
+        Whether the transforms of all links are included, or of the base link alone.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class RobotTransforms:
         return self._template.serialised(time_ns, self._poses)
 
     def static_message(self, time_ns: int) -> bytes | None:
-        """Return the message of the links that do not move in their parents, if there are any."""
+        """Return the message of links fixed to their parents; None without such links."""
         if self._links is None or not self._fixed:
             return None
         return TransformTemplate(self._fixed).serialised(time_ns, self._links.fixed_transforms)
@@ -119,12 +119,12 @@ class StateFrames:
         self._joints = JointReader(description.joint_names, ["position"], measured=True)
 
     def accept(self, odom: bytes, joint_states: bytes) -> None:
-        """Make these the state.
+        """Take the serialised messages as the new state.
 
         Raises
         ------
         CommandError
-            They are not of this robot.
+            The messages are of another robot.
         """
         self._joints.accept(joint_states)
         self._odom.accept(odom)
@@ -146,7 +146,7 @@ class StateFrames:
 
 
 def robot_frames(description: RobotDescription, state: StateFrames) -> dict[str, tuple[str, Array]]:
-    """Return, by name of a link, its parent and its pose (7,) in that, in a measured state."""
+    """Return the parent of each link and the pose (7,) in it, by link name, in a measured state."""
     links, prefix = ForwardKinematics(description), state.prefix
     links.update(state.q)
     frames = {prefix + description.base_link: (state.world, state.pose)}
@@ -204,7 +204,7 @@ def goal_message(goal: Goal, frame: str, stamp_ns: int = 0) -> bytes:
 def trajectory_message(schedule: GaitSchedule, stamp_ns: int, frame: str) -> bytes:
     """Return a schedule as trajectory_msgs/JointTrajectory.
 
-    Point k holds the shape at tick k and the velocities held from there on (zero at the last).
+    Point k has the joint positions at tick k and the velocities until tick k+1 (at the end zero).
     Long gaits have a hundred thousand points.
     """
     n, count = len(schedule.joint_names), len(schedule.positions)

@@ -1,4 +1,4 @@
-"""Definitions of message types: those installed here, and those that bags bring with them.
+"""Definitions of message types: of installed packages, and of schemas in bags.
 
 ``rosbags`` writes Python code for every type that it decodes, a line for each element of an array
 of messages, and follows types that contain themselves for ever. The definitions of a bag may be
@@ -39,7 +39,7 @@ _OWN_DEFINITIONS = {
         "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     )
 }
-"""Text and hash of types that are in bags whether their packages are installed or not."""
+"""Text and hash of types that this package writes even if ROS does not have them installed."""
 
 _INTEGERS = {f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
 _PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring", *_INTEGERS}
@@ -140,7 +140,7 @@ def _share_folder(package: str) -> Path:
 
         return Path(get_package_share_directory(package))
     except (ImportError, LookupError, OSError, ValueError):
-        # The wheels install into the environment's own prefix and set no search path.
+        # Packages from pip are below the environment's prefix and set no search path.
         folder = Path(sys.prefix) / "share" / package
     if not folder.is_dir():
         raise RecordingError(
@@ -165,13 +165,13 @@ _TYPE_NAME = re.compile(r"[A-Za-z]\w*/(msg|srv|action)/[A-Za-z]\w*", re.ASCII)
 _MAX_TEXT_BYTES = 262_144
 _MAX_LINES = 5_000
 _MAX_FIELDS = 1_000
-"""Arrays of numbers count as one field, arrays of messages and strings with every element."""
+"""Largest number of fields; in arrays of messages and strings every element counts."""
 
 _MAX_NESTING = 32
 
 
 class MessageTypes:
-    """The types of a bag's messages, as far as they have been asked for."""
+    """Message types defined in a bag, parsed on first use."""
 
     def __init__(self) -> None:
         self._store = get_typestore(Stores.EMPTY)
@@ -191,7 +191,7 @@ class MessageTypes:
         Raises
         ------
         ValueError
-            The definition is refused.
+            The schema cannot be parsed or exceeds a limit.
         """
         store, definition = _type_store(type_name, text)
         self._add_types(store)
@@ -223,12 +223,12 @@ def _field_kinds(fields: Any) -> list[Any]:
 
 @lru_cache(maxsize=64)
 def _type_store(type_name: str, text: bytes) -> tuple[Typestore, Any]:
-    """Return a store of the types in a text, and the code for the type: made once for all bags."""
+    """Return the types that a schema defines and the class of one type; cached for all bags."""
     parsed, store = _parse_definition(type_name, text), get_typestore(Stores.EMPTY)
     try:
         store.register(parsed)
         return store, store.get_msgdef(type_name)
-    # Generated code has no errors of its own: names, syntax, keys, whatever is in the text.
+    # The parser raises any kind of error, depending on the text.
     except Exception as error:
         raise ValueError(_one_line(error)) from error
 
@@ -257,14 +257,14 @@ def _one_line(error: Exception) -> str:
 
 
 class _FieldCounts:
-    """How many fields each type has, with all messages inside of it written out."""
+    """Number of fields of each type, with the fields of nested messages."""
 
     def __init__(self, types: dict[str, Any]) -> None:
         self._types = types
         self._type_store: dict[str, int] = {}
 
     def of(self, name: str, depth: int) -> int:
-        """Return the count for one type; ValueError where it is too large, unknown or endless."""
+        """Return the number of fields of a type; ValueError if too large, unknown or recursive."""
         if name in self._type_store:
             return self._type_store[name]
         if name not in self._types:

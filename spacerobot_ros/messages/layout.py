@@ -35,10 +35,10 @@ DTYPES = {
     "float32": np.dtype("<f4"),
     "float64": np.dtype("<f8"),
 }
-"""Number types of messages as they are serialised."""
+"""Number types in serialised messages, by their names in definitions."""
 
 ENCAPSULATION = 4
-"""Bytes before the fields; alignment counts from their end."""
+"""Length of the CDR header, bytes; alignment counts from its end."""
 
 BIG_ENDIAN, LITTLE_ENDIAN = b"\x00\x00", b"\x00\x01"
 """First two bytes of a message in CDR of either byte order."""
@@ -137,7 +137,7 @@ class Layout:
         self._fields = fields_of(type_name) if fields is None else fields
 
     def walk(self, type_name: str, prefix: str | None = "") -> Layout:
-        """Go through the fields of a type; ``prefix`` is None where they get no paths."""
+        """Add the fields of a type below ``prefix``; None: the fields get no paths."""
         for name, (kind, detail) in self._fields[type_name][1]:
             path = None if prefix is None else prefix + name
             if kind == Nodetype.BASE:
@@ -197,7 +197,7 @@ class Layout:
     def _advance(self, size: int) -> None:
         self.end += size
         if self.end > len(self._message):
-            # Or a count of 4e9 messages in a list would be believed.
+            # Without this check a false count of 4e9 messages would be accepted.
             raise IndexError("the message ends before its fields")
 
     def _read_length(self) -> int:
@@ -322,7 +322,7 @@ def encode_list(
     count = len(next(iter(columns.values())))
     if not count:
         return encode(type_name, values)
-    # Three elements show the layout: the first may be padded differently, all others are alike.
+    # Three elements show the layout: only the padding of the first may differ.
     raw = encode(type_name, {**values, name: [element] * 3})
     layout = layout_of(raw, type_name, elements=True)
     first, second, third = (layout.ends[f"{name}[{i}]"] for i in range(3))
@@ -345,7 +345,7 @@ def stamped_copies(
     stamps_ns: NDArray[np.int64],
     columns: Mapping[str, NDArray[np.float64]],
 ) -> list[bytes]:
-    """Return copies of a message with other numbers.
+    """Return copies of a message with new stamps and numbers.
 
     Parameters
     ----------
@@ -378,7 +378,7 @@ def stamp_pairs(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
 
 
 class Columns:
-    """Fields that have a fixed place in all of some messages, as arrays over the messages."""
+    """Fields at the same place in all messages of a list, as arrays over the messages."""
 
     def __init__(
         self, matrix: NDArray[np.uint8], leaves: dict[str, Leaf], texts: dict[str, slice]
@@ -393,7 +393,7 @@ class Columns:
         return self._leaves.keys()
 
     def constant(self, path: str) -> bool:
-        """Whether a list of texts has the same bytes in all messages."""
+        """Whether a list of texts is the same in all messages."""
         part = self._texts.get(path)
         return part is not None and bool((self._matrix[:, part] == self._matrix[0, part]).all())
 
@@ -407,7 +407,7 @@ class Columns:
 
 
 def column_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of a column of ``dtype``, in which sums do not soon overflow."""
+    """Return the wider number type in which a column of ``dtype`` is stored."""
     if dtype.kind == "f":
         return np.dtype(np.float64)
     if dtype.kind in "iu" and dtype.itemsize < 8:
@@ -418,7 +418,7 @@ def column_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
 def read_columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> Columns | None:
     """Return the fields that have the same place in every message of one type.
 
-    They are those outside of lists of messages and of texts; None if the layouts differ.
+    Fields in lists of messages and of texts are left out. None if the layouts differ.
     """
     if not messages or len(set(map(len, messages))) != 1:
         return None

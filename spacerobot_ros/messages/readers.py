@@ -42,19 +42,19 @@ WRENCH = "geometry_msgs/msg/WrenchStamped"
 
 _MAX_ALIGNMENT = 8
 _MAX_LIST_TEXTS = 10_000
-"""Texts in a list that are read, against a faulty publisher: a million of them take a second."""
+"""Largest number of texts in a list; a faulty publisher may send a million."""
 
 _HEADER_BYTES = 4096
-"""Bytes for the header of a message of joints, and for a writer that packs it differently."""
+"""Size allowed for the header of a JointState and for padding, bytes."""
 
 _POSE_PATH, _TWIST_PATH = "pose.pose.position.x", "twist.twist.linear.x"
 
 Quantity = Literal["position", "velocity", "effort"]
-"""The numbers of a JointState."""
+"""Name of a number array of a JointState."""
 
 
 class UnreadableError(CommandError):
-    """Bytes that are no message of their type; the clause says of which."""
+    """Bytes are no message of their type; the message names the type."""
 
 
 def read_text(raw: bytes, type_name: str, path: str) -> str:
@@ -73,7 +73,7 @@ def read_text(raw: bytes, type_name: str, path: str) -> str:
 
 
 class MessageTemplate:
-    """A message serialised once, whose numbers are then written in place.
+    """A serialised message whose numbers are then written in place.
 
     Parameters
     ----------
@@ -139,26 +139,27 @@ class TemplateReader:
         self._type_name, self._spans, self._max_size = type_name, spans, max_size
         self._fields = fields_of(type_name)
         self._size = -1
-        self._raw = bytes(2)  # Of no message.
+        self._raw = bytes(2)  # The initial template matches no message.
         self._fixed_spans: list[tuple[slice, bytes]] = []
         self._joined_spans: list[tuple[slice, bytes]] = []
         self._value_spans: dict[str, tuple[int, int]] = {}
         self._layout: Layout | None = None
         self.layout_changes = 0
-        """How often the layout has changed."""
+        """Number of layout changes."""
 
     def accept(self, raw: bytes) -> None:
-        """Make ``raw`` the message to read from.
+        """Read from ``raw`` from now on.
 
         Raises
         ------
         UnreadableError
-            The bytes are not a message of the type; the message before stays.
+            The bytes are not a message of the type; the earlier message stays.
         """
         if raw is self._raw:
             return
         if len(raw) == self._size:
-            # One writer repeats its padding too: a few whole stretches are compared first.
+            # Messages of one writer have equal padding: longer spans, with padding, are compared
+            # first.
             for place, text in self._joined_spans:
                 if raw[place] != text:
                     break
@@ -177,7 +178,7 @@ class TemplateReader:
         return np.frombuffer(self._raw, np.float64, count, offset)
 
     def byte_span(self, path: str) -> slice:
-        """Return where the bytes of the values at ``path`` are in messages of this layout."""
+        """Return the span of bytes of the values at ``path`` in messages of this layout."""
         offset, count = self._value_spans[path]
         return slice(offset, offset + 8 * count)
 
@@ -207,7 +208,7 @@ class TemplateReader:
         return int(seconds * SECOND + nanoseconds)
 
     def _join_fixed_spans(self, raw: bytes) -> None:
-        """Keep the fixed spans joined where only padding can lie between them."""
+        """Join neighbouring fixed spans that only padding separates."""
         stretches: list[slice] = []
         for place, _ in self._fixed_spans:
             if stretches and place.start - stretches[-1].stop < _MAX_ALIGNMENT:
@@ -235,7 +236,8 @@ class TemplateReader:
             short = name.rpartition("/")[2]
             raise UnreadableError(f"its bytes are no {short}") from error
         except TooLongError as error:
-            # Its stamp can be read; the bytes themselves would count as accepted.
+            # The stamp of the refused message stays readable, but its bytes do not count as
+            # accepted.
             self._raw, self._size = raw[: HEADER_STAMP.stop], -1
             raise CommandError(str(error)) from error
         self._raw, self._size, self._layout = raw, len(raw), layout
@@ -257,7 +259,7 @@ def _as_little_endian(raw: bytes, type_name: str) -> bytes:
     decode = types.decoder(type_name, message_definition(type_name).encode())
     try:
         return bytes(types.serialise(decode(raw)))
-    except Exception as error:  # Generated code has no errors of its own.
+    except Exception as error:  # Decoding raises any kind of error, depending on the bytes.
         raise IndexError(str(error)) from error
 
 
@@ -286,13 +288,13 @@ class JointReader:
         self._measured, self._joints, self._quantities = measured, list(joint_names), quantities
         max_size = math.inf
         if measured:
-            # Of each joint a name with its length and three numbers.
+            # Every joint adds a name with its length and three numbers.
             max_size = _HEADER_BYTES + 2 * sum(len(name.encode()) + 32 for name in joint_names)
         self._reader = TemplateReader(JOINT_STATE, dict.fromkeys(quantities), max_size)
         self._known_layout = 0
         self._problem = ""
         self._last_accepted: bytes | None = None
-        """The last message that was accepted: the same bytes are often received again."""
+        """Last accepted message: publishers often repeat the same bytes."""
         self._order: npt.NDArray[np.intp] | None = None
         self._copies: list[tuple[memoryview, slice]] = []
         self.values = {name: np.zeros(len(joint_names)) for name in quantities}
@@ -309,7 +311,7 @@ class JointReader:
         self.require(raw)
         stamp = self._reader.stamp_ns
         if stamp > LATEST_NS and self._measured:
-            raise UnreadableError(f"no answer can carry its stamp of {stamp / SECOND:.10g} s")
+            raise UnreadableError(f"no command can carry its stamp of {stamp / SECOND:.10g} s")
         for target, place in self._copies:
             target[:] = raw[place]
         if self._order is not None:
@@ -343,7 +345,7 @@ class JointReader:
         return self._reader.stamp_ns
 
     def _check_names_and_lengths(self) -> None:
-        """Check names and lengths, once for every layout."""
+        """Check joint names and array lengths of a new layout."""
         names = self._reader.texts("name")
         self._problem, self._order, self._copies = "", None, []
         try:
@@ -357,7 +359,7 @@ class JointReader:
             return
         for values in self.values.values():
             values[:] = 0.0
-        # Joints in the model's order, as the stack's own nodes send them, are copied as bytes.
+        # Joints in the model's order, as nodes of the stack send them, are copied as bytes.
         if names == self._joints:
             self._copies = [
                 (values.data.cast("B"), self._reader.byte_span(name))
@@ -403,11 +405,11 @@ class CommandReader:
     Parameters
     ----------
     source
-        Where the commands come from.
+        Topic and kind of the commands.
     robot
         The model.
     frame_prefix
-        Which the name of the base link may have in commands.
+        Prefix that the name of the base link may have in commands.
     """
 
     def __init__(self, source: CommandSource, robot: SpaceRobot, frame_prefix: str = "") -> None:
@@ -421,7 +423,7 @@ class CommandReader:
             self._values = self._reader.values[source.quantity]
 
     def offer(self, commands: CommandValidator, raw: bytes, now_ns: int) -> Refusal | None:
-        """Offer a message to the validator; return why it is refused, if it is."""
+        """Offer a command message to the validator; return the refusal, None if accepted."""
         try:
             stamp_ns, command = self.read(raw)
         except UnreadableError as error:
@@ -443,7 +445,7 @@ class CommandReader:
 
 
 class _WrenchReader:
-    """Reads force over torque (6,) into ``values``; their frame must be that of the base link."""
+    """Reads force and torque (6,) in the frame of the base link into ``values``."""
 
     def __init__(self, base_link: str, frame_prefix: str) -> None:
         self.values: Array = np.zeros(6)

@@ -19,15 +19,15 @@ class StatusRecord:
     Attributes
     ----------
     name
-        The node, or a part of it.
+        Name of the node, or of a part of the node.
     level
         0 OK, 1 WARN, 2 ERROR, 3 STALE.
     message
-        One sentence for people.
+        One sentence for the user.
     values
-        Values as texts by their keys.
+        Values as texts by key.
     hardware_id
-        The robot, the bag, or the role of the node.
+        Name of the robot or bag, or role of the node.
     """
 
     name: str
@@ -51,7 +51,7 @@ def key_values(pairs: Iterable[Any]) -> dict[str, str]:
 def read_status(message: Any) -> StatusRecord:
     """Return the content of a received or recorded DiagnosticStatus, printable.
 
-    Anybody may have published it; a later pair replaces an earlier one of the same key.
+    Of several pairs with one key the last counts.
     """
     level = message.level if isinstance(message.level, int) else message.level[0]
     return StatusRecord(

@@ -114,7 +114,7 @@ def test_a_damaged_object_is_made_anew(
     whole = kept.read_bytes()
     kept.write_bytes(DAMAGE[damage](whole))
     assert is_compiled()
-    assert "is thrown away and made anew: it is damaged" in caplog.text
+    assert "is deleted and computed again: it is damaged" in caplog.text
     assert only_file(cache).read_bytes() == whole
     caplog.clear()
     assert is_compiled()

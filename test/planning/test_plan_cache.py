@@ -163,7 +163,7 @@ def test_a_plan_that_is_not_one_is_thrown_away(
     with pytest.raises(PlanningError, match="searched"):
         plan(robot, **ASKED)
     (record,) = caplog.records
-    assert "is thrown away and made anew: " in record.getMessage()
+    assert "is deleted and computed again: " in record.getMessage()
     assert any(each in record.getMessage() for each in reason.split("|")), record.getMessage()
     assert not list(cache.folder.iterdir())
 
