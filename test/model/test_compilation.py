@@ -150,7 +150,7 @@ def test_an_object_under_the_name_of_another_is_not_loaded(
     (own,) = set(cache.iterdir()) - {other}
     own.write_bytes(content)
     assert is_compiled()
-    assert "thrown away" in caplog.text
+    assert "is deleted" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -304,7 +304,7 @@ def test_a_file_that_others_could_have_written_is_replaced(
     assert facts.st_uid == os.geteuid()
     assert stat.S_ISREG(facts.st_mode)
     assert len(caplog.records) == 1
-    assert "thrown away" in caplog.text
+    assert "is deleted" in caplog.text
 
 
 def test_a_link_to_a_folder_of_ones_own_is_followed(cache: Path, tmp_path: Path) -> None:
