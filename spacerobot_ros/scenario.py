@@ -22,6 +22,7 @@ from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.parameters import Value, configured, declared, reconfigured, values_of
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import (
     is_path,
@@ -249,7 +250,8 @@ class Scenario:
             raise ParameterError(f"The scenario '{self.name}' names no robot; see plant.robot.")
         robot = SpaceRobot.from_file(robot_file(name))
         self.require_shape_of(robot)
-        return Problem(self.name, robot, InitialState.of(plant), self.goal, planner)
+        goal = self.goal.for_robot(robot.description)
+        return Problem(self.name, robot, InitialState.of(plant), goal, planner)
 
     def require_shape_of(self, robot: SpaceRobot) -> None:
         """Refuse a goal whose joint positions are of another robot.
@@ -364,7 +366,23 @@ class Scenario:
             goal = replace(goal, quaternion=given.quaternion)
         if goal is self.goal:
             return self
+        goal = replace(goal, end_effectors=(), base=POSE)
         return replace(self, goal=goal, published=(), has_goal=True)
+
+    def with_end_effectors(
+        self, goals: Sequence[EndEffectorGoal], base: frozenset[Controlled] = frozenset()
+    ) -> Scenario:
+        """Return the scenario with goals of end-effectors, and its goal in parts of the base alone.
+
+        Raises
+        ------
+        GoalError
+            A link has two goals.
+        """
+        made = Goal.of_end_effectors(goals)
+        goal = replace(self.goal, joint_positions=None, base=base)
+        aimed = replace(goal, end_effectors=made.end_effectors)
+        return replace(self, goal=aimed, published=(), has_goal=True)
 
     def require_goal(self) -> None:
         """Raise an error if the scenario has no goal, such as one made from a robot file.

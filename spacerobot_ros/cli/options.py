@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, wraps
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +17,7 @@ import click
 from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
+    from spacerobot_ros.planning.core.goal import Controlled, EndEffectorGoal
     from spacerobot_ros.scenario import Scenario
 
     _Choice = click.Choice[str]
@@ -159,22 +160,116 @@ class GoalOptions:
     pose: tuple[float, ...] | None
     rotvec: tuple[float, ...] | None
     rpy_deg: tuple[float, ...] | None
+    end_effectors: EndEffectorOptions = field(default_factory=lambda: EndEffectorOptions())
 
     def apply_to(self, scenario: Scenario) -> Scenario:
         """Return a scenario with this goal; a rotation that looks like degrees is reported."""
         if self.rotvec is not None:
             note_large_angles(self.rotvec, "--goal-rpy-deg")
-        return scenario.with_goal(self.pose, self.rotvec, self.rpy_deg)
+        scenario = scenario.with_goal(self.pose, self.rotvec, self.rpy_deg)
+        hands = self.end_effectors.goals()
+        if not hands:
+            return scenario
+        attitude = self.rotvec is not None or self.rpy_deg is not None
+        asked: set[Controlled] = {"attitude"} if attitude else set()
+        if self.pose is not None:
+            asked = {"position", "attitude"}
+        return scenario.with_end_effectors(hands, frozenset(asked))
+
+
+@dataclass(frozen=True)
+class EndEffectorOptions:
+    """Goals of end-effectors as the command line gives them.
+
+    Attributes
+    ----------
+    poses, positions
+        Poses (7,) and positions (3,), m.
+    links
+        Names of their links, in the order of the poses, then of the positions; none: the default.
+    """
+
+    poses: Sequence[tuple[float, ...]] = ()
+    positions: Sequence[tuple[float, ...]] = ()
+    links: Sequence[str] = ()
+
+    def goals(self) -> list[EndEffectorGoal]:
+        """Return the goals; none where none is given.
+
+        Raises
+        ------
+        click.UsageError
+            There are more or fewer names than goals.
+        GoalError
+            One is no position or no pose, or a link has two.
+        """
+        from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
+
+        values = [*self.poses, *self.positions]
+        links = self.links or [""] * min(len(values), 1)
+        if len(links) != len(values):
+            raise click.UsageError(
+                f"{len(values)} goal(s) of end-effectors and {len(self.links)} name(s): give one "
+                "--end-effector for each --end-effector-goal, then for each "
+                "--end-effector-position."
+            )
+        goals = [EndEffectorGoal.checked(*each) for each in zip(links, values, strict=True)]
+        return list(Goal.of_end_effectors(goals).end_effectors) if goals else goals
 
 
 def goal_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command the options of a goal, as its argument ``goal``."""
 
     @wraps(command)
-    def with_goal(*words: Any, goal: Any, rotvec: Any, rpy_deg: Any, **options: Any) -> None:
-        command(*words, goal=GoalOptions(goal, rotvec, rpy_deg), **options)
+    def with_goal(
+        *words: Any,
+        goal: Any,
+        rotvec: Any,
+        rpy_deg: Any,
+        poses: Any = (),
+        positions: Any = (),
+        links: Any = (),
+        **options: Any,
+    ) -> None:
+        hands = EndEffectorOptions(poses, positions, links)
+        command(*words, goal=GoalOptions(goal, rotvec, rpy_deg, hands), **options)
 
     return cast("Callable[..., None]", _pose_option(_attitude_options("goal-")(with_goal)))
+
+
+def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of end-effectors to those of a goal."""
+    for option in (
+        click.option(
+            "--end-effector",
+            "links",
+            multiple=True,
+            metavar="NAME",
+            help="Link of a goal of an end-effector [end_effector]. May be repeated: in the order "
+            "of the poses, then of the positions.",
+        ),
+        click.option(
+            "--end-effector-position",
+            "positions",
+            nargs=3,
+            type=float,
+            multiple=True,
+            metavar="X Y Z",
+            help="Goal position of an end-effector (m), in any attitude. May be repeated.",
+        ),
+        click.option(
+            "--end-effector-goal",
+            "poses",
+            nargs=7,
+            type=float,
+            multiple=True,
+            metavar="X Y Z QX QY QZ QW",
+            help="Goal pose of an end-effector (m, quaternion), with the base where it ends, but "
+            "for the goal of the base that is given. May be repeated.",
+        ),
+    ):
+        command = option(command)
+    return command
 
 
 def note_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> None:

@@ -16,6 +16,7 @@ from spacerobot_ros.cli.options import (
     METHODS,
     GoalOptions,
     Registered,
+    end_effector_options,
     goal_options,
     json_option,
     out_option,
@@ -38,6 +39,7 @@ _NO_GOAL = GoalOptions(None, None, None)
 
 @click.command("plan")
 @click.argument("scenario", metavar="SCENARIO|ROBOT")
+@end_effector_options
 @goal_options
 @click.option("--method", type=Registered(METHODS), help="Gait method [the scenario's].")
 @settings_option
@@ -90,7 +92,7 @@ def plan_command(
     trial = fastest(plans) if comparing and method == "auto" else plans.get(method)
     if not isinstance(trial, PlanEvaluation):
         fail()
-    left = f"{trial.error.angle:.3g} rad and {trial.error.distance:.3g} m from the goal"
+    left = _distance_from(problem.goal, trial)
     if not comparing:
         click.echo(f"{scenario}, {method}: {trial.duration:.6g} s, ends {left}")
         click.echo(f"planned in {trial.plan_time:.3f} s")
@@ -111,6 +113,15 @@ def plan_command(
         click.echo(f"picture     {picture}")
     if not trial.reached:
         fail(f"The goal is not reached within the planner's tolerance: {left}.")
+
+
+def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:
+    """Return how far a plan ends from its goal."""
+    if not goal.end_effectors:
+        return f"{trial.error.angle:.3g} rad and {trial.error.distance:.3g} m from the goal"
+    from spacerobot_ros.planning.execution.status import describe_remaining_error
+
+    return describe_remaining_error(trial.error, trial.controls - {"shape"})
 
 
 def problem_of(name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] = ()) -> Problem:
@@ -143,15 +154,16 @@ def json_of(problem: Problem, trial: PlanEvaluation) -> dict[str, Any]:
     return {
         "scenario": problem.name,
         "method": trial.method,
-        "goal": [*goal.position.tolist(), *goal.quaternion.tolist()],
+        "goal": [*goal.position.tolist(), *goal.quaternion.tolist()] if goal.base else None,
         "succeeded": trial.reached,
         "manoeuvre_time_s": trial.duration,
         "plan_time_s": trial.plan_time,
         "final_position_m": trial.pose[:3].tolist(),
         "final_attitude_rotvec_rad": rotvec_from_quaternion(trial.pose[3:]).tolist(),
         "final_joint_positions": trial.positions[-1].tolist(),
-        "position_error_m": trial.error.distance,
-        "attitude_error_rad": trial.error.angle,
+        "position_error_m": trial.error.distance if "position" in goal.base else None,
+        "attitude_error_rad": trial.error.angle if "attitude" in goal.base else None,
+        **_end_effectors_of(problem.goal, trial),
         "notes": trial.pieces[-1].notes,
         "schedule": {
             "tick_period_s": problem.control_period,
@@ -163,6 +175,22 @@ def json_of(problem: Problem, trial: PlanEvaluation) -> dict[str, Any]:
             "position_m": path.position.tolist(),
             "quaternion": path.quaternion.tolist(),
         },
+    }
+
+
+def _end_effectors_of(goal: Goal, trial: PlanEvaluation) -> dict[str, Any]:
+    """Return goals and errors of end-effectors, where the goal has any."""
+    if not goal.end_effectors:
+        return {}
+    return {
+        "end_effectors": {
+            each.link: {
+                "goal": list(each.values),
+                "position_error_m": error.distance,
+                "attitude_error_rad": error.angle,
+            }
+            for each, error in zip(goal.end_effectors, trial.error.end_effectors, strict=True)
+        }
     }
 
 

@@ -17,6 +17,8 @@ from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal
+from spacerobot_ros.planning.api import EndEffectorValues, end_effector_goals
+from spacerobot_ros.planning.core.goal import POSE, Controlled
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.resources import resource_names
@@ -29,6 +31,9 @@ from spacerobot_ros.scenario import (
     scenario_or_robot,
 )
 from spacerobot_ros.simulation.trials import state_of
+
+_ORIGIN = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+"""The pose of a base that is nowhere else."""
 
 
 def fly(
@@ -89,6 +94,9 @@ def plan(
     *,
     position: npt.ArrayLike | None = None,
     rotvec: npt.ArrayLike | None = None,
+    end_effector_position: EndEffectorValues | None = None,
+    end_effector_pose: EndEffectorValues | None = None,
+    end_effector: str = "",
     method: str | None = None,
     **options: Any,
 ) -> GaitSchedule:
@@ -110,6 +118,10 @@ def plan(
     position, rotvec
         Position (3,), m, and attitude (3,), rad, as exponential coordinates; they replace those of
         ``goal``.
+    end_effector_position, end_effector_pose, end_effector
+        Goal of an end-effector, with the base free but for what is given of its pose: its position
+        (3,), m, or position and quaternion (7,), and the name of its link; or positions or poses
+        of several, by name.
     method
         Name of a gait method; None: that of the scenario; of a robot alone ``auto``, or ``optimal``
         if there are options of a method.
@@ -124,19 +136,26 @@ def plan(
     ParameterError
         There is no such scenario, robot, method or option, or one is refused.
     """
-    aimed = any(each is not None for each in (goal, position, rotvec))
+    hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
+    aimed = bool(hands) or any(each is not None for each in (goal, position, rotvec))
     if not _is_scenario(what, aimed=aimed):
         assert not isinstance(what, Scenario)
         if goal is not None:
-            start = Goal.checked([0, 0, 0], [0, 0, 0, 1])
+            start = Goal.checked(*_ORIGIN)
             goal, position, rotvec = _changed_goal(start, goal, position, rotvec), None, None
             if (shape := options.pop("joint_positions", None)) is not None:
-                goal = Goal.checked(goal.position, goal.quaternion, shape)
+                goal = replace(goal, joint_positions=Goal.checked(*_ORIGIN, shape).joint_positions)
+            if hands:
+                goal = replace(goal, end_effectors=hands)
         chosen = {
             name: _float_list(value, name)
             for name, value in (("position", position), ("rotvec", rotvec))
             if value is not None
         }
+        if goal is None and hands:
+            options["end_effector_position"] = end_effector_position
+            options["end_effector_pose"] = end_effector_pose
+            options["end_effector"] = end_effector
         if method is None:
             # The options of a method that is not named are those of `optimal`.
             of_method = options.keys() - signature(planning.plan).parameters.keys()
@@ -144,6 +163,11 @@ def plan(
         return planning.plan(what, goal, method=method, **{**chosen, **options})
     scenario = what if isinstance(what, Scenario) else load_scenario(str(what))
     scenario = _with_goal(scenario, goal, position, rotvec)
+    if hands:
+        asked: set[Controlled] = set() if goal is None else set(POSE)
+        asked |= set() if position is None else {"position"}
+        asked |= set() if rotvec is None else {"attitude"}
+        scenario = scenario.with_end_effectors(hands, frozenset(asked))
     settings: dict[str, Any] = {} if method is None else {"method": method}
     name = method or scenario.planner.method
     method_options(name, options)  # Refused here, by the names that were given.

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
-from spacerobot_ros.planning.core.goal import Goal, RobotState, Tolerance
+from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.methods.registry import build_method, method_options
 from spacerobot_ros.resources import robot_file
+
+EndEffectorValues = npt.ArrayLike | Mapping[str, npt.ArrayLike]
+"""Numbers of the goal of one end-effector, or of several, by the names of their links."""
 
 _DEFAULT_TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
 
@@ -25,9 +29,12 @@ def plan(
     robot: SpaceRobot | str | Path,
     goal: Goal | None = None,
     *,
-    position: npt.ArrayLike = (0.0, 0.0, 0.0),
-    rotvec: npt.ArrayLike = (0.0, 0.0, 0.0),
+    position: npt.ArrayLike | None = None,
+    rotvec: npt.ArrayLike | None = None,
     joint_positions: npt.ArrayLike | None = None,
+    end_effector_position: EndEffectorValues | None = None,
+    end_effector_pose: EndEffectorValues | None = None,
+    end_effector: str = "",
     start: RobotState | npt.ArrayLike | None = None,
     method: str = "optimal",
     control_period: float = 0.05,
@@ -37,13 +44,19 @@ def plan(
 ) -> GaitSchedule:
     """Plan a gait: ``plan("sliding_masses", position=(0.3, 0, 0.1), rotvec=(0.5, 0, 0))``.
 
+    With a goal of an end-effector, ``plan("three_joint_arm", end_effector_position=(2, 1, 0.5))``,
+    the base is free but for what is given of its pose.
+
     Parameters
     ----------
     robot
         The model, a URDF file, or the name of a robot of this package.
     goal
-        Goal of the base; or ``position`` (3,) in m, ``rotvec`` (3,) in rad (exponential
-        coordinates), and the final ``joint_positions`` (n,) in m or rad.
+        The goal; or, of the base, ``position`` (3,) in m (the origin) and ``rotvec`` (3,) in rad
+        (exponential coordinates; no rotation), and the final ``joint_positions`` (n,) in m or rad.
+    end_effector_position, end_effector_pose
+        Position (3,) in m, or position and quaternion (7,), of the link ``end_effector`` (its name;
+        empty: the link of that name); or of several links, by name.
     start
         The start: a state, or the shape (n,) alone with the base at the origin of W; None is the
         shape zero, or as near to it as the joint limits allow.
@@ -63,10 +76,56 @@ def plan(
     if not isinstance(robot, SpaceRobot):
         robot = SpaceRobot.from_file(robot_file(str(robot)))
     if goal is None:
-        goal = Goal.checked(position, quaternion_from_rotvec(rotvec), joint_positions)
+        hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
+        quaternion = None if rotvec is None else quaternion_from_rotvec(rotvec)
+        if hands:
+            goal = Goal.of_end_effectors(
+                hands, position=position, quaternion=quaternion, joint_positions=joint_positions
+            )
+        else:
+            goal = Goal.checked(
+                (0.0, 0.0, 0.0) if position is None else position,
+                (0.0, 0.0, 0.0, 1.0) if quaternion is None else quaternion,
+                joint_positions,
+            )
+    goal = goal.for_robot(robot.description)
     options_of_method = {method: method_options(method, options)}
     planner = build_method(method, robot, control_period, integration_step, options_of_method)
     return planner.plan(PlanRequest(_start_state(robot, start), goal, tolerance))
+
+
+def end_effector_goals(
+    position: EndEffectorValues | None, pose: EndEffectorValues | None, link: str = ""
+) -> tuple[EndEffectorGoal, ...]:
+    """Return goals of end-effectors from positions and poses: of one ``link``, or by name.
+
+    Raises
+    ------
+    GoalError
+        One is no position or no pose, or a link has two goals, or one is named twice.
+    """
+    goals = []
+    for values, count in ((position, 3), (pose, 7)):
+        if values is None:
+            continue
+        by_link = values if isinstance(values, Mapping) else {link: values}
+        if link and isinstance(values, Mapping):
+            raise GoalError(
+                f"The goals of end-effectors are given by name, and '{link}' is named beside them."
+            )
+        for name, numbers in by_link.items():
+            goal = EndEffectorGoal.checked(str(name), numbers)
+            if len(goal.values) != count:
+                kind = "a position has 3" if count == 3 else "a pose has 7"
+                raise GoalError(
+                    f"The goal of the end-effector has {len(goal.values)} numbers; {kind}."
+                )
+            goals.append(goal)
+    if goals:
+        Goal.of_end_effectors(goals)
+    elif link:
+        raise GoalError(f"The end-effector '{link}' has no goal: give its position or its pose.")
+    return tuple(goals)
 
 
 def _start_state(robot: SpaceRobot, start: RobotState | npt.ArrayLike | None) -> RobotState:

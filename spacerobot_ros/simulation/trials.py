@@ -175,7 +175,8 @@ def try_method(problem: Problem, name: str, method: GaitMethod | None = None) ->
         for rates in schedule.velocities:
             plant.step(rates)
         pieces.append(schedule)
-        error = PoseError.between(plant.pose[:3], plant.pose[3:], problem.goal, plant.q)
+        pose, robot = plant.pose, problem.robot
+        error = PoseError.between(pose[:3], pose[3:], problem.goal, plant.q, robot)
         reached = tolerance.admits(error, schedule.controls)
         if reached:
             break

@@ -188,7 +188,7 @@ def test_a_motion_is_late_in_its_last_third(
     def aim(self: PathCheck, *arguments: Any, late: bool) -> None:
         told.append(late)
 
-    monkeypatch.setattr(PathCheck, "aim", aim)
+    monkeypatch.setattr(PathCheck, "shift_goal", aim)
     loop = Loop({"takeover_time": 0.3, "replan_period": 0.1}, method=MovingStub(90))
     loop.propose_goal(NEAR)
     loop.tick(ticks_flown + 2)

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import GoalError
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.rotations import (
     attitude_error,
+    matrix_from_quaternion,
     matrix_from_rpy,
     quaternion_from_matrix,
     quaternion_from_rotvec,
     unit_quaternion,
 )
 
-Controlled = Literal["position", "attitude", "shape"]
-"""A part of a goal: the position and the attitude of the base, and the joint positions."""
+Controlled = Literal["position", "attitude", "shape", "end_effectors"]
+"""A part of a goal: the position and the attitude of the base, the joint positions, and the poses
+of end-effectors.
+"""
 
 POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
 """The parts of a goal that are the pose of the base."""
@@ -36,8 +42,51 @@ _MAX_ANGLE = 2e6 * np.pi
 
 
 @dataclass(frozen=True)
+class EndEffectorGoal:
+    """A position or a pose in the world of a link E of the robot.
+
+    Attributes
+    ----------
+    link
+        Name of the link; empty: that of the robot's default end-effector.
+    position
+        (3,) r_WE of the origin of its frame, m.
+    quaternion
+        (4,) of R_WE, (x, y, z, w); None: any attitude.
+    """
+
+    link: str
+    position: Array
+    quaternion: Array | None = None
+
+    @classmethod
+    def checked(cls, link: str, pose: npt.ArrayLike) -> EndEffectorGoal:
+        """Return the goal at a position (3,), m, or a pose (7,) with a quaternion (x, y, z, w).
+
+        Raises
+        ------
+        GoalError
+            They are not 3 or 7 finite numbers, or the quaternion is zero.
+        """
+        values = _convert_numbers(pose, f"of '{link}'")
+        if values.shape not in ((3,), (7,)):
+            raise GoalError(
+                f"The goal of '{link}' is {values.size} number(s); it takes 3, a position, or 7, "
+                "a position and a quaternion."
+            )
+        given = Goal.checked(values[:3], values[3:] if len(values) == 7 else [0, 0, 0, 1])
+        return cls(link, given.position, given.quaternion if len(values) == 7 else None)
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Position (3,), or position and quaternion (7,), as :meth:`checked` takes them."""
+        attitude = [] if self.quaternion is None else self.quaternion.tolist()
+        return (*self.position.tolist(), *attitude)
+
+
+@dataclass(frozen=True)
 class Goal:
-    """A pose of the base link in the world, and the final shape of the joints.
+    """A pose of the base link in the world, the final shape of the joints, and end-effectors.
 
     Attributes
     ----------
@@ -47,11 +96,50 @@ class Goal:
         (4,) of R_WB, (x, y, z, w).
     joint_positions
         (n,) in the order of the robot's joints, m or rad; None: the method chooses.
+    end_effectors
+        Goals of links, each of another one.
+    base
+        The parts of the pose of the base that are asked for. With end-effectors it may be any of
+        them or none; the base is then where the motion leaves it.
     """
 
     position: Array
     quaternion: Array
     joint_positions: Array | None = None
+    end_effectors: tuple[EndEffectorGoal, ...] = ()
+    base: frozenset[Controlled] = POSE
+
+    @classmethod
+    def of_end_effectors(
+        cls,
+        end_effectors: Iterable[EndEffectorGoal],
+        *,
+        position: npt.ArrayLike | None = None,
+        quaternion: npt.ArrayLike | None = None,
+        joint_positions: npt.ArrayLike | None = None,
+    ) -> Goal:
+        """Return a goal of end-effectors; the base is free but for what is given of its pose.
+
+        Raises
+        ------
+        GoalError
+            A link has two goals or there is no goal, or a list is refused by :meth:`checked`.
+        """
+        goals = tuple(end_effectors)
+        if not goals:
+            raise GoalError("The goal names no end-effector.")
+        _require_one_goal_each(goals)
+        asked: set[Controlled] = set()
+        if position is not None:
+            asked.add("position")
+        if quaternion is not None:
+            asked.add("attitude")
+        made = cls.checked(
+            [0, 0, 0] if position is None else position,
+            [0, 0, 0, 1] if quaternion is None else quaternion,
+            joint_positions,
+        )
+        return cls(made.position, made.quaternion, made.joint_positions, goals, frozenset(asked))
 
     @classmethod
     def checked(
@@ -129,17 +217,58 @@ class Goal:
             raise GoalError(f"The angles {rpy_deg!r} are not three finite numbers of degrees.")
         return cls.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
+    def for_robot(self, robot: RobotDescription) -> Goal:
+        """Return the goal with the names of its end-effectors; an empty name is the default one.
+
+        Raises
+        ------
+        GoalError
+            The robot has no such link, or it is the base, or a link has two goals.
+        """
+        names = ", ".join(each.name for each in robot.links[1:])
+        goals = []
+        for each in self.end_effectors:
+            link = robot.end_effector(each.link)
+            if not link:
+                raise GoalError(
+                    f"The goal is for the end-effector, and robot '{robot.name}' has no link "
+                    f"'{DEFAULT_END_EFFECTOR}': name one of its links {names}."
+                )
+            if link == robot.base_link:
+                raise GoalError(
+                    f"The goal is for '{link}', which is the base: give its pose as the goal of "
+                    "the base."
+                )
+            if link not in robot.frames:
+                raise GoalError(
+                    f"The goal is for '{link}', which robot '{robot.name}' does not have; its "
+                    f"links are {names}."
+                )
+            goals.append(replace(each, link=link))
+        _require_one_goal_each(goals)
+        return replace(self, end_effectors=tuple(goals))
+
     def equals(self, other: Goal) -> bool:
-        """Whether another goal has exactly the same pose and shape."""
+        """Whether another goal has exactly the same poses and shape."""
         mine, others = self.joint_positions, other.joint_positions
         same_shape = (
             mine is others if mine is None or others is None else np.array_equal(mine, others)
         )
         return (
             bool(same_shape)
+            and self.base == other.base
+            and {each.link: each.values for each in self.end_effectors}
+            == {each.link: each.values for each in other.end_effectors}
             and np.array_equal(self.position, other.position)
             and np.array_equal(self.quaternion, other.quaternion)
         )
+
+
+def _require_one_goal_each(goals: Iterable[EndEffectorGoal]) -> None:
+    for link, count in Counter(each.link for each in goals).items():
+        if count > 1:
+            name = f"'{link}'" if link else "that has no name"
+            raise GoalError(f"The end-effector {name} has {count} goals; it can have one.")
 
 
 def _convert_numbers(given: npt.ArrayLike, name: str) -> Array:
@@ -182,21 +311,51 @@ class PoseError:
         (3,) rotation vector from the attitude to that of the goal, in B, rad.
     shape
         (n,) from the joint positions to those of the goal, m or rad; empty where the goal has none.
+    end_effectors
+        Likewise of each end-effector of the goal: from its pose, in W and in its own frame; the
+        rotation is zero where the goal is a position alone.
     """
 
     position: Array
     rotvec: Array
     shape: Array = field(default_factory=lambda: np.zeros(0))
+    end_effectors: tuple[PoseError, ...] = ()
 
     @classmethod
     def between(
-        cls, position: Array, quaternion: Array, goal: Goal, q: Array | None = None
+        cls,
+        position: Array,
+        quaternion: Array,
+        goal: Goal,
+        q: Array | None = None,
+        robot: SpaceRobot | None = None,
     ) -> PoseError:
-        """Return the error from a pose, and from the shape ``q`` (n,) if given, to the goal."""
+        """Return the error from a pose, and from the shape ``q`` (n,) if given, to the goal.
+
+        The errors of end-effectors take the shape and the robot.
+        """
         shape = np.zeros(0)
+        hands: tuple[PoseError, ...] = ()
         if q is not None and goal.joint_positions is not None:
             shape = goal.joint_positions - q
-        return cls(goal.position - position, attitude_error(quaternion, goal.quaternion), shape)
+        if q is not None and robot is not None and goal.end_effectors:
+            hands = tuple(
+                cls.of_end_effector(robot, position, quaternion, q, each)
+                for each in goal.end_effectors
+            )
+        turn = attitude_error(quaternion, goal.quaternion)
+        return cls(goal.position - position, turn, shape, hands)
+
+    @classmethod
+    def of_end_effector(
+        cls, robot: SpaceRobot, position: Array, quaternion: Array, q: Array, goal: EndEffectorGoal
+    ) -> PoseError:
+        """Return the error from the pose of a link to its goal, for a pose and a shape."""
+        r_WE, quaternion_WE = end_effector_pose(robot, goal.link, position, quaternion, q)
+        turn = np.zeros(3)
+        if goal.quaternion is not None:
+            turn = attitude_error(quaternion_WE, goal.quaternion)
+        return cls(goal.position - r_WE, turn)
 
     @property
     def distance(self) -> float:
@@ -213,10 +372,40 @@ class PoseError:
         """Largest joint error, m or rad; zero for a goal without shape."""
         return float(np.abs(self.shape).max(initial=0.0))
 
+    @property
+    def farthest_end_effector(self) -> float:
+        """Largest distance of an end-effector from its goal, m; zero where the goal has none."""
+        return max((each.distance for each in self.end_effectors), default=0.0)
+
+    @property
+    def most_turned_end_effector(self) -> float:
+        """Largest angle of an end-effector from its goal, rad; zero where the goal has none."""
+        return max((each.angle for each in self.end_effectors), default=0.0)
+
+
+def end_effector_pose(
+    robot: SpaceRobot, link: str, position: Array, quaternion: Array, q: Array
+) -> tuple[Array, Array]:
+    """Return where a link is: r_WE (3,), m, and the quaternion (4,) of R_WE.
+
+    ``position`` (3,), ``quaternion`` (4,) and ``q`` (n,) are the pose of the base and the shape.
+
+    Raises
+    ------
+    KeyError
+        There is no such link.
+    """
+    R_BE, r_BE_B = robot.link_pose(link, q)
+    R_WB = matrix_from_quaternion(quaternion)
+    return position + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE)
+
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Largest errors of a reached goal: ``position`` m, ``attitude`` rad, joints m or rad."""
+    """Largest errors of a reached goal: ``position`` m, ``attitude`` rad, joints m or rad.
+
+    Those of the pose are for the base and for end-effectors alike.
+    """
 
     position: float
     attitude: float
@@ -228,4 +417,11 @@ class Tolerance:
             ("position" not in controls or error.distance <= self.position)
             and ("attitude" not in controls or error.angle <= self.attitude)
             and ("shape" not in controls or error.max_joint_error <= self.shape)
+            and (
+                "end_effectors" not in controls
+                or all(
+                    each.distance <= self.position and each.angle <= self.attitude
+                    for each in error.end_effectors
+                )
+            )
         )

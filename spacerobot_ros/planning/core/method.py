@@ -21,6 +21,9 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 _REST_MOMENTUM = 1e-9
 """Momenta per mass below this count as zero, m/s and m^2/s."""
 
+END_EFFECTOR_METHOD = "optimal"
+"""Name of the method that plans for goals of end-effectors."""
+
 _LIMIT_SLACK = 1e-9
 """Rounding error by which a goal shape may exceed a joint limit, m or rad."""
 
@@ -183,6 +186,8 @@ class GaitMethod(ABC):
         progress: object = None,
     ) -> GaitSchedule:
         """Return shapes (N + 1, n) at the ticks as a schedule of this method."""
+        if self.name != END_EFFECTOR_METHOD:
+            self._require_goal_of_base(goal)
         return GaitSchedule(
             method=self.name,
             joint_names=self.robot.joint_names,
@@ -226,6 +231,15 @@ class GaitMethod(ABC):
                 Proof.LIMITS,
             )
         return np.clip(wanted, robot.lower, robot.upper)
+
+    def _require_goal_of_base(self, goal: Goal) -> None:
+        """Refuse goals of end-effectors, by methods that reach none."""
+        if goal.end_effectors:
+            names = " and ".join(f"'{each.link}'" for each in goal.end_effectors)
+            raise PlanningError(
+                f"{self.name} plans for the pose of the base, and the goal is for {names}: "
+                f"{END_EFFECTOR_METHOD} plans for end-effectors."
+            )
 
     def _require_rest(self, state: RobotState) -> None:
         """Refuse an unsuitable robot, and a robot whose total momentum is not zero."""

@@ -21,7 +21,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning.core.goal import POSE, Controlled, PoseError, RobotState
+from spacerobot_ros.planning.core.goal import Controlled, PoseError, RobotState
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -464,7 +464,8 @@ class Executive:
             self._add_status(PlannerState.FAILED, str(reason), active.identified)
             self._end_goal(Event.FAILED)
             return
-        error = PoseError.between(state.position, state.quaternion, active.identified.goal, state.q)
+        goal = active.identified.goal
+        error = PoseError.between(state.position, state.quaternion, goal, state.q, self._robot)
         if self.config.tolerance.admits(error, controls):
             message = f"The goal is reached: {describe_remaining_error(error, controls)}."
             self._add_status(PlannerState.REACHED, message, active.identified, active, error)
@@ -589,7 +590,7 @@ class Executive:
         aim = self._tracker.path_check.shift_goal(
             active.identified.goal,
             self.config.tolerance,
-            active.schedule.controls & POSE,
+            active.schedule.controls - {"shape"},
             late=active.ends_at - self._stamp_ns / 1e9 < _LATE_TIME_SHARE * active.manoeuvre_time,
         )
         if aim is None:
@@ -871,7 +872,7 @@ class Executive:
         self._drop_plan()
         tracker.stop()
         self._subtract_remainder(active, self._stamp_ns)
-        active.required = active.schedule.controls & POSE
+        active.required = active.schedule.controls - {"shape"}
         active.next_plan = PlanReason.STUCK_JOINTS
         self._average.restart()
         self._change_phase(Event.JOINTS_STUCK, self._phase_at_rest())

@@ -25,7 +25,15 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_rotvec,
     quaternion_multiply,
 )
-from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState, Tolerance
+from spacerobot_ros.planning.core.goal import (
+    Controlled,
+    EndEffectorGoal,
+    Goal,
+    PoseError,
+    RobotState,
+    Tolerance,
+    end_effector_pose,
+)
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 
@@ -159,14 +167,35 @@ class PathCheck:
         expected from the estimated masses, as far as it exceeds a share of the tolerance.
         """
         position, quaternion = self.end
-        error = PoseError.between(*self.expected_end, goal)
+        last = self._positions[-1]
+        error = PoseError.between(*self.expected_end, goal, last, self._robot)
         near = Tolerance(*(_NEAR_SHARES[late] * x for x in (within.position, within.attitude)))
         if near.admits(error, controls):
             return None
         moved = error.position * _excess_share(error.distance, _AIM_SHARES[late] * within.position)
         turn = error.rotvec * _excess_share(error.angle, _AIM_SHARES[late] * within.attitude)
         aimed = quaternion_multiply(quaternion, quaternion_from_rotvec(turn))
-        return Goal(position + moved, aimed, goal.joint_positions)
+        hands = tuple(
+            self._aimed_end_effector(each, missing, within, late=late)
+            for each, missing in zip(goal.end_effectors, error.end_effectors, strict=True)
+        )
+        return replace(goal, position=position + moved, quaternion=aimed, end_effectors=hands)
+
+    def _aimed_end_effector(
+        self, goal: EndEffectorGoal, error: PoseError, within: Tolerance, *, late: bool
+    ) -> EndEffectorGoal:
+        """Return the goal of an end-effector, shifted likewise."""
+        position, quaternion = end_effector_pose(
+            self._robot, goal.link, *self.end, self._positions[-1]
+        )
+        position = position + error.position * _excess_share(
+            error.distance, _AIM_SHARES[late] * within.position
+        )
+        if goal.quaternion is None:
+            return replace(goal, position=position)
+        turn = error.rotvec * _excess_share(error.angle, _AIM_SHARES[late] * within.attitude)
+        aimed = quaternion_multiply(quaternion, quaternion_from_rotvec(turn))
+        return replace(goal, position=position, quaternion=aimed)
 
 
 def _excess_share(error: float, allowed: float) -> float:

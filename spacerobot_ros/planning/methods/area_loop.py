@@ -135,6 +135,7 @@ class AreaLoopGait(GaitMethod):
         """
         state, goal, tolerance = request.state, request.goal, request.tolerance
         self._require_rest(state)
+        self._require_goal_of_base(goal)
         final = self._goal_shape(goal)
         gait = _PlannedMotion(state.q[np.newaxis], state.quaternion[np.newaxis])
         notes: Notes = {"cycles": 0.0}

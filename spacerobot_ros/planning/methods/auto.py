@@ -78,6 +78,8 @@ class AutoGait(GaitMethod):
         """
         refusals = dict(self._unsuitable)
         names = self._list_comparable(refusals)
+        if request.goal.end_effectors:
+            names = [name for name in self._candidates if name not in self._unsuitable]
         if request.motion is not None:
             for name in names:
                 if not self._candidates[name].method.starts_in_motion:
@@ -88,13 +90,13 @@ class AutoGait(GaitMethod):
             names.remove(flying)
             kept = self._plan_by_method(flying, request, refusals, cancellation)
             if kept is not None:
-                result = {flying: _MethodResult.of(kept, request)}
+                result = {flying: _MethodResult.of(self.robot, kept, request)}
                 return _add_notes(kept, flying, f"{flying} planned this goal before.", result, {})
         results: dict[str, _MethodResult] = {}
         for name in names:
             schedule = self._plan_by_method(name, request, refusals, cancellation)
             if schedule is not None:
-                results[name] = _MethodResult.of(schedule, request)
+                results[name] = _MethodResult.of(self.robot, schedule, request)
         if not results:
             raise self._refuse_goal(refusals)
         chosen = min(results, key=lambda name: results[name].rank(results.values()))
@@ -179,11 +181,11 @@ class _MethodResult:
     reaches: bool
 
     @classmethod
-    def of(cls, schedule: GaitSchedule, request: PlanRequest) -> _MethodResult:
+    def of(cls, robot: SpaceRobot, schedule: GaitSchedule, request: PlanRequest) -> _MethodResult:
         goal, path = request.goal, schedule.path
-        asked = POSE if goal.joint_positions is None else POSE | {"shape"}
+        asked = goal.base if goal.joint_positions is None else goal.base | {"shape"}
         q = schedule.positions[-1]
-        error = PoseError.between(path.position[-1], path.quaternion[-1], goal, q)
+        error = PoseError.between(path.position[-1], path.quaternion[-1], goal, q, robot)
         reaches = schedule.partial or request.tolerance.admits(error, schedule.controls)
         return cls(schedule, schedule.controls & asked, reaches)
 

@@ -108,6 +108,7 @@ class LieBracketGait(GaitMethod):
         cancellation.raise_if_requested()
         state, goal = request.state, request.goal
         self._require_rest(state)
+        self._require_goal_of_base(goal)
         z_f = self.final_shape(state, goal, POSITION_SLACK * request.tolerance.position)
         slide = self._slide_shapes(state.q, z_f)
         t1 = (len(slide) - 1) * self.control_period or self.options.t1

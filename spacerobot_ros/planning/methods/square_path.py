@@ -135,6 +135,7 @@ class SquarePathGait(GaitMethod):
         cancellation.raise_if_requested()
         state, goal, tolerance = request.state, request.goal, request.tolerance
         self._require_rest(state)
+        self._require_goal_of_base(goal)
         turn = self._requested_turn(request)
         psi_e = self._goal_shape(goal)
         if psi_e is None:

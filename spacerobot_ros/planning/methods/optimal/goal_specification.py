@@ -173,7 +173,7 @@ class GoalSpecification:
         if shape is None and self.same_shape:
             shape = state.q
         if self.attitude:
-            self._require_reachable_turn(robot, turn, tolerance.attitude)
+            self.require_reachable_turn(robot, turn, tolerance.attitude)
             if robot.n == 1 and len(self.turning.axes):
                 _require_within_one_joint(
                     robot, limits, state.q, self.turning.axes[0], turn, tolerance.attitude
@@ -214,7 +214,7 @@ class GoalSpecification:
             return BoundaryConditions(state.q, turn, likely, likely, None, direction)
         return BoundaryConditions(state.q, turn, likely, None, center, direction)
 
-    def _require_reachable_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
+    def require_reachable_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
         """Refuse attitudes that the joints cannot bring about."""
         axes, name = self.turning.axes, robot.description.name
         tilt = swing_angle(turn, axes)
@@ -484,7 +484,7 @@ class CenterReach:
         """Return the set of a robot whose joints keep to ``lower`` and ``upper`` (n,)."""
         bodies = robot.description.bodies
         if robot.description.coupled:
-            lower, upper = _moving_joint_ranges(robot, lower, upper)
+            lower, upper = moving_joint_ranges(robot, lower, upper)
         base = bodies[0].inertia
         origin, radius = base.mass * base.com, 0.0
         slots = np.zeros((3, len(lower)))
@@ -518,7 +518,7 @@ class CenterReach:
         return max(0.0, float(np.linalg.norm(beside)) - self.radius)
 
 
-def _moving_joint_ranges(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Array, Array]:
+def moving_joint_ranges(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Array, Array]:
     """Return ranges (m,) of all moving joints, each by itself: a larger set than that of (n,)."""
     G, offsets = robot.description.coupling
     leaders = np.argmax(np.abs(G), axis=1)

@@ -27,6 +27,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, matrix_from_quaternion
 from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
 from spacerobot_ros.planning.methods.optimal.problem import (
@@ -83,6 +84,8 @@ class ManoeuvreModel:
         (m, 3) directions in the base along which the attitude is reached.
     constraints, efforts
         Constraints of the path; no efforts: any.
+    end_effectors
+        Rows of the end-effectors that are to be reached; None: none are.
     """
 
     robot: SpaceRobot
@@ -91,6 +94,7 @@ class ManoeuvreModel:
     axes: Array
     constraints: PathConstraints
     efforts: JointEfforts | None = None
+    end_effectors: EndEffectorRows | None = None
 
 
 class CommandHolder:
@@ -101,6 +105,7 @@ class CommandHolder:
         self._prediction = model.prediction
         self._period = model.control_period
         self._axes, self._efforts = model.axes, model.efforts
+        self._end_effectors = model.end_effectors
         self._curvature = robot.function("curvature", compile=False)
         self._connection = robot.connection
         self._n = robot.n
@@ -133,9 +138,11 @@ class CommandHolder:
             ticks if fixed else max(_MIN_SMOOTH_TICKS, math.ceil(_MAX_STRETCH_FACTOR * ticks) + 4)
         )
         free = boundary.final is None and boundary.center is None
+        # The last shape is that at which end-effectors are at their goals.
+        choices = (False, True)[free and self._end_effectors is not None : 1 + free]
         for _ in range(_MAX_STRETCHES):
             factor = math.inf
-            for moves_end in (False, True)[: 1 + free]:
+            for moves_end in choices:
                 positions = trajectory.at_ticks(ticks)
                 held = self._adjust_to_goal(positions, boundary, final, limits, moves_end=moves_end)
                 if held is None:
@@ -194,6 +201,11 @@ class CommandHolder:
                 positions, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
             )
             error = self._axes @ attitude_error(quaternions[-1], boundary.turn)
+            if self._end_effectors is not None:
+                rows, by_turn, by_shape = self._end_effectors.evaluate(
+                    quaternions[-1:], positions[-1:], boundary.end_effectors
+                )
+                error = np.concatenate([error, -rows[0]])
             miss = float(np.linalg.norm(error))
             if miss <= _ATTITUDE_TOLERANCE or (
                 miss <= 1e3 * _ATTITUDE_TOLERANCE and miss > best / 2
@@ -202,14 +214,21 @@ class CommandHolder:
             if miss > 2 * best:
                 return None
             best = min(best, miss)
-            J = self._axes @ self._first_variation(positions, quaternions, waves)
+            turn = self._first_variation(positions, quaternions, waves)
+            J = self._axes @ turn
+            if self._end_effectors is not None:
+                J = np.vstack([J, by_turn[0] @ turn + by_shape[0] @ waves[-1].T])
             amplitudes = np.linalg.lstsq(J, error, rcond=1e-10)[0]
             positions = positions + np.einsum("kin,i->kn", waves, amplitudes)
             if clipped:
                 positions = np.clip(positions, limits.lower, limits.upper)
                 waves = self._build_waves(positions, limits)
                 if moves_end:
-                    waves = np.hstack([waves, self._build_ramps(s, limits)])
+                    ramps = self._build_ramps(s, limits)
+                    if self._end_effectors is not None:
+                        # The others make up for joints at the end of their range.
+                        ramps = ramps * self._fading(positions[-1], limits)
+                    waves = np.hstack([waves, ramps])
         return None
 
     def _build_waves(self, positions: Array, limits: MotionLimits) -> Array:
@@ -217,17 +236,22 @@ class CommandHolder:
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         order = np.arange(1, _WAVES_PER_JOINT + 1)
         shape = np.sin(math.pi * s) * np.sin(math.pi * s * order) / order
-        speed, half = self._speeds_and_half_ranges(positions[0], limits)
-        room = np.minimum(positions - limits.lower, limits.upper - positions)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            fading = np.clip(np.nan_to_num(room / (_FADING_ZONE * half), nan=0.0), 0.0, 1.0)
-        # Smooth where it begins, so that accelerations stay small.
-        fading = fading**2 * (3 - 2 * fading)
+        speed, _ = self._speeds_and_half_ranges(positions[0], limits)
+        fading = self._fading(positions, limits)
         joints = np.eye(self._n) * speed
         waves = (
             shape[:, :, np.newaxis, np.newaxis] * (fading[:, np.newaxis] * joints)[:, np.newaxis]
         )
         return np.asarray(waves.reshape(len(positions), -1, self._n))
+
+    def _fading(self, positions: Array, limits: MotionLimits) -> Array:
+        """Return factors (..., n) that vanish where joints are at the ends of their ranges."""
+        _, half = self._speeds_and_half_ranges(positions.reshape(-1, self._n)[0], limits)
+        room = np.minimum(positions - limits.lower, limits.upper - positions)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fading = np.clip(np.nan_to_num(room / (_FADING_ZONE * half), nan=0.0), 0.0, 1.0)
+        # Smooth where it begins, so that accelerations stay small.
+        return np.asarray(fading**2 * (3 - 2 * fading))
 
     def _build_ramps(self, s: Array, limits: MotionLimits) -> Array:
         """Return ramps (N + 1, n, n) that move the last shape."""

@@ -39,11 +39,15 @@ from spacerobot_ros.planning.methods.optimal.archives import (
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
+    PossibleEnd,
     Trajectory,
 )
 
 _CANDIDATES_PER_GUESS = 24
 """Loops of one kind from which the one that ends nearest to the goal is taken."""
+
+_LEAST_SIZE = 0.1
+"""Least size of loops on the way to a possible end, in half ranges, from the second guess on."""
 
 _MAX_RANGE_SHARE = 0.85
 """Share of half the joints' ranges that a guess uses at most."""
@@ -74,16 +78,23 @@ class InitialGuesses:
     def generate(
         self, boundary: BoundaryConditions, limits: MotionLimits, final: Array
     ) -> Iterator[Trajectory]:
-        """Yield guesses that end in the shape ``final`` (n,)."""
+        """Yield guesses that end in the shape ``final`` (n,), or in all possible ends in turn."""
         rng = np.random.default_rng(1)
         half = limits.span(boundary.start)[1]
-        (direct,) = self._build_trajectories(
-            self._direct_path(boundary.start, final)[np.newaxis], limits
-        )
-        missing = attitude_error(direct.quaternions[-1], boundary.turn)
-        size = min(1.0, self._loop_size(final, half, float(np.linalg.norm(missing))))
+        ends = boundary.ends or (PossibleEnd(final, boundary.turn),)
+        sizes = []
+        for end in ends:
+            (direct,) = self._build_trajectories(
+                self._direct_path(boundary.start, end.shape)[np.newaxis], limits
+            )
+            missing = attitude_error(direct.quaternions[-1], end.turn)
+            sizes.append(min(1.0, self._loop_size(end.shape, half, float(np.linalg.norm(missing)))))
         for number in itertools.count():
-            loop = _LOOPS[number % len(_LOOPS)]
+            around, place = divmod(number, len(ends))
+            final, turn = ends[place].shape, ends[place].turn
+            # The direct way to an end may be all that it takes, and is no guess twice.
+            size = max(sizes[place], _LEAST_SIZE if boundary.ends and around else 0.0)
+            loop = _LOOPS[around % len(_LOOPS)]
             rounds = [
                 size * rng.uniform(0.3, 1.5) * loop(rng, self._instants, len(half))
                 for _ in range(_CANDIDATES_PER_GUESS)
@@ -91,7 +102,7 @@ class InitialGuesses:
             shapes = self._add_loops(np.array(rounds), boundary.start, final, limits)
             candidates = self._build_trajectories(shapes, limits)
             # The cosine of half the angle that is left.
-            near = np.abs([each.quaternions[-1] @ boundary.turn for each in candidates])
+            near = np.abs([each.quaternions[-1] @ turn for each in candidates])
             yield candidates[int(near.argmax())]
 
     def _direct_path(self, start: Array, final: Array) -> Array:

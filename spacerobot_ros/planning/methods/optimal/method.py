@@ -31,13 +31,23 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
-from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
+from spacerobot_ros.planning.core.goal import (
+    Goal,
+    PoseError,
+    RobotState,
+    Tolerance,
+    end_effector_pose,
+)
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 from spacerobot_ros.planning.methods.optimal.archives import (
     archive_name,
     pack_arrays,
     unpack_arrays,
+)
+from spacerobot_ros.planning.methods.optimal.end_effectors import (
+    EndEffectorRows,
+    EndEffectorSpecification,
 )
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
@@ -83,11 +93,24 @@ _LIMIT_ROUNDING = 1e-8
 """Largest excess of a cached manoeuvre over a limit, relative or in joint coordinates."""
 
 
+@dataclass(frozen=True)
+class _GoalKind:
+    """Goals with the same parts: the searches for their manoeuvres, with the rows of
+    end-effectors, if there are any.
+    """
+
+    specification: GoalSpecification | EndEffectorSpecification
+    search: ManoeuvreSearch
+    motion_search: MotionSearch
+    rows: EndEffectorRows | None = None
+
+
 class OptimalGait(GaitMethod):
     """Minimum time, or least effort in a given time, from rest to rest.
 
     It reaches the attitude; the position where sliders can put the base anywhere, or where the
-    options ask for it; and the final shape where the goal gives one. The search has a budget of
+    options ask for it; and the final shape where the goal gives one. Of goals of end-effectors it
+    reaches these, and the parts of the pose of the base that they name. The search has a budget of
     starts and of steps of the solver, so equal requests have equal schedules on any machine, idle
     or busy; only where the user limits its wall time as well, they need not.
     """
@@ -107,7 +130,7 @@ class OptimalGait(GaitMethod):
             self._margin = per_joint(robot, "joint_margin", chosen.joint_margin)
         self._constraints = PathConstraints.of(robot, chosen)
         self._efforts = JointEfforts.of(robot, chosen, self.control_period)
-        model = ManoeuvreModel(
+        self._model = ManoeuvreModel(
             robot,
             self._prediction,
             self.control_period,
@@ -115,13 +138,39 @@ class OptimalGait(GaitMethod):
             self._constraints,
             self._efforts,
         )
-        self._search = ManoeuvreSearch(model, compiling=chosen.answers > 1)
-        self._motion_search = MotionSearch(model, self._search.solver)
+        self._base_goals = self._goal_kind(self._specification, self._model)
+        self._end_effector_goals: dict[tuple[object, ...], _GoalKind] = {}
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
         self._library_key = library_key(
             robot, self._limits, self._specification.axes, position=self._specification.position
         )
         self._library = load_library(chosen.library, self._library_key)
+
+    def _goal_kind(
+        self,
+        specification: GoalSpecification | EndEffectorSpecification,
+        model: ManoeuvreModel,
+    ) -> _GoalKind:
+        search = ManoeuvreSearch(model, compiling=self.options.answers > 1)
+        motion_search = MotionSearch(model, search.solver)
+        return _GoalKind(specification, search, motion_search, model.end_effectors)
+
+    def _kind_of(self, goal: Goal) -> _GoalKind:
+        """Return the kind of a goal; that of a goal of end-effectors is made when it is needed.
+
+        Raises
+        ------
+        GoalError
+            The robot has no such link.
+        """
+        if not goal.end_effectors:
+            return self._base_goals
+        key = EndEffectorSpecification.key(goal)
+        if key not in self._end_effector_goals:
+            of = EndEffectorSpecification.of(self.robot, self._specification, goal)
+            model = replace(self._model, axes=of.axes, end_effectors=of.rows_at_end)
+            self._end_effector_goals[key] = self._goal_kind(of, model)
+        return self._end_effector_goals[key]
 
     def build_library(self, requests: Iterable[PlanRequest]) -> SolutionLibrary | None:
         """Return the manoeuvres of all requests that can be reached; None if none can.
@@ -157,14 +206,16 @@ class OptimalGait(GaitMethod):
         self._require_rest(request.state)
         # Measured shapes may be a little beyond the joint limits.
         q = np.clip(request.state.q, self.robot.lower, self.robot.upper)
-        state, goal, correction = replace(request.state, q=q), request.goal, request.correction
-        request = replace(request, state=state)
+        goal, correction = request.goal.for_robot(self.robot.description), request.correction
+        state = replace(request.state, q=q)
+        request = replace(request, state=state, goal=goal)
         margin = np.zeros(self.robot.n) if correction else self._margin
-        shape = self._goal_shape(goal)
-        if request.motion is not None and shape is None and self._specification.same_shape:
+        shape, kind = self._goal_shape(goal), self._kind_of(goal)
+        same_shape = self._specification.same_shape and not goal.end_effectors
+        if request.motion is not None and shape is None and same_shape:
             # The shape of now is one on the way.
             shape = request.motion.remaining[-1]
-        boundary = self._specification.boundary_conditions(
+        boundary = kind.specification.boundary_conditions(
             self.robot,
             request,
             shape,
@@ -187,14 +238,16 @@ class OptimalGait(GaitMethod):
             key = self._request_key(request)
             if kept := self._load_cached_plan(self._cache, key, request, boundary, limits):
                 return kept
-        found = self._search.search(
+        # Libraries have manoeuvres to attitudes of the base.
+        library = None if correction or goal.end_effectors else self._library
+        found = kind.search.search(
             boundary,
             limits,
             state.quaternion,
             self._count_intervals(correction),
             replace(self.options, duration=0.0, answers=1) if correction else self.options,
             cancellation,
-            library=None if correction else self._library,
+            library=library,
             gentle=correction,
         )
         notes: Notes = {
@@ -238,7 +291,7 @@ class OptimalGait(GaitMethod):
             starts=1 if again else min(chosen.starts, _MAX_STARTS_IN_MOTION),
             answers=1 if again else chosen.answers,
         )
-        found = self._motion_search.search(
+        found = self._kind_of(request.goal).motion_search.search(
             boundary,
             limits,
             request.state.quaternion,
@@ -257,9 +310,9 @@ class OptimalGait(GaitMethod):
         return min(intervals, _MAX_CORRECTION_INTERVALS) if correction else intervals
 
     def _is_reached(self, state: RobotState, goal: Goal) -> bool:
-        error = PoseError.between(state.position, state.quaternion, goal, state.q)
+        error = PoseError.between(state.position, state.quaternion, goal, state.q, self.robot)
         nothing = Tolerance(_ZERO_ERROR, _ZERO_ERROR, _ZERO_ERROR)
-        return nothing.admits(error, self.controls)
+        return nothing.admits(error, self._kind_of(goal).specification.controls)
 
     def _build_schedule(
         self,
@@ -270,16 +323,26 @@ class OptimalGait(GaitMethod):
         velocity: Array | float = 0.0,
     ) -> GaitSchedule:
         path = self._prediction.path(state, positions)
-        left = PoseError.between(path.position[-1], path.quaternion[-1], goal)
+        end = path.position[-1], path.quaternion[-1]
+        left = PoseError.between(*end, goal, positions[-1], self.robot)
+        controls = self._kind_of(goal).specification.controls
         notes = {
             **notes,
             "final_shape": positions[-1].tolist(),
             "final_position": path.position[-1].tolist(),
-            "predicted_attitude_error": left.angle,
-            "predicted_position_error": left.distance,
-            "limited_by": self._list_active_limits(positions, velocity),
         }
-        return self._schedule_of(goal, positions, path, notes)
+        if not goal.end_effectors or "attitude" in controls:
+            notes["predicted_attitude_error"] = left.angle
+        if not goal.end_effectors or "position" in controls:
+            notes["predicted_position_error"] = left.distance
+        for each in goal.end_effectors:
+            r_WE, quaternion = end_effector_pose(self.robot, each.link, *end, positions[-1])
+            notes[f"final_pose_of_{each.link}"] = [*r_WE.tolist(), *quaternion.tolist()]
+        if goal.end_effectors:
+            notes["predicted_end_effector_position_error"] = left.farthest_end_effector
+            notes["predicted_end_effector_attitude_error"] = left.most_turned_end_effector
+        notes["limited_by"] = self._list_active_limits(positions, velocity)
+        return replace(self._schedule_of(goal, positions, path, notes), controls=controls)
 
     def _list_active_limits(self, positions: Array, velocity: Array | float) -> str:
         """Return the limits that held commands come near to, with their joints."""
@@ -308,6 +371,11 @@ class OptimalGait(GaitMethod):
             "tolerance": np.array([tolerance.position, tolerance.attitude]),
             **vars(self._limits),
         }
+        for each in goal.end_effectors:
+            numbers[f"end_effector {each.link}"] = np.array(each.values)
+        if goal.end_effectors:
+            parts = [part in goal.base for part in ("position", "attitude")]
+            numbers["base"] = np.array(parts, dtype=float)
         if self._efforts is not None:
             numbers["effort"] = self._efforts.limit
         if self._library is not None:
@@ -378,9 +446,17 @@ class OptimalGait(GaitMethod):
         if factor > 1 + _LIMIT_ROUNDING or overrun > _LIMIT_ROUNDING:
             raise CandidateError("it exceeds a limit of the joints")
         attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
-        error = attitude_error(attitudes[-1], request.goal.quaternion)
-        if np.linalg.norm(self._specification.axes @ error) > _MAX_CACHED_END_ERROR:
+        kind = self._kind_of(request.goal)
+        aim = quaternion_multiply(state.quaternion, boundary.turn)
+        aim = aim if request.goal.end_effectors else request.goal.quaternion
+        error = attitude_error(attitudes[-1], aim)
+        if np.linalg.norm(kind.specification.axes @ error) > _MAX_CACHED_END_ERROR:
             raise CandidateError("it ends in another attitude")
+        if kind.rows is not None:
+            turn = quaternion_multiply(quaternion_inverse(state.quaternion), attitudes[-1])
+            rows = kind.rows.evaluate(turn[np.newaxis], last[np.newaxis], boundary.end_effectors)
+            if np.abs(rows[0]).max() > _MAX_CACHED_END_ERROR:
+                raise CandidateError("it ends with end-effectors elsewhere")
         self._constraints.check(positions, attitudes, period)
 
 

@@ -194,7 +194,10 @@ def _pack_parameters(
         weights = np.array([0.0, 1.0 / max(float(np.sum(change**2)) / len(change), 1e-300)])
     center = np.zeros(3) if boundary.center is None else boundary.center
     return np.concatenate(
-        [boundary.start, boundary.turn, boundary.direction, center, typical, weights]
+        [
+            *(boundary.start, boundary.turn, boundary.direction, center, boundary.end_effectors),
+            *(typical, weights),
+        ]
     )
 
 

@@ -160,6 +160,14 @@ class CandidateError(PlanningError):
 
 
 @dataclass(frozen=True)
+class PossibleEnd:
+    """An end of a guess: a ``shape`` (n,), and the ``turn`` (4,) of the base since the start."""
+
+    shape: Array
+    turn: Array
+
+
+@dataclass(frozen=True)
 class BoundaryConditions:
     """Both ends of a motion that ends at rest, seen from the attitude that it starts at.
 
@@ -180,6 +188,10 @@ class BoundaryConditions:
     velocity
         (n,) first velocities of the joints, m/s or rad/s, at zero momentum; a number is that of
         all.
+    end_effectors
+        (7 k,) goals of k links (:meth:`.EndEffectorRows.pack`).
+    ends
+        Ends of the guesses, in turn; none: the likely shape, and the turn.
     """
 
     start: Array
@@ -189,6 +201,8 @@ class BoundaryConditions:
     center: Array | None = None
     direction: Array = field(default_factory=lambda: np.zeros(3))
     velocity: Array | float = 0.0
+    end_effectors: Array = field(default_factory=lambda: np.zeros(0))
+    ends: tuple[PossibleEnd, ...] = ()
 
 
 @dataclass(frozen=True)

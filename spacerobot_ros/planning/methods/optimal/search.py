@@ -241,6 +241,7 @@ class ManoeuvreSearch:
         self._compiling = compiling
         self._robot, self._period, self._axes = model.robot, model.control_period, model.axes
         self._constraints, self._efforts = model.constraints, model.efforts
+        self._end_effectors = model.end_effectors
         self._holder = CommandHolder(model)
         self._stages: dict[tuple[bool, bool], Stages] = {}
         self._solvers: dict[tuple[int, bool, float], MultipleShooting] = {}
@@ -409,6 +410,7 @@ class ManoeuvreSearch:
                 self._constraints,
                 inequalities,
                 compiling=self._compiling,
+                end_effectors=self._end_effectors and self._end_effectors.function,
             )
         return self._stages[key]
 

@@ -136,6 +136,7 @@ class Stages:
         inequalities: Sequence[PathInequality] = (),
         *,
         compiling: bool = False,
+        end_effectors: ca.Function | None = None,
     ) -> Stages:
         """Derive them, or take them from the cache.
 
@@ -151,6 +152,8 @@ class Stages:
             Constraints of the path.
         compiling
             Whether they are evaluated so often that compiling them pays.
+        end_effectors
+            Of SX: ``(turn (4,), shape (n,), parameters)``, rows that vanish at the end.
         """
         n = robot.n
         X, s, v = ca.SX.sym("X", 4), ca.SX.sym("s", n), ca.SX.sym("v", n)
@@ -161,7 +164,11 @@ class Stages:
         if position:
             center_of_mass = robot.function("center_of_mass", compile=False)
             reached.append(center_of_mass(s) - center)
-        ends = Block.of("end", ca.vertcat(X, s), ca.vertcat(turn, center), ca.vertcat(*reached))
+        p = [turn, center]
+        if end_effectors is not None:
+            p.append(ca.SX.sym("end_effectors", end_effectors.size1_in(2)))
+            reached.append(end_effectors(X, s, p[-1]))
+        ends = Block.of("end", ca.vertcat(X, s), ca.vertcat(*p), ca.vertcat(*reached))
         interval = _kept_interval(robot, constraints, inequalities, compiling=compiling)
         path = interval.rows - _dynamics(n)
         return cls(n, begins, interval, ends, path, turn_function(robot))
@@ -408,7 +415,9 @@ def program(stages: Stages, intervals: int) -> Program:
     layout = Layout(n, N)
     X, s, v, a = layout.knots()
     x = ca.MX.sym("x", layout.size)
-    sizes = {"start": n, "turn": 4, "direction": 3, "center": 3, "typical": n, "weights": 2}
+    goals = int(stages.end.values.size1_in(1)) - 7
+    sizes = {"start": n, "turn": 4, "direction": 3, "center": 3, "end_effectors": goals}
+    sizes |= {"typical": n, "weights": 2}
     p = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
     zero = np.zeros((N, 1), dtype=np.int64)
 
@@ -435,7 +444,7 @@ def program(stages: Stages, intervals: int) -> Program:
             stages.end,
             np.hstack([X[-1:], s[-1:]]),
             of_end,
-            ca.vertcat(p["turn"], p["center"]),
+            ca.vertcat(p["turn"], p["center"], p["end_effectors"]),
         ),
     ]
     rows = equalities + N * stages.path

@@ -1,0 +1,633 @@
+"""End-effectors at the end of a motion: conditions on the last shape and attitude.
+
+At zero momentum the centre of mass C of the system rests, so the last shape q and the turn X of the
+base since the start place every link E: seen from C, in the attitude B_0 of the base at the start,
+
+``r_CE = X (r_BE(q) - r_BC(q))``,  ``R = X R_BE(q)``.
+
+A goal of an end-effector is a value of the first, or of both; the position of the base is that of
+the base link, likewise. These are :class:`EndEffectorRows` of the optimal control problem, along
+those directions alone in which the joints move the link at all. Its guesses end in shapes that
+inverse kinematics finds (:meth:`EndEffectorSpecification.boundary_conditions`), each with the turn
+of the base on the direct way there (Umetani and Yoshida's generalised Jacobian), because the solver
+finds the nearest minimum only, and every family of shapes has its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array, JointKind
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_rotvec,
+    quaternion_inverse,
+    quaternion_multiply,
+    quaternions_from_rotvecs,
+    swing_angle,
+)
+from spacerobot_ros.model.symbolic_rotations import (
+    matrix_from_quaternion as symbolic_matrix_from_quaternion,
+)
+from spacerobot_ros.planning.core.controllability import sample_shapes
+from spacerobot_ros.planning.core.goal import (
+    Controlled,
+    EndEffectorGoal,
+    Goal,
+    RobotState,
+    end_effector_pose,
+)
+from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.methods.optimal.goal_specification import (
+    GoalSpecification,
+    moving_joint_ranges,
+)
+from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
+    MotionLimits,
+    PossibleEnd,
+)
+from spacerobot_ros.planning.methods.optimal.transcription import turn_function
+
+_SAMPLED_SHAPES = 8
+"""Shapes in general position at which the motion of the links is examined."""
+
+_SINGULAR_VALUE_TOLERANCE = 1e-7
+"""Singular values below this share of the largest count as zero."""
+
+_MIN_MOTION = 1e-9
+"""Motion of a link a metre or radian of the joints that is none, m or rad."""
+
+_PARAMETERS_PER_LINK = 7
+"""Numbers that a goal of a link takes: r_CE and a quaternion."""
+
+_HALF_TURN_ROUNDING = 1e-9
+"""Keeps the derivatives of the rotation error finite at half a turn."""
+
+_STARTS, _MORE_STARTS = 16, 96
+"""Shapes from which inverse kinematics begins, and those where none of these leads to the goal."""
+
+_ITERATIONS = 40
+"""Steps of inverse kinematics."""
+
+_DAMPING = 1e-4
+"""Of the least squares of a step, relative to the largest entry of their matrix."""
+
+_END_ERROR = 2e-3
+"""Error of a shape that may be the end of a guess, m or rad: the solver brings it to the goal."""
+
+_STEPS_ON_DIRECT_WAY = 12
+"""Steps in which the turn of the base on the direct way to a shape is integrated."""
+
+_MAX_STEP = 0.5
+"""Longest step of a joint in inverse kinematics, m or rad."""
+
+_POSSIBLE_ENDS = 6
+"""Ends that guesses of the search have, one after the other."""
+
+_SAME_END = 0.05
+"""Ends nearer than this, as shares of the joints' ranges, are the same."""
+
+_GIVEN_SHAPE_ERROR = 1e-9
+"""Smallest error at which given joint positions contradict a goal of an end-effector, m or rad."""
+
+
+@dataclass(frozen=True)
+class _LinkRows:
+    """Directions, in B_0, along which the joints move a link: (k, 3) of its origin, (l, 3) of its
+    rotation; no rows of rotation where any attitude will do.
+    """
+
+    link: str
+    displacements: Array
+    rotations: Array
+
+
+class EndEffectorRows:
+    """Rows that vanish where links of one robot are at their goals.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    links
+        Links, each with whether its attitude is part of the goal.
+    axes
+        (m, 3) directions in the base about which loops of the joints turn it.
+    """
+
+    def __init__(self, robot: SpaceRobot, links: Sequence[tuple[str, bool]], axes: Array) -> None:
+        self.robot, self.links, self.axes = robot, tuple(links), axes
+        self.parameters = _PARAMETERS_PER_LINK * len(self.links)
+        self.turn = turn_function(robot)
+        self._of_links = [self._directions(link, attitude) for link, attitude in links]
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """The rows, of SX: turn (4,) of the base, shape (n,) and parameters (:meth:`pack`)."""
+        X, q = ca.SX.sym("X", 4), ca.SX.sym("q", self.robot.n)
+        parameters = ca.SX.sym("p", self.parameters)
+        center = self.robot.function("center_of_mass", compile=False)(q)
+        R_all, r_all = self.robot.function("link_poses", compile=False)(q)
+        R_X, rows = symbolic_matrix_from_quaternion(X), [ca.SX(0, 1)]
+        by_link = ca.vertsplit(parameters, _PARAMETERS_PER_LINK)
+        for each, goal in zip(self._of_links, by_link, strict=True):
+            index = self.robot.link_names.index(each.link)
+            r_CE = R_X @ (r_all[:, index] - center)
+            rows.append(ca.DM(each.displacements) @ (r_CE - goal[:3]))
+            if len(each.rotations):
+                R_E = R_X @ R_all[:, 3 * index : 3 * index + 3]
+                turned = R_E @ symbolic_matrix_from_quaternion(goal[3:]).T
+                # Twice the sine of half the angle, about the axis of the rotation.
+                vector = ca.inv_skew((turned - turned.T) / 2) * 2
+                scale = ca.sqrt(ca.fmax(1 + ca.trace(turned), 0) + _HALF_TURN_ROUNDING)
+                rows.append(ca.DM(each.rotations) @ (vector / scale))
+        return ca.Function("end_effectors", [X, q, parameters], [ca.vertcat(*rows)])
+
+    def pack(self, state: RobotState, goals: Sequence[EndEffectorGoal]) -> Array:
+        """Return the parameters (7 k,) of goals: r_CE and the quaternion of E, both in B_0."""
+        R_WB = matrix_from_quaternion(state.quaternion)
+        r_WC = state.position + R_WB @ self.robot.center_of_mass(state.q)
+        from_start = quaternion_inverse(state.quaternion)
+        values = []
+        for each in goals:
+            values.append(R_WB.T @ (each.position - r_WC))
+            attitude = np.array([0.0, 0.0, 0.0, 1.0])
+            if each.quaternion is not None:
+                attitude = quaternion_multiply(from_start, each.quaternion)
+            values.append(attitude)
+        return np.concatenate(values)
+
+    @cached_property
+    def _with_derivatives(self) -> ca.Function:
+        """Rows, and their derivatives by a rotation of the base (in its components) and by q."""
+        X, q = ca.SX.sym("X", 4), ca.SX.sym("q", self.robot.n)
+        p = ca.SX.sym("p", self.parameters)
+        rows = self.function(X, q, p)
+        v, w = X[:3], X[3]
+        by_rotation = ca.vertcat(w * ca.DM.eye(3) + ca.skew(v), -v.T) / 2
+        outputs = [rows, ca.jacobian(rows, X) @ by_rotation, ca.jacobian(rows, q)]
+        return ca.Function("end_effectors", [X, q, p], ca.cse(list(map(ca.densify, outputs))))
+
+    def evaluate(self, X: Array, q: Array, parameters: Array) -> tuple[Array, Array, Array]:
+        """Return rows (K, m) and their derivatives (K, m, 3) and (K, m, n) at K ends.
+
+        The derivatives are by a rotation of the base, in its components, and by the shape;
+        ``X`` (K, 4) and ``q`` (K, n).
+        """
+        K = len(q)
+        p = np.repeat(parameters[:, np.newaxis], K, axis=1)
+        rows, by_rotation, by_shape = (each.full() for each in self._with_derivatives(X.T, q.T, p))
+        m = len(rows)
+        return (
+            rows.T,
+            by_rotation.reshape(m, K, 3).transpose(1, 0, 2),
+            by_shape.reshape(m, K, self.robot.n).transpose(1, 0, 2),
+        )
+
+    def turns_on_direct_way(self, start: Array, ends: Array) -> Array:
+        """Return the turns (K, 4) of the base on straight ways from a shape (n,) to ends (K, n)."""
+        N = _STEPS_ON_DIRECT_WAY
+        step = (ends - start) / N
+        shapes = start + step[:, np.newaxis] * np.arange(N)[:, np.newaxis]
+        steps = np.repeat(step, N, axis=0).T
+        Omega = self.turn(shapes.reshape(-1, len(start)).T, steps, steps).full().T
+        rotations = quaternions_from_rotvecs(Omega).reshape(len(ends), N, 4)
+        X = np.tile([0.0, 0.0, 0.0, 1.0], (len(ends), 1))
+        for k in range(N):
+            X = quaternion_multiply(X, rotations[:, k])
+        return X
+
+    def require_enough_freedom(self, fixed_attitude: bool) -> None:
+        """Refuse goals with more independent numbers than the joints can bring about.
+
+        Raises
+        ------
+        PlanningError
+            It is such a goal.
+        """
+        ranks, rows = [], 0
+        for q, turn in zip(*self._samples(), strict=True):
+            blocks = []
+            for each in self._of_links:
+                by_shape, by_turn = self._rates(each.link, q, turn)
+                use = np.hstack([by_shape] if fixed_attitude else [by_shape, by_turn])
+                blocks += [each.displacements @ use[:3], each.rotations @ use[3:]]
+            J = np.vstack(blocks)
+            rows = len(J)
+            ranks.append(int(np.linalg.matrix_rank(J, tol=1e-6)))
+        if max(ranks) < rows:
+            names = " and ".join(f"'{each.link}'" for each in self._of_links)
+            raise PlanningError(
+                f"The goal of {names} asks for {rows} independent coordinates, and the joints of "
+                f"robot '{self.robot.description.name}' move no more than {max(ranks)}: ask for "
+                "a position instead of a pose, or for less of the base."
+            )
+
+    def require_directions(
+        self, state: RobotState, goals: Sequence[EndEffectorGoal], tolerance: tuple[float, float]
+    ) -> None:
+        """Refuse goals off the directions in which the links move at all.
+
+        ``tolerance`` is that of positions, m, and of attitudes, rad.
+
+        Raises
+        ------
+        UnreachableError
+            It is such a goal.
+        """
+        R_WB = matrix_from_quaternion(state.quaternion)
+        name = self.robot.description.name
+        for each, goal in zip(self._of_links, goals, strict=True):
+            r_WE, now = end_effector_pose(
+                self.robot, each.link, state.position, state.quaternion, state.q
+            )
+            way = R_WB.T @ (goal.position - r_WE)
+            beside = float(np.linalg.norm(way - each.displacements.T @ (each.displacements @ way)))
+            if beside > tolerance[0]:
+                where = {0: "does not move", 1: "moves along one line", 2: "moves in one plane"}
+                raise UnreachableError(
+                    f"The end-effector '{each.link}' of robot '{name}' "
+                    f"{where[len(each.displacements)]} whatever the joints do, and its goal is "
+                    f"{beside:.3g} m away from there.",
+                    Proof.RANK,
+                )
+            if goal.quaternion is None:
+                continue
+            turn = quaternion_multiply(goal.quaternion, quaternion_inverse(now))
+            turn = np.append(R_WB.T @ turn[:3], turn[3])
+            swing = swing_angle(turn, each.rotations)
+            if swing > tolerance[1]:
+                where = {0: "does not turn", 1: "turns about one axis"}
+                raise UnreachableError(
+                    f"The end-effector '{each.link}' of robot '{name}' "
+                    f"{where[len(each.rotations)]} whatever the joints do, and its goal is tilted "
+                    f"by {swing:.3g} rad from there.",
+                    Proof.RANK,
+                )
+
+    def _samples(self) -> tuple[Array, Array]:
+        """Return shapes (K, n) in general position, and turns of the base (K, 4) that go with."""
+        shapes = sample_shapes(self.robot, _SAMPLED_SHAPES)
+        vectors = np.random.default_rng(0).normal(size=(len(shapes), len(self.axes))) @ self.axes
+        return shapes, quaternions_from_rotvecs(vectors)
+
+    def _rates(self, link: str, q: Array, X: Array) -> tuple[Array, Array]:
+        """Return how a link moves in B_0, seen from the centre of mass: displacement over rotation.
+
+        (6, n) by the joints at zero momentum, as the generalised Jacobian has it, and (6, m) by
+        turns of the base about the axes.
+        """
+        n, R_X = self.robot.n, matrix_from_quaternion(X)
+        # [v_cm; omega; qdot] -> [v_E; omega_E]
+        J = self.robot.jacobian(link, q)
+        by_base, by_joints = J[:, 3:6], J[:, 6 : 6 + n]
+        A = self.robot.connection(q)[3:]
+        blocks = by_joints - by_base @ A, by_base @ self.axes.T
+        first, second = (np.vstack([R_X @ each[:3], R_X @ each[3:]]) for each in blocks)
+        return first, second
+
+    def _directions(self, link: str, attitude: bool) -> _LinkRows:
+        samples = zip(*self._samples(), strict=True)
+        rates = np.hstack([np.hstack(self._rates(link, q, X)) for q, X in samples])
+        return _LinkRows(link, _span(rates[:3]), _span(rates[3:]) if attitude else np.zeros((0, 3)))
+
+
+def _span(vectors: Array) -> Array:
+    """Return an orthonormal basis (k, 3) of the space that columns (3, N) span."""
+    U, sizes, _ = np.linalg.svd(vectors, full_matrices=False)
+    if sizes[0] <= _MIN_MOTION:
+        return np.zeros((0, 3))
+    k = int(np.sum(sizes > _SINGULAR_VALUE_TOLERANCE * sizes[0]))
+    return np.eye(3) if k == 3 else np.asarray(U[:, :k].T)
+
+
+@dataclass(frozen=True)
+class EndEffectorSpecification:
+    """The parts of goals of end-effectors that one robot's manoeuvres reach.
+
+    Attributes
+    ----------
+    rows
+        Rows of the end-effectors, and of the base link where its position is asked for.
+    base
+        How the joints turn the base.
+    attitude, position, shape
+        Whether attitude and position of the base, and joint positions are parts of the goal.
+    """
+
+    rows: EndEffectorRows
+    base: GoalSpecification
+    attitude: bool
+    position: bool
+    shape: bool
+
+    @classmethod
+    def of(cls, robot: SpaceRobot, base: GoalSpecification, goal: Goal) -> EndEffectorSpecification:
+        """Return the specification for goals with the parts of this one.
+
+        Raises
+        ------
+        GoalError
+            There is no such link, or it is the base.
+        """
+        goal = goal.for_robot(robot.description)
+        attitude, position = "attitude" in goal.base, "position" in goal.base
+        links = [(each.link, each.quaternion is not None) for each in goal.end_effectors]
+        if position:
+            links.append((robot.base_link, False))
+        axes = base.turning.axes if base.turning.loops else np.zeros((0, 3))
+        shape = goal.joint_positions is not None
+        return cls(EndEffectorRows(robot, links, axes), base, attitude, position, shape)
+
+    @staticmethod
+    def key(goal: Goal) -> tuple[object, ...]:
+        """Return a key that is the same for goals with the same parts."""
+        links = ((each.link, each.quaternion is not None) for each in goal.end_effectors)
+        return (*links, goal.base, goal.joint_positions is not None)
+
+    @property
+    def controls(self) -> frozenset[Controlled]:
+        """The parts by name."""
+        parts: set[Controlled] = {"shape", "end_effectors"}
+        if self.attitude:
+            parts.add("attitude")
+        if self.position:
+            parts.add("position")
+        return frozenset(parts)
+
+    @property
+    def axes(self) -> Array:
+        """Directions (m, 3) in the base along which its attitude is to be reached."""
+        if self.shape:
+            return self.rows.axes
+        return self.base.turning.axes if self.attitude else np.zeros((0, 3))
+
+    @property
+    def rows_at_end(self) -> EndEffectorRows | None:
+        """The rows of the optimal control problem; none where the last shape is given.
+
+        The attitude that goes with the shape is then that of the goal.
+        """
+        return None if self.shape else self.rows
+
+    def boundary_conditions(
+        self,
+        robot: SpaceRobot,
+        request: PlanRequest,
+        shape: Array | None,
+        limits: MotionLimits,
+        direction_W: Array | None,
+    ) -> BoundaryConditions:
+        """Return the boundary conditions of a request, with possible ends for guesses.
+
+        The arguments are those of :meth:`GoalSpecification.boundary_conditions`.
+
+        Raises
+        ------
+        UnreachableError
+            A part of the goal is out of the robot's reach.
+        NotFoundError
+            No shape that puts the end-effectors there was found.
+        PlanningError
+            No such goal is planned.
+        """
+        state, goal, tolerance = request.state, request.goal, request.tolerance
+        if robot.n == 0:
+            name = robot.description.name
+            raise PlanningError(f"Robot '{name}' has no joints that could move an end-effector.")
+        turn = quaternion_multiply(quaternion_inverse(state.quaternion), goal.quaternion)
+        if self.attitude:
+            self.base.require_suitable(robot)
+            self.base.require_reachable_turn(robot, turn, tolerance.attitude)
+        goals = list(goal.end_effectors)
+        if self.position:
+            goals.append(EndEffectorGoal(robot.base_link, goal.position))
+        rows = self.rows
+        rows.require_directions(state, goals, (tolerance.position, tolerance.attitude))
+        _require_within_radius(robot, limits, state, goal)
+        parameters = rows.pack(state, goals)
+        R_WB = matrix_from_quaternion(state.quaternion)
+        direction = np.zeros(3) if direction_W is None else R_WB.T @ direction_W
+        if shape is not None:
+            turn = self._turn_with_shape(request, shape, turn, parameters)
+            ends: list[PossibleEnd] = [PossibleEnd(shape, turn)]
+        else:
+            rows.require_enough_freedom(self.attitude)
+            ends = self._possible_ends(state.q, limits, parameters, turn)
+        return BoundaryConditions(
+            state.q,
+            turn,
+            ends[0].shape,
+            shape,
+            None,
+            direction,
+            end_effectors=np.zeros(0) if self.shape else parameters,
+            ends=tuple(ends),
+        )
+
+    def _turn_with_shape(
+        self, request: PlanRequest, shape: Array, turn: Array, parameters: Array
+    ) -> Array:
+        """Return the turn (4,) of the base that puts the end-effectors to their goals in a shape.
+
+        Raises
+        ------
+        UnreachableError
+            There is none.
+        """
+        tolerance = request.tolerance
+        X = turn
+        if not self.attitude:
+            X = self.rows.turns_on_direct_way(request.state.q, shape[np.newaxis])[0]
+        most = max(tolerance.position, _GIVEN_SHAPE_ERROR)
+        if not self.attitude and len(self.rows.axes):
+            # Loops of the joints turn the base about the axes; Newton's method finds how far.
+            candidates = quaternions_from_rotvecs(
+                np.vstack([np.zeros((1, 3)), *(np.pi * k / 2 * self.rows.axes for k in (1, 2, 3))])
+            )
+            least = np.inf
+            for candidate in candidates:
+                for _ in range(_ITERATIONS):
+                    values, by_rotation, _ = self.rows.evaluate(
+                        candidate[np.newaxis], shape[np.newaxis], parameters
+                    )
+                    J = by_rotation[0] @ self.rows.axes.T
+                    step = self.rows.axes.T @ np.linalg.lstsq(J, -values[0], rcond=1e-9)[0]
+                    candidate = quaternion_multiply(candidate, quaternion_from_rotvec(step))
+                if (miss := float(np.linalg.norm(values[0]))) < least:
+                    least, X = miss, candidate
+        values, _, _ = self.rows.evaluate(X[np.newaxis], shape[np.newaxis], parameters)
+        if (miss := float(np.abs(values).max(initial=0.0))) > most:
+            raise UnreachableError(
+                f"With the joint positions of the goal no attitude of the base puts the "
+                f"end-effectors nearer than {miss:.3g} m or rad to their goals: the centre of mass "
+                "stays where it is. Leave the joint positions out.",
+                Proof.MOMENTUM,
+            )
+        return X
+
+    def _possible_ends(
+        self, start: Array, limits: MotionLimits, parameters: Array, turn: Array
+    ) -> list[PossibleEnd]:
+        """Return ends of guesses, those that the joints reach soonest first.
+
+        Raises
+        ------
+        NotFoundError
+            There are none.
+        """
+        given = turn if self.attitude else None
+        rng = np.random.default_rng(0)
+        middle, half = limits.span(start)
+        speed = np.where(np.isfinite(limits.velocity), limits.velocity, half)
+        nearest = np.inf
+        for count, follows in ((_STARTS, True), (_STARTS, False), (_MORE_STARTS, False)):
+            # From here, from nearby, and from anywhere.
+            anywhere = middle + half * rng.uniform(-1, 1, (count, len(start)))
+            share = np.linspace(0.0, 1.0, count)[:, np.newaxis]
+            shapes = np.clip(start + share * (anywhere - start), limits.lower, limits.upper)
+            shapes, X, miss = self._inverse_kinematics(
+                shapes, start, limits, parameters, given, follows=follows
+            )
+            nearest = min(nearest, float(miss.min()))
+            times = np.abs((shapes - start) / np.maximum(speed, 1e-9)).max(axis=1)
+            ends: list[PossibleEnd] = []
+            for k in np.argsort(times, kind="stable"):
+                scaled = [np.abs((shapes[k] - end.shape) / np.maximum(half, 1e-9)) for end in ends]
+                is_new = all(each.max() > _SAME_END for each in scaled)
+                if miss[k] <= _END_ERROR and is_new:
+                    ends.append(PossibleEnd(shapes[k], X[k]))
+            if ends:
+                return ends[:_POSSIBLE_ENDS]
+            if given is not None and not follows:
+                continue
+        names = " and ".join(f"'{link}'" for link, _ in self.rows.links)
+        raise NotFoundError(
+            f"No shape of robot '{self.rows.robot.description.name}' that puts {names} to the goal "
+            f"was found from {2 * _STARTS + _MORE_STARTS} shapes; the nearest is {nearest:.3g} m "
+            "or rad away. A nearer goal may help, a position instead of a pose, or more freedom "
+            "of the base."
+        )
+
+    def _inverse_kinematics(
+        self,
+        shapes: Array,
+        start: Array,
+        limits: MotionLimits,
+        parameters: Array,
+        given: Array | None,
+        *,
+        follows: bool,
+    ) -> tuple[Array, Array, Array]:
+        """Return shapes (K, n), turns (K, 4) and errors (K,) of ends, from first shapes (K, n).
+
+        The turn is the ``given`` one; else it ``follows`` from the direct way, or is free along the
+        axes.
+        """
+        rows, n, count = self.rows, len(start), len(shapes)
+        connection = rows.robot.function("connection", compile=False)
+        free = given is None and not follows
+        X = np.tile(given, (count, 1)) if given is not None else None
+        if X is None:
+            X = rows.turns_on_direct_way(start, shapes)
+        for _ in range(_ITERATIONS):
+            values, by_rotation, by_shape = rows.evaluate(X, shapes, parameters)
+            J = by_shape
+            if free:
+                J = np.concatenate([by_shape, by_rotation @ rows.axes.T], axis=2)
+            elif given is None:
+                A = connection(shapes.T).full()[3:].reshape(3, count, n).transpose(1, 0, 2)
+                J = by_shape - by_rotation @ A
+            if np.abs(values).max() <= _END_ERROR / 10:
+                break
+            # Joints at a limit that the step would take beyond it are left out of it.
+            for _ in range(2):
+                normal = J.transpose(0, 2, 1) @ J
+                largest = np.maximum(np.abs(normal).max(axis=(1, 2)), 1e-12)
+                normal = normal + _DAMPING * largest[:, np.newaxis, np.newaxis] * np.eye(J.shape[2])
+                slope = -(J.transpose(0, 2, 1) @ values[:, :, np.newaxis])
+                step = np.linalg.solve(normal, slope)[:, :, 0]
+                beyond = (shapes <= limits.lower) & (step[:, :n] < 0)
+                beyond |= (shapes >= limits.upper) & (step[:, :n] > 0)
+                if not beyond.any():
+                    break
+                J = J.copy()
+                J[:, :, :n] *= ~beyond[:, np.newaxis]
+            step *= np.minimum(1.0, _MAX_STEP / np.abs(step).max(axis=1, keepdims=True).clip(1e-9))
+            shapes = np.clip(shapes + step[:, :n], limits.lower, limits.upper)
+            if free:
+                turns = quaternions_from_rotvecs(step[:, n:] @ rows.axes)
+                X = quaternion_multiply(X, turns)
+            elif given is None:
+                X = rows.turns_on_direct_way(start, shapes)
+        values, _, _ = rows.evaluate(X, shapes, parameters)
+        return shapes, X, np.abs(values).max(axis=1)
+
+
+def _require_within_radius(
+    robot: SpaceRobot, limits: MotionLimits, state: RobotState, goal: Goal
+) -> None:
+    """Refuse goals that are farther from the centre of mass than any shape puts the end-effector.
+
+    Raises
+    ------
+    UnreachableError
+        It is such a goal.
+    """
+    R_WB = matrix_from_quaternion(state.quaternion)
+    r_WC = state.position + R_WB @ robot.center_of_mass(state.q)
+    for each in goal.end_effectors:
+        reach = reach_of_end_effector(robot, limits.lower, limits.upper, each.link)
+        distance = float(np.linalg.norm(each.position - r_WC))
+        if distance > reach * (1 + 1e-9):
+            raise UnreachableError(
+                f"The goal of '{each.link}' is out of reach: it is {distance:.4g} m from the "
+                "centre of mass, which stays where it is without thrust, and the joints of "
+                f"'{robot.description.name}' put '{each.link}' no farther from it than "
+                f"{reach:.4g} m.",
+                Proof.LIMITS,
+            )
+
+
+def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: str) -> float:
+    """Return a distance, m, that no shape puts a link's origin farther from the centre of mass.
+
+    ``r_CE`` is the mean of the vectors from the centres of mass of the bodies to E, weighted by
+    their masses, and each is no longer than the chain of joints between (triangle inequality).
+    ``lower`` and ``upper`` (n,) are the limits of the joints.
+    """
+    bodies = robot.description.bodies
+    if robot.description.coupled:
+        lower, upper = moving_joint_ranges(robot, lower, upper)
+    travel = [
+        max(abs(low), abs(high)) if body.joint.kind is JointKind.PRISMATIC else 0.0
+        for body, low, high in zip(bodies[1:], lower, upper, strict=True)
+        if body.joint is not None
+    ]
+
+    def chain(body: int, point: Array) -> dict[int, tuple[Array, float]]:
+        """Return, for a body and each that carries it, a point of it and the way from there."""
+        found, way = {body: (point, 0.0)}, 0.0
+        while body > 0:
+            way += float(np.linalg.norm(point)) + travel[body - 1]
+            point, body = bodies[body].origin.r, bodies[body].parent
+            found[body] = (point, way)
+        return found
+
+    index, pose = robot.description.frames[link]
+    of_link, total = chain(index, pose.r), 0.0
+    for number, body in enumerate(bodies):
+        of_body = chain(number, body.inertia.com)
+        # The first body in common; the topological order has it last.
+        common = max(of_link.keys() & of_body.keys())
+        (u, first), (v, second) = of_link[common], of_body[common]
+        total += body.inertia.mass * (first + second + float(np.linalg.norm(u - v)))
+    return total / robot.total_mass

@@ -1,0 +1,346 @@
+"""Goals of end-effectors with the base free: reached by another engine, or refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+from support.hand_motion import end_of_motion
+
+from spacerobot_ros.errors import GoalError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, build_method, plan
+from spacerobot_ros.planning.core.goal import EndEffectorGoal, PoseError, Tolerance
+from spacerobot_ros.planning.core.method import InitialMotion, PlanRequest
+from spacerobot_ros.planning.methods.optimal.end_effectors import (
+    EndEffectorRows,
+    reach_of_end_effector,
+)
+from spacerobot_ros.planning.methods.registry import method_options
+
+Array = npt.NDArray[np.float64]
+
+FOLDER = Path(__file__).parents[2] / "urdf"
+QUICK: dict[str, Any] = {"cache": 0, "answers": 1, "intervals": 30, "control_period": 0.1}
+PLACE, ATTITUDE = np.array([0.4, -0.3, 0.2]), Rotation.from_rotvec([0.3, -0.5, 0.4])
+ARM = np.array([0.4, -0.9, 1.1])
+
+
+def urdf_of(robot: str) -> str:
+    return (FOLDER / f"{robot}.urdf").read_text("utf-8")
+
+
+def robot_of(name: str) -> SpaceRobot:
+    return SpaceRobot.from_file(FOLDER / f"{name}.urdf")
+
+
+def at_rest(q: npt.ArrayLike) -> RobotState:
+    return RobotState(PLACE, ATTITUDE.as_quat(), np.asarray(q, dtype=float))
+
+
+def ends(robot: str, schedule: GaitSchedule, *links: str) -> dict[str, tuple[Array, Rotation]]:
+    return end_of_motion(
+        *(urdf_of(robot), schedule.joint_names, schedule.positions, list(links), PLACE, ATTITUDE)
+    )
+
+
+def beside(robot: str, start: Array, end: Array, link: str) -> tuple[Array, Rotation]:
+    """Return where a link is after the straight way to a shape: a goal that can be reached."""
+    way = start + np.linspace(0.0, 1.0, 40)[:, np.newaxis] * (end - start)
+    names = robot_of(robot).joint_names
+    return end_of_motion(urdf_of(robot), names, way, [link], PLACE, ATTITUDE)[link]
+
+
+def assert_within_limits(robot: SpaceRobot, schedule: GaitSchedule) -> None:
+    q = schedule.positions
+    rest = np.zeros((1, robot.n))
+    rates = np.vstack([rest, np.diff(q, axis=0) / schedule.control_period, rest])
+    changes = np.diff(rates, axis=0) / schedule.control_period
+    assert np.all(np.abs(rates) <= robot.velocity_limit * (1 + 1e-8))
+    assert np.all(np.abs(changes) <= robot.velocity_limit / 0.5 * (1 + 1e-8))
+    assert np.all((q >= robot.lower - 1e-8) & (q <= robot.upper + 1e-8))
+
+
+def test_a_position_is_reached_with_the_base_free() -> None:
+    r, _ = beside("three_joint_arm", ARM, np.array([-0.7, -0.2, 1.9]), "end_effector")
+    schedule = plan("three_joint_arm", end_effector_position=r, start=at_rest(ARM), **QUICK)
+    reached, _ = ends("three_joint_arm", schedule, "end_effector")["end_effector"]
+    np.testing.assert_allclose(reached, r, atol=1e-6)
+    assert_within_limits(robot_of("three_joint_arm"), schedule)
+    assert schedule.controls == {"shape", "end_effectors"}
+    # The note says so, too.
+    noted = schedule.notes["final_pose_of_end_effector"]
+    assert isinstance(noted, list)
+    assert noted[:3] == pytest.approx(r, abs=1e-6)
+
+
+SEVEN = np.array([0.3, 0.2, -0.4, -1.7, 0.5, 1.6, 0.8])
+SEVEN_END = np.array([-0.6, 0.8, 0.3, -1.1, -0.4, 2.3, 0.1])
+
+
+def test_a_pose_is_reached_with_the_base_free() -> None:
+    r, R = beside("seven_joint_arm", SEVEN, SEVEN_END, "link_7")
+    schedule = plan(
+        "seven_joint_arm",
+        end_effector_pose=[*r, *R.as_quat()],
+        end_effector="link_7",
+        start=at_rest(SEVEN),
+        **QUICK,
+    )
+    reached, R_reached = ends("seven_joint_arm", schedule, "link_7")["link_7"]
+    np.testing.assert_allclose(reached, r, atol=1e-6)
+    assert (R_reached.inv() * R).magnitude() < 1e-6
+    assert_within_limits(robot_of("seven_joint_arm"), schedule)
+
+
+def test_the_attitude_of_the_base_is_reached_with_a_position() -> None:
+    r, _ = beside("seven_joint_arm", SEVEN, SEVEN_END, "link_7")
+    turned = (ATTITUDE * Rotation.from_rotvec([0.02, 0.03, -0.04])).as_rotvec()
+    schedule = plan(
+        "seven_joint_arm",
+        end_effector_position={"link_7": r},
+        rotvec=turned,
+        start=at_rest(SEVEN),
+        **QUICK,
+    )
+    found = ends("seven_joint_arm", schedule, "link_7", "base_link")
+    np.testing.assert_allclose(found["link_7"][0], r, atol=1e-6)
+    assert (found["base_link"][1].inv() * Rotation.from_rotvec(turned)).magnitude() < 1e-6
+    assert "attitude" in schedule.controls
+
+
+@pytest.mark.slow
+def test_two_hands_are_reached_at_once() -> None:
+    start = robot_of("dual_arm")
+    q = np.linspace(-0.5, 0.7, start.n)
+    end = np.linspace(0.6, -0.3, start.n)
+    left, right = (beside("dual_arm", q, end, f"{side}_link_7") for side in ("left", "right"))
+    schedule = plan(
+        "dual_arm",
+        end_effector_pose={"left_link_7": [*left[0], *left[1].as_quat()]},
+        end_effector_position={"right_link_7": right[0]},
+        start=at_rest(q),
+        **QUICK,
+    )
+    found = ends("dual_arm", schedule, "left_link_7", "right_link_7")
+    np.testing.assert_allclose(found["left_link_7"][0], left[0], atol=1e-6)
+    assert (found["left_link_7"][1].inv() * left[1]).magnitude() < 1e-6
+    np.testing.assert_allclose(found["right_link_7"][0], right[0], atol=1e-6)
+
+
+def test_planar_robots_reach_positions_in_their_plane_and_no_other() -> None:
+    chain = robot_of("planar_chain")
+    link = chain.link_names[-1]
+    q, end = np.array([0.4, -0.9]), np.array([1.1, -0.2])
+    r, R = beside("planar_chain", q, end, link)
+    schedule = plan("planar_chain", end_effector_position={link: r}, start=at_rest(q), **QUICK)
+    np.testing.assert_allclose(ends("planar_chain", schedule, link)[link][0], r, atol=1e-6)
+    off = r + 0.05 * ATTITUDE.apply([0.0, 0.0, 1.0])
+    with pytest.raises(UnreachableError, match="in one plane") as refusal:
+        plan("planar_chain", end_effector_position={link: off}, start=at_rest(q), **QUICK)
+    assert refusal.value.proof is Proof.RANK
+    tilted = R * Rotation.from_rotvec([0.3, 0.0, 0.0])
+    with pytest.raises(UnreachableError, match="about one axis"):
+        plan(
+            "planar_chain",
+            end_effector_pose={link: [*r, *tilted.as_quat()]},
+            start=at_rest(q),
+            **QUICK,
+        )
+
+
+def test_joint_positions_that_go_with_the_goal_are_reached_and_others_refused() -> None:
+    end = np.array([-0.7, -0.2, 1.9])
+    r, R = beside("three_joint_arm", ARM, end, "end_effector")
+    schedule = plan(
+        "three_joint_arm",
+        end_effector_pose=[*r, *R.as_quat()],
+        joint_positions=end,
+        start=at_rest(ARM),
+        **{**QUICK, "intervals": 40, "answers": 2},
+    )
+    reached, R_reached = ends("three_joint_arm", schedule, "end_effector")["end_effector"]
+    np.testing.assert_allclose(reached, r, atol=1e-6)
+    assert (R_reached.inv() * R).magnitude() < 1e-6
+    np.testing.assert_allclose(schedule.positions[-1], end, atol=1e-9)
+    with pytest.raises(UnreachableError, match="Leave the joint positions out"):
+        plan(
+            "three_joint_arm",
+            end_effector_position=r,
+            joint_positions=end + 0.2,
+            start=at_rest(ARM),
+            **QUICK,
+        )
+
+
+def test_a_start_at_the_goal_is_no_motion() -> None:
+    robot = robot_of("three_joint_arm")
+    names = robot.joint_names
+    here = end_of_motion(
+        urdf_of("three_joint_arm"), names, ARM[np.newaxis], ["end_effector"], PLACE, ATTITUDE
+    )["end_effector"]
+    schedule = plan("three_joint_arm", end_effector_position=here[0], start=at_rest(ARM), **QUICK)
+    assert schedule.ticks == 0
+
+
+def test_no_shape_is_beyond_the_radius_and_goals_beyond_are_refused() -> None:
+    robot = robot_of("three_joint_arm")
+    radius = reach_of_end_effector(robot, robot.lower, robot.upper, "end_effector")
+    rng = np.random.default_rng(3)
+    distances = [
+        np.linalg.norm(robot.link_pose("end_effector", q)[1] - robot.center_of_mass(q))
+        for q in rng.uniform(robot.lower, robot.upper, (300, robot.n))
+    ]
+    assert 0.9 * radius < max(distances) <= radius
+    center = PLACE + ATTITUDE.apply(robot.center_of_mass(ARM))
+    far = center + 1.01 * radius * np.array([0.6, 0.0, -0.8])
+    with pytest.raises(UnreachableError, match="out of reach") as refusal:
+        plan("three_joint_arm", end_effector_position=far, start=at_rest(ARM), **QUICK)
+    assert refusal.value.proof is Proof.LIMITS
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"end_effector_position": (1, 0, 0), "end_effector": "hand"}, "does not have"),
+        ({"end_effector_position": (1, 0, 0), "end_effector": "base_link"}, "is the base"),
+        ({"end_effector_position": (1, 0, 0, 0)}, "takes 3, a position, or 7"),
+        ({"end_effector_pose": (1, 0, 0)}, "a pose has 7"),
+        ({"end_effector_pose": (1, 0, 0, 0, 0, 0, 0)}, "zero quaternion"),
+        ({"end_effector_position": (1, 0, np.nan)}, "not finite"),
+        ({"end_effector": "end_effector"}, "has no goal"),
+        (
+            {
+                "end_effector_position": {"end_effector": (1, 0, 0)},
+                "end_effector_pose": {"": (1, 0, 0, 0, 0, 0, 1)},
+            },
+            "'end_effector' has 2 goals",
+        ),
+    ],
+)
+def test_goals_that_are_none_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(GoalError, match=message):
+        plan("three_joint_arm", start=at_rest(ARM), **arguments, **QUICK)
+
+
+def test_goals_of_more_than_the_joints_bring_about_are_refused() -> None:
+    with pytest.raises(PlanningError, match="6 independent coordinates"):
+        plan(
+            "three_joint_arm",
+            end_effector_pose=(1.2, 0.4, 0.3, 0, 0, 0, 1),
+            start=at_rest(ARM),
+            **QUICK,
+        )
+
+
+def test_a_default_end_effector_is_named_where_there_is_none() -> None:
+    with pytest.raises(GoalError, match="name one of its links"):
+        plan("seven_joint_arm", end_effector_position=(1, 0, 0))
+
+
+@pytest.mark.parametrize("method", ["area_loop", "auto"])
+def test_methods_of_loops_leave_the_goal_to_optimal(method: str) -> None:
+    r, _ = beside("three_joint_arm", ARM, ARM + np.array([0.3, 0.2, -0.2]), "end_effector")
+    request = PlanRequest(
+        at_rest(ARM),
+        Goal.of_end_effectors([EndEffectorGoal("end_effector", r)]),
+        Tolerance(1e-6, 1e-6),
+    )
+    options = {"optimal": method_options("optimal", {"cache": 0, "answers": 1, "intervals": 30})}
+    planner = build_method(method, robot_of("three_joint_arm"), 0.1, 0.01, options)
+    if method == "auto":
+        assert planner.plan(request).method == "optimal"
+    else:
+        with pytest.raises(
+            PlanningError, match=r"area_loop plans for the pose of the base.*optimal"
+        ):
+            planner.plan(request)
+
+
+def test_a_cached_plan_is_that_of_the_same_goal_alone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
+    r, _ = beside("three_joint_arm", ARM, np.array([-0.3, -0.5, 1.5]), "end_effector")
+    options = {**QUICK, "cache": 1}
+
+    def planned(goal: Array) -> GaitSchedule:
+        return plan("three_joint_arm", end_effector_position=goal, start=at_rest(ARM), **options)
+
+    first, again = planned(r), planned(r)
+    assert again.notes["from_cache"] == 1.0
+    np.testing.assert_array_equal(first.positions, again.positions)
+    assert "from_cache" not in planned(r + np.array([0.0, 0.0, 1e-3])).notes
+
+
+def test_a_motion_takes_another_goal_without_a_stop() -> None:
+    robot = robot_of("three_joint_arm")
+    r, _ = beside("three_joint_arm", ARM, np.array([-0.7, -0.2, 1.9]), "end_effector")
+    other, _ = beside("three_joint_arm", ARM, np.array([0.9, -0.7, 0.4]), "end_effector")
+    options = {"optimal": method_options("optimal", {"cache": 0, "answers": 1, "intervals": 30})}
+    planner = build_method("optimal", robot, 0.1, 0.01, options)
+    goal = Goal.of_end_effectors([EndEffectorGoal("end_effector", r)])
+    tolerance = Tolerance(1e-6, 1e-6)
+    first = planner.plan(PlanRequest(at_rest(ARM), goal, tolerance))
+    tick = first.ticks // 3
+    path = planner._prediction.path(at_rest(ARM), first.positions[: tick + 1])
+    state = RobotState(path.position[-1], path.quaternion[-1], first.positions[tick])
+    motion = InitialMotion(first.velocities[tick - 1], first.positions[tick:])
+    aim = Goal.of_end_effectors([EndEffectorGoal("end_effector", other)])
+    second = planner.plan(PlanRequest(state, aim, tolerance, motion=motion))
+    positions = np.vstack([first.positions[:tick], second.positions])
+    flown = end_of_motion(
+        *(urdf_of("three_joint_arm"), robot.joint_names, positions, ["end_effector"]),
+        PLACE,
+        ATTITUDE,
+    )
+    np.testing.assert_allclose(flown["end_effector"][0], other, atol=1e-6)
+
+
+def test_errors_are_those_of_the_links() -> None:
+    robot = robot_of("three_joint_arm")
+    r, R = beside("three_joint_arm", ARM, ARM, "end_effector")
+    shift, turn = np.array([0.03, -0.04, 0.0]), Rotation.from_rotvec([0.0, 0.02, 0.0])
+    aim = EndEffectorGoal("end_effector", r + shift, (R * turn).as_quat())
+    goal = Goal.of_end_effectors([aim])
+    error = PoseError.between(PLACE, ATTITUDE.as_quat(), goal, ARM, robot)
+    assert error.farthest_end_effector == pytest.approx(0.05)
+    assert error.most_turned_end_effector == pytest.approx(0.02)
+    parts = frozenset({"end_effectors"})
+    assert Tolerance(0.051, 0.021).admits(error, parts)  # type: ignore[arg-type]
+    assert not Tolerance(0.049, 0.021).admits(error, parts)  # type: ignore[arg-type]
+    assert not Tolerance(0.051, 0.019).admits(error, parts)  # type: ignore[arg-type]
+
+
+def test_derivatives_of_the_rows_are_their_differences() -> None:
+    robot = robot_of("three_joint_arm")
+    rows = EndEffectorRows(robot, [("end_effector", True), ("base_link", False)], np.eye(3))
+    rng = np.random.default_rng(4)
+    goals = [
+        EndEffectorGoal("end_effector", rng.normal(size=3), np.array([0.1, 0.7, 0.1, 0.7])),
+        EndEffectorGoal("base_link", rng.normal(size=3)),
+    ]
+    p = rows.pack(at_rest(ARM), goals)
+    X, q = Rotation.from_rotvec(rng.normal(size=3)), ARM + 0.3
+    value, by_rotation, by_shape = rows.evaluate(X.as_quat()[np.newaxis], q[np.newaxis], p)
+    assert value.shape == (1, 9)
+    step = 1e-6
+    for k in range(3):
+        d = np.eye(3)[k] * step
+        after, before = (
+            rows.evaluate((X * Rotation.from_rotvec(s * d)).as_quat()[np.newaxis], q[np.newaxis], p)
+            for s in (1, -1)
+        )
+        np.testing.assert_allclose(
+            (after[0][0] - before[0][0]) / (2 * step), by_rotation[0][:, k], atol=1e-7
+        )
+        after, before = (
+            rows.evaluate(X.as_quat()[np.newaxis], (q + s * d)[np.newaxis], p) for s in (1, -1)
+        )
+        np.testing.assert_allclose(
+            (after[0][0] - before[0][0]) / (2 * step), by_shape[0][:, k], atol=1e-7
+        )
