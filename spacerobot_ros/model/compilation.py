@@ -38,18 +38,17 @@ from spacerobot_ros.files import Cache, warn_once
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.termination import tool
 
-# Contraction into fused multiply-adds would make the numbers depend on the processor.
+# With fused multiply-adds, results would depend on the processor.
 _COMMON_FLAGS = ("-fPIC", "-shared", "-ffp-contract=off")
 
 _FLAGS = ("-O2", *_COMMON_FLAGS)
 
 _LONG_FLAGS = ("-O0", *_COMMON_FLAGS)
-"""For functions of ten thousands of operations: a tenth of the time to compile, half the speed,
-still seven times that of the virtual machine."""
+"""Flags for functions of ten thousands of operations: a tenth of the time to compile, half
+the speed, still seven times that of the virtual machine."""
 
 _LEAST_OPERATIONS_TO_KEEP = 5000
-"""Number of operations of a function that takes a tenth of a second to derive, ten times as long
-as to read."""
+"""Fewest operations of a function for the cache: it takes 0.1 s to derive, 0.01 s to read."""
 
 _COMPILE_TIMEOUT = 120.0
 """Time limit for compiling one function, s: ten times that of the largest."""
@@ -61,12 +60,12 @@ _LARGEST_DIFFERENCE = 1e-6
 """Largest relative difference between a compiled function and the virtual machine."""
 
 _LARGEST_COMPARED_RESULT = 1e9
-"""Results above it are near a singularity and depend on rounding."""
+"""Largest compared result; larger results are near a singularity and depend on rounding."""
 
 _MOST_FUNCTIONS_IN_MEMORY = 12
 
 _functions_in_memory: dict[tuple[str, ...], ca.Function] = {}
-"""The kept functions that were used last, by name, key and settings of the compilation."""
+"""The latest used functions of the cache, by name, key and settings of the compilation."""
 
 ANNOUNCEMENT = "announcement"
 """Attribute of log records that announce a long computation."""
@@ -76,22 +75,23 @@ _LOG = logging.getLogger(__name__)
 _Loaded = TypeVar("_Loaded")
 
 contexts: list[Callable[[], AbstractContextManager[None]]] = []
-"""Contexts in which the compiler runs, for those that have to say that they are busy then."""
+"""Contexts around every run of the compiler, such as one in which a node reports to be busy."""
 
 _hung_compilations: set[str] = set()
-"""Compilers that have exceeded the time limit: they are not called again."""
+"""Calls of compilers that exceeded the time limit: they are not called again."""
 
 
 class _CompilationError(Exception):
-    """An object cannot be made; the text is the reason, a clause."""
+    """An object file cannot be compiled or loaded; the text is the reason, a clause."""
 
 
 class NoLibraryError(SpaceRobotError):
-    """A library cannot be made; the text is the reason, a clause."""
+    """A library cannot be compiled or loaded; the text is the reason, a clause."""
 
 
 class BufferedFunction:
-    """A CasADi function on fixed memory: fill ``inputs``, call :meth:`evaluate`, read ``outputs``.
+    """A CasADi function with fixed memory: fill ``inputs``, call
+    :meth:`evaluate`, read ``outputs``.
 
     ``inputs`` and ``outputs`` are numpy arrays shaped like the function's arguments (vectors are
     1-D) that stay in place for the life of the object; a call costs well under a microsecond
@@ -162,7 +162,7 @@ def dense_function(
 
 
 def compiled(function: ca.Function) -> ca.Function:
-    """Return the function as compiled C, or unchanged where that is not possible.
+    """Return the function as compiled C, or unchanged without a compiler.
 
     Raises
     ------
@@ -202,7 +202,7 @@ def _warn_of_virtual_machine(reason: _CompilationError) -> None:
 def kept_function(
     name: str, key: str, build: Callable[[], ca.Function], *, compiling: bool
 ) -> ca.Function:
-    """Return a function that takes long to derive, from the cache if it was derived before.
+    """Return an expensive function from the cache, or derive and cache it.
 
     This process has those at hand that it has used last. The same numbers come out whether a
     function is compiled, read or derived: it is compiled without optimisation, operation by
@@ -268,7 +268,7 @@ def native_library(
     libraries: Sequence[str],
     tried: Sequence[ca.Function],
 ) -> ctypes.CDLL:
-    """Return a C++ source as a library, compiled, tried and cached as functions are.
+    """Return the library of a C++ source, compiled, tried and cached like single functions.
 
     Parameters
     ----------
@@ -387,7 +387,7 @@ def _object_file_name(name: str, key: str) -> str:
 
 
 def _load_compiled(cache: Cache, name: str, key: str) -> ca.Function | None:
-    """Return a compiled function from the cache, None if it is not there."""
+    """Return a compiled function from the cache, None if the cache lacks it."""
     if kept := cache.load(_object_file_name(name, key), key):
         try:
             return ca.external(name, str(kept[0]))
@@ -402,7 +402,7 @@ def _load_compiled(cache: Cache, name: str, key: str) -> ca.Function | None:
 def _compile_function(
     function: ca.Function, key: str, flags: Sequence[str], compiler: str
 ) -> ca.Function:
-    """Return the function newly compiled, and keep it in the cache.
+    """Compile a function, and keep it in the cache.
 
     Raises
     ------
@@ -417,7 +417,7 @@ def _compile_function(
 
 @dataclass(frozen=True)
 class _Build:
-    """A source, and the call of the compiler that makes a shared object of it.
+    """A source, and the call of the compiler for its shared object.
 
     Attributes
     ----------
@@ -467,7 +467,8 @@ def _make_object(
                 _object_file_name(name, key), key, built.read_bytes()
             )
             for path in (stored, built):
-                # A folder may forbid execution; a loaded object stays when its file is deleted.
+                # The cache's folder may forbid execution, so the object is loaded from a deleted
+                # temporary file.
                 with suppress(OSError, RuntimeError):
                     if path is not None:
                         return load(str(path))
@@ -478,7 +479,7 @@ def _make_object(
 
 @lru_cache(maxsize=1)
 def _announce_compilation() -> None:
-    """Log, once in a process, that the first flight of a robot waits for the compiler."""
+    """Log once per process that the first flight of a robot waits for the compiler."""
     _LOG.info(
         "Compiling the equations of this robot: once, some seconds.", extra={ANNOUNCEMENT: True}
     )
@@ -493,7 +494,7 @@ def _c_library_version() -> str:
 
 
 def _compile_object(build: _Build, folder: Path, limit: float) -> Path:
-    """Return the object that the compiler makes in a folder."""
+    """Compile an object file in a folder, and return its path."""
     source, built, output = (
         folder / f"function.{build.suffix}",
         folder / "function.so",
@@ -569,7 +570,7 @@ def _try_object(function: ca.Function, path: Path) -> None:
     work = [function.sz_arg(), function.sz_res(), function.sz_iw(), function.sz_w()]
     task = json.dumps([str(path), function.name(), sizes, [v.tolist() for v in values], work])
     output = path.with_name("trial")
-    # Isolated and without site: it starts in a few hundredths of a second.
+    # Python starts in a few hundredths of a second with -I and -S.
     code = _run_compiler(
         [sys.executable, "-I", "-S", "-c", _TRIAL_SCRIPT, task], output, _TRIAL_TIMEOUT
     )

@@ -71,7 +71,7 @@ class SpatialInertia:
     J: ca.SX
 
     def __add__(self, other: SpatialInertia) -> SpatialInertia:
-        """Take two bodies as one."""
+        """Return the inertia of two bodies as one rigid body."""
         return SpatialInertia(self.mass + other.mass, self.h + other.h, self.J + other.J)
 
     def __matmul__(self, motion: ca.SX) -> ca.SX:
@@ -84,7 +84,7 @@ class SpatialInertia:
 
 
 class Factor:
-    """``L D L'`` of a symmetric positive definite matrix, to solve with."""
+    """The factorisation ``L D L'`` of a symmetric positive definite matrix."""
 
     def __init__(self, matrix: ca.SX) -> None:
         n = self._n = matrix.shape[0]
@@ -140,7 +140,7 @@ class Composites:
 
     @property
     def D_q(self) -> ca.SX:
-        """Angular momentum (3, n) of unit joint rates about that centre (paper 4, eq. 16a).
+        """Angular momentum (3, n) of unit joint rates about the centre of mass (paper 4, eq. 16a).
 
         The momentum about the centre of mass does not depend on how that centre moves, so the
         composites' momenta at the common point are it.
@@ -167,7 +167,7 @@ class Composites:
 
 
 def composites(kin: TreeKinematics) -> Composites:
-    """Add up the bodies inward (Featherstone, table 6.2)."""
+    """Add up the inertias of the bodies inward (Featherstone, table 6.2)."""
     n, c = kin.moving, kin.r_BC_B
     J = tuple(kin.second_moment(k) for k in range(n + 1))
     composite = []
@@ -245,7 +245,7 @@ def motion_forces(
         i = kin.parent(k)
         rate = kin.axis[k] * qdot[k - 1]
         push = ca.SX(3, 1) if qddot is None else kin.axis[k] * qddot[k - 1]
-        # Not as a difference of origins, in which CasADi finds nothing to cancel or to share.
+        # A difference of origins would keep CasADi from cancelling and sharing terms.
         arm = kin.R[i] @ _to_constant(kin.robot.bodies[k].origin.r)
         if kin.is_revolute(k):
             accelerations.append(accelerations[i] + A[i] @ arm)
@@ -366,7 +366,7 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
     free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)
     _, quaternion, qdot, p_W, _, _ = (x[part] for part in state_slices(kin.n))
     system, omega, external, Q = _equations(kin, x, command)
-    # A held joint takes no part in the others' equations; its own makes its qddot zero.
+    # A held joint is absent from the equations of other joints; its own equation is qddot = 0.
     K = system.K * (free @ free.T)
     for j in range(kin.n):
         K[j, j] = system.K[j, j]

@@ -57,7 +57,7 @@ class Inertia:
     about_com: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def moved(self, pose: Pose) -> Inertia:
-        """Return the inertia of the same body in the frame in which its own frame has ``pose``."""
+        """Return the inertia of the body in another frame, in which its frame has ``pose``."""
         return Inertia(self.mass, pose.r + pose.R @ self.com, pose.R @ self.about_com @ pose.R.T)
 
     def __add__(self, other: Inertia) -> Inertia:
@@ -126,7 +126,7 @@ class Joint:
         return "m" if self.kind is JointKind.PRISMATIC else "rad"
 
     def locked(self, position: float) -> Joint:
-        """Return a fixed joint that holds the child at ``position`` of this one."""
+        """Return a fixed joint that holds the child link at ``position`` of this joint."""
         moved = Pose(r=position * self.axis)
         if self.kind is not JointKind.PRISMATIC:
             moved = Pose(matrix_about_axis(self.axis, position))
@@ -177,12 +177,12 @@ class RobotDescription:
 
     @property
     def movable_joints(self) -> tuple[Joint, ...]:
-        """The joints that are not fixed and follow no other, in the order of the coordinates q."""
+        """The joints that are neither fixed nor mimic joints, in the order of the coordinates q."""
         return tuple(joint for joint in self.moving_joints if joint.mimic is None)
 
     @property
     def moving_joints(self) -> tuple[Joint, ...]:
-        """The joints of ``bodies[1:]``, those that follow others among them."""
+        """The joints of ``bodies[1:]``, including mimic joints."""
         return tuple(body.joint for body in self.bodies[1:] if body.joint is not None)
 
     @property
@@ -234,7 +234,7 @@ class RobotDescription:
         return link or (DEFAULT_END_EFFECTOR if DEFAULT_END_EFFECTOR in names else "")
 
     def with_links(self, links: tuple[Link, ...]) -> RobotDescription:
-        """Return the robot with other links of the same names and the same ``urdf``."""
+        """Return the robot with replaced links of the same names; ``urdf`` is unchanged."""
         return self._with_tree(links, self.joints)
 
     def with_locked(self, positions: Mapping[str, float]) -> RobotDescription:
@@ -290,7 +290,7 @@ class RobotDescription:
 
 
 def _leading_limit(limits: JointLimits, mimic: Mimic, kind: str) -> float:
-    """Return the limit on the leading joint that a limit of its mimic joint implies."""
+    """Return the limit of a leading joint that follows from a limit of its mimic joint."""
     k = mimic.multiplier
     if kind == "velocity":
         return limits.velocity / abs(k)

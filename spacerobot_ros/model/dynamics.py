@@ -51,8 +51,8 @@ def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
     bodies = range(kin.moving + 1)
     M = kin.total_mass
     outboard = [set(kin.outboard(k)) for k in bodies]
-    # towards[i][j]: from the mass centre of i to the joint it shares with its neighbour j,
-    # with the mass that lies beyond that joint.
+    # towards[i][j]: vector from the mass centre of i to its joint with neighbour j, and the mass
+    # beyond that joint.
     towards: list[dict[int, tuple[ca.SX, float | ca.SX]]] = [{} for _ in bodies]
     for k in bodies[1:]:
         i = kin.parent(k)
@@ -180,7 +180,7 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
         )
     mean = sum((kin.mass(k) / M * a for k, a in enumerate(com_accelerations)), ca.SX(3, 1))
 
-    # Force and moment about the system's centre of mass of each body, then of all it carries.
+    # Force and moment of each body about the system's centre of mass, then of its subtree.
     forces, moments = [], []
     for k, a in enumerate(com_accelerations):
         force = kin.mass(k) * (a - mean)

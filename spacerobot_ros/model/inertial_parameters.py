@@ -19,7 +19,7 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import Array, Inertia, RobotDescription
 
 TRIANGLE_SLACK = 0.01
-"""Relative violation of the triangle inequality that rounded principal moments may have."""
+"""Largest relative violation of the triangle inequality by rounding of principal moments."""
 
 _ROUNDING_ERROR = 1e-12
 
@@ -27,7 +27,7 @@ NUMBERS_PER_BODY = 10
 """Numbers per body in :attr:`InertialParameters.vector`."""
 
 INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Rows and columns of a body's six second moments in their matrix."""
+"""Row and column of each of a body's six second moments in the matrix (3, 3)."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class InertialParameters:
 
     @classmethod
     def stacked(cls, each: Sequence[InertialParameters]) -> InertialParameters:
-        """Return robots as one batch, (N, ...)."""
+        """Return the parameters of N robots as one batch, (N, ...)."""
         return cls(
             np.stack([one.masses for one in each]),
             np.stack([one.centers for one in each]),
@@ -84,7 +84,7 @@ class InertialParameters:
         )
 
     def __getitem__(self, index: int | slice | Array) -> InertialParameters:
-        """Return robots of a batch."""
+        """Return the parameters of some robots of a batch."""
         return InertialParameters(self.masses[index], self.centers[index], self.inertias[index])
 
     @property
@@ -95,7 +95,7 @@ class InertialParameters:
     def scaled(
         self, masses: npt.ArrayLike = 1.0, inertias: npt.ArrayLike | None = None
     ) -> InertialParameters:
-        """Multiply masses and inertias by factors (..., B).
+        """Return the parameters with masses and inertias multiplied by factors (..., B).
 
         Inertias take the factors of the masses (another density) unless they are given factors of
         their own. Factors of shape (N, B), or (N, 1) for all bodies alike, turn one robot into a
@@ -111,7 +111,7 @@ class InertialParameters:
         )
 
     def shifted(self, offsets: npt.ArrayLike) -> InertialParameters:
-        """Move the centres of mass by offsets (..., B, 3), m; inertias about the centres stay."""
+        """Return the parameters with centres of mass moved by offsets (..., B, 3), m."""
         centers = self.centers + np.asarray(offsets, dtype=float)
         shape = centers.shape[:-1]
         return InertialParameters(
@@ -121,7 +121,7 @@ class InertialParameters:
         )
 
     def with_payload(self, body: int, payload: Inertia) -> InertialParameters:
-        """Fix a payload, given in the frame of a body, to that body of one robot."""
+        """Return the parameters with a payload fixed to a body, given in the body's frame."""
         own = Inertia(float(self.masses[body]), self.centers[body], self.inertias[body])
         both = own + payload
         masses, centers, inertias = (
@@ -138,7 +138,7 @@ class InertialParameters:
 
     @property
     def vector(self) -> Array:
-        """All numbers in a row, (..., 10 B), as compiled functions take them.
+        """All numbers (..., 10 B) as one vector, the argument ``p`` of compiled functions.
 
         For each body: mass, centre (3), second moments xx, yy, zz, xy, xz, yz.
         """
@@ -182,7 +182,7 @@ class InertialParameters:
             )
 
     def described(self, robot: RobotDescription) -> RobotDescription:
-        """Return a robot description with these inertial parameters; its ``urdf`` is not changed.
+        """Return a robot description with these parameters; its ``urdf`` is unchanged.
 
         The first link of each body gets the mass properties of the body, the links that are welded
         to it by fixed joints get none.
@@ -200,7 +200,7 @@ class InertialParameters:
 
 
 class MassProperties:
-    """Mass properties of a robot description in expressions, as constants.
+    """Mass properties of a robot description as constants in expressions.
 
     Attributes
     ----------
@@ -284,7 +284,7 @@ class SymbolicMassProperties(MassProperties):
 
 
 def free_entries(nominal: InertialParameters) -> npt.NDArray[np.bool_]:
-    """Return which entries (10 B,) of the vector may differ from zero for robots like this one.
+    """Return the entries (10 B,) of the vector that can be nonzero for robots of this structure.
 
     All masses may. Entries of centres and products of inertia that are zero stay zero; principal
     moments are all zero (a point mass) or all free.

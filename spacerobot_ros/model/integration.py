@@ -1,4 +1,4 @@
-"""Runge-Kutta 4 under held commands, as functions to compose larger ones from."""
+"""Steps of Runge-Kutta 4 under held commands, as CasADi functions."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
 
 
 def repeated(step: ca.Function, count: int) -> ca.Function:
-    """Return ``step`` applied ``count`` times to its first argument, the others held.
+    """Return ``step`` applied ``count`` times to its first argument; other arguments are held.
 
     Each half is one function called twice: the code grows with the logarithm of ``count``.
     """
@@ -84,14 +84,14 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     x = ca.SX.sym("x", n + 4)
     qdot, L_W, h = ca.SX.sym("qdot", n), ca.SX.sym("L_W", 3), ca.SX.sym("h")
     q, quaternion = x[:n], x[n:]
-    # Start, middle and end of the step: the middle serves two of the four stages.
+    # Two of the four stages are evaluated at the middle of the step.
     shapes = [locked_inertia(q + fraction * h * qdot, *p) for fraction in (0.0, 0.5, 1.0)]
 
     def rate(at: ca.SX, shape: tuple[ca.SX, ca.SX]) -> ca.SX:
         D, D_q = shape
         L_B = matrix_from_quaternion(at).T @ L_W
-        # The factor has no roots and a quarter of the divisions, which take most of the time in
-        # vector registers; it is equal up to rounding. Recorded flights used the other solver.
+        # The factor needs no roots and a quarter of the divisions, which take most of the time in
+        # vector registers. Recorded flights used Cholesky's, which is equal up to rounding.
         solve = Factor(D).solve if p else partial(solve_positive_definite, D)
         return quaternion_rate(at, solve(L_B - D_q @ qdot))
 

@@ -56,7 +56,7 @@ class TreeKinematics:
 
     @property
     def moving(self) -> int:
-        """Number of bodies that joints carry; more than ``n`` where joints follow others."""
+        """Number of bodies that joints move; more than ``n`` for robots with mimic joints."""
         return len(self.robot.bodies) - 1
 
     def spread(self, rates: ca.SX) -> ca.SX:
@@ -96,7 +96,7 @@ class TreeKinematics:
         return self.mass_properties.second_moment(k, self.R[k])
 
     def parent(self, k: int) -> int:
-        """Index of the body that body k moves on; -1 for the base."""
+        """Index of the parent of body k; -1 for the base."""
         return self.robot.bodies[k].parent
 
     def is_revolute(self, k: int) -> bool:
@@ -105,7 +105,7 @@ class TreeKinematics:
         return joint is not None and joint.kind is not JointKind.PRISMATIC
 
     def ancestors(self, k: int) -> list[int]:
-        """Return the bodies from the first one on the base out to k itself, without the base."""
+        """Return the bodies on the path from the base (excluded) to body k (included)."""
         chain = []
         while k > 0:
             chain.append(k)
@@ -117,7 +117,7 @@ class TreeKinematics:
         return [k for k in range(len(self.robot.bodies)) if j == 0 or j in self.ancestors(k)]
 
     def frame(self, link: str) -> tuple[ca.SX, ca.SX, int]:
-        """Return attitude (3, 3), position (3,) in B, and the body, of a link's frame."""
+        """Return attitude (3, 3), position (3,) in B, and body index, of a link's frame."""
         body, pose = self.robot.frames[link]
         R, r = _chain_pose(self.R[body], self.p[body], pose)
         return R, r, body
@@ -206,11 +206,11 @@ def _to_constant(R: Array) -> ca.DM:
 # -- numeric ------------------------------------------------------------------------------------
 
 Frames = tuple[tuple[str, str], ...]
-"""Names of the parent link and the child link of joints."""
+"""Names of the parent link and the child link of each joint."""
 
 
 def joints_outward(robot: RobotDescription) -> list[Joint]:
-    """Return all joints, fixed ones too, each after the joint that carries its parent link."""
+    """Return all joints, including fixed joints, from the base outward."""
     above = {joint.child: joint for joint in robot.joints}
     # The links of ``frames`` are in topological order.
     return [above[link] for link in robot.frames if link in above]

@@ -34,10 +34,10 @@ _MOST_MESH_BYTES = 100_000_000
 _MOST_TRIANGLES = 2_000_000
 
 _LARGEST_COORDINATE = 1e6
-"""Coordinates beyond that are a damaged file's, in whatever unit."""
+"""Largest coordinate in any unit; a file with larger coordinates is damaged."""
 
 _STL_HEADER_BYTES = 84
-"""Bytes of a binary STL before its triangles: a text of 80, and their number."""
+"""Bytes of a binary STL file before its triangles: a text of 80, and their number."""
 
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -72,7 +72,7 @@ class TriangleMesh:
         return TriangleMesh(vertices, np.ascontiguousarray(faces))
 
     def coarsened(self, most: int) -> TriangleMesh:
-        """Return a mesh of at most ``most`` faces, which looks alike from afar.
+        """Return a simplified mesh of at most ``most`` faces.
 
         Vertices in one cell of a grid become their mean, and faces that lose their area go. The
         grid has cubes, as fine as ``most`` allows among halvings of the whole.
@@ -118,7 +118,8 @@ def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
 
 
 def mesh_beside(resource: str, folder: Path) -> Path | None:
-    """Return the file of a mesh beside the URDF in a folder; None: its URI is complete."""
+    """Return the file of a mesh named relative to a folder; None: its URI is
+    complete."""
     scheme, mark, rest = resource.partition("://")
     if not mark:
         found = folder / resource
@@ -220,7 +221,7 @@ def read_mesh(path: str | Path) -> TriangleMesh:
 
 
 def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
-    """Read the triangles of STL from elsewhere than a file, such as a bag.
+    """Read the triangles of STL bytes, such as those of a bag.
 
     Raises
     ------
@@ -246,7 +247,7 @@ def stl_of(mesh: TriangleMesh) -> bytes:
 
 
 class _DamagedError(Exception):
-    """A flaw of the content of a file, as a clause."""
+    """The content of a mesh file is damaged; the text is a clause."""
 
 
 def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
@@ -256,10 +257,10 @@ def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
         raise _DamagedError(
             f"it has {len(faces)} triangles, and at most {_MOST_TRIANGLES} are read"
         )
-    if not np.all(np.abs(vertices) < _LARGEST_COORDINATE):  # A NaN is not below it either.
+    if not np.all(np.abs(vertices) < _LARGEST_COORDINATE):  # This also finds NaN.
         raise _DamagedError(f"a coordinate is not finite, or beyond {_LARGEST_COORDINATE:g}")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise _DamagedError("a face names a vertex that is not there")
+        raise _DamagedError("a face has the index of a missing vertex")
     faces = _without_slivers(faces)
     if not len(faces):
         raise _DamagedError("it has no triangle")
@@ -273,7 +274,7 @@ def _without_slivers(faces: Faces) -> Faces:
 
 
 def _read_stl(data: bytes) -> TriangleMesh:
-    """Read STL, binary where its length is what its header says, or else text."""
+    """Read STL; the file is binary if its header states its length, otherwise text."""
     if len(data) >= _STL_HEADER_BYTES:
         count = int.from_bytes(data[80:_STL_HEADER_BYTES], "little")
         if len(data) >= _STL_HEADER_BYTES + count * _STL_TRIANGLE.itemsize and (
@@ -296,7 +297,7 @@ def mesh_from_corners(corners: npt.NDArray[Any]) -> TriangleMesh:
     """Return the mesh of triangles that are given by their corners (3 M, 3): equal ones are one."""
     if not len(corners):
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    # Adding zero makes one of both zeros, so that equal numbers are equal bytes.
+    # Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bytes.
     rows = np.ascontiguousarray(corners + 0.0)
     keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * 3))).ravel()
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
@@ -339,7 +340,7 @@ def _parse_corner_index(word: bytes, count: int) -> int:
     except ValueError:
         raise _DamagedError("a corner of a face is no number") from None
     if not 0 < abs(number) <= _MOST_MESH_BYTES:
-        raise _DamagedError("a face names a vertex that is not there")
+        raise _DamagedError("a face has the index of a missing vertex")
     return number - 1 if number > 0 else count + number
 
 
@@ -361,13 +362,13 @@ def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
         found = load(path, force="mesh", process=False, skip_materials=True)
         vertices = np.asarray(found.vertices, dtype=float).reshape(-1, 3)
         faces = np.asarray(found.faces, dtype=np.int32).reshape(-1, 3)
-    except Exception as error:  # Each parser of trimesh has its own.
+    except Exception as error:  # Each parser of trimesh raises exceptions of its own.
         raise _DamagedError(f"trimesh says {type(error).__name__}") from error
     return TriangleMesh(vertices * _unit_in_metres(path, data), faces)
 
 
 def _unit_in_metres(path: Path, data: bytes) -> float:
-    """Return the unit of a COLLADA file in m; those of the other formats are m."""
+    """Return the unit of a COLLADA file in m; other formats have metres."""
     if path.suffix.lower() != ".dae":
         return 1.0
     found = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)[\"']", data)

@@ -75,7 +75,7 @@ class ModelFunctions:
         self._symbolic: dict[str, ca.Function] = {}
         self._compiled: dict[tuple[str, ...], ca.Function] = {}
         self.derived: dict[Hashable, Any] = {}
-        """Cache of objects that other modules derive from the model, by their keys."""
+        """Cache of objects that other modules derive from the model, by key."""
 
     @classmethod
     def of(cls, robot: RobotDescription) -> ModelFunctions:
@@ -91,7 +91,7 @@ class ModelFunctions:
         if name not in self._symbolic:
             build = self._builders[kind]
             self._symbolic[name] = build(argument) if argument else build()
-        # Curvature is large and evaluated once in a plan: compiling takes longer than all calls.
+        # Compiling the large curvature would take longer than its few calls in a plan.
         if not compile or kind == "curvature":
             return self._symbolic[name]
         return self.composed(name, lambda: self._symbolic[name])
@@ -215,7 +215,7 @@ class ModelFunctions:
         return self._dense_model_function("forward_dynamics", inputs, {"z0ddot": acceleration})
 
     def _dynamics(self) -> ca.Function:
-        """The same function as ``forward_dynamics``, by fewer operations."""
+        """Return the forward dynamics by composite rigid bodies, with fewer operations."""
         state = self._state_symbols("v_cm_B")
         _, *velocities = state.values()
         forces = {"wrench_B": ca.SX.sym("wrench_B", 6), "tau": ca.SX.sym("tau", self.n)}
@@ -339,12 +339,12 @@ class Composition:
     def function(
         self, name: str, inputs: Sequence[ca.MX | ca.SX], outputs: Sequence[ca.MX | ca.SX]
     ) -> ca.Function:
-        """Return the function of some inputs."""
+        """Return a function of given input symbols and output expressions."""
         return ca.Function(name, [*inputs, *self.inputs.values()], list(outputs))
 
 
 class SymbolicModels:
-    """Models with mass properties as an argument, shared by robots that differ in these alone."""
+    """Models with mass properties as an argument, for all robots of the same structure."""
 
     def __init__(self, robot: RobotDescription, free: npt.NDArray[np.bool_]) -> None:
         self._robot, self._free = robot, free
@@ -352,7 +352,7 @@ class SymbolicModels:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> SymbolicModels:
-        """Return the models of all robots that differ from this one in mass properties alone."""
+        """Return the models for all robots that differ from this robot in mass properties alone."""
         free = free_entries(InertialParameters.of(robot))
         key = _structure_key(robot, free)
         found = _symbolic_models.pop(key, None) or cls(robot, free)

@@ -118,7 +118,7 @@ def attitude_error(quaternion: npt.ArrayLike, target: npt.ArrayLike) -> Array:
 
 
 def swing_angle(quaternion: npt.ArrayLike, axes: Array) -> float:
-    """Return by how much a rotation differs from all rotations about axes (k, 3), rad.
+    """Return the angle, rad, between a rotation and the nearest rotation about axes (k, 3).
 
     The axes are orthonormal; with one of them this is the swing that remains of a unit quaternion
     (x, y, z, w) after its twist about the axis, with none the whole rotation.
@@ -140,7 +140,7 @@ def unit_quaternion(quaternion: npt.ArrayLike) -> Array:
     q = np.asarray(quaternion, dtype=float)
     largest = float(np.abs(q).max())
     if math.isfinite(largest) and largest > 1.0:
-        q = q / largest  # Squares of large numbers overflow.
+        q = q / largest  # Scaling avoids overflow of squares.
     norm = float(np.linalg.norm(q))
     if not math.isfinite(norm) or norm < 1e-6:
         raise ValueError(f"the quaternion {q.tolist()} is not a rotation")
@@ -149,7 +149,7 @@ def unit_quaternion(quaternion: npt.ArrayLike) -> Array:
 
 def quaternion_from_matrix(R: Array) -> Array:
     """Return the unit quaternion (x, y, z, w) of a rotation matrix (3, 3)."""
-    # The largest of the four squares is divided by, so that none is lost near half turns.
+    # The divisor is the largest of four squares, which keeps precision near half turns.
     trace = float(R[0, 0] + R[1, 1] + R[2, 2])
     squares = [*(1 + 2 * float(R[i, i]) - trace for i in range(3)), 1 + trace]
     largest = max(range(4), key=squares.__getitem__)

@@ -24,7 +24,7 @@ class RobotConfig:
     )
 
     def believed(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot as the node with this configuration models it."""
+        """Return the robot with the mass properties that the configured node assumes."""
         return robot
 
 
@@ -38,7 +38,7 @@ class BelievedRobotConfig(RobotConfig):
     model_error_seed: int = parameter(0, "seed of the draw of these errors", minimum=0)
 
     def believed(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot with masses and inertias off by up to ``model_error``."""
+        """Return the robot with random errors of masses and inertias of up to ``model_error``."""
         if self.model_error > 0.0:
             return robot.with_model_error(self.model_error, self.model_error_seed)
         return robot
@@ -66,7 +66,7 @@ def robot_of(config: RobotConfig) -> SpaceRobot | None:
 
 
 def robot_from_text(text: str, config: RobotConfig) -> SpaceRobot:
-    """Return the robot of a URDF text, as the node with this configuration models it.
+    """Return the robot of a URDF text with the mass properties that the node assumes.
 
     Raises
     ------
@@ -101,14 +101,12 @@ class CommanderConfig(WatchdogConfig, BelievedRobotConfig):
 
     tick_rate: float = parameter(
         20.0,
-        "commands a second; that of the plant",
+        "commands per second, equal to the plant's tick_rate",
         unit="Hz",
         minimum=0.001,
         maximum=100000.0,
     )
-    world_frame: str = parameter(
-        "world", "frame that goals are in, if they name no other that is known"
-    )
+    world_frame: str = parameter("world", "frame of goals that name no known frame")
     state_reliability: str = parameter(
         "auto",
         "how odom and joint_states are subscribed: best_effort receives from every publisher, "

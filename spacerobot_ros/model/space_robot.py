@@ -23,7 +23,7 @@ from spacerobot_ros.model.model_functions import Composition, ModelFunctions, Sy
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 
 _LEAST_RELATIVE_INERTIA = 1e-6
-"""Component of a joint in a motion without inertia below which the joint does not take part."""
+"""Largest component of a joint that counts as zero in a motion without inertia."""
 
 
 class SpaceRobot:
@@ -236,7 +236,7 @@ class SpaceRobot:
         return self.buffered(f"velocity_step:{substeps}")
 
     def composed(self, name: str, build: Callable[[Composition], ca.Function]) -> BufferedFunction:
-        """Return a function that ``build`` composes of the model's, in MX, with its own buffers.
+        """Return a function that ``build`` composes from MX functions of the model, with buffers.
 
         It is compiled once per name for all robots that differ in mass properties alone.
         """
@@ -245,7 +245,7 @@ class SpaceRobot:
         return BufferedFunction(function, self._p)
 
     def expressions(self) -> Composition:
-        """Return the model's functions to compose larger ones from, in SX; see :meth:`view`."""
+        """Return the model's functions as SX expressions for larger functions; see :meth:`view`."""
         return Composition(self._model, ca.SX)
 
     def view(self, function: ca.Function) -> BufferedFunction:
@@ -257,12 +257,12 @@ class SpaceRobot:
 
     @property
     def mass_arguments(self) -> dict[str, Array]:
-        """Last argument of functions of :meth:`expressions`, by its name; empty: none."""
+        """The last argument of functions of :meth:`expressions`, by name; empty: none."""
         return {} if self._p is None else {"p": self._p}
 
     @property
     def equations_key(self) -> str:
-        """Hash of the equations at zero momentum, equal for robots that move alike."""
+        """Hash of the equations at zero momentum, equal for robots with equal equations."""
         return self._numeric_model.equations_key
 
     @cached_property

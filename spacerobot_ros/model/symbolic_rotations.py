@@ -50,7 +50,7 @@ def quaternion_rate(quaternion: ca.SX, omega_WB_B: ca.SX) -> ca.SX:
 
 def quaternion_from_rotvec(rotvec: ca.SX) -> ca.SX:
     """Return the quaternion (4,) of ``exp(hat(rotvec))``; rotvec (3,) in rad."""
-    # The small number gives the limit, 1/2, at no rotation, and is below rounding elsewhere.
+    # The small number gives the limit 1/2 at zero rotation, and is below rounding elsewhere.
     angle = ca.sqrt(ca.dot(rotvec, rotvec) + 1e-30)
     return ca.vertcat(rotvec * (ca.sin(angle / 2) / angle), ca.cos(angle / 2))
 
@@ -76,6 +76,6 @@ def rotation_error(quaternion: ca.SX, target: ca.SX) -> ca.SX:
     inverse = ca.vertcat(-quaternion[:3], quaternion[3])
     error = quaternion_multiply(target, inverse)
     error = error * ca.if_else(error[3] < 0, -1, 1)
-    # The small number gives the limit, 2, at no rotation, and is below rounding elsewhere.
+    # The small number gives the limit 2 at zero rotation, and is below rounding elsewhere.
     sine = ca.sqrt(ca.dot(error[:3], error[:3]) + 1e-30)
     return error[:3] * (2 * ca.atan2(sine, error[3]) / sine)

@@ -1,4 +1,4 @@
-"""URDF files and texts to :class:`.RobotDescription`.
+"""Reads URDF files and texts as :class:`.RobotDescription`.
 
 The form of the text is checked first (:func:`_checked_root`): every message names the element and
 its correction. Then links and joints are read, fixed joints are welded, and robots whose equations
@@ -178,7 +178,7 @@ def parse_robot(text: str) -> RobotDescription:
 
 
 def _read_numbers(element: Element | None, name: str, default: str, where: str) -> Array:
-    """Return the numbers of an attribute; those of ``default`` if it or its element is missing."""
+    """Return the numbers of an attribute; ``default`` for a missing attribute or element."""
     text = default if element is None else element.get(name, default)
     return _require_finite([float(word) for word in text.split()], where)
 
@@ -232,7 +232,7 @@ def _read_link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
 
 
 def flaw_of_inertia(about: Array) -> str:
-    """Return the flaw of moments of inertia (3, 3), kg m^2, that no body can have; empty: none.
+    """Return a clause on impossible moments of inertia (3, 3), kg m^2; empty: none.
 
     It completes a message that begins with the owner of the inertia.
     """
@@ -380,7 +380,7 @@ def _with_leaders(joints: list[Joint]) -> list[Joint]:
 
 
 def _require_common_range(robot: RobotDescription) -> None:
-    """Refuse a joint whose limits and those of its mimic joints have no common range."""
+    """Refuse a joint whose limits have no common range with the limits of its mimic joints."""
     lower, upper = robot.limits("lower"), robot.limits("upper")
     for name, low, high in zip(robot.joint_names, lower, upper, strict=True):
         if low >= high:
@@ -450,7 +450,7 @@ def _require_mass(robot: RobotDescription) -> None:
 # -- form of the text -------------------------------------------------------------------------
 
 _OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": "a COLLADA file"}
-"""File formats by the root element."""
+"""Descriptions of other file formats by their root elements."""
 
 _ELEMENTS_READ = {
     "robot": ("link", "joint", "material"),
@@ -458,7 +458,7 @@ _ELEMENTS_READ = {
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
     "material": ("color",),
 }
-"""Elements that are read, by their parent; all others are ignored."""
+"""Tags of the elements to read, by the tag of their parent; other elements are ignored."""
 
 _GEOMETRIES = ("box", "cylinder", "sphere", "mesh")
 
@@ -495,7 +495,7 @@ _ATTRIBUTES = {
     ),
     "mimic": (
         _Attribute("joint", 0, "the name of the joint that it follows"),
-        _Attribute("multiplier", 1, "its position over that of the other", needed=False),
+        _Attribute("multiplier", 1, "its position per position of the leading joint", needed=False),
         _Attribute("offset", 1, "m or rad", needed=False),
     ),
     "box": (_Attribute("size", 3, "m"),),

@@ -85,13 +85,13 @@ class Visual:
 
     @property
     def is_rod(self) -> bool:
-        """Whether it is a box too thin to show edges."""
+        """Whether the visual is a box too thin to show edges."""
         size = sorted(self.shape.size)
         return self.shape.kind == "box" and size[1] < _ROD_THICKNESS_RATIO * size[2]
 
     @property
     def outline(self) -> Array:
-        """Lines (K, 2, 3) in the frame of the link that outline it without hiding other parts."""
+        """Outline of the visual, lines (K, 2, 3) in the link's frame that hide no other part."""
         shape = self.shape
         if self.is_rod:
             longest = int(np.argmax(shape.size))
@@ -255,7 +255,7 @@ def meshes_in(robot: RobotDescription, attachments: Mapping[str, bytes]) -> dict
 
 
 class MeshFolder:
-    """A folder with those meshes of a bag that this machine lacks, for programs that read files.
+    """A folder with the meshes of a bag that this machine lacks, for programs that read files.
 
     Parameters
     ----------
@@ -274,7 +274,7 @@ class MeshFolder:
         self._files: dict[str, Path | None] = {}
 
     def described(self, urdf: str) -> str:
-        """Return the text of a URDF in which meshes that only the bag has are files of this folder.
+        """Return the URDF text with meshes of the bag as files of this folder.
 
         Other meshes keep their names.
         """
@@ -293,7 +293,7 @@ class MeshFolder:
             mesh = mesh_of_stl(data, resource).coarsened(_MOST_FACES_IN_BAG)
         except MeshError:
             return None
-        # Neither the name nor the bytes of the bag: a stranger may have written both.
+        # Name and bytes are not copied from the bag, which a stranger may have written.
         path = Path(self._folder.name, f"{len(self._files)}.stl")
         path.write_bytes(stl_of(mesh))
         return path

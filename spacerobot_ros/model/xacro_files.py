@@ -24,7 +24,7 @@ _MOST_MEMORY = 2**30
 _MOST_OPEN_FILES = 64
 
 _READABLE_SUFFIXES = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
-"""Files that may be read."""
+"""Suffixes of the files that xacro may read."""
 
 _LARGEST_TEXT = 20_000_000
 """Longest expanded text, characters."""
@@ -42,7 +42,7 @@ _REFUSED_NAMES = frozenset({"type", "vars", "format", "format_map", "mro", "geta
 
 
 def check_expression(expression: str) -> None:
-    """Refuse an expression that could reach beyond its values.
+    """Refuse an expression that could call functions or reach the interpreter.
 
     Raises
     ------
@@ -126,6 +126,6 @@ def main(file: str, seconds: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.path.pop(0)  # The folder of this file: its modules are none of xacro's.
+    sys.path.pop(0)  # Modules beside this file must not shadow xacro's modules.
     sys.dont_write_bytecode = True
     sys.exit(main(sys.argv[1], int(sys.argv[2])))
