@@ -22,7 +22,7 @@ from spacerobot_ros.planning import GaitSchedule, PlanRequest
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.simulation.actuators import build_plant
-from spacerobot_ros.simulation.trials import Problem, state_of, try_method
+from spacerobot_ros.simulation.trials import PlanningProblem, robot_state_of, try_method
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures.json"
 
@@ -70,7 +70,7 @@ def _area_loop() -> dict[str, str]:
     method, plant = problem.method("area_loop"), problem.plant()
     found, previous = {}, None
     for cycle in range(1, _CYCLES + 1):
-        state = state_of(plant)
+        state = robot_state_of(plant)
         previous = method.plan(
             PlanRequest(
                 state,
@@ -132,8 +132,8 @@ def _coordinated_control() -> dict[str, str]:
     return found
 
 
-def _planned(problem: Problem, method: str) -> GaitSchedule:
-    state = state_of(problem.plant())
+def _planned(problem: PlanningProblem, method: str) -> GaitSchedule:
+    state = robot_state_of(problem.plant())
     return problem.method(method).plan(PlanRequest(state, problem.goal, problem.config.tolerance))
 
 

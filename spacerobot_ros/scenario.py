@@ -33,7 +33,7 @@ from spacerobot_ros.resources import (
 )
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.trials import Problem
+from spacerobot_ros.simulation.trials import PlanningProblem
 from spacerobot_ros.viewer.server import ViewerConfig
 
 CONFIGS: Mapping[str, type[Any]] = {
@@ -234,7 +234,7 @@ class Scenario:
             for part, values in (("position", goal.position), ("orientation", goal.quaternion))
         }
 
-    def problem(self) -> Problem:
+    def problem(self) -> PlanningProblem:
         """Return the planning problem of the goal of the base.
 
         Raises
@@ -251,7 +251,7 @@ class Scenario:
         robot = SpaceRobot.from_file(robot_file(name))
         self.require_shape_of(robot)
         goal = self.goal.for_robot(robot.description)
-        return Problem(self.name, robot, InitialState.of(plant), goal, planner)
+        return PlanningProblem(self.name, robot, InitialState.of(plant), goal, planner)
 
     def require_shape_of(self, robot: SpaceRobot) -> None:
         """Refuse a goal whose joint positions are of another robot.

@@ -179,12 +179,12 @@ class Recording:
         """Attach a robot description, and those of its meshes that exist on this machine."""
         # Importing the robot model doubles the import time of this module.
         from spacerobot_ros.model.urdf import parse_robot
-        from spacerobot_ros.model.visuals import carried_meshes
+        from spacerobot_ros.model.visuals import meshes_for_bag
 
         self.attach(name, urdf, "application/xml")
         if b"<mesh" in urdf:
             with suppress(RobotDescriptionError, UnicodeDecodeError):
-                for mesh, data in carried_meshes(parse_robot(urdf.decode())).items():
+                for mesh, data in meshes_for_bag(parse_robot(urdf.decode())).items():
                     self.attach(mesh, data, "model/stl")
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:

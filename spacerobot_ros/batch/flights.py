@@ -20,7 +20,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
-from spacerobot_ros.model.integration import steps_in
+from spacerobot_ros.model.integration import count_steps
 from spacerobot_ros.simulation.actuators import PLANTS
 from spacerobot_ros.simulation.config import SensorConfig
 from spacerobot_ros.simulation.plant import InitialState
@@ -356,7 +356,7 @@ class Flights:
     def substeps(self) -> int:
         """Runge-Kutta steps in a tick."""
         step = self.integration_step or PLANTS[self.actuation].integration_step
-        return steps_in(self.control_period, step)
+        return count_steps(self.control_period, step)
 
     @property
     def thruster_count(self) -> int:

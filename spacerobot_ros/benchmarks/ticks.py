@@ -41,7 +41,7 @@ from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.stack import InProcessStack
 from spacerobot_ros.simulation import VelocityPlant
-from spacerobot_ros.simulation.trials import state_of
+from spacerobot_ros.simulation.trials import robot_state_of
 from spacerobot_ros.times import SECOND
 
 _ROUNDS = 5
@@ -279,7 +279,9 @@ def _planning_times() -> Iterator[tuple[str, float, float]]:
     for scenario, name in _SCENARIOS_AND_METHODS:
         problem = load_scenario(scenario).problem()
         method = problem.method(name)
-        request = PlanRequest(state_of(problem.plant()), problem.goal, problem.config.tolerance)
+        request = PlanRequest(
+            robot_state_of(problem.plant()), problem.goal, problem.config.tolerance
+        )
         times = []
         for _ in range(1 + _PLANS_PER_MEDIAN):
             began = time.perf_counter()

@@ -20,7 +20,7 @@ from spacerobot_ros.parameters import Parameter, declared, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file, suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario
-from spacerobot_ros.simulation.faults import KINDS
+from spacerobot_ros.simulation.faults import FAULT_KINDS
 
 AXES = ("x", "y", "z")
 
@@ -398,7 +398,7 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Targe
             f"'{name}': plant.faults has {len(faults)} fault(s); the first is faults[0]."
         )
     kind = faults[index].split()[0]
-    if part == "value" and not (kind in KINDS and KINDS[kind].value):
+    if part == "value" and not (kind in FAULT_KINDS and FAULT_KINDS[kind].value):
         raise ParameterError(f"'{name}': a fault of the kind {kind} has no value.")
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:

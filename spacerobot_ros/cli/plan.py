@@ -31,7 +31,7 @@ from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
     from spacerobot_ros.planning import Goal
-    from spacerobot_ros.simulation.trials import PlanEvaluation, Problem, Record
+    from spacerobot_ros.simulation.trials import MethodRecord, PlanEvaluation, PlanningProblem
 
 
 _NO_GOAL = GoalOptions(None, None, None)
@@ -124,7 +124,9 @@ def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:
     return describe_remaining_error(trial.error, trial.controls - {"shape"})
 
 
-def problem_of(name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] = ()) -> Problem:
+def problem_of(
+    name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] = ()
+) -> PlanningProblem:
     """Return the planning problem of a scenario, or of a robot (a name or a URDF file) at rest.
 
     ``goal`` replaces the scenario's, ``settings`` are ``planner.parameter=value`` and
@@ -146,7 +148,7 @@ def problem_of(name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] 
     return goal.apply_to(scenario_or_robot(name).with_settings(settings)).problem()
 
 
-def json_of(problem: Problem, trial: PlanEvaluation) -> dict[str, Any]:
+def json_of(problem: PlanningProblem, trial: PlanEvaluation) -> dict[str, Any]:
     """Return the content of the file that ``--json`` names."""
     from spacerobot_ros.model.rotations import rotvec_from_quaternion
 
@@ -210,7 +212,7 @@ def comparison_lines(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> I
         yield f"{name:<14}{times}{angle:>14}{distance:>14}"
 
 
-def _random_goals(problem: Problem, count: int, within: tuple[float, float]) -> list[Goal]:
+def _random_goals(problem: PlanningProblem, count: int, within: tuple[float, float]) -> list[Goal]:
     """Return random goals; ``within`` are the largest distance, m, and angle, deg."""
     from spacerobot_ros.simulation.trials import random_goals
 
@@ -218,7 +220,7 @@ def _random_goals(problem: Problem, count: int, within: tuple[float, float]) -> 
 
 
 def _plan_random_goals(
-    problem: Problem, methods: list[str], count: int, within: tuple[float, float]
+    problem: PlanningProblem, methods: list[str], count: int, within: tuple[float, float]
 ) -> None:
     """Plan and print random goals; exit code 0: all that were simulated were reached."""
     from spacerobot_ros.simulation.trials import try_goals
@@ -239,7 +241,7 @@ def _plan_random_goals(
         fail()
 
 
-def _record_row(record: Record) -> str:
+def _record_row(record: MethodRecord) -> str:
     import numpy as np
 
     goals = record.reached + record.missed + len(record.refused)
@@ -280,14 +282,14 @@ def library_command(
     """
     from spacerobot_ros.planning import PlanRequest
     from spacerobot_ros.planning.methods.optimal.method import OptimalGait
-    from spacerobot_ros.simulation.trials import state_of
+    from spacerobot_ros.simulation.trials import robot_state_of
 
     problem = problem_of(scenario, settings=settings)
     method = problem.method("optimal")
     assert isinstance(method, OptimalGait)
     goals = _random_goals(problem, count, within)
     with click.progressbar(goals, label=problem.name, file=sys.stderr) as bar:
-        state, tolerance = state_of(problem.plant()), problem.config.tolerance
+        state, tolerance = robot_state_of(problem.plant()), problem.config.tolerance
         library = method.build_library(PlanRequest(state, goal, tolerance) for goal in bar)
     if library is None:
         fail("None of the goals could be reached.")

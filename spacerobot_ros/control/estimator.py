@@ -7,7 +7,7 @@ import numpy as np
 from spacerobot_ros.control.state import Actuation, ControlState
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, steps_in
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, count_steps
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_from_rotvec,
@@ -49,7 +49,7 @@ class DeadReckoning:
         control_period: float,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        self._substeps = steps_in(control_period, integration_step)
+        self._substeps = count_steps(control_period, integration_step)
         self.robot = robot
         self.control_period = control_period
         self.elapsed = 0.0

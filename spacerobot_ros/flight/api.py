@@ -30,7 +30,7 @@ from spacerobot_ros.scenario import (
     scenario_of,
     scenario_or_robot,
 )
-from spacerobot_ros.simulation.trials import state_of
+from spacerobot_ros.simulation.trials import robot_state_of
 
 _ORIGIN = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 """The pose of a base that is nowhere else."""
@@ -173,7 +173,7 @@ def plan(
     method_options(name, options)  # Refused here, by the names that were given.
     settings |= {f"{name}.{option}": value for option, value in options.items()}
     problem = scenario.with_overrides("planner", settings).problem()
-    state, tolerance = state_of(problem.plant()), problem.config.tolerance
+    state, tolerance = robot_state_of(problem.plant()), problem.config.tolerance
     request = planning.PlanRequest(state, problem.goal, tolerance)
     return problem.method(name).plan(request)
 

@@ -527,7 +527,7 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
     urdf = bag.parts[0].urdf
     if urdf is None:
         raise RecordingError(f"The bag {bag.path} holds no description of its robot.")
-    robot = scenario.plant.believed(parse_robot(urdf.decode(errors="replace")))
+    robot = scenario.plant.assumed_robot(parse_robot(urdf.decode(errors="replace")))
     flight = replace(
         read_flight(bag),
         scenario=scenario,

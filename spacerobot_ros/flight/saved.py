@@ -22,7 +22,7 @@ from spacerobot_ros.messages.builders import (
 from spacerobot_ros.messages.layout import encode, stamped_copies
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.visuals import carried_meshes
+from spacerobot_ros.model.visuals import meshes_for_bag
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS, Topic, state_topics
@@ -59,7 +59,7 @@ def save_flight(flight: Flight, path: str | os.PathLike[str], *, overwrite: bool
             writer.add_metadata(title, values)
         urdf = robot.urdf.encode()
         writer.add_attachment("robot_description.urdf", urdf, "application/xml", 0)
-        for name, mesh in carried_meshes(robot).items():
+        for name, mesh in meshes_for_bag(robot).items():
             writer.add_attachment(name, mesh, "model/stl", 0)
         entries = []
         for place, stream in enumerate(streams):

@@ -190,7 +190,7 @@ class _RecordedPlant:
                 f"The joint states in the bag {bag.path} are of {', '.join(names)}; its robot has "
                 f"{', '.join(description.joint_names)}."
             )
-        return cls(recorded, config, SpaceRobot(config.believed(description)), injections)
+        return cls(recorded, config, SpaceRobot(config.assumed_robot(description)), injections)
 
     def commands(self, source: CommandSource) -> dict[int, RecordedCommand]:
         """Return the first command of each tick; later ones and those between ticks are stale."""

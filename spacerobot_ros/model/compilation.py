@@ -41,13 +41,13 @@ from spacerobot_ros.termination import tool
 # With fused multiply-adds, results would depend on the processor.
 _COMMON_FLAGS = ("-fPIC", "-shared", "-ffp-contract=off")
 
-_FLAGS = ("-O2", *_COMMON_FLAGS)
+_COMPILER_FLAGS = ("-O2", *_COMMON_FLAGS)
 
-_LONG_FLAGS = ("-O0", *_COMMON_FLAGS)
+_LONG_FUNCTION_FLAGS = ("-O0", *_COMMON_FLAGS)
 """Flags for functions of ten thousands of operations: a tenth of the time to compile, half
 the speed, still seven times that of the virtual machine."""
 
-_LEAST_OPERATIONS_TO_KEEP = 5000
+_MIN_OPERATIONS_TO_KEEP = 5000
 """Fewest operations of a function for the cache: it takes 0.1 s to derive, 0.01 s to read."""
 
 _COMPILE_TIMEOUT = 120.0
@@ -56,13 +56,13 @@ _COMPILE_TIMEOUT = 120.0
 _TRIAL_TIMEOUT = 20.0
 """Time limit for trying a new object, s."""
 
-_LARGEST_DIFFERENCE = 1e-6
+_MAX_DIFFERENCE = 1e-6
 """Largest relative difference between a compiled function and the virtual machine."""
 
-_LARGEST_COMPARED_RESULT = 1e9
+_MAX_COMPARED_RESULT = 1e9
 """Largest compared result; larger results are near a singularity and depend on rounding."""
 
-_MOST_FUNCTIONS_IN_MEMORY = 12
+_MAX_FUNCTIONS_IN_MEMORY = 12
 
 _functions_in_memory: dict[tuple[str, ...], ca.Function] = {}
 """The latest used functions of the cache, by name, key and settings of the compilation."""
@@ -74,7 +74,7 @@ _LOG = logging.getLogger(__name__)
 
 _Loaded = TypeVar("_Loaded")
 
-contexts: list[Callable[[], AbstractContextManager[None]]] = []
+compilation_contexts: list[Callable[[], AbstractContextManager[None]]] = []
 """Contexts around every run of the compiler, such as one in which a node reports to be busy."""
 
 _hung_compilations: set[str] = set()
@@ -176,17 +176,17 @@ def compiled(function: ca.Function) -> ca.Function:
     try:
         if compiler is None:
             raise _CompilationError("no C compiler (cc, gcc, clang or $CC) was found")
-        key = _hash_text(f"{_platform_key(compiler, _FLAGS)}\n{_c_source(function)}")
+        key = _hash_text(f"{_platform_key(compiler, _COMPILER_FLAGS)}\n{_c_source(function)}")
         if found := _load_compiled(Cache(cache_directory()), function.name(), key):
             return found
-        return _compile_function(function, key, _FLAGS, compiler)
+        return _compile_function(function, key, _COMPILER_FLAGS, compiler)
     except _CompilationError as reason:
         _warn_of_virtual_machine(reason)
         return function
 
 
 @lru_cache
-def source_of(*names: str) -> str:
+def source_hash(*names: str) -> str:
     """Return a hash of modules of this package, and of CasADi's version, for keys of functions."""
     texts = [Path(str(sys.modules[name].__file__)).read_text("utf-8") for name in names]
     return _hash_text("\n".join([ca.__version__, *texts]))
@@ -199,7 +199,7 @@ def _warn_of_virtual_machine(reason: _CompilationError) -> None:
     )
 
 
-def kept_function(
+def cached_function(
     name: str, key: str, build: Callable[[], ca.Function], *, compiling: bool
 ) -> ca.Function:
     """Return an expensive function from the cache, or derive and cache it.
@@ -230,7 +230,7 @@ def kept_function(
         name, key, build, compiling=compiling
     )
     _functions_in_memory[place] = function
-    if len(_functions_in_memory) > _MOST_FUNCTIONS_IN_MEMORY:
+    if len(_functions_in_memory) > _MAX_FUNCTIONS_IN_MEMORY:
         del _functions_in_memory[next(iter(_functions_in_memory))]
     return function
 
@@ -241,7 +241,7 @@ def _load_or_derive(
     cache, compiler = Cache(cache_directory()), c_compiler()
     compiled_key = ""
     if compiler is not None:
-        compiled_key = _hash_text(f"{_platform_key(compiler, _LONG_FLAGS)}\n{name}\n{key}")
+        compiled_key = _hash_text(f"{_platform_key(compiler, _LONG_FUNCTION_FLAGS)}\n{name}\n{key}")
         if found := _load_compiled(cache, name, compiled_key):
             return found
     serialised = f"{name}-{key[:32]}.casadi"
@@ -253,10 +253,10 @@ def _load_or_derive(
     function = build()
     if compiling and compiler is not None:
         try:
-            return _compile_function(function, compiled_key, _LONG_FLAGS, compiler)
+            return _compile_function(function, compiled_key, _LONG_FUNCTION_FLAGS, compiler)
         except _CompilationError as reason:
             _warn_of_virtual_machine(reason)
-    if function.n_instructions() >= _LEAST_OPERATIONS_TO_KEEP:
+    if function.n_instructions() >= _MIN_OPERATIONS_TO_KEEP:
         cache.store(serialised, key, function.serialize().encode())
     return function
 
@@ -299,7 +299,7 @@ def native_library(
             return ctypes.CDLL(str(kept[0]))
     try:
         return _make_object(
-            name, key, _Build(source, compiler, flags, libraries, "cpp"), tried, ctypes.CDLL
+            name, key, _CompilerCall(source, compiler, flags, libraries, "cpp"), tried, ctypes.CDLL
         )
     except _CompilationError as reason:
         raise NoLibraryError(str(reason)) from None
@@ -411,12 +411,12 @@ def _compile_function(
     """
     name = function.name()
     _announce_compilation()
-    build = _Build(_c_source(function), compiler, flags)
+    build = _CompilerCall(_c_source(function), compiler, flags)
     return _make_object(name, key, build, [function], lambda path: ca.external(name, path))
 
 
 @dataclass(frozen=True)
-class _Build:
+class _CompilerCall:
     """A source, and the call of the compiler for its shared object.
 
     Attributes
@@ -439,7 +439,7 @@ class _Build:
 def _make_object(
     name: str,
     key: str,
-    build: _Build,
+    build: _CompilerCall,
     tried: Sequence[ca.Function],
     load: Callable[[str], _Loaded],
 ) -> _Loaded:
@@ -458,7 +458,7 @@ def _make_object(
             ExitStack() as entered,
             tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder,
         ):
-            for context in tuple(contexts):
+            for context in tuple(compilation_contexts):
                 entered.enter_context(context())
             built = _compile_object(build, Path(folder), limit)
             for each in tried:
@@ -493,7 +493,7 @@ def _c_library_version() -> str:
     return ""
 
 
-def _compile_object(build: _Build, folder: Path, limit: float) -> Path:
+def _compile_object(build: _CompilerCall, folder: Path, limit: float) -> Path:
     """Compile an object file in a folder, and return its path."""
     source, built, output = (
         folder / f"function.{build.suffix}",
@@ -584,8 +584,8 @@ def _try_object(function: ca.Function, path: Path) -> None:
     for result, wanted in zip(results, expected, strict=True):
         there, here = np.array(result), np.array(wanted.nonzeros())
         with np.errstate(invalid="ignore"):
-            judged = np.isfinite(here) & (np.abs(here) < _LARGEST_COMPARED_RESULT)
-            near = np.abs(there - here) <= _LARGEST_DIFFERENCE * (
+            judged = np.isfinite(here) & (np.abs(here) < _MAX_COMPARED_RESULT)
+            near = np.abs(there - here) <= _MAX_DIFFERENCE * (
                 1 + np.abs(here).max(initial=0, where=judged)
             )
         if failed or not np.all(near[judged]):

@@ -83,7 +83,7 @@ class SpatialInertia:
         )
 
 
-class Factor:
+class SymmetricFactor:
     """The factorisation ``L D L'`` of a symmetric positive definite matrix."""
 
     def __init__(self, matrix: ca.SX) -> None:
@@ -150,7 +150,7 @@ class Composites:
     @property
     def D_qq(self) -> ca.SX:
         """Inertia matrix (n, n) of the joint rates where base and centre rest (eq. 16b)."""
-        m = self.kin.moving
+        m = self.kin.moving_body_count
         D_qq = ca.SX(m, m)
         for j in range(1, m + 1):
             carriers = self.kin.ancestors(j)
@@ -168,7 +168,7 @@ class Composites:
 
 def composites(kin: TreeKinematics) -> Composites:
     """Add up the inertias of the bodies inward (Featherstone, table 6.2)."""
-    n, c = kin.moving, kin.r_BC_B
+    n, c = kin.moving_body_count, kin.r_BC_B
     J = tuple(kin.second_moment(k) for k in range(n + 1))
     composite = []
     for k in range(n + 1):
@@ -193,7 +193,7 @@ class ShapeSystem:
 
     parts: Composites
     B: tuple[ca.SX, ...]
-    D: Factor
+    D: SymmetricFactor
     K: ca.SX
 
     def base_rate(self, L_B: ca.SX, qdot: ca.SX) -> ca.SX:
@@ -213,8 +213,8 @@ class ShapeSystem:
 def shape_system(kin: TreeKinematics) -> ShapeSystem:
     """Eliminate the base from the composites."""
     parts = composites(kin)
-    S, P, n = parts.S, parts.P, kin.moving
-    D = Factor(parts.rotational)
+    S, P, n = parts.S, parts.P, kin.moving_body_count
+    D = SymmetricFactor(parts.rotational)
     B = [ca.vertcat(D.solve(p[:3]), p[3:] * kin.per_mass) for p in P]
     K = ca.SX(n, n)
     for j in range(1, n + 1):
@@ -241,7 +241,7 @@ def motion_forces(
     qddot = None if qddot is None else kin.spread(qddot)
     omegas, alphas = [omega], [ca.SX(3, 1)]
     A, accelerations = [_angular_operator(omega, ca.SX(3, 1))], [ca.SX(3, 1)]
-    for k in range(1, kin.moving + 1):
+    for k in range(1, kin.moving_body_count + 1):
         i = kin.parent(k)
         rate = kin.axis[k] * qdot[k - 1]
         push = ca.SX(3, 1) if qddot is None else kin.axis[k] * qddot[k - 1]
@@ -262,14 +262,14 @@ def motion_forces(
             A.append(A[i])
 
     forces = []
-    for k in range(kin.moving + 1):
+    for k in range(kin.moving_body_count + 1):
         arm = kin.R[k] @ kin.center(k)
         force = kin.mass(k) * (accelerations[k] + A[k] @ arm)
         # The moment is the integral of rho x A rho over the body: the axial vector of A J.
         AJ = A[k] @ parts.J[k]
         spin = ca.vertcat(AJ[2, 1] - AJ[1, 2], AJ[0, 2] - AJ[2, 0], AJ[1, 0] - AJ[0, 1])
         forces.append(ca.vertcat(ca.cross(kin.com[k] - kin.r_BC_B, force) + spin, force))
-    for k in range(kin.moving, 0, -1):
+    for k in range(kin.moving_body_count, 0, -1):
         forces[kin.parent(k)] += forces[k]
     return tuple(forces)
 
@@ -285,10 +285,10 @@ def shape_forces(
     f = motion_forces(system.parts, omega, qdot)
     excess = f[0] - external
     kin = system.parts.kin
-    if kin.robot.coupled:
+    if kin.robot.has_mimic_joints:
         along = [
             ca.dot(system.B[k], excess) - ca.dot(system.parts.S[k], f[k])
-            for k in range(1, kin.moving + 1)
+            for k in range(1, kin.moving_body_count + 1)
         ]
         return tau + kin.gather(ca.vertcat(*along)), -excess[:3]
     Q = [
@@ -308,7 +308,7 @@ def joint_efforts(kin: TreeKinematics, qdot: ca.SX, qddot: ca.SX) -> ca.SX:
     They are of second degree in time: the same path in half the time takes four times the efforts.
     """
     parts = composites(kin)
-    D = Factor(parts.rotational)
+    D = SymmetricFactor(parts.rotational)
     f = motion_forces(parts, -D.solve(parts.D_q @ qdot), qdot, qddot)
     base = ca.vertcat(D.solve(f[0][:3]), f[0][3:] * kin.per_mass)
     along = (
@@ -334,7 +334,7 @@ def composite_dynamics(
     system = shape_system(kin)
     external = external_force(kin, wrench_B)
     Q, moment = shape_forces(system, omega, qdot, external, tau)
-    qddot = Factor(system.K).solve(Q)
+    qddot = SymmetricFactor(system.K).solve(Q)
     return ca.vertcat(
         external[3:] / kin.total_mass - ca.cross(omega, v_cm),
         system.base_acceleration(moment, qddot),
@@ -374,7 +374,7 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
     x_dot = ca.vertcat(
         qdot,
         quaternion_rate(quaternion, omega),
-        Factor(K).solve(Q * free),
+        SymmetricFactor(K).solve(Q * free),
         R_WB @ external[3:],
         R_WB @ external[:3],
         p_W / kin.total_mass,

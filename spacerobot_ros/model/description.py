@@ -186,7 +186,7 @@ class RobotDescription:
         return tuple(body.joint for body in self.bodies[1:] if body.joint is not None)
 
     @property
-    def coupled(self) -> bool:
+    def has_mimic_joints(self) -> bool:
         """Whether joints follow others."""
         return any(joint.mimic is not None for joint in self.moving_joints)
 
@@ -285,7 +285,7 @@ class RobotDescription:
         return self.with_links(tuple(links))
 
     def _with_tree(self, links: tuple[Link, ...], joints: tuple[Joint, ...]) -> RobotDescription:
-        bodies, frames = weld({link.name: link for link in links}, joints)
+        bodies, frames = weld_links({link.name: link for link in links}, joints)
         return replace(self, links=links, joints=joints, bodies=tuple(bodies), frames=frames)
 
 
@@ -298,7 +298,7 @@ def _leading_limit(limits: JointLimits, mimic: Mimic, kind: str) -> float:
     return bounds[0] if kind == "lower" else bounds[1]
 
 
-def weld(
+def weld_links(
     links: Mapping[str, Link], joints: Sequence[Joint]
 ) -> tuple[list[Body], dict[str, tuple[int, Pose]]]:
     """Order the tree from the root, and merge links that fixed joints weld together.

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from spacerobot_ros.model.composite_rigid_body import Composites, Factor, inertia_matrix
+from spacerobot_ros.model.composite_rigid_body import Composites, SymmetricFactor, inertia_matrix
 from spacerobot_ros.model.kinematics import TreeKinematics
 
 
@@ -48,7 +48,7 @@ def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
     """Return ``v[i][k]``, eqs (3a) and (3b): ``rho_k = sum_i v[i][k]`` is the mass centre of body k
     from that of the system, base components.
     """
-    bodies = range(kin.moving + 1)
+    bodies = range(kin.moving_body_count + 1)
     M = kin.total_mass
     outboard = [set(kin.outboard(k)) for k in bodies]
     # towards[i][j]: vector from the mass centre of i to its joint with neighbour j, and the mass
@@ -74,7 +74,7 @@ def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
 
 def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
     """Return the blocks of ``H+`` (eqs 14-17), with the slide terms of prismatic joints."""
-    n, M = kin.moving, kin.total_mass
+    n, M = kin.moving_body_count, kin.total_mass
     bodies = range(n + 1)
     v = barycentric_vectors(kin)
     one = ca.SX.eye(3)
@@ -152,7 +152,7 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
     """
     M, qdot = kin.total_mass, kin.spread(qdot)
     omegas, alphas, accelerations = [omega], [ca.SX(3, 1)], [ca.SX(3, 1)]
-    for k in range(1, kin.moving + 1):
+    for k in range(1, kin.moving_body_count + 1):
         i = kin.parent(k)
         arm = kin.p[k] - kin.p[i]
         rate = kin.axis[k] * qdot[k - 1]
@@ -171,7 +171,7 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
         accelerations.append(acceleration)
 
     com_accelerations = []
-    for k in range(kin.moving + 1):
+    for k in range(kin.moving_body_count + 1):
         arm = kin.com[k] - kin.p[k]
         com_accelerations.append(
             accelerations[k]
@@ -191,8 +191,8 @@ def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
             + kin.inertia[k] @ alphas[k]
             + ca.cross(omegas[k], spin)
         )
-    joint_rows = [ca.SX(1, 1) for _ in range(kin.moving)]
-    for k in range(kin.moving, 0, -1):
+    joint_rows = [ca.SX(1, 1) for _ in range(kin.moving_body_count)]
+    for k in range(kin.moving_body_count, 0, -1):
         if kin.is_revolute(k):
             about_joint = moments[k] - ca.cross(kin.p[k] - kin.r_BC_B, forces[k])
             joint_rows[k - 1] = ca.dot(kin.axis[k], about_joint)
@@ -241,7 +241,7 @@ def momentum_of_bodies(
     linear, angular, energy = ca.SX(3, 1), ca.SX(3, 1), ca.SX(0)
     qdot = kin.spread(qdot)
     omegas, origin_velocities = [omega_WB_B], [v_WB_B]
-    for k in range(1, kin.moving + 1):
+    for k in range(1, kin.moving_body_count + 1):
         parent = kin.parent(k)
         v = origin_velocities[parent] + ca.cross(omegas[parent], kin.p[k] - kin.p[parent])
         omega = omegas[parent]
@@ -274,7 +274,7 @@ def base_twist(
     """
     excess = L_B - inertia.D_q @ qdot
     if kin.mass_properties.inputs:
-        omega = Factor(inertia.D).solve(excess)
+        omega = SymmetricFactor(inertia.D).solve(excess)
     else:
         omega = solve_positive_definite(inertia.D, excess)
     c = kin.r_BC_B

@@ -8,7 +8,7 @@ from functools import partial
 import casadi as ca
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.composite_rigid_body import Factor
+from spacerobot_ros.model.composite_rigid_body import SymmetricFactor
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
 
@@ -16,7 +16,7 @@ DEFAULT_INTEGRATION_STEP = 0.01
 """Longest Runge-Kutta step of the attitude under held joint velocities, s."""
 
 
-def steps_in(control_period: float, integration_step: float) -> int:
+def count_steps(control_period: float, integration_step: float) -> int:
     """Return the least number of equal steps of at most ``integration_step`` s in a control period.
 
     Raises
@@ -52,7 +52,7 @@ def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
     return ca.Function(rate.name().replace("rate", "step"), inputs, [x_next])
 
 
-def repeated(step: ca.Function, count: int) -> ca.Function:
+def repeat_step(step: ca.Function, count: int) -> ca.Function:
     """Return ``step`` applied ``count`` times to its first argument; other arguments are held.
 
     Each half is one function called twice: the code grows with the logarithm of ``count``.
@@ -60,7 +60,7 @@ def repeated(step: ca.Function, count: int) -> ca.Function:
     if count == 1:
         return step
     x, held = _symbols_for_inputs(step)
-    half = repeated(step, count // 2)
+    half = repeat_step(step, count // 2)
     x_next = half(half(x, *held), *held)
     if count % 2:
         x_next = step(x_next, *held)
@@ -92,7 +92,7 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
         L_B = matrix_from_quaternion(at).T @ L_W
         # The factor needs no roots and a quarter of the divisions, which take most of the time in
         # vector registers. Recorded flights used Cholesky's, which is equal up to rounding.
-        solve = Factor(D).solve if p else partial(solve_positive_definite, D)
+        solve = SymmetricFactor(D).solve if p else partial(solve_positive_definite, D)
         return quaternion_rate(at, solve(L_B - D_q @ qdot))
 
     k1 = rate(quaternion, shapes[0])

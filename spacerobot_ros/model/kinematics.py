@@ -55,17 +55,17 @@ class TreeKinematics:
         return len(self.robot.joint_names)
 
     @property
-    def moving(self) -> int:
+    def moving_body_count(self) -> int:
         """Number of bodies that joints move; more than ``n`` for robots with mimic joints."""
         return len(self.robot.bodies) - 1
 
     def spread(self, rates: ca.SX) -> ca.SX:
         """Return joint rates (m, ...) for coordinate rates (n, ...): ``G rates``."""
-        return self._coupling @ rates if self.robot.coupled else rates
+        return self._coupling @ rates if self.robot.has_mimic_joints else rates
 
     def gather(self, forces: ca.SX) -> ca.SX:
         """Return generalised forces (n, ...) of forces (m, ...) on the joints: ``G' forces``."""
-        return self._coupling.T @ forces if self.robot.coupled else forces
+        return self._coupling.T @ forces if self.robot.has_mimic_joints else forces
 
     @property
     def _coupling(self) -> ca.DM:
@@ -124,7 +124,7 @@ class TreeKinematics:
 
     def angular_jacobian(self, k: int) -> ca.SX:
         """Return ``0F_k`` (3, n), which maps joint rates to the angular velocity of k (eq. 6)."""
-        F = ca.SX(3, self.moving)
+        F = ca.SX(3, self.moving_body_count)
         for j in self.ancestors(k):
             if self.is_revolute(j):
                 F[:, j - 1] = self.axis[j]
@@ -137,7 +137,7 @@ def _chain_pose(R: ca.SX, p: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
 
 def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
     """Return the positions (m,) of the joints that carry ``bodies[1:]`` at coordinates q (n,)."""
-    if not robot.coupled:
+    if not robot.has_mimic_joints:
         return q
     G, b = robot.coupling
     return ca.sparsify(ca.DM(G)) @ q + ca.sparsify(ca.DM(b))

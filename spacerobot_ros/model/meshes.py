@@ -30,10 +30,10 @@ from spacerobot_ros.errors import MeshError, SpaceRobotError
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.resources import share_directory
 
-_MOST_MESH_BYTES = 100_000_000
-_MOST_TRIANGLES = 2_000_000
+_MAX_MESH_BYTES = 100_000_000
+_MAX_TRIANGLES = 2_000_000
 
-_LARGEST_COORDINATE = 1e6
+_MAX_COORDINATE = 1e6
 """Largest coordinate in any unit; a file with larger coordinates is damaged."""
 
 _STL_HEADER_BYTES = 84
@@ -160,7 +160,7 @@ def _package_folder(name: str) -> Path | None:
         return None
 
 
-def shape_mesh(shape: Shape, most: int = _MOST_TRIANGLES) -> TriangleMesh:
+def shape_mesh(shape: Shape, most: int = _MAX_TRIANGLES) -> TriangleMesh:
     """Return the triangles of a mesh of a URDF in the frame of its link, origin and scale applied.
 
     Parameters
@@ -200,10 +200,10 @@ def read_mesh(path: str | Path) -> TriangleMesh:
             "convert it to STL."
         )
     try:
-        if (size := path.stat().st_size) > _MOST_MESH_BYTES:
+        if (size := path.stat().st_size) > _MAX_MESH_BYTES:
             raise MeshError(
                 f"The mesh {path} has {size / 1e6:.0f} MB; at most "
-                f"{_MOST_MESH_BYTES / 1e6:.0f} MB are read. Make it coarser."
+                f"{_MAX_MESH_BYTES / 1e6:.0f} MB are read. Make it coarser."
             )
         data = path.read_bytes()
     except OSError as error:
@@ -253,12 +253,10 @@ class _DamagedError(Exception):
 def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
     """Return a mesh without faces of zero area; refuse invalid coordinates and indices."""
     vertices, faces = mesh.vertices, mesh.faces
-    if len(faces) > _MOST_TRIANGLES:
-        raise _DamagedError(
-            f"it has {len(faces)} triangles, and at most {_MOST_TRIANGLES} are read"
-        )
-    if not np.all(np.abs(vertices) < _LARGEST_COORDINATE):  # This also finds NaN.
-        raise _DamagedError(f"a coordinate is not finite, or beyond {_LARGEST_COORDINATE:g}")
+    if len(faces) > _MAX_TRIANGLES:
+        raise _DamagedError(f"it has {len(faces)} triangles, and at most {_MAX_TRIANGLES} are read")
+    if not np.all(np.abs(vertices) < _MAX_COORDINATE):  # This also finds NaN.
+        raise _DamagedError(f"a coordinate is not finite, or beyond {_MAX_COORDINATE:g}")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise _DamagedError("a face has the index of a missing vertex")
     faces = _without_slivers(faces)
@@ -326,8 +324,8 @@ def _read_obj(data: bytes) -> TriangleMesh:
         elif words[0] == b"f":
             face = [_parse_corner_index(word, len(corners)) for word in words[1:]]
             faces += [(face[0], a, b) for a, b in pairwise(face[1:])]
-            if len(faces) > _MOST_TRIANGLES:
-                raise _DamagedError(f"it has more than {_MOST_TRIANGLES} triangles")
+            if len(faces) > _MAX_TRIANGLES:
+                raise _DamagedError(f"it has more than {_MAX_TRIANGLES} triangles")
     return TriangleMesh(
         _parse_coordinates(corners).reshape(-1, 3), np.array(faces, dtype=np.int32).reshape(-1, 3)
     )
@@ -339,7 +337,7 @@ def _parse_corner_index(word: bytes, count: int) -> int:
         number = int(word.split(b"/")[0])
     except ValueError:
         raise _DamagedError("a corner of a face is no number") from None
-    if not 0 < abs(number) <= _MOST_MESH_BYTES:
+    if not 0 < abs(number) <= _MAX_MESH_BYTES:
         raise _DamagedError("a face has the index of a missing vertex")
     return number - 1 if number > 0 else count + number
 
@@ -373,6 +371,6 @@ def _unit_in_metres(path: Path, data: bytes) -> float:
         return 1.0
     found = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)[\"']", data)
     unit = 1.0 if found is None else float(_parse_coordinates([found[1]])[0])
-    if not 0 < unit < _LARGEST_COORDINATE:
+    if not 0 < unit < _MAX_COORDINATE:
         raise _DamagedError("its unit is no length")
     return unit

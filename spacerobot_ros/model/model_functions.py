@@ -18,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.model.compilation import (
+    cached_function,
     compilation_settings,
     compiled,
     dense_function,
-    kept_function,
-    source_of,
+    source_hash,
 )
 from spacerobot_ros.model.composite_rigid_body import (
     composite_dynamics,
@@ -49,7 +49,7 @@ from spacerobot_ros.model.inertial_parameters import (
     SymbolicMassProperties,
     free_entries,
 )
-from spacerobot_ros.model.integration import attitude_step, repeated, runge_kutta_step
+from spacerobot_ros.model.integration import attitude_step, repeat_step, runge_kutta_step
 from spacerobot_ros.model.kinematics import tree_kinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 
@@ -244,9 +244,9 @@ class ModelFunctions:
             stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
             return self._shape_function("curvature", stacked)
 
-        facts = f"{source_of(curvature.__module__)} {self.equations_key}"
+        facts = f"{source_hash(curvature.__module__)} {self.equations_key}"
         key = hashlib.sha256(facts.encode()).hexdigest()
-        return kept_function("curvature", key, derived, compiling=False)
+        return cached_function("curvature", key, derived, compiling=False)
 
     def _momentum(self) -> ca.Function:
         state = self._state_symbols("v_WB_B", quaternion=True)
@@ -285,7 +285,7 @@ class ModelFunctions:
             },
         }
         x0, qdot, L_W, h, *p = inputs.values()
-        x = repeated(step, count)(x0, qdot, L_W, h / count, *p)
+        x = repeat_step(step, count)(x0, qdot, L_W, h / count, *p)
         return ca.Function(
             f"velocity_step_{count}", list(inputs.values()), [x], list(inputs), ["x_next"]
         )
@@ -296,7 +296,7 @@ class ModelFunctions:
         )
 
 
-_MOST_SYMBOLIC_MODELS = 8
+_MAX_SYMBOLIC_MODELS = 8
 """Number of models in each cache; the least recently used is dropped first."""
 
 
@@ -308,7 +308,7 @@ class _RobotKey:
     robot: RobotDescription = field(compare=False)
 
 
-@lru_cache(maxsize=_MOST_SYMBOLIC_MODELS)
+@lru_cache(maxsize=_MAX_SYMBOLIC_MODELS)
 def _model_of_key(equal: _RobotKey) -> ModelFunctions:
     return ModelFunctions(equal.robot)
 
@@ -357,7 +357,7 @@ class SymbolicModels:
         key = _structure_key(robot, free)
         found = _symbolic_models.pop(key, None) or cls(robot, free)
         _symbolic_models[key] = found
-        if len(_symbolic_models) > _MOST_SYMBOLIC_MODELS:
+        if len(_symbolic_models) > _MAX_SYMBOLIC_MODELS:
             del _symbolic_models[next(iter(_symbolic_models))]
         return found
 

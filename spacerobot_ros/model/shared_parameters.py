@@ -23,7 +23,7 @@ class RobotConfig:
         "", "URDF file, or the name of a robot of this package (sliding_masses, ...)"
     )
 
-    def believed(self, robot: RobotDescription) -> RobotDescription:
+    def assumed_robot(self, robot: RobotDescription) -> RobotDescription:
         """Return the robot with the mass properties that the configured node assumes."""
         return robot
 
@@ -37,7 +37,7 @@ class BelievedRobotConfig(RobotConfig):
     )
     model_error_seed: int = parameter(0, "seed of the draw of these errors", minimum=0)
 
-    def believed(self, robot: RobotDescription) -> RobotDescription:
+    def assumed_robot(self, robot: RobotDescription) -> RobotDescription:
         """Return the robot with random errors of masses and inertias of up to ``model_error``."""
         if self.model_error > 0.0:
             return robot.with_model_error(self.model_error, self.model_error_seed)
@@ -77,7 +77,7 @@ def robot_from_text(text: str, config: RobotConfig) -> SpaceRobot:
 
 
 def _with_model_error(true: RobotDescription, config: RobotConfig) -> SpaceRobot:
-    believed = config.believed(true)
+    believed = config.assumed_robot(true)
     # Models with other mass properties share their compiled functions.
     return SpaceRobot(believed, None if believed is true else SymbolicModels.of(true))
 

@@ -22,7 +22,7 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions, SymbolicModels
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 
-_LEAST_RELATIVE_INERTIA = 1e-6
+_MIN_RELATIVE_INERTIA = 1e-6
 """Largest component of a joint that counts as zero in a motion without inertia."""
 
 
@@ -299,7 +299,7 @@ class SpaceRobot:
             return
         moved = np.abs(vectors[6:, 0])
         box = "an <inertia>, for a box of sides a, b, c ixx = m (b^2 + c^2) / 12 and so on"
-        if not moved.size or moved.max() < _LEAST_RELATIVE_INERTIA:
+        if not moved.size or moved.max() < _MIN_RELATIVE_INERTIA:
             mend = f"it turns without any mass moving. Give '{self.description.base_link}' {box}."
         else:
             joint = self.description.movable_joints[int(moved.argmax())]

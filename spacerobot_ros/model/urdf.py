@@ -35,17 +35,17 @@ from spacerobot_ros.model.description import (
     Pose,
     RobotDescription,
     Shape,
-    weld,
+    weld_links,
 )
 from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
 from spacerobot_ros.model.meshes import mesh_beside, with_mesh_files
 from spacerobot_ros.model.rotations import matrix_from_rpy
 from spacerobot_ros.resources import suggestion
 
-_LARGEST_NUMBER = 1e12
+_MAX_NUMBER = 1e12
 """Largest number (kg, m, kg m^2): larger ones are typing errors, and their squares overflow."""
 
-_MOST_LINKS = 200
+_MAX_LINKS = 200
 
 _XACRO_CPU_TIME = 10
 """Limit of processor time for the expansion of a xacro file, s; six times as much wall time."""
@@ -133,9 +133,9 @@ def parse_robot(text: str) -> RobotDescription:
         The text is not URDF, or does not describe a free-floating tree of prismatic, revolute,
         continuous and fixed joints with positive definite inertia.
     """
-    if text.count("<link") > _MOST_LINKS:
+    if text.count("<link") > _MAX_LINKS:
         raise RobotDescriptionError(
-            f"The robot description has more than {_MOST_LINKS} links: its equations would take "
+            f"The robot description has more than {_MAX_LINKS} links: its equations would take "
             "hours to derive."
         )
     root = _checked_root(text)
@@ -155,9 +155,9 @@ def parse_robot(text: str) -> RobotDescription:
         link.name: link for link in (_read_link(each, colours) for each in root.findall("link"))
     }
     joints = _with_leaders([_read_joint(each, links) for each in root.findall("joint")])
-    bodies, frames = weld(links, joints)
+    bodies, frames = weld_links(links, joints)
     for number, body in enumerate(bodies):
-        if flaw_of_inertia(body.inertia.about_com):
+        if describe_inertia_flaw(body.inertia.about_com):
             _refuse_impossible_inertia(
                 [link for link in links.values() if frames[link.name][0] == number]
             )
@@ -191,10 +191,9 @@ def _require_finite(values: float | list[float], where: str) -> Array:
     array = np.array(values, dtype=float)
     if not np.all(np.isfinite(array)):
         raise RobotDescriptionError(f"A number in {where} is not finite: {array.tolist()}.")
-    if array.size and np.abs(array).max() > _LARGEST_NUMBER:
+    if array.size and np.abs(array).max() > _MAX_NUMBER:
         raise RobotDescriptionError(
-            f"A number in {where} is larger than {_LARGEST_NUMBER:g} in its SI unit: "
-            f"{array.tolist()}."
+            f"A number in {where} is larger than {_MAX_NUMBER:g} in its SI unit: {array.tolist()}."
         )
     return array
 
@@ -231,7 +230,7 @@ def _read_link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
     return Link(name, inertia, shapes)
 
 
-def flaw_of_inertia(about: Array) -> str:
+def describe_inertia_flaw(about: Array) -> str:
     """Return a clause on impossible moments of inertia (3, 3), kg m^2; empty: none.
 
     It completes a message that begins with the owner of the inertia.
@@ -257,7 +256,7 @@ def _refuse_impossible_inertia(welded: list[Link]) -> NoReturn:
 
     worst = max(welded, key=excess)
     raise RobotDescriptionError(
-        f"The inertia of link '{worst.name}' {flaw_of_inertia(worst.inertia.about_com)}"
+        f"The inertia of link '{worst.name}' {describe_inertia_flaw(worst.inertia.about_com)}"
     )
 
 

@@ -1,8 +1,8 @@
 """The visuals of a robot as triangles and sharp edges, for pictures, pages and the viewer.
 
-Those choose colours, cameras and backgrounds. Meshes come from files (:func:`meshes_from_files`) or
-from a bag (:func:`meshes_in`), which carries those of :func:`carried_meshes`; :class:`MeshFolder`
-writes them to files again.
+Pictures, pages and the viewer choose colours, cameras and backgrounds. Meshes come from files
+(:func:`meshes_from_files`) or from a bag (:func:`meshes_from_attachments`), into which a recorder
+writes the result of :func:`meshes_for_bag`; :class:`MeshFolder` writes them to files again.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _ROD_THICKNESS_RATIO = 0.05
 """Ratio of thickness to length below which a box counts as a rod, drawn as a line."""
 
 _SHARP_EDGE_COSINE = math.cos(math.radians(30.0))
-_MOST_FACES_IN_BAG = 20_000
+_MAX_FACES_IN_BAG = 20_000
 """Largest number of faces of a mesh in a bag: 1 MB."""
 
 _BALL_RADIUS, _BAR_RADIUS = 0.05, 0.02
@@ -233,13 +233,15 @@ def meshes_from_files(
     return found
 
 
-def carried_meshes(robot: RobotDescription) -> dict[str, bytes]:
+def meshes_for_bag(robot: RobotDescription) -> dict[str, bytes]:
     """Return the meshes of a robot for a bag, by attachment name, as STL of at most 1 MB each."""
-    meshes = meshes_from_files(robot, _MOST_FACES_IN_BAG)
+    meshes = meshes_from_files(robot, _MAX_FACES_IN_BAG)
     return {f"{_ATTACHMENT_PREFIX}{resource}": stl_of(mesh) for resource, mesh in meshes.items()}
 
 
-def meshes_in(robot: RobotDescription, attachments: Mapping[str, bytes]) -> dict[str, TriangleMesh]:
+def meshes_from_attachments(
+    robot: RobotDescription, attachments: Mapping[str, bytes]
+) -> dict[str, TriangleMesh]:
     """Return the meshes of a robot that are among the attachments of a bag, by their URIs.
 
     No file is read: a stranger's bag may name any file of this machine.
@@ -260,7 +262,7 @@ class MeshFolder:
     Parameters
     ----------
     attachments
-        Attachments of the bag, as of :func:`carried_meshes`.
+        Attachments of the bag, as of :func:`meshes_for_bag`.
 
     Raises
     ------
@@ -290,7 +292,7 @@ class MeshFolder:
         if data is None or mesh_file(resource) is not None:
             return None
         try:
-            mesh = mesh_of_stl(data, resource).coarsened(_MOST_FACES_IN_BAG)
+            mesh = mesh_of_stl(data, resource).coarsened(_MAX_FACES_IN_BAG)
         except MeshError:
             return None
         # Name and bytes are not copied from the bag, which a stranger may have written.
@@ -303,7 +305,7 @@ class MeshFolder:
         self._folder.cleanup()
 
 
-def carries_meshes(attachments: Mapping[str, bytes]) -> bool:
+def has_meshes(attachments: Mapping[str, bytes]) -> bool:
     """Whether a mesh is among the attachments of a bag."""
     return any(name.startswith(_ATTACHMENT_PREFIX) for name in attachments)
 

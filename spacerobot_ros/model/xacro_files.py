@@ -18,15 +18,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-_MOST_MEMORY = 2**30
+_MAX_MEMORY = 2**30
 """Limit of the address space, bytes."""
 
-_MOST_OPEN_FILES = 64
+_MAX_OPEN_FILES = 64
 
 _READABLE_SUFFIXES = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 """Suffixes of the files that xacro may read."""
 
-_LARGEST_TEXT = 20_000_000
+_MAX_TEXT = 20_000_000
 """Longest expanded text, characters."""
 
 _ALLOWED_SYNTAX = (
@@ -106,8 +106,8 @@ def main(file: str, seconds: int) -> int:
     ``seconds`` is the limit of processor time.
     """
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
-    resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
-    resource.setrlimit(resource.RLIMIT_NOFILE, (_MOST_OPEN_FILES, _MOST_OPEN_FILES))
+    resource.setrlimit(resource.RLIMIT_AS, (_MAX_MEMORY, _MAX_MEMORY))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (_MAX_OPEN_FILES, _MAX_OPEN_FILES))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     try:
         import xacro
@@ -115,8 +115,8 @@ def main(file: str, seconds: int) -> int:
 
         _confine_xacro(xacro, substitution_args, Path(file))
         text = str(xacro.process_file(file).toxml())
-        if len(text) > _LARGEST_TEXT:
-            raise ValueError(f"its text has {len(text)} characters, and at most {_LARGEST_TEXT}")
+        if len(text) > _MAX_TEXT:
+            raise ValueError(f"its text has {len(text)} characters, and at most {_MAX_TEXT}")
     except Exception as error:  # Of xacro, its expressions, the XML parser
         reason = " ".join(str(error).split()) or type(error).__name__
         print(f"REASON {reason}", file=sys.stderr)

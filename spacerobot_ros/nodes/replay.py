@@ -24,7 +24,7 @@ from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.playback import ReaderWait, ReplayStatus, renamed_topics
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE
-from spacerobot_ros.model.visuals import MeshFolder, carries_meshes
+from spacerobot_ros.model.visuals import MeshFolder, has_meshes
 from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
@@ -102,7 +102,7 @@ class ReplayNode(FlightNode):
         self._close_bag = self._playback.close
         self._outputs: list[Publisher] = []
         self._sends = {}
-        if carries_meshes(bag.attachments):
+        if has_meshes(bag.attachments):
             self._meshes = MeshFolder(bag.attachments)
         replayed = {topic.name for topic in self._playback.topics}
         self._create_publishers(renamed_topics(config.remap, replayed))

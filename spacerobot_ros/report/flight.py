@@ -25,7 +25,7 @@ from spacerobot_ros.model import RobotDescription
 from spacerobot_ros.model.description import Array, Joint, Pose
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
-from spacerobot_ros.model.visuals import meshes_in
+from spacerobot_ros.model.visuals import meshes_from_attachments
 from spacerobot_ros.planning import METHODS, Goal, PoseError
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.report.events import FlightEvent, drawn_events
@@ -146,7 +146,9 @@ class FlightReport:
             position=Signal(base.time, base.values[:, :3]),
             quaternion=base.values[:, 3:],
             events=drawn_events(bag.events(), bag.began, stamped=bag.stamped),
-            meshes=meshes_in(flight.robot, bag.parts[0].bag.attachments) if flight.robot else {},
+            meshes=meshes_from_attachments(flight.robot, bag.parts[0].bag.attachments)
+            if flight.robot
+            else {},
         )
 
     # -- signals ------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ from spacerobot_ros.report.figures import (
     set_time,
     sheet,
 )
-from spacerobot_ros.simulation.trials import PlanEvaluation, Problem
+from spacerobot_ros.simulation.trials import PlanEvaluation, PlanningProblem
 
 _FINE_GRID, _COARSE_GRID = 61, 37
 """Points a side of a map, of robots with up to three joints and with more."""
@@ -250,14 +250,14 @@ def _joint_symbol(pair: Sequence[int], index: int) -> str:
 
 
 def draw_plan(
-    problem: Problem, trial: PlanEvaluation, format: PictureFormat = PictureFormat.PNG
+    problem: PlanningProblem, trial: PlanEvaluation, format: PictureFormat = PictureFormat.PNG
 ) -> bytes:
     """Return the picture of a plan: joints, their velocities, base path, and goal."""
     with drawing():
         return picture_of(_plan_figure(problem, trial), format)
 
 
-def _plan_figure(problem: Problem, trial: PlanEvaluation) -> Figure:
+def _plan_figure(problem: PlanningProblem, trial: PlanEvaluation) -> Figure:
     robot, goal = problem.robot, problem.goal
     positions = trial.positions
     ticks = problem.control_period * np.arange(len(positions), dtype=np.float64)

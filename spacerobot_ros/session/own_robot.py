@@ -14,12 +14,12 @@ from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.meshes import mesh_file
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_quaternion
-from spacerobot_ros.model.urdf import flaw_of_inertia
+from spacerobot_ros.model.urdf import describe_inertia_flaw
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.trials import Problem
+from spacerobot_ros.simulation.trials import PlanningProblem
 
 _FIRST_TURN = math.radians(5.0)
 """Largest turn of the base in the first scenario of a robot, rad."""
@@ -97,7 +97,7 @@ def remarks(robot: RobotDescription) -> Iterator[str]:
             )
     for link in robot.links:
         # Of a body as a whole it is refused.
-        if flaw := flaw_of_inertia(link.inertia.about_com):
+        if flaw := describe_inertia_flaw(link.inertia.about_com):
             yield f"The inertia of link '{link.name}' {flaw} The links welded to it make up for it."
     yield from _visual_remarks(robot)
 
@@ -139,7 +139,7 @@ def first_shape(robot: SpaceRobot) -> Array:
     return np.asarray(np.round(np.clip(shape, lower, upper), 3))
 
 
-def first_problem(name: str, robot: SpaceRobot, file: Path) -> Problem:
+def first_problem(name: str, robot: SpaceRobot, file: Path) -> PlanningProblem:
     """Return the problem to turn the base a little, about an axis that its joints turn it about.
 
     Raises
@@ -161,7 +161,7 @@ def first_problem(name: str, robot: SpaceRobot, file: Path) -> Problem:
     config = PlannerConfig(robot=str(file))
     tolerance = min(config.attitude_tolerance, float(f"{angle / _ROTATION_TO_TOLERANCE:.1g}"))
     config = replace(config, attitude_tolerance=tolerance)
-    return Problem(name, robot, InitialState(joint_positions=shape), goal, config)
+    return PlanningProblem(name, robot, InitialState(joint_positions=shape), goal, config)
 
 
 def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
@@ -187,7 +187,7 @@ def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
     return np.asarray(math.radians(degrees) * axis / np.linalg.norm(axis))
 
 
-def scenario_text(problem: Problem, method: str, robot_path: str) -> str:
+def scenario_text(problem: PlanningProblem, method: str, robot_path: str) -> str:
     """Return a parameter file that flies a problem by a method; see docs/own_robot.md."""
     x, y, z, w = (float(value) for value in problem.goal.quaternion)
     assert problem.initial.joint_positions is not None

@@ -21,17 +21,17 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.simulation import effort_plant
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.effort_plant import EffortPlant
-from spacerobot_ros.simulation.faults import KINDS, WRENCH_AXES, Fault, FaultTimeline, Targets
+from spacerobot_ros.simulation.faults import FAULT_KINDS, WRENCH_AXES, Fault, FaultTimeline, Targets
 from spacerobot_ros.simulation.plant import InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 _FAULT_TIME_ROUNDING = 1e-6
 """Rounding error allowed in the time of a fault, share of a tick."""
 
-_SHORTEST_STEP = 1e-5
+_MIN_STEP = 1e-5
 """Shorter Runge-Kutta steps lose more to rounding than they gain, s."""
 
-_MOST_STEPS_PER_TICK = 1e6
+_MAX_STEPS_PER_TICK = 1e6
 """Most Runge-Kutta steps of a tick: more take minutes."""
 
 
@@ -310,7 +310,7 @@ class FaultyPlant(WrappedPlant):
                 (self._wrench_factor, self._wrench_held) if wrench_faulty else None
             )
             self._disturb_nozzles(self._thrusters, active)
-        self._actuators_sound = all(KINDS[f.kind].sensor for f in active)
+        self._actuators_sound = all(FAULT_KINDS[f.kind].sensor for f in active)
 
     @staticmethod
     def _disturb_nozzles(thrusters: ThrusterPlant, active: tuple[Fault, ...]) -> None:
@@ -394,10 +394,10 @@ def build_plant(
     """
     kind, step = PLANTS[config.actuation], config.integration_step
     control_period = config.control_period
-    if 0.0 < step < _SHORTEST_STEP:
+    if 0.0 < step < _MIN_STEP:
         raise ParameterError(
             f"Parameter 'integration_step' is {step}; it must be 0 (by the actuation) or at least "
-            f"{_SHORTEST_STEP:g} s."
+            f"{_MIN_STEP:g} s."
         )
     if config.thrusters and not kind.wrench:
         raise ParameterError(
@@ -405,10 +405,10 @@ def build_plant(
             f"'{config.actuation}' has no wrench on the base: set actuation to effort, or "
             "thrusters to ''."
         )
-    if step and control_period / step > _MOST_STEPS_PER_TICK:
+    if step and control_period / step > _MAX_STEPS_PER_TICK:
         raise ParameterError(
             f"Parameter 'integration_step' is {step:g} s, which is more than "
-            f"{_MOST_STEPS_PER_TICK:.0e} steps in a tick of {control_period:g} s; "
+            f"{_MAX_STEPS_PER_TICK:.0e} steps in a tick of {control_period:g} s; "
             "choose longer steps or shorter ticks."
         )
     start = InitialState.of(config) if initial is None else initial

@@ -46,7 +46,7 @@ _SUPERSEDED_CLAUSE = (
 _BRAKING_RATE = 20.0
 """Joint rates decay as exp(-20 t/s) while the motors are strong enough."""
 
-_LARGEST_RATE_PER_TICK = 0.5
+_MAX_RATE_PER_TICK = 0.5
 """A held effort must not stop a joint in less than two ticks: it would swing back."""
 
 Quantity = Literal["velocity", "effort", "wrench"]
@@ -175,10 +175,10 @@ class CommandSource:
     """
 
     def __init__(
-        self, topic: str, quantity: Quantity, limits: Array, senders: Senders | None = None
+        self, topic: str, quantity: Quantity, limits: Array, senders: PublisherTracker | None = None
     ) -> None:
         self.topic, self.quantity, self.limits = topic, quantity, limits
-        self.senders = senders or Senders(SECOND)
+        self.senders = senders or PublisherTracker(SECOND)
         self.sender: int | None = None
         self.command: Array = np.zeros(len(limits))
         self.stamp_ns: float = NO_STAMP
@@ -220,14 +220,16 @@ class CommandValidator:
     def __init__(self, plant: Plant, config: PlantConfig) -> None:
         robot = plant.robot
         silence_ns = round((config.command_timeout or _START_TIME) * SECOND)
-        joints = partial(CommandSource, "joint_commands", senders=Senders(silence_ns))
+        joints = partial(CommandSource, "joint_commands", senders=PublisherTracker(silence_ns))
         self.sources = [joints("velocity", robot.velocity_limit)]
         """Sources in the order of the arguments of a step: the joints' first."""
         self._brakes: _JointBrakes | None = None
         if config.actuation == "effort":
             self.sources = [
                 joints("effort", robot.effort_limit),
-                CommandSource("base_wrench", "wrench", np.full(6, np.inf), Senders(silence_ns)),
+                CommandSource(
+                    "base_wrench", "wrench", np.full(6, np.inf), PublisherTracker(silence_ns)
+                ),
             ]
             # Velocity servos stop at once; motors have to brake.
             self._brakes = _JointBrakes(plant, config.control_period)
@@ -475,7 +477,7 @@ class _JointBrakes:
 
     def __init__(self, plant: Plant, control_period: float) -> None:
         robot: SpaceRobot = plant.robot
-        rate = min(_BRAKING_RATE, _LARGEST_RATE_PER_TICK / control_period)
+        rate = min(_BRAKING_RATE, _MAX_RATE_PER_TICK / control_period)
         outputs = ComputedTorqueLaw.default_outputs(robot, "")
         # Only the damping acts: the reference is always the present shape.
         self._law = ComputedTorqueLaw(robot, outputs, Gains.uniform(1.0, rate))
@@ -490,14 +492,14 @@ class _JointBrakes:
         return self._law.command(state, Reference(joints=JointReference.at_rest(plant.q))).tau
 
 
-_LEAST_MISSING_NUMBER = 2**63
+_MIN_MISSING_NUMBER = 2**63
 """Middleware without sequence numbers reports a larger number."""
 
-_MOST_PUBLISHERS = 100
+_MAX_PUBLISHERS = 100
 """Largest number of remembered publishers."""
 
 
-class Senders:
+class PublisherTracker:
     """Identifies the publishers of one topic by their sequence numbers.
 
     A publisher numbers its messages consecutively, so a message belongs to the publisher whose last
@@ -533,7 +535,7 @@ class Senders:
         if number == self._next:
             self._next, self._heard, self.multiple_publishers = number + 1, now_ns, False
             return
-        if not 0 < number < _LEAST_MISSING_NUMBER:
+        if not 0 < number < _MIN_MISSING_NUMBER:
             self.current = None
             return
         if self.current is not None:
@@ -542,6 +544,6 @@ class Senders:
         self.multiple_publishers = bool(publisher) and now_ns - heard <= self._silence
         if not publisher:
             self._publishers = publisher = self._publishers + 1
-        if len(self._others) > _MOST_PUBLISHERS:
+        if len(self._others) > _MAX_PUBLISHERS:
             del self._others[next(iter(self._others))]
         self.current, self._next, self._heard = publisher, number + 1, now_ns

@@ -9,10 +9,10 @@ from spacerobot_ros.model.shared_parameters import RobotConfig, WatchdogConfig
 from spacerobot_ros.parameters import group, parameter
 from spacerobot_ros.times import SECOND
 
-_MAX_ERROR = 1e6
+_MAX_SENSOR_ERROR = 1e6
 """Largest error of a sensor, m or rad (/s): squares of much larger ones overflow."""
 
-_MAX_START = 1e9
+_MAX_INITIAL_VALUE = 1e9
 """Largest quantity of an initial state, and longest time, SI."""
 
 
@@ -21,14 +21,14 @@ def period_ns(tick_rate: float) -> int:
     return round(SECOND / tick_rate)
 
 
-def _bias(default: tuple[float, ...], description: str, unit: str) -> Any:
+def _bias_parameter(default: tuple[float, ...], description: str, unit: str) -> Any:
     """Return the parameter of a bias with the length of its default, of any length if that is 0."""
     return parameter(
         default,
         description,
         unit=unit,
-        minimum=-_MAX_ERROR,
-        maximum=_MAX_ERROR,
+        minimum=-_MAX_SENSOR_ERROR,
+        maximum=_MAX_SENSOR_ERROR,
         length=len(default) or None,
     )
 
@@ -38,26 +38,38 @@ class SensorConfig:
     """Errors of the sensors: 1 sigma of their noise, their biases, and the seed."""
 
     position_noise: float = parameter(
-        0.0, "1 sigma an axis of odom, in world", unit="m", minimum=0.0, maximum=_MAX_ERROR
+        0.0, "1 sigma an axis of odom, in world", unit="m", minimum=0.0, maximum=_MAX_SENSOR_ERROR
     )
     attitude_noise: float = parameter(
-        0.0, "likewise, a rotation vector in base", unit="rad", minimum=0.0, maximum=_MAX_ERROR
+        0.0,
+        "likewise, a rotation vector in base",
+        unit="rad",
+        minimum=0.0,
+        maximum=_MAX_SENSOR_ERROR,
     )
     velocity_noise: float = parameter(
-        0.0, "likewise, of the twist", unit="m/s", minimum=0.0, maximum=_MAX_ERROR
+        0.0, "likewise, of the twist", unit="m/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
     )
     angular_velocity_noise: float = parameter(
-        0.0, "likewise", unit="rad/s", minimum=0.0, maximum=_MAX_ERROR
+        0.0, "likewise", unit="rad/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
     )
     joint_noise: float = parameter(
-        0.0, "1 sigma of every joint position", unit="m or rad", minimum=0.0, maximum=_MAX_ERROR
+        0.0,
+        "1 sigma of every joint position",
+        unit="m or rad",
+        minimum=0.0,
+        maximum=_MAX_SENSOR_ERROR,
     )
     joint_rate_noise: float = parameter(
-        0.0, "of every joint velocity", unit="m/s or rad/s", minimum=0.0, maximum=_MAX_ERROR
+        0.0, "of every joint velocity", unit="m/s or rad/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
     )
-    position_bias: tuple[float, ...] = _bias((0.0, 0.0, 0.0), "of odom, in world", "m")
-    attitude_bias: tuple[float, ...] = _bias((0.0, 0.0, 0.0), "rotation vector in base", "rad")
-    joint_bias: tuple[float, ...] = _bias((), "by joint order of the URDF; []: none", "m or rad")
+    position_bias: tuple[float, ...] = _bias_parameter((0.0, 0.0, 0.0), "of odom, in world", "m")
+    attitude_bias: tuple[float, ...] = _bias_parameter(
+        (0.0, 0.0, 0.0), "rotation vector in base", "rad"
+    )
+    joint_bias: tuple[float, ...] = _bias_parameter(
+        (), "by joint order of the URDF; []: none", "m or rad"
+    )
     seed: int = parameter(0, "of the noise of sensors and actuators", minimum=0)
 
 
@@ -80,7 +92,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "realtime: older commands stop the joints; 0: never",
         unit="s",
         minimum=0.0,
-        maximum=_MAX_START,
+        maximum=_MAX_INITIAL_VALUE,
     )
     beyond_limits: str = parameter(
         "clip", "commands beyond the rate or effort limits of the URDF", choices=("clip", "refuse")
@@ -107,7 +119,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "longest step; 0: 0.01 (velocity), 0.001 (effort)",
         unit="s",
         minimum=0.0,
-        maximum=_MAX_START,
+        maximum=_MAX_INITIAL_VALUE,
     )
     thrusters: str = parameter("", "'urdf': those of the robot's URDF; a YAML file; '': any wrench")
     thrusters_excluded: str = parameter("", "names of thrusters out of use, separated by spaces")
@@ -118,21 +130,21 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "simulated time between base_pose; 0: every tick. Realtime: at most 0.5 s of wall time",
         unit="s",
         minimum=0.0,
-        maximum=_MAX_START,
+        maximum=_MAX_INITIAL_VALUE,
     )
     marker_period: float = parameter(
         0.5,
         "simulated time between markers; 0: none. Realtime: at most 0.5 s of wall time",
         unit="s",
         minimum=0.0,
-        maximum=_MAX_START,
+        maximum=_MAX_INITIAL_VALUE,
     )
     tf_period: float = parameter(
         0.1,
         "simulated time between transforms on /tf; 0: none. Realtime: at most 0.1 s of wall time",
         unit="s",
         minimum=0.0,
-        maximum=_MAX_START,
+        maximum=_MAX_INITIAL_VALUE,
     )
     tf_links: bool = parameter(
         True, "whether all links are on /tf; false: the base alone, beside robot_state_publisher"
@@ -146,7 +158,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "time; a paused plant: once a second of wall time",
         unit="s",
         minimum=0.0,
-        maximum=_MAX_START,
+        maximum=_MAX_INITIAL_VALUE,
     )
     resume_bag: str = parameter(
         "", "bag from whose last state and time to go on; '': the initial state"
@@ -155,8 +167,8 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         (0.0, 0.0, 0.0),
         "base link in the world",
         unit="m",
-        minimum=-_MAX_START,
-        maximum=_MAX_START,
+        minimum=-_MAX_INITIAL_VALUE,
+        maximum=_MAX_INITIAL_VALUE,
         length=3,
     )
     initial_orientation: tuple[float, ...] = parameter(
@@ -166,38 +178,38 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         (),
         "by joint order of the URDF; []: zero",
         unit="m or rad",
-        minimum=-_MAX_START,
-        maximum=_MAX_START,
+        minimum=-_MAX_INITIAL_VALUE,
+        maximum=_MAX_INITIAL_VALUE,
     )
     initial_joint_velocities: tuple[float, ...] = parameter(
         (),
         "likewise, under efforts; []: zero",
         unit="m/s or rad/s",
-        minimum=-_MAX_START,
-        maximum=_MAX_START,
+        minimum=-_MAX_INITIAL_VALUE,
+        maximum=_MAX_INITIAL_VALUE,
     )
     initial_center_of_mass: tuple[float, ...] = parameter(
         (),
         "of the system in the world, instead of initial_position",
         unit="m",
-        minimum=-_MAX_START,
-        maximum=_MAX_START,
+        minimum=-_MAX_INITIAL_VALUE,
+        maximum=_MAX_INITIAL_VALUE,
         length=3,
     )
     linear_momentum: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0),
         "total, in world",
         unit="kg m/s",
-        minimum=-_MAX_START,
-        maximum=_MAX_START,
+        minimum=-_MAX_INITIAL_VALUE,
+        maximum=_MAX_INITIAL_VALUE,
         length=3,
     )
     angular_momentum: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0),
         "total, about the centre of mass, in world",
         unit="kg m^2/s",
-        minimum=-_MAX_START,
-        maximum=_MAX_START,
+        minimum=-_MAX_INITIAL_VALUE,
+        maximum=_MAX_INITIAL_VALUE,
         length=3,
     )
     faults: tuple[str, ...] = parameter(

@@ -30,7 +30,7 @@ from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import repeated, steps_in
+from spacerobot_ros.model.integration import count_steps, repeat_step
 from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
@@ -189,7 +189,7 @@ With it the energy of a tumbling six-joint arm, its joints turning at several ra
 1e-12 in 100 s, relative; by 2e-10 with four times the step. A step takes some microseconds.
 """
 
-_LARGEST_FINITE_STATE = 1e100
+_MAX_FINITE_STATE = 1e100
 """Magnitude (SI units) beyond which a state counts as diverged."""
 
 
@@ -227,7 +227,7 @@ class EffortPlant:
         initial: InitialState | None = None,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        substeps = steps_in(control_period, integration_step)
+        substeps = count_steps(control_period, integration_step)
         self.robot = robot
         self.control_period = control_period
         self.initial = initial or InitialState()
@@ -353,7 +353,7 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     h = ca.MX.sym("h")
     effort = ca.fmin(ca.fmax(command[:n], -robot.effort_limit), robot.effort_limit)
     realised = ca.vertcat(effort, command[n:])
-    march = repeated(_step_counting_stops(robot, model), substeps)
+    march = repeat_step(_step_counting_stops(robot, model), substeps)
     p = list(model.inputs.values())
     marched = march(
         ca.vertcat(state, _count_touching_joints(robot, state)), realised, h / substeps, *p
@@ -368,7 +368,7 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     link_R, link_r = model("link_poses", q)
     clipped = command[:n] != effort
     # Comparisons with NaN are false.
-    diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _LARGEST_FINITE_STATE)
+    diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _MAX_FINITE_STATE)
     touched = marched[-1] + diverged
     return model.function(
         f"effort_tick_{substeps}",

@@ -2,7 +2,7 @@
 
 ``KIND TARGET [VALUE] [at SECONDS] [until SECONDS]``, for example
 ``joint_stuck joint_2 at 10 until 50``. Without ``at`` a fault begins at once, without ``until`` it
-never ends. :data:`KINDS` has the kinds with their targets and values.
+never ends. :data:`FAULT_KINDS` has the kinds with their targets and values.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 from spacerobot_ros.errors import ParameterError
 
-_LARGEST_FAULT_VALUE = 1e6
+_MAX_FAULT_VALUE = 1e6
 """Largest value of a fault, in its unit: squares of much larger ones overflow."""
 
-_LATEST_FAULT_TIME = 1e9
+_MAX_FAULT_TIME = 1e9
 """Largest time of a fault, s."""
 
-_MOST_FAULTS = 1000
+_MAX_FAULTS = 1000
 """Largest number of faults: more take longer than a tick to search."""
 
 WRENCH_AXES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
@@ -35,7 +35,7 @@ POSE_AXES = (
 )
 """Components of the measured pose: position in W, rotation vector in B."""
 
-GROUPS = ("position", "attitude", "velocity", "angular_velocity", "joints", "joint_rates")
+SENSOR_GROUPS = ("position", "attitude", "velocity", "angular_velocity", "joints", "joint_rates")
 """Groups of measured quantities: the base's pose and twist, joint positions and rates."""
 
 
@@ -57,12 +57,12 @@ class FaultKind:
 
     targets: tuple[str, ...]
     value: str = ""
-    minimum: float = -_LARGEST_FAULT_VALUE
-    maximum: float = _LARGEST_FAULT_VALUE
+    minimum: float = -_MAX_FAULT_VALUE
+    maximum: float = _MAX_FAULT_VALUE
     sensor: bool = False
 
 
-KINDS: dict[str, FaultKind] = {
+FAULT_KINDS: dict[str, FaultKind] = {
     "joint_stuck": FaultKind(("joint",)),
     "joint_slow": FaultKind(("joint",), "factor on the command", 0.0, 1.0),
     "actuator_bias": FaultKind(("joint",), "added to the command, in its unit"),
@@ -76,7 +76,9 @@ KINDS: dict[str, FaultKind] = {
     "sensor_bias": FaultKind(
         (*POSE_AXES, "joint"), "added to the measurement, m or rad", sensor=True
     ),
-    "sensor_noise": FaultKind(GROUPS, "1 sigma a component, m or rad (/s)", 0.0, sensor=True),
+    "sensor_noise": FaultKind(
+        SENSOR_GROUPS, "1 sigma a component, m or rad (/s)", 0.0, sensor=True
+    ),
     "sensor_dropout": FaultKind(("odom",), sensor=True),
     "sensor_delay": FaultKind(("odom",), "s, to whole ticks", 0.0, 60.0, sensor=True),
 }
@@ -94,7 +96,7 @@ class Fault:
     end: float = math.inf
 
     def __str__(self) -> str:
-        value = f" {self.value:g}" if KINDS[self.kind].value else ""
+        value = f" {self.value:g}" if FAULT_KINDS[self.kind].value else ""
         # Six digits would make a fault of a long flight begin and end at the same time.
         until = f" until {self.end:.12g}" if math.isfinite(self.end) else ""
         return f"{self.kind} {self.target}{value} at {self.start:.12g}{until}"
@@ -148,9 +150,9 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
     if len(words) < 2:
         raise refusal("it must be KIND TARGET [VALUE] [at SECONDS] [until SECONDS]")
     name, target, *rest = words
-    if name not in KINDS:
-        raise refusal(f"there is no kind '{name[:40]}'; there are {', '.join(KINDS)}")
-    kind = KINDS[name]
+    if name not in FAULT_KINDS:
+        raise refusal(f"there is no kind '{name[:40]}'; there are {', '.join(FAULT_KINDS)}")
+    kind = FAULT_KINDS[name]
     known = targets.of(kind)
     if not known:
         raise refusal(f"this plant has no target of {name}")
@@ -170,9 +172,9 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
         raise refusal(f"after {name} {target} come only 'at SECONDS' and 'until SECONDS'")
     for word, text in zip(rest[0::2], rest[1::2], strict=True):
         times[word] = _parse_number(text, refusal)
-        if abs(times[word]) > _LATEST_FAULT_TIME:
+        if abs(times[word]) > _MAX_FAULT_TIME:
             raise refusal(
-                f"its time is {times[word]:g} s and must be at most {_LATEST_FAULT_TIME:g} s"
+                f"its time is {times[word]:g} s and must be at most {_MAX_FAULT_TIME:g} s"
             )
     if not times["until"] > times["at"]:
         raise refusal(f"it ends at {times['until']:g} s and begins at {times['at']:g} s")
@@ -218,10 +220,10 @@ class FaultTimeline:
             A line is not a fault, or there are too many; none is added.
         """
         added = [parse_fault(line, self._targets, now) for line in lines if line.strip()]
-        if len(self.faults) + len(added) > _MOST_FAULTS:
+        if len(self.faults) + len(added) > _MAX_FAULTS:
             raise ParameterError(
                 f"{len(added)} more fault(s) are refused: there are {len(self.faults)}, and at "
-                f"most {_MOST_FAULTS}; inject 'clear' first."
+                f"most {_MAX_FAULTS}; inject 'clear' first."
             )
         self.faults += added
         self.next_change = -math.inf

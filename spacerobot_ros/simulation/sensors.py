@@ -17,7 +17,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
-from spacerobot_ros.simulation.faults import KINDS, POSE_AXES, Fault
+from spacerobot_ros.simulation.faults import FAULT_KINDS, POSE_AXES, Fault
 from spacerobot_ros.topics import Topic, state_topics
 
 _NOISE_PARAMETERS = {
@@ -28,7 +28,7 @@ _NOISE_PARAMETERS = {
     "joints": "joint_noise",
     "joint_rates": "joint_rate_noise",
 }
-"""The parameter of the noise of each group (:data:`~spacerobot_ros.simulation.faults.GROUPS`)."""
+"""Noise parameters by sensor group (:data:`~spacerobot_ros.simulation.faults.SENSOR_GROUPS`)."""
 
 
 class Sensors:
@@ -78,11 +78,13 @@ class Sensors:
         self._past: deque[tuple[Array, Array]] = deque(maxlen=1)
         """True poses and twists of the last ticks, copied."""
         self._apply_faults(plant.active)
-        self.used = self.imperfect or any(KINDS[f.kind].sensor for f in plant.timeline.faults)
+        self.used = self.is_imperfect or any(
+            FAULT_KINDS[f.kind].sensor for f in plant.timeline.faults
+        )
         """Whether measurements differ from the truth now, did before, or will by a known fault."""
 
     @property
-    def imperfect(self) -> bool:
+    def is_imperfect(self) -> bool:
         """Whether measurements differ from the truth now."""
         return bool(
             self.dropout
@@ -96,7 +98,7 @@ class Sensors:
         """Measure the present state of the plant; does nothing for sensors without errors."""
         if self._plant.active is not self._faults:
             self._apply_faults(self._plant.active)
-            self.used = self.used or self.imperfect
+            self.used = self.used or self.is_imperfect
         if not self.used:
             return
         plant, normal, noise = self._plant, self._rng.standard_normal, self._noise

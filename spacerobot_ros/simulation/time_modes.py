@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
-_MOST_LATE_TICKS = 10
+_MAX_LATE_TICKS = 10
 """Late ticks that a real-time plant makes up; further ones are lost."""
 
-_MOST_TICKS_AT_ONCE = 2
+_MAX_TICKS_AT_ONCE = 2
 """Ticks that a late plant takes at once, before commands are read again."""
 
 
@@ -46,7 +46,7 @@ class Lockstep:
 
 
 @dataclass(frozen=True)
-class Timing:
+class TimingStatistics:
     """Deadline statistics of a plant in real time, and of its commander.
 
     Attributes
@@ -111,10 +111,10 @@ class RealTime:
     def due(self, now_ns: int, tick: int) -> int:
         """Return the number of ticks to take now, after ``tick``; lost ticks are dropped."""
         behind = int((now_ns - self._origin) / self._pace) - tick
-        if behind > _MOST_LATE_TICKS:
-            self.ticks_lost += behind - _MOST_LATE_TICKS
-            self._origin += (behind - _MOST_LATE_TICKS) * self._pace
-        return min(behind, _MOST_TICKS_AT_ONCE)
+        if behind > _MAX_LATE_TICKS:
+            self.ticks_lost += behind - _MAX_LATE_TICKS
+            self._origin += (behind - _MAX_LATE_TICKS) * self._pace
+        return min(behind, _MAX_TICKS_AT_ONCE)
 
     def count_tick(self, now_ns: int, tick: int) -> None:
         """Count the tick after ``tick``, which is taken now."""
@@ -136,14 +136,14 @@ class RealTime:
             self._answers_late += 1
             self._worst_answer = max(self._worst_answer, late)
 
-    def report(self) -> Timing:
+    def report(self) -> TimingStatistics:
         """Return the statistics, and the rate of ticks since the last call."""
         late = self._ticks_late, self._answers_late
         worse, self._reported = late != self._reported, late
         elapsed = (self._now - self._reported_at) / SECOND
         rate = (self._ticks - self._ticks_reported) / elapsed if elapsed > 0 else 0.0
         self._ticks_reported, self._reported_at = self._ticks, self._now
-        return Timing(
+        return TimingStatistics(
             tick_rate=rate,
             ticks=self._ticks,
             ticks_late=self._ticks_late,

@@ -32,7 +32,7 @@ from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 from spacerobot_ros.times import SECOND
 
-_MOST_SCHEDULES = 1000
+_MAX_SCHEDULES = 1000
 """Largest number of successive schedules of a method that plans in stages."""
 
 _RANDOM_GOAL_TOLERANCE = 1e-5
@@ -40,7 +40,7 @@ _RANDOM_GOAL_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
-class Problem:
+class PlanningProblem:
     """A planning problem.
 
     Attributes
@@ -133,7 +133,7 @@ class PlanEvaluation:
         )
 
 
-def state_of(plant: VelocityPlant) -> RobotState:
+def robot_state_of(plant: VelocityPlant) -> RobotState:
     """Return the state of a plant."""
     return RobotState(
         plant.pose[:3].copy(),
@@ -144,7 +144,9 @@ def state_of(plant: VelocityPlant) -> RobotState:
     )
 
 
-def try_method(problem: Problem, name: str, method: GaitMethod | None = None) -> PlanEvaluation:
+def try_method(
+    problem: PlanningProblem, name: str, method: GaitMethod | None = None
+) -> PlanEvaluation:
     """Plan by a method (``method``, if it is built already), and fly the schedule in the plant.
 
     Raises
@@ -159,12 +161,12 @@ def try_method(problem: Problem, name: str, method: GaitMethod | None = None) ->
     began = time.perf_counter()
     method = method or problem.method(name)
     plan_time = time.perf_counter() - began
-    while not pieces or (pieces[-1].partial and len(pieces) < _MOST_SCHEDULES):
+    while not pieces or (pieces[-1].partial and len(pieces) < _MAX_SCHEDULES):
         began = time.perf_counter()
         previous = pieces[-1] if pieces else None
         schedule = method.plan(
             PlanRequest(
-                state_of(plant),
+                robot_state_of(plant),
                 problem.goal,
                 tolerance,
                 correction=previous is not None,
@@ -185,7 +187,7 @@ def try_method(problem: Problem, name: str, method: GaitMethod | None = None) ->
     return PlanEvaluation(name, pieces, error, pose, limited, plan_time, reached, controls)
 
 
-def compare(problem: Problem) -> dict[str, PlanEvaluation | SpaceRobotError]:
+def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | SpaceRobotError]:
     """Return the evaluation of every method by its name, or the reason of its refusal."""
     found: dict[str, PlanEvaluation | SpaceRobotError] = {}
     for name, method in METHODS.items():
@@ -206,7 +208,7 @@ def fastest(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> PlanEvalua
 
 
 @dataclass
-class Record:
+class MethodRecord:
     """Results of a method for random goals.
 
     ``reached`` and ``missed`` count the flights, ``refused`` has the messages of goals that could
@@ -221,7 +223,7 @@ class Record:
     plan_times: list[float] = field(default_factory=list)
 
 
-def random_goals(problem: Problem, count: int, distance: float, angle: float) -> list[Goal]:
+def random_goals(problem: PlanningProblem, count: int, distance: float, angle: float) -> list[Goal]:
     """Return goals within ``distance`` (m) and ``angle`` (rad) of the start, with a fixed seed.
 
     Axes of rotation are uniform; those of planar robots are their axis.
@@ -243,11 +245,11 @@ def random_goals(problem: Problem, count: int, distance: float, angle: float) ->
 
 
 def try_goals(
-    problem: Problem,
+    problem: PlanningProblem,
     goals: Sequence[Goal],
     methods: Sequence[str],
     show: Callable[[str], None] = lambda line: None,
-) -> list[Record]:
+) -> list[MethodRecord]:
     """Plan every goal by every method, fly the plans in the plant, and count the results."""
     tight = replace(
         problem.config,
@@ -257,7 +259,7 @@ def try_goals(
     )
     problem = replace(problem, config=tight)
     built = {name: problem.method(name) for name in methods}
-    records = [Record(name) for name in methods]
+    records = [MethodRecord(name) for name in methods]
     for number, goal in enumerate(goals, 1):
         for record in records:
             try:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, steps_in
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, count_steps
 from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
@@ -49,7 +49,7 @@ class VelocityPlant:
         initial: InitialState | None = None,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        substeps = steps_in(control_period, integration_step)
+        substeps = count_steps(control_period, integration_step)
         self.robot = robot
         self.control_period = control_period
         self.initial = initial or InitialState()

@@ -14,7 +14,7 @@ from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.planning.execution.status import PlannerState
-from spacerobot_ros.simulation.faults import KINDS, Targets, parse_fault
+from spacerobot_ros.simulation.faults import FAULT_KINDS, Targets, parse_fault
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.viewer.reachability import Check, Verdict
 from spacerobot_ros.viewer.state import Momenta, Notice, Part, StackState
@@ -267,7 +267,7 @@ def has_tool(state: StackState) -> bool:
 
 def fault_kinds(targets: Targets) -> dict[str, list[str]]:
     """Return the possible targets of each kind of fault that has any."""
-    found = {name: targets.of(kind) for name, kind in KINDS.items()}
+    found = {name: targets.of(kind) for name, kind in FAULT_KINDS.items()}
     return {name: names for name, names in found.items() if names}
 
 
@@ -284,7 +284,7 @@ def fault_line(
     if not (math.isfinite(lasts_s) and lasts_s >= 0.0):
         raise ParameterError(f"The duration of the fault is {lasts_s:g} s; it must be 0 or more.")
     words = [kind, target]
-    if kind in KINDS and KINDS[kind].value:
+    if kind in FAULT_KINDS and FAULT_KINDS[kind].value:
         words.append(f"{value:.9g}")
     if lasts_s:
         words += ["until", f"{now_s + lasts_s:.9g}"]

@@ -18,7 +18,7 @@ import numpy as np
 from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.simulation.faults import KINDS, Targets
+from spacerobot_ros.simulation.faults import FAULT_KINDS, Targets
 from spacerobot_ros.viewer import content, scene
 from spacerobot_ros.viewer.content import History, Trail
 from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor
@@ -209,14 +209,14 @@ class Faults:
         self._target.options = tuple(names)
         if before in names:
             self._target.value = before
-        kind = KINDS.get(self._kind.value)
+        kind = FAULT_KINDS.get(self._kind.value)
         self._value.visible = self._has_value and self._kind.visible
         self._meaning.content = "" if kind is None else content.hint_html(kind.value)
 
     @property
     def _has_value(self) -> bool:
         """Whether the chosen kind of fault takes a number."""
-        kind = KINDS.get(self._kind.value)
+        kind = FAULT_KINDS.get(self._kind.value)
         return kind is not None and bool(kind.value)
 
     def _on_inject(self) -> None:

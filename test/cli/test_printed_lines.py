@@ -23,7 +23,7 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.flight.verification import Difference, Verification
 from spacerobot_ros.planning import METHODS, BasePath, GaitSchedule, Goal, PoseError
 from spacerobot_ros.session.run import RunResult
-from spacerobot_ros.simulation.trials import PlanEvaluation, Problem, Record
+from spacerobot_ros.simulation.trials import MethodRecord, PlanEvaluation, PlanningProblem
 
 SUMMARY: dict[str, Any] = {
     "scenario": "sliding_masses",
@@ -217,7 +217,7 @@ def test_numbers_for_people() -> None:
 # -- plans ------------------------------------------------------------------------------------
 
 
-def trial(problem: Problem, name: str, reached: bool = True) -> PlanEvaluation:
+def trial(problem: PlanningProblem, name: str, reached: bool = True) -> PlanEvaluation:
     """Return a flight of two ticks and one more that ends 0.0123 m and 0.0456 rad off."""
     n, tool = problem.robot.n, METHODS[name]
     goal, pieces = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])), []
@@ -306,7 +306,7 @@ def test_a_comparison_has_a_row_for_each_method(
 ) -> None:
     from spacerobot_ros.simulation import trials
 
-    def compare(problem: Problem) -> dict[str, PlanEvaluation | PlanningError]:
+    def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | PlanningError]:
         refusal = PlanningError("It has no slider.")
         found = {name: trial(problem, name) for name in ("square_path", "optimal")}
         return {"lie_bracket": refusal, **found}
@@ -340,19 +340,21 @@ def test_random_goals_that_are_missed_are_exit_1(
 
     tried: list[Any] = []
 
-    def random_goals(problem: Problem, count: int, distance: float, angle: float) -> list[Goal]:
+    def random_goals(
+        problem: PlanningProblem, count: int, distance: float, angle: float
+    ) -> list[Goal]:
         tried[:] = [count, distance, angle]
         return [problem.goal] * count
 
     def try_goals(
-        problem: Problem, goals: list[Goal], methods: list[str], show: Any
-    ) -> list[Record]:
+        problem: PlanningProblem, goals: list[Goal], methods: list[str], show: Any
+    ) -> list[MethodRecord]:
         tried.append(methods)
         times = {"durations": [4.0, 1.0, 2.0], "plan_times": [0.1, 0.5, 0.2]}
         refused = ["Too far.", "Too near.", "Too far."]
         return [
-            Record(methods[0], 5, missed, refused, **times),
-            Record(methods[1], 0, missed_beside, [], [], []),
+            MethodRecord(methods[0], 5, missed, refused, **times),
+            MethodRecord(methods[1], 0, missed_beside, [], [], []),
         ]
 
     monkeypatch.setattr(trials, "random_goals", random_goals)

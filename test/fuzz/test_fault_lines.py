@@ -13,9 +13,9 @@ from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
-    GROUPS,
-    KINDS,
+    FAULT_KINDS,
     POSE_AXES,
+    SENSOR_GROUPS,
     WRENCH_AXES,
     FaultTimeline,
     Targets,
@@ -23,14 +23,14 @@ from spacerobot_ros.simulation.faults import (
 )
 
 JOINTS = ("slider_1", "slider_2", "slider_3")
-TARGETS = (*JOINTS, *WRENCH_AXES, *POSE_AXES, *GROUPS, "odom", "all", "nozzle_1")
+TARGETS = (*JOINTS, *WRENCH_AXES, *POSE_AXES, *SENSOR_GROUPS, "odom", "all", "nozzle_1")
 WORDS = st.one_of(
-    st.sampled_from([*KINDS, *TARGETS, "at", "until", "clear"]), NUMBERS.map(str), TEXTS
+    st.sampled_from([*FAULT_KINDS, *TARGETS, "at", "until", "clear"]), NUMBERS.map(str), TEXTS
 )
 LINES = st.one_of(
     st.lists(WORDS, max_size=8).map(" ".join),
     st.tuples(
-        st.sampled_from(list(KINDS)), st.sampled_from(TARGETS), st.lists(WORDS, max_size=5)
+        st.sampled_from(list(FAULT_KINDS)), st.sampled_from(TARGETS), st.lists(WORDS, max_size=5)
     ).map(lambda parts: " ".join([parts[0], parts[1], *parts[2]])),
     st.builds(
         "{} {} at {}".format,
@@ -47,7 +47,7 @@ LINES = st.one_of(
     ),
     st.builds(
         "{} {} {} at {} until {}".format,
-        st.sampled_from(list(KINDS)),
+        st.sampled_from(list(FAULT_KINDS)),
         st.sampled_from(TARGETS),
         NUMBERS,
         NUMBERS,

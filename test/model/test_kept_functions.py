@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spacerobot_ros.model import compilation
-from spacerobot_ros.model.compilation import c_compiler, kept_function
+from spacerobot_ros.model.compilation import c_compiler, cached_function
 
 POINT = np.array([0.3, -1.2, 0.7])
 
@@ -28,14 +28,14 @@ class Derivation:
 
     def kept(self, key: str = "a" * 64, *, compiling: bool) -> list[list[float]]:
         compilation._functions_in_memory.clear()  # As another process.
-        function = kept_function("bent", key, self, compiling=compiling)
+        function = cached_function("bent", key, self, compiling=compiling)
         return [each.nonzeros() for each in function.call([ca.DM(POINT)])]
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(compilation, "_LEAST_OPERATIONS_TO_KEEP", 1)
+    monkeypatch.setattr(compilation, "_MIN_OPERATIONS_TO_KEEP", 1)
     return tmp_path
 
 
@@ -86,15 +86,15 @@ def test_what_others_may_have_written_is_not_read(folder: Path) -> None:
 
 def test_a_process_reads_and_derives_a_function_once(folder: Path) -> None:
     derivation = Derivation()
-    first = kept_function("bent", "c" * 64, derivation, compiling=False)
+    first = cached_function("bent", "c" * 64, derivation, compiling=False)
     for file in folder.iterdir():
         file.unlink()
-    assert kept_function("bent", "c" * 64, derivation, compiling=False) is first
+    assert cached_function("bent", "c" * 64, derivation, compiling=False) is first
     assert derivation.count == 1
     # Another function, another way of compiling, and what was used long ago.
-    assert kept_function("bent", "d" * 64, Derivation(2.0), compiling=False) is not first
-    assert kept_function("bent", "c" * 64, derivation, compiling=True) is not first
-    for number in range(compilation._MOST_FUNCTIONS_IN_MEMORY):
-        kept_function("bent", f"{number:064}", derivation, compiling=False)
-    assert kept_function("bent", "c" * 64, derivation, compiling=False) is not first
-    assert len(compilation._functions_in_memory) == compilation._MOST_FUNCTIONS_IN_MEMORY
+    assert cached_function("bent", "d" * 64, Derivation(2.0), compiling=False) is not first
+    assert cached_function("bent", "c" * 64, derivation, compiling=True) is not first
+    for number in range(compilation._MAX_FUNCTIONS_IN_MEMORY):
+        cached_function("bent", f"{number:064}", derivation, compiling=False)
+    assert cached_function("bent", "c" * 64, derivation, compiling=False) is not first
+    assert len(compilation._functions_in_memory) == compilation._MAX_FUNCTIONS_IN_MEMORY

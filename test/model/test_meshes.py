@@ -161,10 +161,10 @@ def test_what_cannot_be_read_is_refused_in_a_sentence(
 
 def test_sizes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path, "a.stl", stl_binary(WEDGE, WEDGE_FACES))
-    monkeypatch.setattr(module, "_MOST_TRIANGLES", 3)
+    monkeypatch.setattr(module, "_MAX_TRIANGLES", 3)
     with pytest.raises(MeshError, match="it has 4 triangles, and at most 3 are read"):
         read_mesh(path)
-    monkeypatch.setattr(module, "_MOST_MESH_BYTES", 83)
+    monkeypatch.setattr(module, "_MAX_MESH_BYTES", 83)
     with pytest.raises(MeshError, match=r"at most 0 MB are read\. Make it coarser"):
         read_mesh(path)
     with pytest.raises(MeshError, match=r"cannot be read: No such file or directory[.]"):

@@ -14,8 +14,8 @@ from spacerobot_ros.model.meshes import TriangleMesh, mesh_of_stl, shape_mesh, s
 from spacerobot_ros.model.rotations import matrix_from_rpy
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.model.visuals import (
-    carried_meshes,
-    meshes_in,
+    meshes_for_bag,
+    meshes_from_attachments,
     sharp_edges,
     solid_mesh,
     visuals_of,
@@ -103,11 +103,11 @@ def surveyor() -> RobotDescription:
 
 
 def test_meshes_travel_in_a_bag(surveyor: RobotDescription) -> None:
-    carried = carried_meshes(surveyor)
+    carried = meshes_for_bag(surveyor)
     elsewhere = parse_robot(surveyor.urdf.replace("package://", "package://not_here_"))
     moved = {name.replace("//", "//not_here_"): data for name, data in carried.items()}
-    assert carried_meshes(elsewhere) == {}
-    meshes = meshes_in(elsewhere, moved)
+    assert meshes_for_bag(elsewhere) == {}
+    meshes = meshes_from_attachments(elsewhere, moved)
     found = visuals_of(elsewhere, meshes, 20_000)
     shapes = [
         (link.name, shape)
@@ -129,9 +129,9 @@ def test_meshes_travel_in_a_bag(surveyor: RobotDescription) -> None:
 
 
 def test_no_file_is_read_that_a_bag_names(surveyor: RobotDescription) -> None:
-    assert meshes_in(surveyor, {}) == {}
-    damaged = {name: data[:100] for name, data in carried_meshes(surveyor).items()}
-    assert meshes_in(surveyor, damaged) == {}
+    assert meshes_from_attachments(surveyor, {}) == {}
+    damaged = {name: data[:100] for name, data in meshes_for_bag(surveyor).items()}
+    assert meshes_from_attachments(surveyor, damaged) == {}
     assert all(each.shape.kind != "mesh" for each in visuals_of(surveyor, {}, 100))
 
 

@@ -18,7 +18,7 @@ from support.random_robots import random_chain_urdf
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction, c_compiler
 from spacerobot_ros.model.composite_rigid_body import state_slices
-from spacerobot_ros.model.integration import repeated
+from spacerobot_ros.model.integration import repeat_step
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.simulation import EffortPlant, InitialState
 from spacerobot_ros.simulation.effort_plant import DEFAULT_INTEGRATION_STEP
@@ -73,7 +73,7 @@ def test_momenta_are_constant_to_the_last_bit() -> None:
     x = rng.uniform(-1.0, 1.0, 2 * robot.n + 13)
     x[robot.n : robot.n + 4] /= np.linalg.norm(x[robot.n : robot.n + 4])
     command = np.append(rng.uniform(-1.0, 1.0, robot.n), np.zeros(6))
-    after = BufferedFunction(repeated(robot.function("flight_step"), 50))(x, command, 0.01)[0]
+    after = BufferedFunction(repeat_step(robot.function("flight_step"), 50))(x, command, 0.01)[0]
     *_, p_W, L_W, _ = state_slices(robot.n)
     assert after[p_W].tolist() == x[p_W].tolist()
     assert after[L_W].tolist() == x[L_W].tolist()
@@ -195,7 +195,7 @@ def test_a_long_tick_is_many_short_ones_in_little_code() -> None:
 
     def code(repetitions: int) -> int:
         generator = ca.CodeGenerator("march", {"with_header": False})
-        generator.add(repeated(robot.function("flight_step", compile=False), repetitions))
+        generator.add(repeat_step(robot.function("flight_step", compile=False), repetitions))
         return len(generator.dump())
 
     assert code(count) < 1.4 * code(1)

@@ -26,7 +26,7 @@ from spacerobot_ros.simulation.actuators import (
 )
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
-    KINDS,
+    FAULT_KINDS,
     Fault,
     FaultTimeline,
     Targets,
@@ -150,7 +150,7 @@ def test_so_many_faults_that_none_could_look_through_them_are_refused() -> None:
     timeline.read(["joint_stuck elbow_pitch"])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FAULT_KINDS)
 @pytest.mark.parametrize("actuation", ["velocity", "effort"])
 def test_the_largest_faults_leave_numbers_finite_or_stop_the_plant_with_a_sentence(
     kind: str, actuation: str
@@ -159,8 +159,10 @@ def test_the_largest_faults_leave_numbers_finite_or_stop_the_plant_with_a_senten
     config = PlantConfig(actuation=actuation, tick_rate=20.0)
     plant = build_plant(robot, config)
     sensors = Sensors(plant, config.sensors, config.control_period)
-    targets = Targets(robot.joint_names, actuation == "effort").of(KINDS[kind])
-    extremes = {KINDS[kind].minimum, KINDS[kind].maximum} if KINDS[kind].value else {""}
+    targets = Targets(robot.joint_names, actuation == "effort").of(FAULT_KINDS[kind])
+    extremes = (
+        {FAULT_KINDS[kind].minimum, FAULT_KINDS[kind].maximum} if FAULT_KINDS[kind].value else {""}
+    )
     commands = [np.full(3, 0.1), *([np.zeros(6)] if actuation == "effort" else [])]
     for value in extremes:
         for target in targets:

@@ -196,7 +196,7 @@ def test_parameters_that_would_overflow_are_refused_by_name(name: str, value: ob
 def test_sensors_that_will_fail_are_in_use_from_the_begin(fault: str) -> None:
     flight = Flight(SensorConfig(), f"{fault} at 5", ticks=1)
     assert flight.sensors.used
-    assert not flight.sensors.imperfect
+    assert not flight.sensors.is_imperfect
     assert not Flight(SensorConfig(), "joint_stuck elbow_pitch at 5", ticks=1).sensors.used
 
 

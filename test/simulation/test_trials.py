@@ -14,14 +14,14 @@ from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.trials import Problem, random_goals, try_goals, try_method
+from spacerobot_ros.simulation.trials import PlanningProblem, random_goals, try_goals, try_method
 
 AWAY = goal_at(([0.05, -0.03, 0.02], [0.0, 0.0, 0.0]))
 
 
-def problem(robot: str = "sliding_masses", **start: Any) -> Problem:
+def problem(robot: str = "sliding_masses", **start: Any) -> PlanningProblem:
     config = configured(PlannerConfig, {**QUICK, "position_tolerance": 1e-3})
-    return Problem("a test", robot_of(robot), InitialState(**start), AWAY, config)
+    return PlanningProblem("a test", robot_of(robot), InitialState(**start), AWAY, config)
 
 
 class Halves(StubMethod):
@@ -93,7 +93,7 @@ def test_random_goals_are_spread_evenly_over_a_ball_and_over_angles(robot: str, 
 def test_goals_are_counted_by_what_became_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """They are reached within 1e-5, whatever the tolerance of the planner is."""
     method = StubMethod(ticks=40)
-    monkeypatch.setattr(Problem, "method", lambda self, name: method)
+    monkeypatch.setattr(PlanningProblem, "method", lambda self, name: method)
     far = Goal(np.array([2.0, 0.0, 0.0]), AWAY.quaternion)
     lines: list[str] = []
 

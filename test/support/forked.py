@@ -41,7 +41,7 @@ WAITED = 120.0
 """Wall time (s) beyond which a test that does not use the processor hangs; a multiple of what it
 takes otherwise comes on top."""
 
-_MOST_MEMORY = 12 * 2**30
+_MAX_MEMORY = 12 * 2**30
 """Address space of a fork, in bytes."""
 
 _limits: dict[str, tuple[float, float]] = {}
@@ -109,7 +109,7 @@ def _run(
     code = 3
     try:
         os.setsid()
-        resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
+        resource.setrlimit(resource.RLIMIT_AS, (_MAX_MEMORY, _MAX_MEMORY))
         os.environ.update(job["environment"])
         _log = Path(job["log"])
         _forget()

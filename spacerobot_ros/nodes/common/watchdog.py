@@ -15,7 +15,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
 from spacerobot_ros.messages.statuses import read_status
-from spacerobot_ros.model.compilation import contexts
+from spacerobot_ros.model.compilation import compilation_contexts
 from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
 
 TOPIC = "heartbeat"
@@ -183,7 +183,7 @@ class Liveness:
         """Give heartbeats, and watch, from now on."""
         self._end_timers()
         # Functions are compiled when they are first called: a node may be active long before.
-        contexts.append(self.busy)
+        compilation_contexts.append(self.busy)
         node = self._node
         beat = node.create_timer(HEARTBEAT_PERIOD, self.beat, clock=self._steady)
         self._timers.append(beat)
@@ -226,8 +226,8 @@ class Liveness:
         )
 
     def _end_timers(self) -> None:
-        if self.busy in contexts:
-            contexts.remove(self.busy)
+        if self.busy in compilation_contexts:
+            compilation_contexts.remove(self.busy)
         for timer in self._timers:
             self._node.destroy_timer(timer)
         self._timers.clear()

@@ -35,7 +35,7 @@ from spacerobot_ros.nodes.plant.publisher import (
 )
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import build_plant
-from spacerobot_ros.simulation.commands import CommandValidator, Senders
+from spacerobot_ros.simulation.commands import CommandValidator, PublisherTracker
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
@@ -381,7 +381,7 @@ class PlantNode(FlightNode):
 
     # -- commands -----------------------------------------------------------------------------
 
-    def _number_taker(self, senders: Senders) -> Callable[[int], None]:
+    def _number_taker(self, senders: PublisherTracker) -> Callable[[int], None]:
         note = senders.note
         return lambda number: note(number, self._tick * self._period_ns)
 

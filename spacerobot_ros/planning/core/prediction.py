@@ -6,7 +6,7 @@ import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import steps_in
+from spacerobot_ros.model.integration import count_steps
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import BasePath
@@ -36,7 +36,7 @@ class BasePrediction:
     def __init__(self, robot: SpaceRobot, control_period: float, integration_step: float) -> None:
         self._robot = robot
         self._control_period = control_period
-        self._step = robot.velocity_step(steps_in(control_period, integration_step))
+        self._step = robot.velocity_step(count_steps(control_period, integration_step))
         self._step.inputs[3][:] = control_period
 
     def attitudes(self, positions: Array, quaternion: Array, L_W: Array) -> Array:

@@ -183,7 +183,7 @@ class LieBracketGait(GaitMethod):
                 f"than {gap:.3g} m to it."
             )
         # Other joints could move the centre of mass, but this method holds them.
-        if len(self.sliders) < self.robot.n or self.robot.description.coupled:
+        if len(self.sliders) < self.robot.n or self.robot.description.has_mimic_joints:
             raise PlanningError(message)
         raise UnreachableError(message, Proof.LIMITS)
 

@@ -483,7 +483,7 @@ class CenterReach:
     def of(cls, robot: SpaceRobot, lower: Array, upper: Array) -> CenterReach:
         """Return the set of a robot whose joints keep to ``lower`` and ``upper`` (n,)."""
         bodies = robot.description.bodies
-        if robot.description.coupled:
+        if robot.description.has_mimic_joints:
             lower, upper = moving_joint_ranges(robot, lower, upper)
         base = bodies[0].inertia
         origin, radius = base.mass * base.com, 0.0

@@ -34,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import kept_function, source_of
+from spacerobot_ros.model.compilation import cached_function, source_hash
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.symbolic_rotations import (
@@ -190,7 +190,7 @@ def _kept_interval(
     q, X, direction = ca.SX.sym("q", robot.n), ca.SX.sym("X", 4), ca.SX.sym("d", 3)
     on_knots = constraints.symbolic(q, X, direction)
     facts = [
-        source_of(__name__, solve_positive_definite.__module__, quaternion_multiply.__module__),
+        source_hash(__name__, solve_positive_definite.__module__, quaternion_multiply.__module__),
         robot.equations_key,
         float(constraints.imposed_base_rate).hex(),
         ca.Function("on_knots", [q, X, direction], [on_knots]).serialize(),
@@ -203,9 +203,9 @@ def _kept_interval(
         return _interval(robot, constraints, inequalities)
 
     return Block(
-        kept_function("interval", key, lambda: derived().values, compiling=compiling),
-        kept_function("interval_jac", key, lambda: derived().jacobian, compiling=compiling),
-        kept_function("interval_hess", key, lambda: derived().hessian, compiling=compiling),
+        cached_function("interval", key, lambda: derived().values, compiling=compiling),
+        cached_function("interval_jac", key, lambda: derived().jacobian, compiling=compiling),
+        cached_function("interval_hess", key, lambda: derived().hessian, compiling=compiling),
     )
 
 
