@@ -29,7 +29,7 @@ _FAULT_TIME_ROUNDING = 1e-6
 """Rounding error allowed in the time of a fault, share of a tick."""
 
 _MIN_STEP = 1e-5
-"""Shorter Runge-Kutta steps lose more to rounding than they gain, s."""
+"""Shortest Runge-Kutta step, s; shorter steps add more rounding than accuracy."""
 
 _MAX_STEPS_PER_TICK = 1e6
 """Most Runge-Kutta steps of a tick: more take minutes."""
@@ -101,7 +101,7 @@ class ThrusterPlant(WrappedPlant):
 
     @property
     def missing(self) -> str:
-        """Wrenches that the thrusters in use cannot give, as a clause; empty: they give all."""
+        """A clause on wrenches that the thrusters in use cannot give; empty: none."""
         return self._modulator.missing
 
     @property
@@ -110,7 +110,7 @@ class ThrusterPlant(WrappedPlant):
         return self._modulator.unmet_periods
 
     def exclude(self, name: str) -> None:
-        """Take a thruster out of use; the others give its share of the wrench, if they can.
+        """Exclude a thruster; the other thrusters give its share of the wrench, if possible.
 
         Raises
         ------
@@ -239,7 +239,7 @@ class FaultyPlant(WrappedPlant):
         """Ticks since the beginning."""
         self.step: Callable[..., bool] = self._step
         self._control_period = control_period
-        # Another stream than that of the sensors, which have the seed itself.
+        # The random stream differs from the sensors' stream, which has the seed itself.
         self._rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
         self._index = {name: i for i, name in enumerate(self.robot.joint_names)}
         n = self.robot.n
@@ -342,7 +342,7 @@ class FaultyPlant(WrappedPlant):
         realised = [self._factor * disturbed]
         if wrench and self._thrusters is None:
             realised.append(self._wrench_factor * wrench[0] + self._wrench_held)
-        elif wrench:  # The thrusters have the faults of the wrench themselves.
+        elif wrench:  # The thrusters apply the faults of the wrench themselves.
             realised.append(wrench[0])
         return realised
 

@@ -30,14 +30,14 @@ from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.times import SECOND
 
 NO_STAMP = -math.inf
-"""The stamp of no command."""
+"""The stamp that stands for a missing command."""
 
 
 _START_TIME = 1.0
 """Time after the start during which a stamp of zero means the first state, without a timeout, s."""
 
 _STAMP_ROUNDING = 1_000
-"""Rounding error allowed in a stamp, of commanders that keep time in floating point, ns."""
+"""Allowed rounding error of stamps, from commanders with floating-point time, ns."""
 
 _SUPERSEDED_CLAUSE = (
     "it answers a state that is older than the last start, reset or stop of the plant"
@@ -53,7 +53,7 @@ Quantity = Literal["velocity", "effort", "wrench"]
 
 
 class Reason(str, Enum):
-    """Reason to refuse a command; the value is its word in parameters and diagnostics."""
+    """Reason to refuse a command; parameters and diagnostics have its value."""
 
     MALFORMED = "malformed"
     """Unknown or missing joints, wrong lengths, another frame."""
@@ -247,16 +247,16 @@ class CommandValidator:
         self.fault_reason = ""
         """Its word: the value of a :class:`Reason`, ``abort``, or ``watchdog``."""
         self.timed_out = False
-        """Whether the last command was revoked because it was too old."""
+        """Whether the last command was revoked because of its age."""
         self.timeouts = 0
         """Number of such revocations."""
         self.last_stamp_ns: float = NO_STAMP
-        """Stamp of the last command before the latest of them."""
+        """Stamp of the command before the latest one."""
 
     @property
     def complete(self) -> bool:
         """Whether all commands that a lockstep plant waits for have arrived."""
-        # Twice as fast as all() over a generator, and asked every tick.
+        # A loop is twice as fast as all() over a generator, and this runs every tick.
         for source in self.sources:  # noqa: SIM110
             if source.required and not source.arrived:
                 return False
@@ -297,7 +297,7 @@ class CommandValidator:
             if not stamp_ns and (
                 self._earliest or now_ns > (self._timeout or _START_TIME) * SECOND
             ):
-                # An unset stamp means now; at the start it is the first state's.
+                # A stamp of zero means the present state, at the start the first state.
                 stamp_ns, unset = now_ns, True
             elif stamp_ns % self._period:
                 stamp_ns = self._round_to_tick(stamp_ns)
@@ -314,17 +314,17 @@ class CommandValidator:
             return None
         refusal = self._refuse(source, refusal, now_ns)
         if self._lockstep:
-            # Time must go on: a refused command is a tick at rest.
+            # Time must go on: a tick with a refused command is flown at rest.
             source.rest()
             source.arrived = True
         return refusal
 
     def unreadable(self, source: CommandSource, error: CommandError, now_ns: int) -> Refusal:
-        """Refuse bytes that are not a message; without a stamp they answer no tick."""
+        """Refuse bytes that are not a message; without a stamp the bytes answer no tick."""
         return self._refuse(source, Refusal(Reason.MALFORMED, str(error)), now_ns)
 
     def begin_step(self) -> list[Array]:
-        """Return the commands to step under, a writable array for each source."""
+        """Return the commands of the next step, a writable array for each source."""
         for source in self.sources:
             source.arrived = False
         if self._brakes is not None and self.sources[0].resting:
@@ -332,7 +332,7 @@ class CommandValidator:
         return self._commands
 
     def begin(self, now_ns: int) -> None:
-        """Revoke all commands, and accept only answers to states of this time or later."""
+        """Revoke all commands, and accept only answers to states stamped ``now_ns`` or later."""
         self.rest()
         self._earliest = now_ns
 
@@ -374,7 +374,7 @@ class CommandValidator:
         for source in self.sources[1:]:
             source.required = source.commanders > 0
             if not source.required:
-                # No commander is left to turn the thrusters off.
+                # Without a commander nobody would turn the thrusters off.
                 source.rest()
                 source.arrived = False
 
@@ -396,10 +396,10 @@ class CommandValidator:
     def _refusal_of_values(
         self, source: CommandSource, values: Array | CommandError
     ) -> Refusal | None:
-        """Return the refusal of values that are never accepted, if they are such."""
+        """Return the refusal of invalid values, None for valid values."""
         if isinstance(values, CommandError):
             return Refusal(Reason.MALFORMED, str(values))
-        # A sum is finite only if every term is; for a few numbers a list is summed fastest.
+        # A sum is finite only if all its terms are; summing a list is fastest for few numbers.
         if not math.isfinite(sum(values.tolist())):
             return Refusal(Reason.NOT_FINITE, f"a value is not finite: {values.tolist()}")
         if not self._clips and np.any(np.abs(values) > source.limits):
@@ -415,7 +415,7 @@ class CommandValidator:
     def _refusal_of_stamp(
         self, source: CommandSource, stamp_ns: int, now_ns: int
     ) -> Refusal | None:
-        """Return the refusal of a command with an unsuitable stamp in real time, if it has one."""
+        """Return the refusal of a command whose stamp is unsuitable in real time, or None."""
         if source.senders.multiple_publishers and self._one_commander:
             return Refusal(Reason.SECOND_COMMANDER, "two publishers alternate on the topic")
         age = (now_ns - stamp_ns) / SECOND
@@ -479,7 +479,7 @@ class _JointBrakes:
         robot: SpaceRobot = plant.robot
         rate = min(_BRAKING_RATE, _MAX_RATE_PER_TICK / control_period)
         outputs = ComputedTorqueLaw.default_outputs(robot, "")
-        # Only the damping acts: the reference is always the present shape.
+        # The reference is always the present shape, so only the damping acts.
         self._law = ComputedTorqueLaw(robot, outputs, Gains.uniform(1.0, rate))
         self._plant = plant
 
@@ -493,7 +493,7 @@ class _JointBrakes:
 
 
 _MIN_MISSING_NUMBER = 2**63
-"""Middleware without sequence numbers reports a larger number."""
+"""Smallest number that stands for a missing sequence number; real numbers are smaller."""
 
 _MAX_PUBLISHERS = 100
 """Largest number of remembered publishers."""

@@ -22,7 +22,7 @@ def period_ns(tick_rate: float) -> int:
 
 
 def _bias_parameter(default: tuple[float, ...], description: str, unit: str) -> Any:
-    """Return the parameter of a bias with the length of its default, of any length if that is 0."""
+    """Return a bias parameter with the length of its default, or of any length for ()."""
     return parameter(
         default,
         description,

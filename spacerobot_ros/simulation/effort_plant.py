@@ -111,7 +111,7 @@ class JointStops:
             if qdot[locked].any():
                 qdot[:], _ = stop_joints(np.asarray(np.linalg.inv(K)), qdot, locked)
                 _, Q = self._equations(x, command)
-            # From here on they are fixed joints.
+            # Joints at rest on their stops are fixed joints from here on.
             free = np.where(locked, 0.0, 1.0)
             K, Q = np.where(np.eye(q.size) > 0, K, K * np.outer(free, free)), Q * free
         compliance: Array = np.asarray(np.linalg.inv(K))
@@ -138,7 +138,7 @@ class JointStops:
         return bool(np.any((q < self._below) | (q > self._above)))
 
     def _time_to_stop(self, x: Array, command: Array, held: Flags, step: float) -> float:
-        """Return the time within a step (s) at which the first joint is outside."""
+        """Return the time within a step (s) at which the first joint leaves its limits."""
         early, late = 0.0, step
         for _ in range(_BISECTIONS):
             middle = (early + late) / 2
@@ -171,7 +171,7 @@ def joints_stopped(compliance: Array, rates: Array, inward: Array, guess: Flags)
     """
     joints = guess.copy()
     tried: set[bytes] = set()
-    # A set that comes up again is a tie to rounding: either answer is right.
+    # A repeated set of joints differs from the other by rounding only: both are right.
     while joints.tobytes() not in tried:
         tried.add(joints.tobytes())
         after, impulses = stop_joints(compliance, rates, joints)
@@ -250,7 +250,7 @@ class EffortPlant:
 
     @property
     def limit_counts(self) -> dict[str, npt.NDArray[np.int64]]:
-        """Ticks in which each joint (n,) was limited, by what limited it."""
+        """Number of ticks in which each joint (n,) was limited, by kind of limit."""
         return {"effort": self.effort_limited, "stroke": self.stroke_limited}
 
     @property
@@ -284,7 +284,7 @@ class EffortPlant:
         self._next_state[:] = state
 
     def hold(self, joints: Flags) -> None:
-        """Lock these joints (n,) at their positions from now on, and no others.
+        """Lock the marked joints (n,) at their positions, and release all other joints.
 
         A moving joint is stopped by an internal impulse; neither total momentum changes.
         """
@@ -330,7 +330,7 @@ class EffortPlant:
                 )
                 self._update_outputs()
         except SpaceRobotError:
-            # The state before the tick remains.
+            # The plant keeps the state before the tick.
             self._command[:] = 0.0
             self._update_outputs()
             raise
@@ -367,7 +367,7 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     momentum = model("momentum", quaternion, q, v, omega, qdot)
     link_R, link_r = model("link_poses", q)
     clipped = command[:n] != effort
-    # Comparisons with NaN are false.
+    # A comparison with NaN is false.
     diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _MAX_FINITE_STATE)
     touched = marched[-1] + diverged
     return model.function(
@@ -387,9 +387,9 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
 
 
 def _step_counting_stops(robot: SpaceRobot, model: Composition) -> ca.Function:
-    """Return the step with one more state: the number of joints on or beyond stops so far.
+    """Return the integration step with one more state, a count of joints on or beyond stops.
 
-    They are counted at the end of each step: a joint cannot swing beyond its limit and back in one.
+    The count grows at the end of each step: a joint cannot swing beyond its limit and back in one.
     """
     watched = ca.MX.sym("x", state_slices(robot.n)[-1].stop + 1)
     command, h = ca.MX.sym("command", robot.n + 6), ca.MX.sym("h")

@@ -97,7 +97,7 @@ class Fault:
 
     def __str__(self) -> str:
         value = f" {self.value:g}" if FAULT_KINDS[self.kind].value else ""
-        # Six digits would make a fault of a long flight begin and end at the same time.
+        # With six digits, a short fault late in a flight would begin and end at the same time.
         until = f" until {self.end:.12g}" if math.isfinite(self.end) else ""
         return f"{self.kind} {self.target}{value} at {self.start:.12g}{until}"
 
@@ -212,7 +212,7 @@ class FaultTimeline:
         self.read(lines)
 
     def read(self, lines: Iterable[str], now: float = 0.0) -> None:
-        """Add a fault per line, which begins ``now`` (s) if the line has no time.
+        """Add a fault per line; a fault without a time begins ``now`` (s).
 
         Raises
         ------
@@ -229,7 +229,7 @@ class FaultTimeline:
         self.next_change = -math.inf
 
     def clear(self) -> None:
-        """Remove all faults, also those that have not begun."""
+        """Remove all faults, including future faults."""
         self.faults.clear()
         self.next_change = -math.inf
 

@@ -20,7 +20,7 @@ Flags = npt.NDArray[np.bool_]
 
 
 class Plant(Protocol):
-    """A simulated robot that advances by ticks; the attributes are its state after the last one.
+    """A simulated robot that advances by ticks; attributes hold its state after the last tick.
 
     ``pose``
         (7,) position ``r_WB`` in m and quaternion ``R_WB`` (x, y, z, w) of the base link.
@@ -54,7 +54,7 @@ class Plant(Protocol):
         """Return to the initial state."""
 
     def hold(self, joints: Flags) -> None:
-        """Lock these joints (n,) at their positions from now on, and no others."""
+        """Lock the marked joints (n,) at their positions, and release all other joints."""
 
     @property
     def step(self) -> Callable[..., bool]:
@@ -62,7 +62,7 @@ class Plant(Protocol):
 
     @property
     def limit_counts(self) -> Mapping[str, Counts]:
-        """Ticks in which each joint (n,) was limited, by what limited it."""
+        """Number of ticks in which each joint (n,) was limited, by kind of limit."""
 
     @property
     def expected_momenta(self) -> Array:
@@ -81,7 +81,7 @@ class WrappedPlant:
 
     @property
     def limit_counts(self) -> Mapping[str, Counts]:
-        """Ticks in which each joint (n,) was limited, by what limited it."""
+        """Number of ticks in which each joint (n,) was limited, by kind of limit."""
         return self.plant.limit_counts
 
     @property
@@ -90,7 +90,7 @@ class WrappedPlant:
         return self.plant.expected_momenta
 
     def hold(self, joints: Flags) -> None:
-        """Lock these joints (n,) at their positions from now on, and no others."""
+        """Lock the marked joints (n,) at their positions, and release all other joints."""
         self.plant.hold(joints)
 
     def reset(self) -> None:

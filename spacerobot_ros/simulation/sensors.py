@@ -68,7 +68,7 @@ class Sensors:
         self.pose, self.twist = plant.pose.copy(), plant.twist.copy()
         self.q, self.qdot = plant.q.copy(), plant.qdot.copy()
         self.dropout = False
-        """Whether there is no measurement of the pose."""
+        """Whether the pose is not measured, because of a dropout."""
         self._pose_bias, self._joint_bias = np.zeros(6), np.zeros(n)
         self._noise = dict.fromkeys(_NOISE_PARAMETERS, 0.0)
         self.pose_covariance, self.twist_covariance = np.zeros(36), np.zeros(36)
@@ -76,12 +76,12 @@ class Sensors:
         neither its bias nor its delay."""
         self._delay = 0
         self._past: deque[tuple[Array, Array]] = deque(maxlen=1)
-        """True poses and twists of the last ticks, copied."""
+        """Copies of the true poses and twists of the last ticks."""
         self._apply_faults(plant.active)
         self.used = self.is_imperfect or any(
             FAULT_KINDS[f.kind].sensor for f in plant.timeline.faults
         )
-        """Whether measurements differ from the truth now, did before, or will by a known fault."""
+        """Whether measurements ever differ from the truth: before, now or by a known fault."""
 
     @property
     def is_imperfect(self) -> bool:
@@ -103,7 +103,7 @@ class Sensors:
             return
         plant, normal, noise = self._plant, self._rng.standard_normal, self._noise
         self._past.append((plant.pose.copy(), plant.twist.copy()))
-        # After the beginning of a delay the past is shorter than it.
+        # At the beginning of a delay, fewer past states than its ticks exist.
         pose, twist = self._past[max(0, len(self._past) - 1 - self._delay)]
         n = len(self.q)
         errors = normal(12)
@@ -138,7 +138,7 @@ class Sensors:
             elif fault.kind == "sensor_delay":
                 delay = max(delay, fault.value)
         self._noise = {group: variance**0.5 for group, variance in variances.items()}
-        # The noise of a group is isotropic, so its covariance is the same in any frame.
+        # The noise of a group is isotropic, so its covariance does not depend on the frame.
         for covariance, linear, angular in (
             (self.pose_covariance, "position", "attitude"),
             (self.twist_covariance, "velocity", "angular_velocity"),
@@ -254,7 +254,7 @@ class ReportedState:
 
 
 def _end_effector_index(robot: SpaceRobot, name: str) -> int | None:
-    """Return the index of the link whose pose is published; None: there is none."""
+    """Return the index of the end-effector's link; None: there is none."""
     links = list(robot.link_names)
     link = robot.description.end_effector(name)
     if link and link not in links:

@@ -19,9 +19,9 @@ class PlantState(str, Enum):
     """State of a plant with regard to time and commands; the value of ``state`` in plant/status."""
 
     INACTIVE = "inactive"
-    """It publishes no states and accepts no command."""
+    """The plant publishes no states and accepts no commands."""
     RUNNING = "running"
-    """A command is in force, or (lockstep) it waits for one."""
+    """A command is in force, or a plant in lockstep waits for a command."""
     RESTING = "resting"
     """Time goes on without a command in force: none has come yet, or the last is too old."""
     PAUSED = "paused"
@@ -29,7 +29,7 @@ class PlantState(str, Enum):
     LATCHED = "latched"
     """Time goes on with everything at rest, until the plant is rearmed."""
     FAILED = "failed"
-    """An error has stopped it: it is inactive until it is configured or activated again."""
+    """An error has stopped the plant: it is inactive until it is configured or activated again."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class PlantStatus:
         return 1 if self.reason == "timeout" or self.faults else 0
 
     def to_values(self) -> dict[str, str]:
-        """Return the key-value pairs of a DiagnosticStatus."""
+        """Return the status as key-value pairs of a DiagnosticStatus."""
         values = {
             "state": self.state.value,
             "reason": self.reason,
@@ -95,7 +95,7 @@ class PlantStatus:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> PlantStatus:
-        """Return the status of key-value pairs as of :meth:`to_values`.
+        """Return the status from the key-value pairs of :meth:`to_values`.
 
         Raises
         ------
@@ -121,7 +121,7 @@ class PlantStatus:
 
 
 class PlantMonitor:
-    """Derives the status of a plant, and the events of its changes.
+    """Derives the status of a plant, and the events between successive statuses.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class PlantMonitor:
         return _events_between(before, self.status)
 
     def _status(self, activity: PlantState) -> PlantStatus:
-        """Return state, message and reason of this moment."""
+        """Return the present status, with state, message and reason."""
         commands, fault = self._commands, self._commands.fault
         match activity:
             case PlantState.INACTIVE:
@@ -205,7 +205,7 @@ class PlantMonitor:
 
 
 def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
-    """Return the events between two statuses, in a possible order."""
+    """Return the events that lead from one status to the next, in a plausible order."""
     events: list[Event] = []
 
     def add(kind: EventKind, message: str, level: int = 0, **about: str) -> None:
@@ -238,7 +238,7 @@ def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
             case PlantState.PAUSED:
                 add(EventKind.PAUSED, now.message)
             case _:
-                pass  # Latched has its event already; activation and failures have those of a node.
+                pass  # The other changes have events of their own.
     elif now.reason != before.reason and now.state is PlantState.RESTING:
         level = 1 if now.reason == "timeout" else 0
         add(EventKind.RESTING, now.message, level, reason=now.reason)

@@ -8,10 +8,10 @@ from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
 _MAX_LATE_TICKS = 10
-"""Late ticks that a real-time plant makes up; further ones are lost."""
+"""Largest number of late ticks that a real-time plant makes up; further ticks are lost."""
 
 _MAX_TICKS_AT_ONCE = 2
-"""Ticks that a late plant takes at once, before commands are read again."""
+"""Largest number of ticks that a late plant takes before it reads commands again."""
 
 
 class Lockstep:
@@ -27,7 +27,7 @@ class Lockstep:
         self._commands = commands
         self._looked_at = -1
         self.waits = False
-        """Whether the plant was waiting in the same tick at the last two checks."""
+        """Whether the plant waited in the same tick at the last two checks."""
 
     @property
     def may_step(self) -> bool:
@@ -92,7 +92,7 @@ class RealTime:
         self._period, self._pace = period_ns, period_ns / factor
         self._origin = 0.0
         self.ticks_lost = 0
-        """Ticks that were not taken in time and are not made up."""
+        """Number of late ticks that the plant never takes."""
         self._ticks = self._ticks_late = self._answers = self._answers_late = 0
         self._worst_tick = self._worst_answer = 0.0
         self._reported = 0, 0
@@ -128,7 +128,7 @@ class RealTime:
     def count_command(self, now_ns: int, stamp_ns: float) -> None:
         """Count a command in force that answers the state of a stamp (simulated time)."""
         if stamp_ns <= self._answered_ns:
-            return  # A command that was refused has changed nothing.
+            return  # A refused command leaves the command in force unchanged.
         self._answered_ns = stamp_ns
         self._answers += 1
         late = now_ns - (self._origin + (stamp_ns / self._period + 1) * self._pace)

@@ -147,7 +147,7 @@ def robot_state_of(plant: VelocityPlant) -> RobotState:
 def try_method(
     problem: PlanningProblem, name: str, method: GaitMethod | None = None
 ) -> PlanEvaluation:
-    """Plan by a method (``method``, if it is built already), and fly the schedule in the plant.
+    """Plan by the named method (or a built ``method``), and fly the schedule in the plant.
 
     Raises
     ------
@@ -192,7 +192,7 @@ def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | SpaceRobotEr
     found: dict[str, PlanEvaluation | SpaceRobotError] = {}
     for name, method in METHODS.items():
         if name == "auto":
-            continue  # It chooses among the others.
+            continue  # The method `auto` only chooses among the other methods.
         try:
             method.require_suitable(problem.robot)
             found[name] = try_method(problem, name)
@@ -202,7 +202,7 @@ def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | SpaceRobotEr
 
 
 def fastest(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> PlanEvaluation | None:
-    """Return the shortest plan that ends within tolerance, None without one."""
+    """Return the shortest plan that ends within tolerance; None if no plan does."""
     reached = [each for each in plans.values() if isinstance(each, PlanEvaluation) and each.reached]
     return min(reached, key=lambda plan: plan.duration, default=None)
 

@@ -69,7 +69,7 @@ class VelocityPlant:
 
     @property
     def limit_counts(self) -> dict[str, npt.NDArray[np.int64]]:
-        """Ticks in which each joint (n,) was limited, by what limited it."""
+        """Number of ticks in which each joint (n,) was limited, by kind of limit."""
         return {"rate": self.velocity_limited, "stroke": self.stroke_limited}
 
     @property
@@ -89,14 +89,14 @@ class VelocityPlant:
         self._state[robot.n :] = start.attitude()
         self._momenta[:] = start.momenta()
         self._r_cm[:] = start.system_position(robot)
-        # A step of zero duration at zero rates fills every output.
+        # A step of zero duration computes all outputs of the present state.
         self._command[:] = 0.0
         self._h[:] = 0.0
         self._advance.evaluate()
         self._h[:] = self.control_period
 
     def hold(self, joints: Flags) -> None:
-        """Lock these joints (n,) at their positions from now on, and no others."""
+        """Lock the marked joints (n,) at their positions, and release all other joints."""
         self._held = joints.copy() if joints.any() else None
 
     def step(self, command: Array) -> bool:
@@ -128,7 +128,7 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
 
     rate = ca.fmin(ca.fmax(command, -robot.velocity_limit), robot.velocity_limit)
     q = state[:n]
-    # A tick of no duration only reports the state: its limits must not divide by zero.
+    # A tick of zero duration computes outputs only, and must not divide by zero.
     duration = ca.fmax(h, 1e-12)
     to_lower, to_upper = (ca.DM(robot.lower) - q) / duration, (ca.DM(robot.upper) - q) / duration
     qdot = ca.fmin(ca.fmax(rate, to_lower), to_upper)

@@ -193,7 +193,7 @@ MUTABLE = {
     "spacerobot_ros.planning.execution.executive.ActiveGoal",
     "spacerobot_ros.planning.methods.optimal.search._Progress",
     "spacerobot_ros.report.solids.Solids",
-    "spacerobot_ros.simulation.trials.Record",
+    "spacerobot_ros.simulation.trials.MethodRecord",
     "spacerobot_ros.flight.verification._Resimulation",
 }
 """Dataclasses that change: records in the making. All others are values."""
