@@ -605,7 +605,7 @@ def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: s
     ``lower`` and ``upper`` (n,) are the limits of the joints.
     """
     bodies = robot.description.bodies
-    if robot.description.coupled:
+    if robot.description.has_mimic_joints:
         lower, upper = moving_joint_ranges(robot, lower, upper)
     travel = [
         max(abs(low), abs(high)) if body.joint.kind is JointKind.PRISMATIC else 0.0
