@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from support.command_line import CliRunner, Result
 
 import spacerobot_ros.cli.bags as bags
+import spacerobot_ros.cli.flights as flights
 import spacerobot_ros.nodes
 import spacerobot_ros.nodes.common.process as process
 import spacerobot_ros.report
@@ -101,6 +102,49 @@ def test_a_library_is_of_as_many_goals_within_the_bounds_by_a_method_with_the_se
     turns = [(at * Rotation.from_quat(each.goal.quaternion)).magnitude() for each in requests]
     assert 0.015 < max(distances) <= 0.02
     assert np.radians(5.0) < max(turns) <= np.radians(7.0)
+
+
+# -- stacks -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, str]]:
+    """Return whether pages are served, and the namespaces of their stacks."""
+    found: list[tuple[bool, str]] = []
+
+    @contextmanager
+    def viewing_if(
+        view: bool, parameters: Mapping[str, Any], namespace: str = ""
+    ) -> Iterator[None]:
+        found.append((view, namespace))
+        yield
+
+    monkeypatch.setattr(flights, "viewing_if", viewing_if)
+    return found
+
+
+def test_options_of_a_stack_that_stays_up(
+    monkeypatch: pytest.MonkeyPatch, views: list[tuple[bool, str]]
+) -> None:
+    kept: list[Any] = []
+
+    def keep_up(scenario: Any, bag: Path | None, show: Any, **named: Any) -> Path | None:
+        kept.append((scenario, bag, named))
+        return bag
+
+    monkeypatch.setattr(session, "keep_up", keep_up)
+    line = "up planar_chain --rate 2.5 --bag b.mcap --processes --namespace left --view"
+    result = call(*line.split(), "--set", "planner.tick_rate=12.5")
+    assert result.output.split() == ["bag", "b.mcap"]
+    assert call("up", "planar_chain").exit_code == 0
+    (given, bag, named), (usual, none, by_default) = kept
+    assert given.parameters("plant")["real_time_factor"] == 2.5
+    assert usual.parameters("plant")["real_time_factor"] == 1.0
+    assert given.parameters("planner")["tick_rate"] == 12.5
+    assert (bag, none) == (Path("b.mcap"), None)
+    assert named == {"processes": True, "namespace": "left"}
+    assert by_default == {"processes": False, "namespace": ""}
+    assert views == [(True, "left"), (False, "")]
 
 
 # -- bags ---------------------------------------------------------------------------------------

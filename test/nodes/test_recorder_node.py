@@ -104,6 +104,35 @@ def test_description_parameters_and_version_are_in_the_bag(stack: Stack) -> None
             assert value == ([] if known is None else np.array(known).tolist()), key
 
 
+def test_named_objects_of_a_file_are_metadata_and_the_wait_for_a_clock_is_as_given(
+    harness: Harness, tmp_path: Path
+) -> None:
+    about = {"crew": {"pilot": "none"}, "site": {"table": "air bearing", "number": "7"}}
+    file = tmp_path / "about.json"
+    file.write_text(json.dumps(about), "utf-8")
+    bag = tmp_path / "notes.mcap"
+    talk = harness.probe({}).create_publisher(String, "/talk", 10)
+    named = {"bag": str(bag), "topics": "/talk", "describe": str(file)}
+    recorder = harness.make(RecorderNode, {**named, "clock_wait": 3600.0})
+    harness.spin_until(lambda: "/talk" in recorder.topics, "the subscription")
+    harness.matched(talk)
+    talk.publish(String(data="early"))
+    recording = recorder.recording
+    assert recording is not None
+    harness.spin_until(lambda: recording.messages_waiting == 1, "the message")
+    now = recording._wall_time
+    recording._wall_time = lambda: now() + 3500 * 10**9
+    talk.publish(String(data="late"))
+    harness.spin_until(lambda: recording.messages_waiting == 2, "the next message")
+    recorder.flush()
+    assert recorder.messages_recorded == 0
+    recording._wall_time = lambda: now() + 3700 * 10**9
+    harness.spin_until(lambda: recorder.messages_recorded == 2, "the end of the wait")
+    recorder.trigger_shutdown()
+    metadata = BagContent(bag).metadata
+    assert {name: metadata[name] for name in about} == about
+
+
 @pytest.mark.parametrize("compression", ["lz4", "none"])
 def test_compression_is_chosen(harness: Harness, tmp_path: Path, compression: str) -> None:
     stack = Stack(harness, tmp_path / "flight.mcap", compression=compression)
