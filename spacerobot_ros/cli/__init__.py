@@ -12,7 +12,7 @@ from spacerobot_ros.termination import Terminated, announce, guarded
 
 
 def start(prog_name: str = "spacerobot") -> NoReturn:
-    """Run the command. Signals end it with one line from here on, also while it imports."""
+    """Run the command; signals end it with one line, also during imports."""
     with guarded(announcing=True):
         try:
             from spacerobot_ros.cli.main import main

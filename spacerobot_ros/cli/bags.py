@@ -124,10 +124,10 @@ def figures_command(
     "--start",
     default=0.0,
     metavar="SECONDS",
-    help="Where to begin, counted from the first message.",
+    help="Start of the replay, from the first message.",
 )
 @click.option("--duration", default=0.0, metavar="SECONDS", help="How much to replay [all].")
-@click.option("--loop", is_flag=True, help="Begin again at the end.")
+@click.option("--loop", is_flag=True, help="Repeat the replay when it ends.")
 @topic_option("Replay only this topic [all].")
 @click.option(
     "--remap", multiple=True, metavar="OLD:=NEW", help="Publish topic OLD as NEW. May be repeated."

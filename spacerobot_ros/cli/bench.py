@@ -31,7 +31,7 @@ _rounds_option = click.option(
 
 
 class _Benchmarks(DefaultGroup):
-    """The benchmarks, also by the options that chose them up to version 0.2.0."""
+    """Command group of the benchmarks, with the options that version 0.2.0 had instead."""
 
     default = "ticks"
 

@@ -129,7 +129,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
 def _fly_campaign(
     file: Path, flights: int | None, engine: str, cluster: Cluster, out: Path | None, name: str = ""
 ) -> Path:
-    """Fly a campaign, print how far it came, and return its folder; ``name`` replaces its own."""
+    """Fly a campaign, print its progress, and return its folder; ``name`` replaces its name."""
     from spacerobot_ros.campaign.config import load_campaign
     from spacerobot_ros.campaign.running import run_campaign
     from spacerobot_ros.termination import ended_on_request
@@ -184,13 +184,13 @@ def _compare(
     out: Path | None,
     report: Path | None,
 ) -> None:
-    """Fly two campaigns on the same draws, and write what differs."""
+    """Fly two campaigns on the same draws, and write a report of their differences."""
     from spacerobot_ros.campaign.comparing import require_same_draws, write_comparison
     from spacerobot_ros.campaign.config import load_campaign
 
     require_same_draws(*(load_campaign(file, flights) for file in files))
     names = [file.stem for file in files]
-    if names[0] == names[1]:  # Of different folders.
+    if names[0] == names[1]:  # The default folders of two campaigns must differ.
         names = [f"{name}_{letter}" for name, letter in zip(names, "AB", strict=True)]
     base = out or Path("out") / "_".join(names)
     folders = []

@@ -1,4 +1,4 @@
-"""Exit codes of commands, and one sentence where a command does not succeed."""
+"""Exit codes of commands, and the one-sentence messages of commands that fail."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ class ExitCode(IntEnum):
     """Exit codes of the command line."""
 
     DONE = 0
-    """The goal was reached within tolerance; the bag is as it should be; nothing was refused."""
+    """Success: the goal was reached within tolerance, or the bag is verified."""
 
     NOT_REACHED = 1
-    """The goal was not reached or cannot be reached; the bag differs."""
+    """The goal was not or cannot be reached, or the bag differs from its re-simulation."""
 
     BAD_INPUT = 2
     """The input is refused, or a program or package that the command needs is missing."""
 
     INTERRUPTED = 130
-    """By SIGINT, that is Ctrl-C; 128 plus the number of another signal: 129 SIGHUP, 143 SIGTERM."""
+    """The command was ended by SIGINT (Ctrl-C); other signals give 128 plus their number."""
 
 
 _ROS_MODULES = ("rclpy", "rosidl_parser", "ament_index_python")
 
 
 def fail(message: str = "") -> NoReturn:
-    """End a command without success, with a message."""
+    """End a failed command with a message."""
     if message:
         click.echo(message, err=True)
     sys.exit(ExitCode.NOT_REACHED)
@@ -55,9 +55,9 @@ def end_if_requested() -> None:
 
 @contextmanager
 def sentences() -> Iterator[None]:
-    """End the process with one sentence and its exit code where an exception of ours is raised.
+    """Turn exceptions of this package into one sentence and an exit code.
 
-    A goal that a method cannot reach is no bad input; everything else that is refused is. A signal
+    An unreachable goal is no bad input; every other refusal is. A signal
     ends it with one line and 128 plus its number, even if a library has replaced its exception.
     """
     try:

@@ -19,7 +19,7 @@ _MODULES = {
     "plan": ("library", "plan"),
     "robots": ("analyze", "new", "robots"),
 }
-"""Modules of this folder, and the commands in each: NAME is its attribute ``NAME_command``."""
+"""Names of the commands in each module of this folder: ``NAME_command`` is the attribute."""
 
 COMMANDS: dict[str, str] = dict(
     sorted((name, module) for module, names in _MODULES.items() for name in names)
@@ -28,7 +28,7 @@ COMMANDS: dict[str, str] = dict(
 
 
 class CommandGroup(click.Group):
-    """Loads a command when it is used, and ends it with a sentence where its input is refused."""
+    """Command group that loads a command on first use and reports errors as one sentence."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands."""
@@ -43,7 +43,7 @@ class CommandGroup(click.Group):
         return command
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command that the words name."""
+        """Run the command named in the arguments."""
         with sentences():
             return super().invoke(ctx)
 

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from spacerobot_ros.scenario import Scenario
 
     _Choice = click.Choice[str]
-else:  # Generic in new versions only.
+else:  # click.Choice is generic only in newer versions of click.
     _Choice = click.Choice
 
 
 class _TextPath(click.Path):
-    """A path whose name is text: messages, parameters and bags hold no other ones."""
+    """Path option that refuses names that are not UTF-8, which messages and bags cannot hold."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path.
@@ -47,12 +47,12 @@ PATH = _TextPath(path_type=Path)
 
 
 class DefaultGroup(click.Group):
-    """A group whose command :attr:`default` need not be named."""
+    """Command group with a default command."""
 
     default = ""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Insert the name of the default command where the first word names none."""
+        """Insert the name of the default command if the first argument is no command."""
         if args and args[0] not in (*self.commands, *ctx.help_option_names):
             args = [self.default, *args]
         return super().parse_args(ctx, args)
@@ -147,7 +147,7 @@ _pose_option = click.option(
 
 @dataclass(frozen=True)
 class GoalOptions:
-    """A goal as the command line gives it.
+    """Goal given by options of the command line.
 
     Attributes
     ----------
@@ -218,7 +218,7 @@ class EndEffectorOptions:
 
 
 def goal_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of a goal, as its argument ``goal``."""
+    """Add the options of a goal to a command, as its argument ``goal``."""
 
     @wraps(command)
     def with_goal(
@@ -328,7 +328,7 @@ def picture_option(help: str) -> Any:
 
     def checked(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
         if path is not None:
-            # Imports matplotlib, which takes a while.
+            # This imports matplotlib, which is slow.
             from spacerobot_ros.report.figures import PictureFormat
 
             PictureFormat.of(path)
@@ -339,7 +339,7 @@ def picture_option(help: str) -> Any:
 
 def beside(bag: Path, ending: str) -> Path:
     """Return a path beside a bag (a file or a folder): its name without suffix, and an ending."""
-    # The folder in which the command runs has no name of its own.
+    # The path ``.`` has no name before it is resolved.
     named = bag if bag.name not in ("", "..") else bag.resolve()
     return named.with_name(f"{named.name if bag.is_dir() else named.stem}{ending}")
 

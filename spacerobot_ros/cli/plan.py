@@ -296,7 +296,7 @@ def library_command(
     if out is None:
         where = method.store_library(library)
     else:
-        # Of this user alone: plans begin with it, and refuse one that others may write.
+        # Only this user may write the library, because planners refuse one that others may write.
         write_output(out, library.to_bytes(), mode=0o600)
         where = out
     if where is None:

@@ -1,4 +1,4 @@
-"""Progress of a command, on standard error if that is a terminal."""
+"""Progress bars of a command on standard error, if it is a terminal."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning.core.progress import SearchProgress
 
 _BAR_STEPS = 1000
-"""Steps of the bar of a flight."""
+"""Number of steps of a flight's progress bar."""
 
 
 class Display:
-    """A bar for the search, with the best so far, then one for the flight.
+    """Progress bars: one for the search, with the best result so far, then one for the flight.
 
     Searches report in threads of their own.
 
@@ -37,7 +37,7 @@ class Display:
         self._lock = threading.Lock()
 
     def search(self, progress: SearchProgress) -> None:
-        """Show how far a search has come; searches in flight are shown nowhere."""
+        """Show the progress of a search before the flight."""
         with self._lock:
             if self._flies or not self._visible:
                 return
@@ -58,14 +58,14 @@ class Display:
             self._bar.update(steps, f"{now:.1f} of {end:.1f} s")
 
     def show_line(self, message: str) -> None:
-        """Show a line."""
+        """Print a line above the progress bar."""
         with self._lock:
             if self._visible:
                 self._finish()
                 click.echo(message, err=True)
 
     def close(self) -> None:
-        """Complete the line of the bar."""
+        """Finish the progress bar."""
         with self._lock:
             self._finish()
 
@@ -91,7 +91,7 @@ class Display:
 
 @contextmanager
 def display(label: str) -> Iterator[Display]:
-    """Show progress during a block; without a terminal nothing is imported."""
+    """Show progress bars during a block; without a terminal they are not imported."""
     shown = Display(label, visible=sys.stderr.isatty())
     try:
         if not sys.stderr.isatty():

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning.core.controllability import Controllability
 
 _MAX_LISTED_JOINTS = 12
-"""Number of joints that are listed; the others are counted."""
+"""Largest number of listed joints; further joints are only counted."""
 
 
 @click.command("analyze")
@@ -230,7 +230,7 @@ def new_command(robot: str, out: Path | None) -> None:
     if best is None:
         fail("No method reaches the goal of a first flight; no scenario is written.")
     target = free_name(out or Path(f"{name}.yaml"))
-    # Beside the scenario the robot is found by its name from anywhere.
+    # A robot file beside its scenario is found from any working folder.
     from_there = os.path.relpath(file.resolve(), target.resolve().parent)
     named = from_there if is_path(robot) else robot
     write_output(target, scenario_text(problem, best.method, named))

@@ -1,4 +1,4 @@
-"""The nodes: thin ROS 2 wrappers, parameters in, topics out."""
+"""ROS 2 nodes around the modules of the stack, with their parameters, topics and services."""
 
 from spacerobot_ros.nodes.common.node import FlightNode
 from spacerobot_ros.nodes.controller import CoordinatedControlNode

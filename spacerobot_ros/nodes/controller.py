@@ -53,7 +53,7 @@ class CoordinatedControlNode(CommanderNode):
     # -- life ---------------------------------------------------------------------------------
 
     def make_commander(self) -> ControllerCommander:
-        """Return a controller without ROS."""
+        """Return the controller behind this node, which is independent of ROS."""
         return ControllerCommander(self.config, self)
 
     def configure(self) -> None:
@@ -69,7 +69,7 @@ class CoordinatedControlNode(CommanderNode):
             )
 
     def start_message(self) -> str:
-        """Return robot, law, rate and the topic of goals."""
+        """Return a log message with robot, law, rate and goal topic."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
             f"Controls {described_robot(self.commander.robot)} by '{config.law}' at "
@@ -77,7 +77,7 @@ class CoordinatedControlNode(CommanderNode):
         )
 
     def parameters_changed(self) -> None:
-        """Use new gains, tolerances and times."""
+        """Use the new gains, tolerances and times."""
         self.commander.reconfigure(self.config)
 
     def use(self, robot: SpaceRobot) -> None:
@@ -109,7 +109,7 @@ class CoordinatedControlNode(CommanderNode):
             self.get_logger().warning(status.message, throttle_duration_sec=5.0)
 
     def announce(self, start: ScheduleStart) -> None:
-        """Have no schedules to publish."""
+        """Ignore schedules, which a controller does not have."""
 
 
 def main() -> None:

@@ -56,13 +56,13 @@ class PlannerNode(CommanderNode):
 
     @property
     def statistics(self) -> PlannerStatistics:
-        """Plans and commands so far."""
+        """Number and time of the plans and commands so far."""
         return self.commander.statistics
 
     # -- life ---------------------------------------------------------------------------------
 
     def make_commander(self) -> PlannerCommander:
-        """Return a planner without ROS."""
+        """Return the planner behind this node, which is independent of ROS."""
         return PlannerCommander(self.config, self, long_work=self.long_work)
 
     def configure(self) -> None:
@@ -80,7 +80,7 @@ class PlannerNode(CommanderNode):
         self.create_service(Trigger, "~/statistics", self._on_statistics)
 
     def start_message(self) -> str:
-        """Return method, robot, rate and the topic of goals."""
+        """Return a log message with method, robot, rate and goal topic."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
             f"Plans by '{config.method}' for {described_robot(self.commander.robot)} at "
@@ -88,7 +88,7 @@ class PlannerNode(CommanderNode):
         )
 
     def deactivate(self) -> None:
-        """Give up the present goal and command nothing any more; the goal file stays."""
+        """Drop the present goal and stop sending commands; the goal file stays."""
         super().deactivate()
         if self._announcement is not None:
             self._announcement.join(MAX_THREAD_END_TIME)
@@ -117,9 +117,9 @@ class PlannerNode(CommanderNode):
         return self._shape
 
     def _on_goal_shape(self, message: JointState) -> None:
-        """Keep the shape that goals from now on are to end in, for methods that take one.
+        """Keep the joint positions in which later goals must end, for methods that support them.
 
-        A message without joints lets them end in any.
+        A message without joints removes the requirement.
         """
         robot = self.commander.robot
         if robot is None:
@@ -145,7 +145,7 @@ class PlannerNode(CommanderNode):
         self.log("warning" if status.state.level else "info", status.message)
 
     def announce(self, start: ScheduleStart) -> None:
-        """Publish a schedule, its path and its goal; in a thread where plans are made in one."""
+        """Publish a schedule, its path and its goal, in a thread if planning runs in a thread."""
         if not self.config.plan_in_background:
             self._publish_schedule(start)
             return

@@ -49,10 +49,10 @@ from spacerobot_ros.topics import NOT_RECORDED
 from spacerobot_ros.version import __version__
 
 _CLOCK = "/clock"
-"""Where no remap moves it; as every absolute name that a stack uses."""
+"""Topic of the clock before remaps."""
 
 _SHARED_TOPICS = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
-"""Absolute names of what stacks in different namespaces may have in common, before remaps."""
+"""Topics, before remaps, that stacks in different namespaces may share."""
 
 _DESCRIPTION_TOPIC = "robot_description"
 
@@ -64,24 +64,24 @@ _PARAMETER_RECORDS = {
     "planner/status": "planner",
     "controller/status": "coordinated_control",
 }
-"""Topics whose publishers have parameters that belong into the bag, and the name of the record.
+"""Record name of a node's parameters, by a topic that the node publishes.
 
 A node that publishes them is configured: its parameters keep their values."""
 
 _QUEUE_DEPTH = 2000
-"""Messages a subscription may be behind; the events executor wedges above 5000."""
+"""Queue depth of subscriptions; above 5000 the events executor stops responding."""
 
 _CHUNK_SIZE = 262_144
-"""Bytes before compression: of larger ones the fixed costs are smaller, a seek's are larger."""
+"""Chunk size before compression, bytes: larger chunks cost less each, but slow down seeking."""
 
 _SCAN_PERIOD = 0.1
-"""Wall s between two looks for new topics."""
+"""Wall time between two checks for new topics, s."""
 
 _CHECK_PERIOD = 0.4
-"""Wall s between two looks whether the file is still there: a failure is seen within a second."""
+"""Wall time between two checks that the bag file still exists, s."""
 
 _LONGEST_DRAIN = 1.2
-"""Wall time after a signal in which messages on their way are still recorded, s."""
+"""Longest wall time after a signal for recording messages still in transit, s."""
 
 _LOSS_LOG_PERIOD = 5.0
 """Wall s between two log lines about lost messages."""
@@ -101,7 +101,7 @@ class RecorderNode(FlightNode):
         self._taps = StreamTaps()
         self._stamps = _StampReader()
         self._parameter_requests: dict[str, RemoteParameters | None] = {}
-        """The records of parameters that are in the bag, or that a node is asked for."""
+        """Names of the parameter records that are in the bag or requested from nodes."""
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
@@ -155,18 +155,18 @@ class RecorderNode(FlightNode):
         self.scan()
 
     def activate(self) -> None:
-        """Record from now on."""
+        """Start recording."""
         if self.recording is not None:
             self.recording.start()
-            # Without the name: what two equal flights record is equal.
+            # The event omits the file name, so that two equal flights have equal bags.
             self.report_event(Event(EventKind.RECORDING, "Recording has begun."))
 
     def start_message(self) -> str:
-        """Return the path of the bag in one message."""
+        """Return a log message with the path of the bag."""
         return f"Records into {self.recording.writer.path}." if self.recording else ""
 
     def deactivate(self) -> None:
-        """Pause: what arrives is not recorded."""
+        """Pause recording; arriving messages are not recorded."""
         if self.recording is not None:
             paused = self.recording.running
             self.recording.pause()
@@ -186,7 +186,7 @@ class RecorderNode(FlightNode):
                 return
 
     def cleanup(self) -> None:
-        """Complete the bag.
+        """Complete and close the bag.
 
         Raises
         ------
@@ -217,7 +217,7 @@ class RecorderNode(FlightNode):
 
     @property
     def questions(self) -> list[str]:
-        """The records that wait for the parameters of a node."""
+        """Names of the parameter records whose node has not answered yet."""
         return [name for name, question in self._parameter_requests.items() if question is not None]
 
     @property
@@ -227,7 +227,7 @@ class RecorderNode(FlightNode):
 
     @property
     def failure(self) -> RecordingError | None:
-        """The error that has ended the recording; None without."""
+        """Error that has ended the recording; None without an error."""
         return self.recording.failure if self.recording is not None else None
 
     def describe(self, name: str, values: dict[str, str]) -> None:
@@ -287,7 +287,7 @@ class RecorderNode(FlightNode):
         return ours and type_name != _CLOCK_TYPE
 
     def _ask_for_parameters(self, topic: str, publishers: Sequence[Any]) -> None:
-        """Have the parameters of a topic's publisher in the bag, unless they are there already."""
+        """Request the parameters of a topic's publisher for the bag, unless the bag has them."""
         for name, title in _PARAMETER_RECORDS.items():
             if not topic.endswith(f"/{name}"):
                 continue
@@ -302,7 +302,7 @@ class RecorderNode(FlightNode):
                 self._parameter_requests[record] = RemoteParameters(self, full)
 
     def _follow_clock(self, recording: Recording) -> None:
-        """Know the time of a clock that is not recorded itself."""
+        """Follow the time of a clock that is not recorded itself."""
 
         def on_clock(raw: bytes) -> None:
             recording.set_clock(first_time_ns(raw))
@@ -317,7 +317,7 @@ class RecorderNode(FlightNode):
         publishers = self.get_publishers_info_by_topic(topic)
         offered = [info.qos_profile for info in publishers]
         if not offered:
-            return  # Only readers so far: its quality of service is not known yet.
+            return  # The topic has no publisher yet, so its quality of service is unknown.
         try:
             kind = message_class(type_name)
             channel = recording.writer.add_topic(topic, type_name, _recorded_qos(offered[0]))
@@ -342,7 +342,7 @@ class RecorderNode(FlightNode):
     # -- reports ------------------------------------------------------------------------------
 
     def _on_failure(self, error: RecordingError) -> None:
-        """Report why nothing is recorded any more; the other nodes go on."""
+        """Report an error that ends the recording; the other nodes continue."""
         message = f"Recording has ended: {error}"
         self.get_logger().error(message)
         self._report_bag_event(EventKind.RECORDING_FAILED, message, level=2)
@@ -395,7 +395,7 @@ class RecorderNode(FlightNode):
     def _publish_diagnostics(
         self, what: str, level: bytes, message: str, values: Mapping[str, object]
     ) -> None:
-        # A publisher without need would be one more thing to wait for and to record.
+        # The publisher is created on first use, as each one is discovered and recorded.
         if self._diagnostics is None:
             self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
         name = diagnostic_name(self.get_fully_qualified_name(), what)
@@ -407,7 +407,7 @@ class RecorderNode(FlightNode):
 
 
 class _RecordedTransforms:
-    """Writes the frames of one robot by its recorded topics.
+    """Writes transforms of one robot, computed from its recorded topics.
 
     A state is taken when its odom and its joint_states are there, whichever comes first; so the
     transforms have the stamps of states, and at least ``period`` s of bag time between them.
@@ -448,7 +448,7 @@ class _RecordedTransforms:
         try:
             description = parse_robot(read_text(raw, _TEXT_TYPE, "data"))
         except (RobotDescriptionError, CommandError):
-            return  # Nothing is known of such a robot.
+            return  # The description is unusable, so no transforms are written.
         self._description, self._frames = description, None
         self._state = StateFrames(description)
 
@@ -465,7 +465,7 @@ class _RecordedTransforms:
             state.accept(self._odom, self._joint_states)
             self._write(state, time_ns)
         except (CommandError, RecordingError):
-            return  # Of another robot; a disk that refuses is reported by whatever is next.
+            return  # The state is of another robot. A failed write is reported by the next message.
         self._last_ns, self._next_ns = time_ns, time_ns + self._period_ns
 
     def _write(self, state: StateFrames, time_ns: int) -> None:
@@ -485,14 +485,14 @@ class _RecordedTransforms:
 
 
 class _StampReader:
-    """Reads the times that messages begin with; those of one state begin with the same bytes."""
+    """Reads the stamps at the beginning of messages; messages of one state share their stamp."""
 
     def __init__(self) -> None:
         self._stamp = b""
         self._time_ns = 0
 
     def time_ns(self, raw: bytes) -> int:
-        """Return the time that a serialised message begins with, ns; 0 if it is before zero."""
+        """Return the stamp of a serialised message, ns; 0 if it is negative."""
         stamp = raw[HEADER_STAMP]
         if stamp != self._stamp:
             self._stamp, self._time_ns = stamp, first_time_ns(raw)

@@ -1,4 +1,4 @@
-"""The replay node: an MCAP bag back onto its topics, in the rhythm in which it was recorded."""
+"""The replay node publishes the messages of an MCAP bag at their recorded times."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import LATEST_NS, SECOND, set_stamp
 
 _READER_CHECK_PERIOD = 0.05
-"""Wall s between two looks for readers."""
+"""Wall time between two checks for readers, s."""
 
 _MAX_MESSAGES_AT_ONCE = 500
-"""Messages that are sent without a look at services and signals."""
+"""Largest number of messages sent before services and signals are served."""
 
 _LONGEST_DELIVERY = Duration(seconds=2)
-"""How long a reader may take for the last messages."""
+"""Longest wait for readers to receive the last messages."""
 
 _LONGEST_WAIT_NS = 3600 * SECOND
-"""Longest period of a timer, which is shorter than times in a bag may be."""
+"""Longest period of a timer, ns; gaps between messages in a bag may be longer."""
 
 _DEEPEST_QUEUE = 10_000
-"""Limit of depths in bags, which may be anything: the middleware allocates queues."""
+"""Largest queue depth, because a bag may state any depth and the middleware allocates it."""
 
 _CLOCK = "/clock"
 _STATUS, _SEEK = "replay/status", "replay/seek"
 
 _STATUS_PERIOD = 0.2
-"""Wall s between two statuses."""
+"""Wall time between two status messages, s."""
 
 _TEXT_TYPE, _DESCRIPTION_TOPIC = "std_msgs/msg/String", "/robot_description"
 
@@ -84,7 +84,7 @@ class ReplayNode(FlightNode):
 
     def configure(self) -> None:
         """Open the bag and make its publishers and the services."""
-        # A configuration that failed has left its bag and files.
+        # A failed configuration leaves its bag and files open.
         self.cleanup()
         config = self.config
         if not config.bag:
@@ -115,7 +115,7 @@ class ReplayNode(FlightNode):
         self.create_subscription(Float64, _SEEK, self._on_seek, STREAM)
 
     def activate(self) -> None:
-        """Wait for readers, then go on from where the replay is."""
+        """Wait for readers, then continue the replay."""
         self._begun = False
         self._wait = ReaderWait(_READER_CHECK_PERIOD, self.config.wait)
         # One timer for the next message, always set anew: half the load of looking every
@@ -136,7 +136,7 @@ class ReplayNode(FlightNode):
             self._begin()
 
     def start_message(self) -> str:
-        """Return bag, number of topics and rate in one message."""
+        """Return a log message with bag, number of topics and rate."""
         config = self.config
         return f"Replays {len(self._outputs)} topic(s) of {config.bag} at {config.rate:g} times."
 
@@ -172,7 +172,7 @@ class ReplayNode(FlightNode):
             if own_clock and topic.name == _CLOCK:
                 continue
             if topic.name in own:
-                continue  # Of a replay that was recorded; this one has its own.
+                continue  # The bag recorded the status of another replay, which is left out.
             name = new_names.get(topic.name, topic.name)
             try:
                 publisher = self.create_publisher(
@@ -222,7 +222,7 @@ class ReplayNode(FlightNode):
         if due is None:
             self._timer.cancel()
             return
-        # A later look finds nothing due and sets the timer anew.
+        # Longer waits are split: the next call finds no message due and sets the timer again.
         self._timer.timer_period_ns = min(max(due - self._now(), 1), _LONGEST_WAIT_NS)
         self._timer.reset()
 
@@ -365,7 +365,7 @@ def _with_mesh_files(send: Callable[[bytes], None], meshes: MeshFolder) -> Calla
     def send_with_files(data: bytes) -> None:
         try:
             text = deserialize_message(data, String).data
-        except RuntimeError:  # It is replayed as it was recorded, like every other message.
+        except RuntimeError:  # A description that cannot be read is replayed unchanged.
             send(data)
             return
         located = meshes.described(text)

@@ -1,1 +1,1 @@
-"""Sessions: a scenario flown by a stack of nodes, in one process or in many."""
+"""Sessions: scenarios flown by a stack of ROS nodes, in one process or in several."""

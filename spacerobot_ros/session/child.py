@@ -1,6 +1,6 @@
 """``python -m spacerobot_ros.session.child MODULE ...``: a node that ends with its supervisor.
 
-The module of a node takes a second to import: signals are guarded before.
+Signals are guarded first, because importing the module of a node takes a second.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from spacerobot_ros.termination import Terminated, guarded
 def run_module(name: str) -> int | None:
     """Import the module of a node and run its ``main``; return the exit code.
 
-    A signal ends it without a traceback, also while it imports.
+    A signal ends the process without a traceback, also during the import.
     """
     with guarded():
         try:

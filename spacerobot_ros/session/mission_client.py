@@ -1,4 +1,4 @@
-"""The client of a mission: sends its goals and follows the status until they are decided."""
+"""Client that sends the goals of a flight and follows their status until they are decided."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
 
 _LOOK_PERIOD = 0.2
-"""Wall s from one look of a follower to the next."""
+"""Wall time between two calls of a ``look`` function, s."""
 
 _LONGEST_DELIVERY = 5.0
-"""Wall s within which a goal reaches every node that subscribes to it."""
+"""Longest wall time until every subscriber has received a goal, s."""
 
 
 class MissionClient:
@@ -71,7 +71,7 @@ class MissionClient:
     ) -> None:
         self.node: Node = rclpy.create_node(name, namespace=namespace, context=context)
         self.status: Status | None = None
-        """The last status of the commander that decides."""
+        """Last status of the commander that decides the goal."""
         self._done = rclpy.task.Future(executor=None)
         self._frame, self._now = world_frame, now
         self._joint_names, self._on_end = joint_names, on_end
@@ -108,12 +108,12 @@ class MissionClient:
 
     @property
     def outcome(self) -> Outcome | None:
-        """Outcome of the goal; None as long as it is followed."""
+        """Outcome of the goal; None before it is decided."""
         return self._done.result()
 
     @property
     def message(self) -> str:
-        """The message of the last status; empty before the first."""
+        """Message of the last status; empty before the first status."""
         return "" if self.status is None else self.status.message
 
     @property
@@ -122,7 +122,7 @@ class MissionClient:
         return self.status.ends_at_s if isinstance(self.status, PlannerStatus) else 0.0
 
     def is_connected(self, readers: int = 1) -> bool:
-        """Whether every goal has that many readers, and all topics all the readers that are known.
+        """Whether goals have ``readers`` subscribers, and all known subscribers are matched.
 
         A commander may be known and not met yet, while a viewer or a recorder is. Planners of
         others need not take joint positions.
@@ -137,9 +137,9 @@ class MissionClient:
         )
 
     def has_decider(self) -> bool:
-        """Whether a commander is connected that publishes its status and reads goals.
+        """Whether a commander is connected, with its status and its subscription of goals.
 
-        A recorder reads goals, too, and may be known before the commander.
+        A recorder also subscribes to goals, and may be discovered first.
         """
         if not self._status_topic.get_publisher_count():
             return False
@@ -210,7 +210,7 @@ class MissionClient:
 
     def _end(self, outcome: Outcome) -> None:
         if not self._done.done():
-            # Here and not when the spin returns: a run ends at the same tick every time.
+            # The run ends in this callback, so that it ends at the same tick every time.
             self._on_end()
             self._done.set_result(outcome)
 

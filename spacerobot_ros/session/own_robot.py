@@ -1,4 +1,4 @@
-"""A first scenario of a robot: notes on its description, a goal, and the text of the file."""
+"""First scenario for a user's robot: notes on its URDF, a goal, and the scenario file."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ _FIRST_TURN = math.radians(5.0)
 """Largest turn of the base in the first scenario of a robot, rad."""
 
 _MAX_USUAL_LIMIT = 4 * math.pi
-"""Joint limits above it may be in degrees, rad."""
+"""Largest usual joint limit, rad; larger ones may be in degrees."""
 
 _EASY_SHARE_OF_ROOM = 0.5
-"""Part of the distance to its limits that a joint moves for a first rotation."""
+"""Largest share of the distance to its limits that a joint uses in the first rotation."""
 
 _LARGEST_ROOM = 1.0
-"""Largest distance to a limit that counts, m or rad: the connection changes beyond it."""
+"""Largest distance to a joint limit that counts, m or rad: linearisation fails beyond it."""
 
 _LEAST_TURN = math.radians(0.2)
-"""Smaller rotations are left to loops of the joints, rad."""
+"""Smallest first rotation without loops of the joints, rad."""
 
 _ROTATION_TO_TOLERANCE = 50.0
-"""Ratio of a small rotation to its tolerance."""
+"""Ratio of a small rotation goal to its tolerance."""
 
 _LEAST_BASE_MASS_RATIO, _LARGEST_BASE_MASS_RATIO = 0.2, 500.0
 """Usual ratios of the base's mass to the mass of all other bodies."""
@@ -96,7 +96,7 @@ def remarks(robot: RobotDescription) -> Iterator[str]:
                 'driven by efforts it cannot. Give <limit effort="..."/> in N or N m.'
             )
     for link in robot.links:
-        # Of a body as a whole it is refused.
+        # A body with such an inertia is refused; a welded link is not.
         if flaw := describe_inertia_flaw(link.inertia.about_com):
             yield f"The inertia of link '{link.name}' {flaw} The links welded to it make up for it."
     yield from _visual_remarks(robot)
@@ -113,7 +113,7 @@ def _visual_remarks(robot: RobotDescription) -> Iterator[str]:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         yield (
             f"The mesh '{missing[0]}'{more} was not found: give a path beside the URDF, or source "
-            "the workspace of its package. It is only a matter of looks."
+            "the workspace of its package. Only pictures need it."
         )
     if not any(link.shapes for link in robot.links):
         yield "No link has a <visual>: the robot is drawn as lines between its joints."
@@ -125,7 +125,7 @@ def _visual_remarks(robot: RobotDescription) -> Iterator[str]:
 
 
 def first_shape(robot: SpaceRobot) -> Array:
-    """Return a shape (n,), m or rad, with room to all sides: the middle of narrow joint limits.
+    """Return joint positions (n,), m or rad, far from all limits: the middle of narrow ranges.
 
     Joints that reach both ways from zero by a third of their range stay at zero, where a URDF is
     usually drawn.
@@ -140,7 +140,7 @@ def first_shape(robot: SpaceRobot) -> Array:
 
 
 def first_problem(name: str, robot: SpaceRobot, file: Path) -> PlanningProblem:
-    """Return the problem to turn the base a little, about an axis that its joints turn it about.
+    """Return the problem of a small base rotation about an axis that the joints allow.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The stack with each node in a process of its own: as users run them, without ros2 launch."""
+"""A stack with a process for each node, as users run nodes, without ros2 launch."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ _LONGEST_START = 60.0
 """Longest wait for the start of all nodes, wall s."""
 
 _LONGEST_END = 10.0
-"""Wall time that a node has to end after a signal before it is killed, s."""
+"""Wall time after a signal at which a node that still runs is killed, s."""
 
 _WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-"""Fast DDS may go on writing into the shared memory of a killed node, not to its successor."""
+"""Settings without shared memory: Fast DDS could keep writing to a killed node's memory."""
 
 _FASTDDS_FILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-"""Environment variables of Fast DDS: the file of its settings, by its new and its old name."""
+"""Environment variables with the settings file of Fast DDS: new and old name."""
 
 _FASTDDS_SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
@@ -57,9 +57,9 @@ _FASTDDS_SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
   </profiles>
 </dds>
 """
-"""Settings by which writers ask for confirmation, and repeat lost messages, after 10 ms.
+"""Fast DDS settings with which writers repeat lost messages after 10 ms.
 
-The default is 3 s: by then the plant has published more than its publishers keep, or has waited."""
+With the default of 3 s a lockstep plant would wait, and others would lose messages."""
 
 _LONGEST_RECORDING_DELAY = 1.0
 """Wall time for the recorder to receive the last messages of the plant, s."""
@@ -76,9 +76,10 @@ _CHILD_MODULE = "spacerobot_ros.session.child"
 
 
 class MultiProcessStack(Stack):
-    """The processes of a scenario, and in this one the client of their mission.
+    """The node processes of a scenario, and the client of their mission in this process.
 
-    They end with this process, however that ends. In lockstep every run is equal: nothing begins
+    The node processes end with this process, even if it is killed. In lockstep every run is equal:
+    nothing begins
     before all nodes have met, and the goal is there before the first state.
 
     Parameters
@@ -123,7 +124,7 @@ class MultiProcessStack(Stack):
         try:
             for name in self.names:
                 self.launch(name, autostart=False)
-            # All at once: models are built and compiled.
+            # All nodes are configured at once, because building models takes long.
             self._change_states(Transition.TRANSITION_CONFIGURE, self.names)
             self._wait_for(self._connected, "the nodes to find each other")
         except BaseException:
@@ -164,7 +165,7 @@ class MultiProcessStack(Stack):
         return Path(self._folder.name, f"{name}.txt")
 
     def _last_line(self, name: str) -> str:
-        # A crash ends with pages of loaded modules.
+        # Python ends the report of a crash with a long list of modules.
         text = self._log_of(name).read_text("utf-8", errors="replace").strip()
         lines = [line for line in text.splitlines() if not line.startswith("Extension mod")]
         return lines[-1] if lines else "it wrote nothing."
@@ -189,7 +190,7 @@ class MultiProcessStack(Stack):
         self._change_states(Transition.TRANSITION_ACTIVATE, ["plant"])
 
     def finish(self) -> None:
-        """Stop time, then end every node, the recorder, whose bag is completed, last.
+        """Stop time, then end all nodes; the recorder ends last and completes the bag.
 
         A flight in real time that was interrupted ends with its joints at rest.
 
@@ -215,7 +216,7 @@ class MultiProcessStack(Stack):
                 )
 
     def close(self) -> None:
-        """End all processes that still run."""
+        """End all node processes that still run."""
         left = [process for process in self.processes.values() if process.poll() is None]
         for process in left:
             process.send_signal(signal.SIGTERM)
@@ -227,12 +228,12 @@ class MultiProcessStack(Stack):
         self._folder.cleanup()
 
     def require_alive(self) -> None:
-        """Raise the last line of a node that has ended.
+        """Raise an error with the last output line of a node that has ended.
 
         Raises
         ------
         SpaceRobotError
-            There is one.
+            A node has ended.
         """
         for name, process in self.processes.items():
             if process.poll() is not None and name not in self._timeline.away:
@@ -246,7 +247,7 @@ class MultiProcessStack(Stack):
 
     def _supervise(self) -> None:
         """Kill and start the nodes that the scenario names for this time; the others must run."""
-        # A killed plant has no clock: the wall's goes on for it.
+        # Without a plant there is no clock, so wall time advances the schedule.
         factor = self.scenario.plant.real_time_factor
         since = factor * (time.monotonic() - self._clock_seen)
         killed, started = self._timeline.due(self._time_ns / SECOND + since)
@@ -261,7 +262,7 @@ class MultiProcessStack(Stack):
         """End nodes together, and return their exit codes."""
         for name in names:
             self.processes[name].send_signal(signal.SIGINT)
-        # The traceback that SIGABRT causes shows where a node hangs.
+        # SIGABRT makes a hanging node print a traceback.
         waits = {0: _LONGEST_END, signal.SIGABRT: 1.0}
         return {name: end_child(self.processes[name], waits) for name in names}
 
@@ -270,7 +271,7 @@ class MultiProcessStack(Stack):
         self._clock_seen = time.monotonic()
 
     def _connected(self) -> bool:
-        """Ask every node for its endpoints; return whether all is connected."""
+        """Ask every node for its connections; return whether all endpoints are matched."""
         requests = {name: Trigger.Request() for name in self.names}
         answers = self._call_all(self._get_connections, requests)
         nodes = {name: Connections.from_json(answer.message) for name, answer in answers.items()}
@@ -287,7 +288,7 @@ class MultiProcessStack(Stack):
                 raise SpaceRobotError(f"The {name} refuses: {self._last_line(name)}")
 
     def _ask_statistics(self, patience: float) -> None:
-        """Request the planner's statistics; one that is interrupted may be busy."""
+        """Request the planner's statistics; an interrupted planner may be busy."""
         request = {"planner": Trigger.Request()}
         try:
             answer = self._call_all({"planner": self._get_statistics}, request, patience)["planner"]
@@ -303,7 +304,7 @@ class MultiProcessStack(Stack):
         requests: Mapping[str, Any],
         patience: float = _LONGEST_START,
     ) -> dict[str, Any]:
-        """Send requests, each as soon as its node is there, and return the answers."""
+        """Send a request to each node as soon as it is discovered, and return the answers."""
         names = ", ".join(requests)
         waiting = set(requests)
         answers: dict[str, Any] = {}
@@ -331,7 +332,7 @@ class MultiProcessStack(Stack):
         while not condition():
             self.require_alive()
             if time.monotonic() > deadline:
-                raise _AnswerLateError(f"Waited {patience:g} s for {what} in vain.")
+                raise _AnswerLateError(f"Timed out after {patience:g} s waiting for {what}.")
             self.executor.spin_once(timeout_sec=0.02)
 
 
@@ -364,7 +365,7 @@ class KillTimeline:
         self._away: list[Kill] = []
 
     def due(self, time: float) -> tuple[list[str], list[str]]:
-        """Return the nodes to kill and those to start, by the simulated time in s."""
+        """Return the nodes to kill and the nodes to start until a simulated time, s."""
         killed = [kill for kill in self._waiting if kill.at <= time]
         started = [kill for kill in self._away if kill.until <= time]
         self._waiting = [kill for kill in self._waiting if kill.at > time]
@@ -373,5 +374,5 @@ class KillTimeline:
 
     @property
     def away(self) -> set[str]:
-        """The nodes that were killed and are not started yet."""
+        """Names of the nodes that were killed and not started again yet."""
         return {kill.node for kill in self._away}

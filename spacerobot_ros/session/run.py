@@ -1,4 +1,4 @@
-"""Stacks that fly a scenario to its goal, or run until they are stopped; goals from outside."""
+"""Runs stacks: to the goal of a scenario, or until they are stopped; sends goals to stacks."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from spacerobot_ros.termination import ended_on_request
 from spacerobot_ros.times import SECOND, stamp_to_ns
 
 Progress = Callable[[float, float], None]
-"""Called with simulated time and the time the present schedule ends, s."""
+"""Function called with simulated time and the end time of the present schedule, s."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class RunResult:
 
     @property
     def message(self) -> str:
-        """The end of the goal, for people."""
+        """Sentence about the outcome of the goal."""
         return str(self.summary["message"])
 
     sentence = message
@@ -62,7 +62,7 @@ class RunResult:
 
 @contextmanager
 def ros(*, private: bool) -> Iterator[None]:
-    """Have rclpy initialised, signals left to Python; discovery private to us or on loopback.
+    """Initialise rclpy without its signal handlers; discovery is private or on loopback.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def run_scenario(
 
                 def look() -> bool:
                     if progress is not None:
-                        with suppress(OSError):  # A closed terminal ends no flight.
+                        with suppress(OSError):  # A closed terminal must not end the flight.
                             progress(stack.time_ns / SECOND, stack.client.ends_at or time_limit)
                     return stopped() or stack.time_ns / SECOND >= longest
 
@@ -142,7 +142,7 @@ def run_scenario(
 
 
 def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
-    """Return the measures of a finished flight: from its bag, and the client's about its goal."""
+    """Return the measures of a finished flight, from its bag and from the mission client."""
     scenario, client = stack.scenario, stack.client
     assert stack.bag is not None
     bag = open_flight_bag(stack.bag)
@@ -171,16 +171,16 @@ def _summary(stack: Stack, wall_time: float) -> dict[str, Any]:
 # -- stacks that run until they are stopped, goals from outside ---------------------------------
 
 _LONGEST_DISCOVERY = 10.0
-"""Wall s to wait for a commander that takes goals."""
+"""Longest wall time until a commander is discovered, s."""
 
 _LONGEST_STATUS_WAIT = 1.0
-"""Wall s to wait for the status of earlier goals, so that it does not pass for an answer."""
+"""Wall time to wait for the status of earlier goals, which is no answer to the new one, s."""
 
 _LOOK_PERIOD = 0.1
 
 
 class _StatusPrinter:
-    """Shows the messages of the statuses that a client receives, each once."""
+    """Shows each new status message that a client receives."""
 
     def __init__(self, client: MissionClient, show: Callable[[str], None]) -> None:
         self._client, self._show, self._shown = client, show, ""
@@ -189,7 +189,7 @@ class _StatusPrinter:
         """Show the message of the last status if it is new."""
         if self._client.message != self._shown:
             self._shown = self._client.message
-            with suppress(OSError):  # A closed terminal is no reason to drop the robot.
+            with suppress(OSError):  # A closed terminal must not stop the robot.
                 self._show(self._shown)
 
 
@@ -258,12 +258,12 @@ def send_goal(
                 lambda: clocks["own"] or clocks["global"] or time.time_ns(),
                 namespace=namespace,
                 name=f"goal_{decider}",
-                # Joint positions that were sent for an earlier goal are not those of this one.
+                # An empty message resets the joint positions that an earlier goal required.
                 joint_names=tuple if decider == "planner" else None,
             )
             for decider in ("planner", "coordinated_control")
         ]
-        # In a namespace the clock is that of its stack, where a remap has moved it there.
+        # In a namespace the stack may have its own clock, by a remap.
         node = clients[0].node
         for topic, which in {"/clock": "global", node.resolve_topic_name("clock"): "own"}.items():
             node.create_subscription(Clock, topic, partial(on_clock, which=which), 10)
@@ -303,7 +303,7 @@ def _find_decider(
                 latest = time.monotonic() + _LONGEST_STATUS_WAIT
                 while client.status is None and time.monotonic() < latest:
                     executor.spin_once(timeout_sec=0.05)
-                # Its other readers may have been found in the meantime.
+                # Other subscribers may have been discovered in the meantime.
                 while not client.is_connected() and time.monotonic() < deadline:
                     executor.spin_once(timeout_sec=0.05)
                 return client

@@ -1,4 +1,4 @@
-"""Stacks, the running nodes of a scenario: their common base, and the stack in one process."""
+"""Stacks, which run the nodes of a scenario: base class, and stack in one process."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _DISCOVERY_TIMEOUT = 10.0
 
 
 def namespace_words(namespace: str) -> list[str]:
-    """Return the ROS arguments that put a node, and the clock and frames of its stack, into it."""
+    """Return the ROS arguments that put a node, its clock and its frames into a namespace."""
     if not namespace:
         return []
     moved = [word for topic in GLOBAL_TOPICS for word in ("-r", f"{topic}:={topic[1:]}")]
@@ -58,7 +58,7 @@ def checked_namespace(name: str) -> str:
     try:
         validate_namespace(namespace or "/")
     except InvalidNamespaceException as error:
-        raise ParameterError(f"The namespace '{name}' is none of ROS: {error}.") from error
+        raise ParameterError(f"The namespace '{name}' is not valid in ROS: {error}.") from error
     return namespace
 
 
@@ -81,7 +81,7 @@ class Stack(ABC):
     """
 
     can_kill: ClassVar[bool] = False
-    """Whether nodes may be killed and started again on the way."""
+    """Whether nodes may be killed and started again in flight."""
 
     client: MissionClient
     executor: EventsExecutor
@@ -95,17 +95,17 @@ class Stack(ABC):
             )
         self.scenario = scenario
         self.when_exists = scenario.parameters("recorder").get("when_exists", "refuse")
-        """Reaction to a bag of this name that exists; by default it is refused."""
+        """Reaction to an existing bag of this name; by default it is refused."""
         self.bag = free_name(bag) if bag is not None and self.when_exists == "next" else bag
         recorder = () if bag is None else ("recorder",)
         self.names = ("plant", *scenario.commanders, *recorder)
-        """The nodes, in the order of their start."""
+        """Names of the nodes, in the order of their start."""
         for name in self.names:
-            scenario.config(name)  # Refused here, before anything runs.
+            scenario.config(name)  # An invalid goal is refused before any node runs.
 
     def _make_client(self, joint_names: Callable[[], Sequence[str]] | None, **options: Any) -> None:
         """Make the client of the mission; ``options`` are those of :class:`MissionClient`."""
-        # The planner decides; a controller alone decides for itself.
+        # A planner decides goals; without one the controller does.
         decider = self.scenario.commanders[0]
         self.client = MissionClient(
             decider,
@@ -129,7 +129,7 @@ class Stack(ABC):
 
     @abstractmethod
     def start(self, goal: Goal | None) -> None:
-        """Send the goal, if there is one, and let time run."""
+        """Send the goal, if given, and start simulated time."""
 
     def spin(self, look: Callable[[], bool]) -> None:
         """Run until the goal is decided, or until ``look``, called five times a second, is true.
@@ -156,10 +156,10 @@ class Stack(ABC):
             raise
 
     def interrupt(self) -> None:  # noqa: B027
-        """Give up computations that take long; called from another thread when all is to end."""
+        """Cancel long computations; called from another thread when the process must end."""
 
     def _supervise(self) -> None:  # noqa: B027
-        """Look after the nodes, five times a second."""
+        """Check the nodes; called five times a second."""
 
     @abstractmethod
     def finish(self) -> None:
@@ -173,10 +173,10 @@ class Stack(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """End what still runs; safe to call twice."""
+        """End all nodes that still run; a second call does nothing."""
 
     def _all_connected(self, nodes: Mapping[str, Connections], recorded: Iterable[str]) -> bool:
-        """Whether nodes and client are connected, and ``recorded`` has all topics to record."""
+        """Whether nodes and client are connected, and all topics to record are in ``recorded``."""
         client = Connections.of(self.client.node)
         if unconnected([*nodes.values(), client]):
             return False
@@ -193,7 +193,7 @@ class Stack(ABC):
 
 
 class InProcessStack(Stack):
-    """Plant, commanders and recorder in one executor: a run is repeatable to the last message.
+    """A stack in one executor, in which runs are repeatable to the last message.
 
     Everything is connected before anything is published: nodes are configured, their endpoints
     matched, the recorder and the commanders activated, the goal sent, and the plant activated last.
@@ -229,12 +229,13 @@ class InProcessStack(Stack):
             self._planner: PlannerNode | None = nodes.get("planner")
             self._recorder: RecorderNode | None = nodes.get("recorder")
             for node in self._commanders:
-                # Their warnings are in their status, which is shown anyway.
+                # Warnings of nodes are in their status, which is shown anyway.
                 node.get_logger().set_level(LoggingSeverity.ERROR)
             shaped = scenario.goal.joint_positions is not None
             self._make_client(
                 (lambda: self.plant.plant.robot.joint_names) if shaped else None,
-                # In lockstep here and now: a run ends at the same tick every time.
+                # In lockstep the run ends in this callback, so that it ends at the same tick every
+                # time.
                 on_end=self.plant.trigger_deactivate if scenario.lockstep else lambda: None,
                 context=context,
             )
@@ -243,7 +244,7 @@ class InProcessStack(Stack):
             for node in running.values():
                 node.require(node.trigger_configure)
             if self._recorder is not None:
-                # Last, when every topic has its publisher.
+                # The recorder comes last, when every topic has its publisher.
                 self._recorder.watch(running.values())
                 self._recorder.require(self._recorder.trigger_configure)
                 for title, values in scenario.records(list(running)).items():
@@ -293,7 +294,7 @@ class InProcessStack(Stack):
         timer = self.client.node.create_timer(0.001, launch, clock=steady)
 
     def _supervise(self) -> None:
-        """Notice a commander that has failed, even where it has no memory left for an event."""
+        """Detect a failed commander, even if it lacked the memory to publish an event."""
         for node in self._commanders:
             if node.fault is not None:
                 raise node.fault
@@ -314,7 +315,7 @@ class InProcessStack(Stack):
                 node.trigger_deactivate()
         if self._recorder is None:
             return
-        # In one process published messages have arrived.
+        # In one process all published messages have arrived already.
         self._recorder.drain(self.executor, quiet=0.1)
         self._recorder.trigger_deactivate()
         self._recorder.trigger_cleanup()
@@ -353,7 +354,7 @@ class InProcessStack(Stack):
         return node
 
     def _connect(self) -> None:
-        """Wait until every subscription in this process is matched with its publisher."""
+        """###"""
         deadline = time.monotonic() + _DISCOVERY_TIMEOUT
         while not self._connected():
             if time.monotonic() > deadline:

@@ -1,4 +1,4 @@
-"""A viewer process beside a command, of lower priority, so that it takes no time from the plant."""
+"""A viewer process beside a command, at lower priority so that it does not delay the plant."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def viewing(
         try:
             show(_read_announcement(process, log))
             for line in _read_log_lines(log):
-                show(line)  # A warning about an address that others can reach.
+                show(line)  # The viewer warns of an address that other machines can reach.
             yield
             if process.poll() is not None:
                 show(f"The viewer ended early: {(_read_log_lines(log) or ['it was killed.'])[-1]}")
@@ -75,7 +75,7 @@ def viewing(
 
 
 def yield_to_flight(pid: int) -> None:
-    """Lower the priority of a process below everything that flies."""
+    """Lower the priority of a process below the priority of all flight nodes."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, _NICENESS)
     # Linux may divide the processor among sessions first; niceness counts within a session only.

@@ -47,18 +47,18 @@ from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND, first_time_ns, set_stamp
 
 _LOOK_PERIOD = 0.1
-"""Wall s between two looks at states that were set aside."""
+"""Wall time between two checks of postponed state messages, s."""
 
 _COMPLAINT_PERIOD = 5.0
-"""Least wall s between two lines about another publisher of plant/status."""
+"""Least wall time between log lines about foreign publishers of plant/status, s."""
 
 _LONGEST_DIAGNOSTICS_PERIOD = 1.0
-"""Longest wall s between two diagnostics, where a run need not be repeatable."""
+"""Longest wall time between diagnostics in runs that need not be repeatable, s."""
 
 _STATUS_QOS = QoSProfile(
     depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-"""Every status counts, not only the last: deeper than the history for latecomers."""
+"""QoS of plant/status: every status counts, so the queue holds more than the latched ones."""
 
 
 class CommanderNode(FlightNode):
@@ -72,14 +72,14 @@ class CommanderNode(FlightNode):
 
     config: PlannerConfig | ControllerConfig
     commander: Commander
-    """Made anew whenever the node is configured."""
+    """Commander of the node, created whenever the node is configured."""
 
     _statuses: Subscription | None = None
 
     # -- life ---------------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Make a commander that is inactive."""
+        """Create an inactive commander."""
         self.commander = self.make_commander()
 
     @abstractmethod
@@ -105,7 +105,7 @@ class CommanderNode(FlightNode):
         self._subscribe_plant_status()
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
-        """A topic of the state with a publisher that this node cannot hear as it subscribes."""
+        """Name of a state topic with a publisher whose QoS the subscription does not match."""
         self._inputs: dict[str, Subscription] = {}
         self._subscribe_states()
         self.create_timer(
@@ -129,24 +129,24 @@ class CommanderNode(FlightNode):
 
     @abstractmethod
     def use(self, robot: SpaceRobot) -> None:
-        """Command this robot from now on."""
+        """Use this robot from now on."""
 
     def activate(self) -> None:
-        """Answer states from now on."""
+        """Start answering states with commands."""
         self.commander.activate()
 
     def deactivate(self) -> None:
-        """Give up the goals and command nothing any more."""
+        """Drop all goals and stop sending commands."""
         self.commander.deactivate()
 
     @property
     def simulated_time_s(self) -> float | None:
-        """Time of the last state, s; None before the first."""
+        """Simulated time of the last state, s; None before the first state."""
         now_ns = self.commander.stamps.now_ns
         return now_ns / SECOND if now_ns else None
 
     def on_silence(self, silence: Silence) -> None:
-        """Give up the goals for a silent plant, where that is asked for."""
+        """Drop all goals if the plant is silent and the parameters request it."""
         super().on_silence(silence)
         if self.config.watchdog_action == "abort" and not silence.over:
             self.commander.plant_silent(silence.message)
@@ -162,7 +162,8 @@ class CommanderNode(FlightNode):
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""
         logger = self.get_logger()
-        match level:  # Four calls: rclpy refuses one that changes its severity.
+        # Each severity has its own call, as rclpy refuses a call site with changing severity.
+        match level:
             case "debug":
                 logger.debug(message)
             case "info":
@@ -185,7 +186,7 @@ class CommanderNode(FlightNode):
     # -- inputs -------------------------------------------------------------------------------
 
     def _on_description(self, message: String) -> None:
-        """Take the robot of a description that differs from the last one."""
+        """Use the robot of a received description unless it equals the last one."""
         if message.data == self._description:
             return
         self._description = message.data
@@ -212,7 +213,7 @@ class CommanderNode(FlightNode):
             self.log("info", goal_description(part, accepted.goal_id, message, accepted.goal))
 
     def _goal_shape(self) -> Array | None:
-        """Return the shape (n,) that goals are to end in; None: any."""
+        """Return the joint positions (n,) required at the end of goals; None: any."""
         return None
 
     def _pose_of(self, frame: str) -> Array | None:
@@ -224,7 +225,7 @@ class CommanderNode(FlightNode):
         robot, states = self.commander.robot, self.commander.states
         if robot is not None and states.odom and states.joints:
             state = StateFrames(robot.description)
-            with suppress(CommandError):  # Of another robot: nothing is known then.
+            with suppress(CommandError):  # The state is of another robot, so no frame is known.
                 state.accept(states.odom, states.joints)
                 own = robot_frames(robot.description, state)
         return self._known_frames.pose(frame, self.config.world_frame, own)
@@ -236,15 +237,15 @@ class CommanderNode(FlightNode):
         return response
 
     def _subscribe_plant_status(self) -> None:
-        """Subscribe (again): the last status of every publisher that is there comes first."""
+        """Subscribe anew to plant/status, whose present publishers first send their last status."""
         if self._statuses is not None:
             self.destroy_subscription(self._statuses)
         self._status_number: int | None = None
-        """Number that the plant gave to its last status; None: that of the next one counts."""
+        """Sequence number of the plant's last status; None: any number is accepted next."""
         self._doubted = False
-        """Whether a status came that was perhaps not the plant's."""
+        """Whether a status was received that another node may have published."""
         receive = self._guarded(self._on_plant_status, "a message on 'plant/status'")
-        # Guarded already, and rclpy looks at the parameters of the callback.
+        # The callback is guarded already, and rclpy inspects its signature.
         self._statuses = LifecycleNode.create_subscription(
             self,
             DiagnosticStatus,
@@ -286,7 +287,7 @@ class CommanderNode(FlightNode):
         self.commander.receive_plant_status(status, record.name or "plant")
 
     def _foreign_plants(self) -> list[str]:
-        """Return the nodes that publish plant/status and not odom; none where there is no odom."""
+        """Return nodes that publish plant/status but not odom; empty if no node publishes odom."""
         found = []
         for topic in ("plant/status", "odom"):
             endpoints = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
@@ -306,7 +307,7 @@ class CommanderNode(FlightNode):
             self._publish_diagnostics()
 
     def _subscribe_states(self) -> None:
-        """Subscribe to the state; where reliability is chosen here, notice who cannot be heard."""
+        """Subscribe to the state; report publishers whose QoS does not match."""
         auto = self.config.state_reliability == "auto" and not self._best_effort
         for kind, topic, callback in (
             (Odometry, "odom", self._on_odom),
@@ -328,7 +329,7 @@ class CommanderNode(FlightNode):
             )
 
     def _resubscribe_best_effort(self) -> None:
-        """Subscribe to the state as drivers of sensors publish it."""
+        """Subscribe to the state with best-effort QoS, as sensor drivers publish it."""
         self.get_logger().info(
             f"A publisher of '{self._unheard}' offers best effort: the state is subscribed so."
         )
@@ -346,10 +347,10 @@ class CommanderNode(FlightNode):
         return found
 
     def _look_at_waiting_messages(self) -> None:
-        """Take statuses that wait, and a state that was set aside once its time is accepted."""
+        """Process waiting statuses, and a postponed state once its time is accepted."""
         assert self._statuses is not None
         commander, handle = self.commander, self._statuses.handle
-        # An executor that is busy may lose a callback.
+        # A busy executor may lose a callback.
         with handle:
             while (taken := handle.take_message(DiagnosticStatus, False)) is not None:
                 self._on_plant_status(*taken)
@@ -359,7 +360,7 @@ class CommanderNode(FlightNode):
             self._resubscribe_best_effort()
         ignored = commander.take_accepted_jump()
         if ignored or (
-            # In a run that is to be repeatable only simulated time counts.
+            # A repeatable run depends on simulated time only.
             self.events_have_wall_time
             and self.config.diagnostics_period
             and self.is_active
@@ -368,7 +369,7 @@ class CommanderNode(FlightNode):
             self._publish_diagnostics(ignored)
 
     def _publish_diagnostics(self, warning: str = "") -> None:
-        """Publish the status and the number of ignored states, or a warning about the last one."""
+        """Publish the commander's status and the number of ignored states, or a warning."""
         robot, stamps = self.commander.robot, self.commander.stamps
         full = self.get_fully_qualified_name()
         hardware = robot.description.name if robot is not None else ""

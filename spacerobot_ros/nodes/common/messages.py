@@ -34,13 +34,13 @@ _MARKER_TYPES = {
     "mesh": Marker.MESH_RESOURCE,
 }
 _MAX_KEPT_TRANSFORMS, _MAX_KEPT_STATIC_TRANSFORMS = 200, 100
-"""Messages of /tf and /tf_static that are kept: some seconds of a robot with several publishers."""
+"""Numbers of kept messages of /tf and of /tf_static: some seconds of several publishers."""
 
 _MAX_CHAINED_FRAMES = 1000
-"""Frames between a frame and the world; frames may be connected in a circle."""
+"""Largest number of frames between a frame and the world; received frames may form a circle."""
 
 _SHORTEST_QUATERNION = 1e-6
-"""Least length of the four numbers of a quaternion."""
+"""Least norm of a quaternion in a message."""
 
 
 def message_class(type_name: str) -> Any:
@@ -51,7 +51,7 @@ def message_class(type_name: str) -> Any:
     Raises
     ------
     SpaceRobotError
-        Its package is not installed; the message goes after the name of a topic.
+        Its package is not installed; the message completes a sentence about a topic.
     """
     try:
         message_definition(type_name)
@@ -98,7 +98,7 @@ def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> Marke
 
 
 def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str) -> MarkerArray:
-    """Return the base as a ghost at the goal, and the planned path of the base as a line.
+    """Return markers of the base at its goal, and of the planned path of the base as a line.
 
     The ghost has the visuals of the base link and of the links that are fixed to it.
     """
@@ -133,7 +133,7 @@ def goal_message(goal: Goal, frame: str, time_ns: int) -> PoseStamped:
 
 
 def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
-    """Return the joint positions that a goal is to end in; an empty message: any."""
+    """Return a message of the joint positions required at a goal; empty without a requirement."""
     positions = goal.joint_positions
     if positions is None:
         return JointState()
@@ -195,7 +195,7 @@ def goal_of(
 
 
 def goal_description(part: str, goal_id: str, message: PoseStamped, goal: Goal) -> str:
-    """Return one line about a goal that has come."""
+    """Return one log line about a received goal."""
     position = ", ".join(f"{x:.4g}" for x in goal.position)
     quaternion = ", ".join(f"{x:.4g}" for x in goal.quaternion)
     frame = printable(message.header.frame_id)
@@ -204,13 +204,13 @@ def goal_description(part: str, goal_id: str, message: PoseStamped, goal: Goal) 
 
 
 def chained(outer: Array, inner: Array) -> Array:
-    """Return the pose (7,) that ``inner`` has where the frame that it is in has ``outer``."""
+    """Return the composition (7,) of two poses; ``inner`` is relative to ``outer``."""
     position = outer[:3] + matrix_from_quaternion(outer[3:]) @ inner[:3]
     return np.concatenate([position, quaternion_multiply(outer[3:], inner[3:])])
 
 
 def shape_of(message: JointState, joint_names: Sequence[str]) -> Array:
-    """Return the positions (n,) of a message in the order of the robot's joints.
+    """Return the joint positions (n,) of a message, in the order of the robot's joints.
 
     Raises
     ------
@@ -227,7 +227,7 @@ def shape_of(message: JointState, joint_names: Sequence[str]) -> Array:
 
 
 def transform_class() -> Any | None:
-    """Return the class of TFMessage, or None where its package is not installed."""
+    """Return the class of tf2_msgs/TFMessage; None if its package is not installed."""
     try:
         return message_class(TRANSFORM_TYPE)
     except SpaceRobotError:
@@ -266,8 +266,8 @@ class KnownFrames:
     def pose(self, frame: str, world: str, own: dict[str, tuple[str, Array]]) -> Array | None:
         """Return the pose (7,) of a frame in the world, by the latest that is known of it.
 
-        ``own`` goes before what /tf says: by frame its parent and its pose in that. None: nothing
-        connects the two.
+        ``own`` has parent and pose in it by frame, and overrides /tf. None: the frames are not
+        connected.
         """
         parents = {**self._received_parents(), **own}
         pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
@@ -288,7 +288,7 @@ class KnownFrames:
                     raw, self._kind
                 ).transforms
             except RuntimeError:
-                continue  # Bytes that are no such message.
+                continue  # The bytes are no TFMessage.
             for each in transforms:
                 pose = pose_array(each.transform.translation, each.transform.rotation)
                 if pose is not None:

@@ -37,22 +37,22 @@ from spacerobot_ros.nodes.common.watchdog import Liveness, Role, Silence
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""State, commands and events: reliable, deep enough for a reader that is briefly busy."""
+"""QoS of states, commands and events: reliable, with a queue for readers that are briefly busy."""
 
 BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""The same from drivers of sensors, which repeat nothing that was lost."""
+"""QoS of state topics from sensor drivers, which do not resend lost messages."""
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-"""A late subscriber gets the last message: reliable, transient local, depth 1."""
+"""QoS that gives a late subscriber the last message: reliable, transient local, depth 1."""
 
 AUTOSTART = Parameter(
     "autostart",
     True,
     description="configure and activate at once; false: wait for a supervisor",
 )
-"""A parameter of every node."""
+"""Parameter of every node: whether it starts by itself."""
 
 _CAN_SHUT_DOWN = (
     State.PRIMARY_STATE_UNCONFIGURED,
@@ -90,24 +90,24 @@ class FlightNode(LifecycleNode):
     """The frozen dataclass that declares the node's parameters."""
 
     role: ClassVar[Role | None] = None
-    """Role of the node that others depend on."""
+    """Role of this node in the stack, on which other nodes depend."""
 
     depends_on: ClassVar[tuple[Role, ...]] = ()
-    """The roles of the nodes that are noticed when they are silent."""
+    """Roles of the nodes whose silence this node reports."""
 
     def __init__(self, name: str, *, autostart: bool | None = None, **kwargs: Any) -> None:
         self._timers_alive: dict[int, list[bool]] = {}
         super().__init__(name, **kwargs)
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
-        """Called with an exit code by a node that has nothing left to do."""
+        """Function that a finished node calls with its exit code."""
         self.raw_streams: list[RawStream] = []
-        """The streams of bytes through the node, from its configuration to its cleanup."""
+        """Serialised streams of the node, from its configuration to its cleanup."""
         self._failure, self._destroyed = "", False
         self._liveness = Liveness(self, self.role, self.depends_on, self.on_silence)
         self._event_stream = self.send_raw(DiagnosticStatus, "events")
         self.events_have_wall_time = True
-        """False in a run whose recorded values must be repeatable."""
+        """Whether wall time may influence published values; False in repeatable runs."""
         self._raising = False
         self._guard_transitions()
         try:
@@ -128,7 +128,7 @@ class FlightNode(LifecycleNode):
             raise
 
     def start(self) -> None:
-        """Configure and activate.
+        """Configure and activate the node.
 
         Raises
         ------
@@ -144,7 +144,7 @@ class FlightNode(LifecycleNode):
         Raises
         ------
         SpaceRobotError
-            It failed; the message, which is not logged as well, says why.
+            The transition failed; the message, which is not logged, states the reason.
         """
         self._raising = True
         try:
@@ -191,7 +191,7 @@ class FlightNode(LifecycleNode):
         self.raw_streams.append(stream)
 
     def report_event(self, event: Event) -> None:
-        """Publish an event of this node, once; its time is the node's unless it has one."""
+        """Publish an event of this node; an event without a time gets the node's time."""
         if event.time_s is None:
             event = replace(event, time_s=self.simulated_time_s)
         values = event.to_values(time.time() if self.events_have_wall_time else None)
@@ -219,7 +219,7 @@ class FlightNode(LifecycleNode):
         guarded, alive = self._guarded(callback, "a timer"), [True]
 
         def fire() -> None:
-            # The executor may have a timer in its queue that has been destroyed since.
+            # The executor may still have a destroyed timer in its queue.
             if alive[0]:
                 guarded()
 
@@ -260,7 +260,7 @@ class FlightNode(LifecycleNode):
     def _fail(self, what: str, error: Exception) -> None:
         """Stop working after an exception of a callback; the executor goes on."""
         if self._destroyed or (isinstance(error, InvalidHandle) and not self._has_entities):
-            return  # The executor had the callback in its queue when its entity was destroyed.
+            return  # The executor may still call back for a destroyed entity.
         self.get_logger().debug("".join(traceback.format_exception(error)))
         if isinstance(error, SpaceRobotError):
             message = str(error)
@@ -269,12 +269,12 @@ class FlightNode(LifecycleNode):
                 f"Node '{self.get_name()}' has failed at {what}: {_describe_exception(error)}."
             )
         if message == self._failure:
-            return  # It is known, and may come with every message.
+            return  # The failure is reported already, and may recur with every message.
         self._report_failure(message, error)
         try:
             if self.is_active:
                 self.trigger_deactivate()
-        except Exception as second:  # There must be an end to it.
+        except Exception as second:  # A second failure must not cause a third one.
             self.get_logger().error(
                 f"Node '{self.get_name()}' cannot stop: {_describe_exception(second)}."
             )
@@ -324,7 +324,7 @@ class FlightNode(LifecycleNode):
 
     @property
     def _has_entities(self) -> bool:
-        """Whether what configure created is there: the node is configured, or in a transition."""
+        """Whether entities of ``configure`` exist: the node is configured or in a transition."""
         return self.lifecycle_state not in (
             State.PRIMARY_STATE_UNKNOWN,
             State.PRIMARY_STATE_UNCONFIGURED,
@@ -332,7 +332,7 @@ class FlightNode(LifecycleNode):
         )
 
     def finalize(self) -> None:
-        """Take the transition to the end, unless the node has taken it before."""
+        """Shut the node down unless it has been shut down before."""
         if self.lifecycle_state in _CAN_SHUT_DOWN:
             self.trigger_shutdown()
 
@@ -352,14 +352,14 @@ class FlightNode(LifecycleNode):
         """Create model, publishers, subscriptions and services."""
 
     def activate(self) -> None:
-        """Begin to work."""
+        """Start the work of the node."""
 
     def start_message(self) -> str:
         """Return the message that the node logs when it becomes active."""
         return f"Node '{self.get_name()}' is active."
 
     def deactivate(self) -> None:
-        """Stop working, keeping everything."""
+        """Stop the work of the node; its resources stay."""
 
     def cleanup(self) -> None:
         """Release the resources of configure."""
@@ -368,10 +368,10 @@ class FlightNode(LifecycleNode):
         """Report in the status of the node that an error stops it; it is deactivated then."""
 
     def interrupt(self) -> None:
-        """Give up a computation that takes long; called from another thread when all is to end."""
+        """Cancel a long computation; called from another thread when the process must end."""
 
     def on_silence(self, silence: Silence) -> None:
-        """React to a node that has become silent, or is back; it is reported everywhere."""
+        """React to a node that has become silent or is back."""
         kind = EventKind.NODE_BACK if silence.over else EventKind.NODE_SILENT
         level, logger = (0 if silence.over else 2), self.get_logger()
         if silence.over:
@@ -383,12 +383,12 @@ class FlightNode(LifecycleNode):
 
     @contextmanager
     def long_work(self) -> Iterator[None]:
-        """Tell those that depend on this node that it works on something that may take long."""
+        """Announce a long computation to the nodes that depend on this one."""
         with self._liveness.busy():
             yield
 
     def drain(self, executor: EventsExecutor) -> None:
-        """Complete pending work before the node ends; about a second is left."""
+        """Complete pending work within about a second before the node ends."""
 
     def parameters_changed(self) -> None:
         """React to a change of live parameters; ``self.config`` has the new values."""
@@ -396,7 +396,7 @@ class FlightNode(LifecycleNode):
     # -- life cycle ---------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run the hook; where it fails, the entities that it has created are destroyed."""
+        """Call :meth:`configure`; if it fails, destroy the entities that it has created."""
         self._liveness.configure(float(getattr(self.config, "watchdog_timeout", 0.0)))
         result = self._run(self.configure)
         if result is TransitionCallbackReturn.FAILURE:
@@ -406,7 +406,7 @@ class FlightNode(LifecycleNode):
         return self._report_transition(result, EventKind.CONFIGURED)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run the hook and begin the heartbeats."""
+        """Call :meth:`activate` and begin the heartbeats."""
         result = self._run(self.activate)
         if result is TransitionCallbackReturn.SUCCESS:
             self._liveness.begin()
@@ -414,12 +414,12 @@ class FlightNode(LifecycleNode):
         return self._report_transition(result, EventKind.ACTIVATED)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run the hook."""
+        """Call :meth:`deactivate`."""
         self._liveness.end()
         return self._report_transition(self._run(self.deactivate), EventKind.DEACTIVATED)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Run the hook and destroy the publishers, subscriptions and timers it leaves."""
+        """Call :meth:`cleanup`, and destroy remaining publishers, subscriptions and timers."""
         result = self._run(self.cleanup)
         self._destroy_configured()
         return self._report_transition(result, EventKind.CLEANED_UP)
@@ -433,7 +433,7 @@ class FlightNode(LifecycleNode):
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Release all resources after a failed transition; the node may be configured again."""
         self._liveness.end()
-        with suppress(Exception):  # What failed may have left anything.
+        with suppress(Exception):  # A failed transition may have left any entity.
             self.cleanup()
         self._destroy_configured()
         if self._failure and self.fault is not None:
@@ -442,7 +442,7 @@ class FlightNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _on_connections(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Answer a supervisor that starts time when all nodes have met."""
+        """Return the node's connections; a supervisor starts time once all nodes have met."""
         response.success, response.message = True, Connections.of(self).to_json()
         return response
 
@@ -455,7 +455,7 @@ class FlightNode(LifecycleNode):
                 self._report_failure(str(error), error)
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
-            # rclpy drops exceptions of transitions; a defect must at least be logged.
+            # rclpy drops exceptions of transitions, so they are logged here.
             message = f"Node '{self.get_name()}' has failed: {_describe_exception(error)}."
             self.fault = SpaceRobotError(message)
             self.get_logger().debug(traceback.format_exc())
@@ -475,7 +475,7 @@ class FlightNode(LifecycleNode):
         return result
 
     def _guard_transitions(self) -> None:
-        """Have a request for an impossible transition answered instead of ending the process."""
+        """Answer requests for impossible transitions, which otherwise end the process."""
         service = self._service_change_state
         change = service.callback
 
@@ -510,12 +510,12 @@ class FlightNode(LifecycleNode):
                 next(act for kind, act in destroy.items() if isinstance(entity, kind))(entity)
 
     def _fix_parameters(self, *, fixed: bool) -> None:
-        """Have the parameters that :meth:`configure` reads keep their values, or not."""
+        """Make the parameters that :meth:`configure` reads constant, or writable again."""
         declared = self._parameters_declared.values()
         fix(self, (each for each in declared if each.read_only), fixed=fixed)
 
     def _require_free(self, changes: list[RosParameter]) -> None:
-        """Raise ParameterError where a parameter that is to change keeps its value now."""
+        """Raise ParameterError if a requested change concerns a parameter that is constant now."""
         for change in changes:
             if change.name == AUTOSTART.name:
                 raise ParameterError(
@@ -552,7 +552,7 @@ def described_robot(robot: SpaceRobot | None) -> str:
 
 
 def _describe_exception(error: BaseException) -> str:
-    """Return type, text and place of an exception that no one expected."""
+    """Return type, text and source line of an unexpected exception."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     text = " ".join(str(error).split()).rstrip(".")

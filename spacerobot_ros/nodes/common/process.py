@@ -22,7 +22,7 @@ from spacerobot_ros.termination import Terminated, ended_on_request, guarded
 _LOG = logging.getLogger(__name__)
 
 _LONGEST_DELIVERY = 1.0
-"""Wall time after a signal in which readers may still confirm messages, s."""
+"""Longest wall time to wait after a signal until readers confirm messages, s."""
 
 _LAST_DOMAIN = 232
 """Largest ROS_DOMAIN_ID: ports of larger ones do not exist."""
@@ -39,11 +39,11 @@ _TRANSPORT_CHOICES = (
 _SHARED_MEMORY = Path("/dev/shm")
 
 _REQUIRED_SHARED_MEMORY = 2 * 2**20
-"""Free bytes of shared memory that a process starts with; the middleware takes about one MiB."""
+"""Least free shared memory for a process, bytes; the middleware uses about 1 MiB."""
 
 
 def use_loopback_discovery() -> None:
-    """Keep discovery on this machine unless the user chose otherwise; find a way for messages."""
+    """Limit discovery to this machine unless the user chose otherwise; select a transport."""
     if not any(os.environ.get(name) for name in _DISCOVERY_CHOICES):
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     _use_sockets_without_shared_memory()
@@ -52,7 +52,7 @@ def use_loopback_discovery() -> None:
 def _use_sockets_without_shared_memory() -> None:
     """Send messages through sockets where shared memory is missing or full, and say why.
 
-    The middleware does so by itself, after error messages that do not name the cause.
+    The middleware also falls back to sockets, but its error messages do not name the cause.
     """
     if any(os.environ.get(name) for name in _TRANSPORT_CHOICES):
         return
@@ -114,7 +114,7 @@ def start_ros(arguments: list[str] | None) -> None:
         ROS does not start: an argument, a parameter file or an environment variable is refused.
     """
     domain = os.environ.get("ROS_DOMAIN_ID", "")
-    # Beyond the last domain the middleware ends the process.
+    # The middleware ends the process for larger domain numbers.
     if domain and not (domain.isascii() and domain.isdigit() and int(domain) <= _LAST_DOMAIN):
         raise SpaceRobotError(
             f"ROS_DOMAIN_ID is '{domain}'; it must be a whole number from 0 to {_LAST_DOMAIN}."
@@ -140,7 +140,8 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
             print(f"{error}", file=sys.stderr, flush=True)
             return 2
         node.on_end = stop.set_result
-        # Present objects stay; collecting among them in flight would take tens of ms.
+        # Existing objects are excluded from garbage collection, which would take tens of ms in
+        # flight.
         gc.collect()
         gc.freeze()
         executor = EventsExecutor()
@@ -159,7 +160,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
 
 
 def _await_delivery(node: FlightNode) -> None:
-    """Wait until readers have received all messages, which are lost when the process ends."""
+    """Wait until readers have received all messages, since unsent ones end with the process."""
     end = time.monotonic() + _LONGEST_DELIVERY
     for publisher in node.publishers:
         left = end - time.monotonic()

@@ -18,15 +18,14 @@ from rclpy.parameter import parameter_value_to_python
 from spacerobot_ros.parameters import Parameter, Value
 
 _MAX_LOOKS_FOR_ANSWER = 200
-"""Looks after which a node that does not answer has no such services."""
+"""Number of checks after which a node without an answer counts as one without services."""
 
 _LOOKS_UNTIL_CONNECTED = 3
-"""Looks after which the node has met the client, too. Before that its answer would hold it up for a
-tenth of a second, and be lost.
+"""Number of checks before a request: before discovery an answer would be lost after 0.1 s.
 """
 
 _LOOKS_UNTIL_LOST = 50
-"""Looks after which an answer is lost: the middleware drops it where it has not met the client."""
+"""Number of checks after which an answer counts as lost by the middleware."""
 
 
 class RemoteParameters:
@@ -43,15 +42,15 @@ class RemoteParameters:
     def __init__(self, node: Node, name: str) -> None:
         self._node, self.name = node, name
         self.values: dict[str, str] | None = None
-        """Every parameter that is set, as a JSON text by its full name; None before the answer."""
+        """Every set parameter as a JSON text by its full name; None before the answer."""
         self._steps = self._request_values()
 
     def look(self) -> bool:
-        """Return whether nothing more is to come: the node has answered, or never will."""
+        """Return whether the request is over: the node has answered, or never will."""
         return next(self._steps, True)
 
     def close(self) -> None:
-        """Stop asking."""
+        """Cancel the request."""
         self._steps.close()
 
     def _request_values(self) -> Generator[bool, None, None]:
@@ -85,13 +84,13 @@ class RemoteParameters:
 
 
 def _json_value(value: Any) -> Any:
-    """Return a value as JSON can say it."""
+    """Return a parameter value as a JSON value."""
     return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
 
 
 _LARGEST_FLOAT = sys.float_info.max
 _INTEGER_BOUNDS = -(2**63), 2**63 - 1
-"""Bounds that descriptors can hold."""
+"""Integer bounds of parameter descriptors."""
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
@@ -147,11 +146,11 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
 
 
 def _given_value(node: Node, name: str) -> Any:
-    """Return the value that was given for a parameter, of any type; None without."""
+    """Return the value that the user set for a parameter; None without one."""
     overrides = getattr(node, "_parameter_overrides", None)
     if isinstance(overrides, dict):
         return overrides[name].value if name in overrides else None
-    # Another rclpy: declared without a type, at three times the cost.
+    # Other versions of rclpy: a declaration without a type, at three times the cost.
     node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True))
     value = node.get_parameter(name).value
     node.undeclare_parameter(name)
@@ -159,7 +158,7 @@ def _given_value(node: Node, name: str) -> Any:
 
 
 def fix(node: Node, parameters: Iterable[Parameter], *, fixed: bool) -> None:
-    """Have ``ros2 param describe`` say whether parameters keep their values now."""
+    """Let ``ros2 param describe`` report whether parameters are read-only now."""
     for parameter in parameters:
         # Node.set_descriptor never makes a parameter writable again.
         node.describe_parameter(parameter.name).read_only = fixed
@@ -168,7 +167,7 @@ def fix(node: Node, parameters: Iterable[Parameter], *, fixed: bool) -> None:
 def typed(
     parameters: Mapping[str, Parameter], changes: Iterable[RosParameter]
 ) -> list[RosParameter]:
-    """Return changed parameters in the types of their declarations; others as they are.
+    """Return parameter changes converted to the declared types; undeclared ones unchanged.
 
     So a whole number does for a real one (``ros2 param set /plant tick_rate 50``), and an empty
     list for any.

@@ -1,4 +1,4 @@
-"""Endpoints of nodes: serialised messages on their way, and which endpoints have met."""
+"""Streams of serialised messages through nodes, and matched publishers and subscriptions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rclpy.publisher import Publisher
 _MIDDLEWARE = ("/rosout", "/parameter_events")
 
 Matches = tuple[tuple[str, int], ...]
-"""For each endpoint its topic, and how many partners it has met."""
+"""Topic of each endpoint, and the number of endpoints matched with it."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Connections:
     Attributes
     ----------
     publishers, subscriptions
-        The topic of each, and the number of endpoints that it has met.
+        Topic of each endpoint, and the number of endpoints matched with it.
     """
 
     publishers: Matches
@@ -51,7 +51,7 @@ class Connections:
 
 
 def unconnected(nodes: Iterable[Connections]) -> set[str]:
-    """Return the topics on which an endpoint of these nodes has not met all of the others'."""
+    """Return the topics on which endpoints of these nodes are not all matched."""
     nodes = list(nodes)
     writers = Counter(topic for node in nodes for topic, _ in node.publishers)
     readers = Counter(topic for node in nodes for topic, _ in node.subscriptions)
@@ -76,10 +76,10 @@ def with_information(callback: Callable[[Any, Any], None]) -> Callable[..., None
     """Return a callback of a subscription that is given each message with its information."""
 
     def take(*given: Any) -> None:
-        # rclpy's events executor hands over message and information as one tuple (7.1).
+        # The events executor of rclpy 7.1 passes message and information as one tuple.
         callback(*(given[0] if len(given) == 1 else given))
 
-    # By the number of parameters rclpy finds out that the information is wanted.
+    # rclpy passes the information if the callback has two parameters.
     take.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
     return take
 
@@ -103,7 +103,7 @@ class RawStream:
     Parameters
     ----------
     topic
-        Its full name.
+        ###
     take
         Called with each message.
     """
@@ -151,9 +151,9 @@ class RawOutput(RawStream):
 
         super().__init__(publisher.topic_name, keep_and_publish if latched else publish)
         self.readers: Callable[[], int] = publisher.get_subscription_count
-        """Returns how many subscriptions it is matched with."""
+        """Function that returns the number of matched subscriptions."""
         self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
-        """Waits until they have received everything; returns whether they have, in time."""
+        """Function that waits for all readers' confirmations; returns whether all came."""
 
     def add_listener(self, listener: Take) -> None:
         """Call a listener with every message, with the last one of a latched topic at once."""
@@ -180,7 +180,8 @@ class RawInput(RawStream):
 
         def take(raw: bytes) -> None:
             try:
-                self.take(raw)  # Looked up for every message: a listener may come and go.
+                # ``take`` is looked up for every message, because listeners come and go.
+                self.take(raw)
             except Exception as error:
                 on_error(error)
 
@@ -188,14 +189,14 @@ class RawInput(RawStream):
             return take
 
         def take_numbered(raw: bytes, information: Any) -> None:
-            number(information.get("publication_sequence_number") or 0)  # 0: it has none.
+            number(information.get("publication_sequence_number") or 0)  # 0: none.
             take(raw)
 
         return with_information(take_numbered)
 
 
 class StreamingNode(Protocol):
-    """A node whose streams others may listen to."""
+    """A node whose serialised streams other components may listen to."""
 
     raw_streams: list[RawStream]
 
@@ -204,14 +205,14 @@ class StreamingNode(Protocol):
 
 
 class StreamTaps:
-    """Listens to the streams of nodes of this process, where these carry all of a topic."""
+    """Listens to streams of nodes in this process that carry every message of a topic."""
 
     def __init__(self) -> None:
         self.nodes: Sequence[StreamingNode] = ()
         self._tapped: dict[str, list[RawStream]] = {}
 
     def tap(self, topic: str, listener: Take, publishers: int) -> bool:
-        """Listen to the streams of a topic; return whether they carry those of all publishers."""
+        """Listen to a topic's streams; return whether they carry all publishers' messages."""
         streams = self._streams(topic, publishers)
         if streams:
             self._tapped[topic] = streams
@@ -220,7 +221,7 @@ class StreamTaps:
         return bool(streams)
 
     def release_incomplete(self, count_publishers: Callable[[str], int]) -> list[str]:
-        """Release topics that have changed their publishers or nodes, and return which."""
+        """Release and return the topics whose publishers or nodes have changed."""
         changed = [
             topic
             for topic, streams in self._tapped.items()
@@ -231,7 +232,7 @@ class StreamTaps:
         return changed
 
     def release(self) -> None:
-        """Release everything."""
+        """Stop listening to all streams."""
         for topic in list(self._tapped):
             self._release(topic)
 

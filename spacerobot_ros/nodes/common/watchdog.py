@@ -1,4 +1,4 @@
-"""Which of the nodes that a node depends on are alive: their heartbeats, and the lack of them."""
+"""Heartbeats of nodes, and the detection of nodes whose heartbeats cease."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ HEARTBEAT_PERIOD = 0.2
 """Wall s between two heartbeats of an active node."""
 
 _LOOK_PERIOD = 0.1
-"""Wall s between two looks for nodes that are silent."""
+"""Wall time between two checks for silent nodes, s."""
 
 _STANDSTILL = 0.3
-"""Wall s between two looks beyond which this node itself stood still."""
+"""Wall time between two checks beyond which this node itself was suspended, s."""
 
 _REPORT_PERIOD = 1.0
 """Wall s between two diagnostics while a node is silent."""
@@ -49,9 +49,9 @@ class Pulse(str, Enum):
 
     ACTIVE = "active"
     BUSY = "busy"
-    """It plans or compiles, and gives no heartbeat until that is done."""
+    """The node plans or compiles, and sends no heartbeat until it is done."""
     INACTIVE = "inactive"
-    """It was deactivated or shut down in order, and gives no heartbeat."""
+    """The node was deactivated or shut down in order, and sends no heartbeat."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ class Silence:
     Attributes
     ----------
     name
-        Its full name.
+        Full name of the node.
     seconds
         Duration without a heartbeat, wall s.
     over
-        Whether it is back.
+        Whether the node is back.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Silence:
 
     @property
     def message(self) -> str:
-        """The text for the user."""
+        """Sentence about the silence for the user."""
         if self.over:
             return f"Node '{self.name}' is back after {self.seconds:.2g} s."
         return f"Node '{self.name}' is silent for {self.seconds:.2g} s."
@@ -98,14 +98,14 @@ class Watchdog:
     def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._timeout, self._clock = timeout, clock
         self._heard: dict[str, float] = {}
-        """When the last heartbeat of a node was received, or should have been."""
+        """Time of the last received or excused heartbeat by node, s."""
         self._busy: set[str] = set()
         self.silent: dict[str, float] = {}
-        """The nodes that are silent, and when the last heartbeat of each was received."""
+        """Time of the last heartbeat by silent node, s."""
         self._looked = clock()
 
     def hear(self, name: str, pulse: str) -> Silence | None:
-        """Take up a heartbeat; return that a node is back."""
+        """Process a heartbeat; return the end of a silence, None if the node was not silent."""
         now = self._clock()
         back = None
         if name in self.silent:
@@ -137,7 +137,7 @@ class Watchdog:
 
 
 class Liveness:
-    """The heartbeats of a node, and its watch over those of others.
+    """Sends the heartbeats of a node, and watches those of other nodes.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ class Liveness:
     def begin(self) -> None:
         """Give heartbeats, and watch, from now on."""
         self._end_timers()
-        # Functions are compiled when they are first called: a node may be active long before.
+        # Compiling a function on its first call counts as a long computation.
         compilation_contexts.append(self.busy)
         node = self._node
         beat = node.create_timer(HEARTBEAT_PERIOD, self.beat, clock=self._steady)
@@ -194,15 +194,15 @@ class Liveness:
         self.beat()
 
     def end(self) -> None:
-        """Announce that no more heartbeats follow."""
+        """Announce the end of this node's heartbeats."""
         if self._timers:
             self._end_timers()
             self._watchdog = None
-            with suppress(Exception):  # The context may be gone.
+            with suppress(Exception):  # The ROS context may be shut down already.
                 self._publish(Pulse.INACTIVE)
 
     def beat(self) -> None:
-        """Give a heartbeat, if the node is active."""
+        """Send a heartbeat if the node is active."""
         if self._timers:
             self._publish(Pulse.BUSY if self._busy else Pulse.ACTIVE)
 
@@ -250,12 +250,12 @@ class Liveness:
             self._report(lost)
 
     def _report(self, news: list[Silence]) -> None:
-        """Have the node react to changes, and publish the nodes that are silent."""
+        """Report changes to the node, and publish diagnostics about silent nodes."""
         for silence in news:
             self._on_silence(silence)
         watchdog, node = self._watchdog, self._node
         if watchdog is None:
-            return  # The reaction was to stop.
+            return  # The node has reacted by stopping.
         self._next_report = time.monotonic() + _REPORT_PERIOD
         silent = sorted(watchdog.silent)
         values = dict.fromkeys(silent, "silent")

@@ -44,7 +44,7 @@ from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS
 
 _LOOK_PERIOD = 0.1
-"""How often a plant looks for new subscribers and commanders, wall s."""
+"""Wall time between two checks for new subscribers and commanders, s."""
 
 _MAX_UNCONFIRMED_TICKS = STREAM.depth // 2
 """Ticks that a lockstep plant takes at most before all readers confirm that they have their states:
@@ -54,15 +54,15 @@ _REST_RATE = 1e-3
 """Joint rates of a robot at rest, m/s or rad/s."""
 
 _LONGEST_REST = 0.8
-"""Wall s in which the joints are brought to rest before the process ends."""
+"""Longest wall time to bring the joints to rest before the process ends, s."""
 
 _REPORT_PERIOD_NS = 950_000_000
-"""Wall time without diagnostics after which they are due: with the look's, one a second."""
+"""Wall time after the last diagnostics at which new ones are due, ns: about one a second."""
 
 _LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD = 0.5, 0.1
-"""Longest wall s, in real time, from one look of the robot to the next: markers, and /tf."""
+"""Longest wall time between two publications in real time, s: of markers, and of /tf."""
 
-# Looked up for every command: an enum takes its time to find a member.
+# Module names are faster than enum members, which are looked up for every command.
 _RUNNING, _PAUSED, _RESTING = PlantState.RUNNING, PlantState.PAUSED, PlantState.RESTING
 
 
@@ -86,27 +86,27 @@ class PlantNode(FlightNode):
         self._wall_timers: list[Timer] = []
         self._monitor: PlantMonitor | None = None
         self.status = PlantStatus(PlantState.INACTIVE)
-        """Last status on plant/status."""
+        """Status published last on plant/status."""
         super().__init__(name, **kwargs)
 
     @property
     def tick(self) -> int:
-        """The tick whose state was published last."""
+        """Number of the tick whose state was published last."""
         return self._tick
 
     @property
     def time_ns(self) -> int:
-        """Simulated time of that tick, ns."""
+        """Simulated time of the last published state, ns."""
         return self._tick * self._period_ns
 
     @property
     def simulated_time_s(self) -> float:
-        """Simulated time of the tick whose state was published last, s."""
+        """Simulated time of the last published state, s."""
         return self.time_ns / SECOND
 
     @property
     def state(self) -> PlantState:
-        """Whether the plant's time runs, and whether it obeys commands."""
+        """State of the plant: whether time runs, and whether commands act."""
         return self.status.state
 
     @property
@@ -116,7 +116,7 @@ class PlantNode(FlightNode):
     # -- life ---------------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Publish the status from the beginning: an unconfigured plant is inactive."""
+        """Publish the status of an unconfigured plant, which is inactive."""
         self._status = self.send_raw(DiagnosticStatus, "plant/status", LATCHED)
         self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
 
@@ -160,7 +160,7 @@ class PlantNode(FlightNode):
                 message_class(TOPICS[source.topic].type),
                 source.topic,
                 partial(self._on_command, reader),
-                # In lockstep the first command of a tick counts, of whichever publisher.
+                # In lockstep the first command of a tick counts, whichever node publishes it.
                 None if self._real_time is None else self._number_taker(source.senders),
             )
         self.create_subscription(String, "fault_injection", self._on_fault, STREAM)
@@ -172,7 +172,7 @@ class PlantNode(FlightNode):
         self._publish_status(self._monitor.status)
 
     def activate(self) -> None:
-        """Publish the robot and its present state, and from now on step."""
+        """Publish the robot and its present state, and start stepping."""
         self._active = self._when_active
         self._commands.begin(self.time_ns)
         self._publisher.publish_description()
@@ -194,7 +194,7 @@ class PlantNode(FlightNode):
         self._publish()
 
     def deactivate(self) -> None:
-        """Stop time; no command is in force when it continues."""
+        """Stop simulated time and drop the present commands."""
         self._stop_timers()
         if self._active in (PlantState.INACTIVE, PlantState.FAILED):
             return
@@ -203,7 +203,7 @@ class PlantNode(FlightNode):
         self._look_at_status()
 
     def start_message(self) -> str:
-        """Return which robot it is, and how its time runs."""
+        """Return a log message with robot, actuation, rate and time mode."""
         config = self.config
         pace = "in lockstep"
         if self._real_time is not None:
@@ -214,7 +214,7 @@ class PlantNode(FlightNode):
         )
 
     def on_failure(self, message: str, error: Exception) -> None:
-        """Report the failure, and command nothing when the plant is started again."""
+        """Report the failure, and drop commands until the plant is started again."""
         self._stop_timers()
         self._active = PlantState.FAILED
         reason = "model" if isinstance(error, SpaceRobotError) else "exception"
@@ -242,7 +242,7 @@ class PlantNode(FlightNode):
         while not at_rest() and time.monotonic() < end and self.is_active:
             executor.spin_once(timeout_sec=0.02)
         if self._tick == began and self.is_active:
-            self._step()  # Time is slow; servos stop within one tick.
+            self._step()  # In slow real time one tick suffices, in which servos stop.
 
     def _stop_timers(self) -> None:
         for timer in self._wall_timers:
@@ -250,12 +250,12 @@ class PlantNode(FlightNode):
         self._wall_timers = []
 
     def cleanup(self) -> None:
-        """Report that there is no plant any more."""
+        """Release the plant and publish that the node is not configured."""
         self._active, self._monitor = PlantState.INACTIVE, None
         self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
 
     def _look_at_status(self) -> None:
-        """Publish a changed status and the events since the last call."""
+        """Publish the status if it has changed, and the events since the last call."""
         assert self._monitor is not None
         self._faults_seen = self.plant.active
         events = self._monitor.update(self._active, self.time_ns / SECOND)
@@ -271,7 +271,7 @@ class PlantNode(FlightNode):
         self._status.take(record.encoded())
 
     def _resumed_state(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:
-        """Return the state to start from (None: the configuration's) and its tick."""
+        """Return the initial state (None: as configured) and its tick."""
         path = self.config.resume_bag
         if not path:
             return None, 0
@@ -327,7 +327,7 @@ class PlantNode(FlightNode):
         self._report.publish(self.time_ns)
 
     def _report_by_wall(self) -> None:
-        """Publish diagnostics where simulated time has not led to any for a second."""
+        """Publish diagnostics if none were published for a second of wall time."""
         if self._steady.now().nanoseconds - self._reported_ns >= _REPORT_PERIOD_NS:
             self._publish_report()
 
@@ -335,7 +335,7 @@ class PlantNode(FlightNode):
         return max(1, round(seconds * SECOND / self._period_ns)) if seconds else 0
 
     def _viewed_ticks(self, seconds: float, longest_wall: float) -> int:
-        """Return the ticks of a period; in real time it is short enough for people to watch."""
+        """Return the ticks of a period, which real time shortens for viewers."""
         if self._real_time is not None and seconds:
             seconds = min(seconds, longest_wall * self.config.real_time_factor)
         return self._ticks(seconds)
@@ -355,11 +355,11 @@ class PlantNode(FlightNode):
             self._step()
 
     def _on_look_round(self) -> None:
-        """Publish the last state again to new subscribers: a lockstep plant waits for an answer."""
+        """Publish the last state again to new subscribers, whose command a lockstep plant needs."""
         if self._active is not PlantState.RUNNING:
             if self._report_ticks:
                 self._report_by_wall()
-            return  # A subscriber that comes now is shown the state after the pause.
+            return  # A new subscriber receives the state after the pause.
         self._look_for_commanders()
         assert self._lockstep is not None
         if self._lockstep.must_step_at_check(self._tick, pose_lost=self._reported.sensors.dropout):
@@ -406,7 +406,7 @@ class PlantNode(FlightNode):
             self._step()
 
     def _on_fault(self, message: String) -> None:
-        """Inject the faults of a message, one a line, or repair everything: "clear"."""
+        """Inject the faults in a message, one a line, or clear all faults ("clear")."""
         try:
             self.plant.inject(message.data)
         except ParameterError as error:
@@ -415,7 +415,7 @@ class PlantNode(FlightNode):
         self._look_at_status()
 
     def on_silence(self, silence: Silence) -> None:
-        """Bring everything to rest for a silent commander, where that is asked for."""
+        """Bring all joints to rest if a commander is silent and the parameters request it."""
         super().on_silence(silence)
         if self.config.watchdog_action == "latch" and not silence.over:
             self._commands.latch("watchdog", f"node '{silence.name}' is silent", self.time_ns)
@@ -431,7 +431,7 @@ class PlantNode(FlightNode):
         self._monitor.resets += 1
         response.success = True
         response.message = "The robot is back in its initial state; time goes on."
-        # A commander is to know of the reset before it answers a state of it.
+        # Commanders must know of the reset before they answer a state after it.
         self._look_at_status()
         if self._steps_or_pauses:
             self._publish()

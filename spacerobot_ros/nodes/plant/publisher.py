@@ -42,13 +42,13 @@ from spacerobot_ros.times import set_stamp, stamp_bytes
 from spacerobot_ros.topics import TOPICS, Topic
 
 PROPELLANT = "propellant_kg"
-"""Key of the propellant used, in the diagnostics."""
+"""Diagnostics key of the propellant used."""
 
 _ROUNDING = 1e-9
-"""Momenta that change by less than this times the mass only round, m/s and m^2/s."""
+"""Largest momentum change by rounding, divided by the mass, m/s and m^2/s."""
 
 _LOG_PERIOD = 5.0
-"""Wall s between two log lines of one kind."""
+"""Wall time between two log lines of one kind, s."""
 
 _MILLISECONDS = 1e3
 
@@ -56,7 +56,7 @@ _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatu
 
 
 class PlantReport:
-    """Logs and diagnostics of one plant.
+    """Writes logs and diagnostics of one plant.
 
     A level is a warning when its counters have moved since the last diagnostics.
 
@@ -67,7 +67,7 @@ class PlantReport:
     plant, commands
         Sources of the report.
     real_time
-        The plant's time against the wall clock; None in lockstep.
+        Clock of a plant in real time; None in lockstep.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class PlantReport:
         )
 
     def timed_out(self, source: CommandSource, timeout: float) -> None:
-        """Count a commander that fell silent."""
+        """Log that a commander's commands have ceased."""
         self._command_timeouts += 1
         self._node.get_logger().warning(
             f"No command on '{source.topic}' for {timeout:g} s: its actuators are brought to rest.",
@@ -152,7 +152,7 @@ class PlantReport:
         return self._real_time.ticks_lost if self._real_time is not None else 0
 
     def _counters(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Return the counts from which the levels of commands and actuators follow."""
+        """Return the counters that determine the levels of command and actuator diagnostics."""
         limits = self._plant.limit_counts.values()
         return (
             (self._commands.counts.total(), self._command_timeouts, self._ticks_lost),
@@ -209,7 +209,7 @@ class PlantReport:
         plant = self._plant
         change = plant.momentum[:6] - plant.expected_momenta
         linear, angular = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
-        # Rounding, for bodies that move at up to 1 m/s, is less.
+        # The threshold exceeds rounding errors of bodies that move at up to 1 m/s.
         leaks = max(linear, angular) > _ROUNDING * plant.robot.total_mass
         return diagnostic_status(
             self._name("momentum"),
@@ -234,7 +234,7 @@ class PlantReport:
         )
 
     def _thruster_status(self, thrusters: ThrusterPlant) -> DiagnosticStatus:
-        """Return propellant, pulses and unmet wrenches; a warning where new ones are unmet."""
+        """Return propellant, pulses and unmet wrenches; a warning for new unmet wrenches."""
         unmet = thrusters.unmet_ticks > self._unmet_reported
         self._unmet_reported = thrusters.unmet_ticks
         sentences = [f"they cannot give {thrusters.missing}"] if thrusters.missing else []
@@ -260,7 +260,7 @@ class PlantReport:
 
 
 def timing_status(name: str, real_time: RealTime) -> DiagnosticStatus:
-    """Return how well a plant keeps to the clock, and its commander to the plant."""
+    """Return the delays of the plant's ticks and of its commander's answers as diagnostics."""
     timing = real_time.report()
     return diagnostic_status(
         name,
@@ -313,7 +313,7 @@ class StatePublisher:
         self.rebuild()
 
     def rebuild(self) -> None:
-        """Publish from now on the quantities that the state has now."""
+        """Create the messages of the quantities that the state has now."""
         clock = TOPICS["/clock"]
         streams = [
             (topic, self._output(topic), self._template(topic))
@@ -326,7 +326,7 @@ class StatePublisher:
         (self._odom,) = (template for topic, _, template in streams if topic.name == "odom")
 
     def publish_description(self) -> None:
-        """Publish the URDF."""
+        """Publish the URDF on robot_description."""
         self._description.publish(String(data=self._robot.description.urdf))
 
     def publish(self, time_ns: int, *, all_topics: bool) -> None:
@@ -343,7 +343,7 @@ class StatePublisher:
     def has_new_readers(self) -> bool:
         """Whether the state has a subscriber that it did not have at the last call.
 
-        Takes a millisecond. A subscription that is replaced by another leaves their number; one
+        The check takes 1 ms. A subscription that is replaced by another leaves their number; one
         that is known of may be matched later.
         """
         outputs = self._outputs.values()
@@ -358,7 +358,7 @@ class StatePublisher:
         return new
 
     def await_readers(self) -> None:
-        """Wait until all readers have received the states, but not for one that has stopped."""
+        """Wait until all readers have received the states, or the time limit is over."""
         end = time.monotonic() + _LONGEST_WAIT
         for output in self._outputs.values():
             left = max(0.0, end - time.monotonic())
@@ -386,9 +386,9 @@ class StatePublisher:
 
 
 class TransformPublisher:
-    """The measured frames of a robot on /tf, and those that do not move on /tf_static.
+    """Publishes the measured frames of a robot on /tf, and its fixed frames on /tf_static.
 
-    Without ``tf2_msgs`` there is nothing to publish with; bags have transforms all the same.
+    Without the package ``tf2_msgs`` nothing is published; bags have the transforms anyway.
     """
 
     def __init__(
@@ -413,7 +413,7 @@ class TransformPublisher:
             self._static.take(self._frames.static_message(time_ns) or b"")
 
     def publish(self, time_ns: int) -> None:
-        """Publish the state that was reported last; without a pose there is nothing to say."""
+        """Publish the transforms of the last reported state, if it has a pose."""
         if not self._state.sensors.dropout:
             quantities = self._state.quantities
             self._stream.take(
@@ -422,9 +422,9 @@ class TransformPublisher:
 
 
 class LinkMarkers:
-    """All visuals of a robot as one marker array in the world frame.
+    """Publishes all visuals of a robot as one marker array in the world frame.
 
-    World poses, not link frames: a viewer then needs no transforms.
+    With poses in the world frame a viewer needs no transforms.
     """
 
     def __init__(self, node: FlightNode, plant: Plant, world_frame: str) -> None:
@@ -442,7 +442,7 @@ class LinkMarkers:
         ]
 
     def publish(self, time_ns: int) -> None:
-        """Publish all shapes at their present poses."""
+        """Publish the markers of all visuals at their present poses."""
         if not self._targets:
             return
         plant = self._plant

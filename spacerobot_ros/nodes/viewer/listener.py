@@ -1,4 +1,4 @@
-"""Topics of the stack in, one :class:`~spacerobot_ros.viewer.state.StackState` out.
+"""Collects topics of the stack into one :class:`~spacerobot_ros.viewer.state.StackState`.
 
 The plant publishes its state hundreds or thousands of times a second; a page is drawn twenty times
 a second. Streams are therefore subscribed by a node that is not spun: the middleware keeps the last
@@ -40,7 +40,7 @@ from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.viewer.state import Firing, Measured, Momenta, Part, StackState
 
 LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Keeps the last message only; no publisher waits for an acknowledgement."""
+"""QoS of streams: only the last message is kept, without acknowledgement."""
 
 _SILENT_AFTER = 1.5
 """Wall time without a heartbeat after which an active node counts as silent, s."""
@@ -124,7 +124,7 @@ class Listener:
         self._beats: dict[str, _Beat] = {}
         self._statuses: dict[str, Any] = {}
         self._reporters: dict[str, str] = {}
-        """Full name of the node that published each status."""
+        """Full name of the node that published a status, by kind of status."""
         self._hidden: dict[str, str] = {}
         """Nodes whose reports are hidden, and the node whose next heartbeat shows them again."""
         self._last_call = time.monotonic()
@@ -149,7 +149,7 @@ class Listener:
             )
 
     def forget_state(self) -> None:
-        """Drop the state, for another robot."""
+        """Drop the received state when the robot changes."""
         self._pose: Array | None = None
         self._stamp_s, self._came_at = 0.0, -math.inf
         self._q: tuple[Array, Array, Array] | None = None
@@ -248,7 +248,7 @@ class Listener:
             if late > _LONGEST_EXPECTED_DELAY_NS:
                 self._expected_momenta = None
             elif late > 0:
-                return  # The next call has a pair.
+                return  # The next call receives a complete pair.
         if self._expected_momenta is not None:
             apart = self._expected.sent_ns - self._momentum.sent_ns
             self._least_apart_ns = min(self._least_apart_ns, apart)
@@ -265,7 +265,7 @@ class Listener:
     def _take_joints(self, message: JointState) -> None:
         places = {name: i for i, name in enumerate(message.name)}
         if any(name not in places for name in self._names):
-            return  # A state of another robot.
+            return  # The message is of another robot.
         order = [places[name] for name in self._names]
 
         def read(values: Any) -> Array:
@@ -288,7 +288,7 @@ class Listener:
             try:
                 status = read(dict(message.values), message.message)
             except SpaceRobotError:
-                return  # A status of another kind of node.
+                return  # The status is of another kind of node.
             self._statuses[key] = status
             self._reporters[key] = message.name
             self._hidden.pop(message.name, None)
@@ -310,10 +310,11 @@ class Listener:
         try:
             self._goals[part] = goal_of(message, self._frame)
         except SpaceRobotError:
-            self._goals.pop(part, None)  # Planner or controller report why it is refused.
+            # The planner or the controller reports the refusal of an invalid goal.
+            self._goals.pop(part, None)
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
-        with suppress(ValueError):  # A heartbeat of another package.
+        with suppress(ValueError):  # The heartbeat is of another package.
             pulse = Pulse(message.message)
             self._beats[message.name] = _Beat(time.monotonic(), pulse, message.hardware_id)
             self._hidden = {name: by for name, by in self._hidden.items() if by != message.name}
@@ -321,7 +322,7 @@ class Listener:
     def _hide_lost_nodes(self, now: float) -> None:
         """Hide the reports of nodes that have long been silent, and of a replay that is over."""
         if now - self._last_call > _SILENT_AFTER:
-            # This process was suspended: the others were not silent.
+            # This process was suspended, so the other nodes were not silent.
             gap = now - self._last_call
             self._beats = {n: replace(b, at=b.at + gap) for n, b in self._beats.items()}
         self._last_call = now

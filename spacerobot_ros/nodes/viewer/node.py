@@ -68,7 +68,7 @@ _ROSOUT_QOS = QoSProfile(
     durability=DurabilityPolicy.VOLATILE,
 )
 _LEAST_LOG_LEVEL = 30
-"""Least level of rcl_interfaces/Log that is shown."""
+"""Least level of shown log messages (rcl_interfaces/Log)."""
 
 _GOAL_TOPICS: Mapping[Part, str] = {"base": "goal_pose", "end_effector": "end_effector/goal_pose"}
 
@@ -82,10 +82,10 @@ _SERVICES: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
     Request.PLAY: (("replay",), "pause", False),
     Request.HOLD: (("replay",), "pause", True),
 }
-"""Of each request the nodes, their service, and its data (None: it is a trigger)."""
+"""For each request of the page: nodes, name of their service, and its data (None: Trigger)."""
 
 _NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
-"""Nodes whose parameters are read."""
+"""Nodes whose parameters the page reads."""
 
 _LONGEST_MEETING = 4.0
 """Wall time that a goal waits for subscribers that are known but not matched yet, s."""
@@ -175,7 +175,7 @@ class ViewerNode(FlightNode):
         return f"Serves the page at {self.url}, drawn {self.config.update_rate:g} times a second."
 
     def deactivate(self) -> None:
-        """Stop drawing; the page stays as it is."""
+        """Stop updating the page, which keeps its content."""
         self.destroy_timer(self._timer)
 
     def cleanup(self) -> None:
@@ -210,7 +210,7 @@ class ViewerNode(FlightNode):
         if planner_state is not self._planner_state:
             self._planner_state = planner_state
             if planner_state not in (PlannerState.PLANNING, PlannerState.EXECUTING):
-                self._page.editor.touch(now)  # The robot is elsewhere, or nobody plans.
+                self._page.editor.touch(now)  # The robot has moved, or no planner runs.
         self._send_goals(state, now)
         self._check_goal(state, now)
 
@@ -242,7 +242,7 @@ class ViewerNode(FlightNode):
         if message.data == self._urdf:
             return
         self._urdf = message.data
-        self._checker.cancel()  # The question is about another robot.
+        self._checker.cancel()  # The goal check is for another robot.
         self._goals_to_send = None
         try:
             self._robot = parse_robot(message.data)
@@ -284,7 +284,7 @@ class ViewerNode(FlightNode):
         # The topic is the same in all namespaces, and loggers have dots for slashes.
         own = self.get_namespace().strip("/").replace("/", ".")
         if own and not message.name.startswith(f"{own}."):
-            return  # Of another stack.
+            return  # The log line is of another stack.
         if message.level >= _LEAST_LOG_LEVEL and message.name != self.get_logger().name:
             level = 1 if message.level == _LEAST_LOG_LEVEL else 2
             self._note(printable(message.msg), level, printable(message.name))
@@ -298,7 +298,7 @@ class ViewerNode(FlightNode):
         """Request the parameters of a node; again after a request in progress."""
         name, before = self._full_names[key], self._requests.get(key)
         if before is not None and before.name == name:
-            # The request before is still open: an answer that is never taken would block that node.
+            # The earlier request is still open; an unread answer would block the node.
             self._requests_to_repeat.add(key)
             return
         if before is not None:
@@ -396,14 +396,14 @@ class ViewerNode(FlightNode):
         self._sent += 1
         flag = time.time_ns() // _MICROSECOND_NS * _MICROSECOND_NS % _MILLISECOND_NS
         time_ns = self._listener.time_ns() + flag + self._sent % 1000
-        # Without it planners keep the joint positions of an earlier goal, perhaps of another tool.
+        # An empty message resets the joint positions that another goal may have required.
         names = () if self._robot is None else self._robot.joint_names
         self._shape_topic.publish(shape_message(goals["base"], names))
         for part, goal in goals.items():
             message = goal_message(goal, self.config.world_frame, time_ns)
             self._goal_topics[part].publish(message)
         readers = self._goal_topics["base"].get_subscription_count()
-        # One of them belongs to this node.
+        # One of the publishers belongs to this node.
         if readers <= 1:
             self._note("No planner or controller takes the goal: none is running.", 2, "page")
         else:
@@ -443,7 +443,7 @@ class ViewerNode(FlightNode):
         return self._clients_by_name[key]
 
     def _on_answer(self, name: str, future: Any) -> None:
-        with suppress(Exception):  # The service has ended.
+        with suppress(Exception):  # The service no longer exists.
             answer = future.result()
             self._note(answer.message, 0 if answer.success else 2, name)
 
