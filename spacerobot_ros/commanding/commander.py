@@ -36,13 +36,13 @@ from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.simulation.status import PlantStatus
 
 _STANDSTILL_TIME = 0.005
-"""Wall s without an answer after which only the last of the states that wait is answered."""
+"""Wall time (s) without an answer after which only the last waiting state is answered."""
 
 _REPORT_PERIOD = 1.0
-"""Least wall s between two warnings about ignored states."""
+"""Shortest wall time between two warnings about ignored states, s."""
 
 _FAULT_LOG_PERIOD = 5.0
-"""Least wall s between two lines about the same fault of messages."""
+"""Shortest wall time between two log lines about one kind of faulty message, s."""
 
 LogLevel = Literal["debug", "info", "warning", "error"]
 
@@ -53,14 +53,14 @@ class Activity(Enum):
     INACTIVE = "inactive"
     ACTIVE = "active"
     DECIDED = "decided"
-    """It was to stop with the decision about a goal (``stop_when_decided``)."""
+    """The commander has stopped after a decision about its goal (``stop_when_decided``)."""
 
 
 class CommanderHost(Protocol):
     """The surroundings of a commander: a node, a loop without ROS, or a test."""
 
     def send_command(self, stamp_ns: int) -> None:
-        """Send the present values of the commander as the answer to the state of this stamp."""
+        """Send the commander's present values as the answer to the state with a stamp."""
 
     def publish_status(self, status: Any) -> None:
         """Publish a status of the goal."""
@@ -69,7 +69,7 @@ class CommanderHost(Protocol):
         """Publish an event."""
 
     def announce(self, start: ScheduleStart) -> None:
-        """Publish a schedule that begins; only a planner has any."""
+        """Publish a schedule that begins; only planners have schedules."""
 
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""
@@ -78,19 +78,19 @@ class CommanderHost(Protocol):
         """Whether a publisher of odom, or of a reference, is connected."""
 
     def waiting_states(self) -> tuple[Iterable[Stamped], Iterable[Stamped]]:
-        """Return the odoms and joints that have come and were not given to the commander yet."""
+        """Return received odoms and joints that the commander does not have yet."""
 
 
 class StateDecoder(Protocol):
     """Reads the messages of one robot, which are opaque to a commander."""
 
     q: Array
-    """Positions (n,) of the joints that were accepted last, m or rad."""
+    """Positions (n,) of the latest accepted joints, m or rad."""
     qdot: Array
-    """Their rates (n,), m/s or rad/s."""
+    """Rates (n,) of the latest accepted joints, m/s or rad/s."""
 
     def require(self, joints: Any) -> None:
-        """Refuse joints of another robot: CommandError."""
+        """Refuse joint states of another robot: CommandError."""
 
     def accept(self, joints: Any) -> int:
         """Read joints into ``q`` and ``qdot``; return their stamp, ns, or raise CommandError."""
@@ -105,7 +105,7 @@ class StateDecoder(Protocol):
 class StateArrays:
     """A state as arrays: joints, and where it is measured the base; all messages in one."""
 
-    # One is made for every state: a frozen dataclass takes four times as long.
+    # Every state makes an object, and a frozen dataclass would take four times as long.
     __slots__ = ("pose", "q", "qdot", "stamp_ns", "twist")
 
     def __init__(
@@ -129,7 +129,7 @@ class ArrayDecoder:
         """Accept any joints."""
 
     def accept(self, joints: StateArrays) -> int:
-        """Take the joints as they are."""
+        """Store the joints unchanged."""
         self.q, self.qdot = joints.q, joints.qdot
         return joints.stamp_ns
 
@@ -145,7 +145,7 @@ class ArrayDecoder:
 
 
 class Commander(ABC):
-    """The part that planners and controllers share.
+    """Base class of the commanders: planner and controller.
 
     States are answered while the commander is active and knows its robot, and only those of the
     plant's present time (:class:`StampFilter`). Goals that come before the robot wait for it. All
@@ -186,11 +186,11 @@ class Commander(ABC):
         self._goal_file = GoalFile(config.resume_file, goal_keys)
         self._goal_ids = GoalIds()
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
-        """Goals that have come before the robot."""
+        """Goals that were received before the robot's description."""
         self._answer_time = clock()
         self._ignored_reported, self._next_report = 0, 0.0
         self._fault_log_times: dict[str, float] = {}
-        """By kind of fault the wall time of the last line about it, s."""
+        """Wall time of the last log line by kind of fault, s."""
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -215,14 +215,14 @@ class Commander(ABC):
             self._submit_goal(key, goal)
 
     def leave_robot(self, why: str) -> None:
-        """Give up the goals and the robot; goals wait for another one."""
+        """Give up the goals and the robot; later goals wait for another robot."""
         if self.executive is not None:
             self._give_up_goals(PlantStopped(why))
             self._stop_executive()
         self.robot = self.executive = self._decoder = None
 
     def activate(self) -> None:
-        """Answer states from now on; resume the goals that an earlier end cut off.
+        """Answer states from now on; resume the goals that an earlier process left undecided.
 
         Raises
         ------
@@ -231,11 +231,11 @@ class Commander(ABC):
         """
         self._resume_goals(self._goal_file.load())
         self.activity = Activity.ACTIVE
-        # A lockstep plant may have been waiting for an answer since before.
+        # A lockstep plant may already wait for an answer.
         self.answer()
 
     def deactivate(self) -> None:
-        """Give up the goals and command nothing any more; the file of goals stays."""
+        """Give up the goals and stop commanding; the file of goals stays."""
         if self.activity is not Activity.INACTIVE and self.executive is not None:
             self._stop_executive()
         self.activity, self._waiting_goals = Activity.INACTIVE, {}
@@ -245,7 +245,7 @@ class Commander(ABC):
     def receive_goal(
         self, key: str, sec: int, nanosec: int, read: Callable[[], Goal]
     ) -> IdentifiedGoal | None:
-        """Accept or refuse a goal; either way a status or the answers to states tell.
+        """Accept or refuse a goal; a status or the next answers report the result.
 
         Parameters
         ----------
@@ -276,7 +276,7 @@ class Commander(ABC):
         return accepted
 
     def abort(self) -> str | None:
-        """Give up all goals; return the message of the answer, None where there was no goal."""
+        """Give up all goals; return the message of the answer, None without a goal."""
         if self._waiting_goals:
             message = "Aborted on request, before the robot was known."
             self._abort_waiting(message)
@@ -288,7 +288,7 @@ class Commander(ABC):
     def _accept_goal(self, key: str, goal: IdentifiedGoal) -> None:
         if self.executive is None:
             self._waiting_goals[key] = goal
-            self._report_waiting(goal, "The goal waits for a robot on robot_description.")
+            self._report_waiting_goal(goal, "The goal waits for a robot on robot_description.")
         else:
             self._submit_goal(key, goal)
 
@@ -296,14 +296,14 @@ class Commander(ABC):
         self._publish_decision(self._make_status("refused", message, goal_id))
 
     def _abort_waiting(self, message: str) -> None:
-        """Give up the goals that wait for the robot."""
+        """Give up the goals that wait for a robot."""
         *_, goal = self._waiting_goals.values()
         self._waiting_goals = {}
         self._goal_file.delete()
         self._publish_decision(self._make_status("aborted", message, goal.goal_id))
 
     def _publish_decision(self, status: Status) -> None:
-        """Publish a status, and the event where it decides a goal."""
+        """Publish a status, and an event if the status decides a goal."""
         self._publish_status(status)
         event = decision_event(status)
         if event is not None:
@@ -317,12 +317,12 @@ class Commander(ABC):
     # -- states -------------------------------------------------------------------------------
 
     def receive_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Take an odom as it comes; those of another time are set aside."""
+        """Take a received odom; set it aside if its stamp belongs to another time."""
         if self.stamps.admits_odom(stamp_ns, odom):
             self.take_odom(stamp_ns, odom)
 
     def receive_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Take joints as they come: those of another time are set aside, and late ones skipped."""
+        """Take received joints: those of another time are set aside, and late ones skipped."""
         if self._clock() - self._answer_time > _STANDSTILL_TIME:
             self._answer_last_state(Stamped(stamp_ns, joints))
         elif self._is_of_robot(joints) and self.stamps.admits(stamp_ns, joints):
@@ -330,7 +330,7 @@ class Commander(ABC):
         self._answer_time = self._clock()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Take an odom of the present time, and answer the state that it completes."""
+        """Take an odom of the present time, and answer its state if complete."""
         if self.states.put_odom(stamp_ns, odom):
             self._log_fault(
                 "contradiction",
@@ -341,12 +341,12 @@ class Commander(ABC):
             self.answer()
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Take joints of the present time, and answer the state that they complete."""
+        """Take joints of the present time, and answer their state if complete."""
         self.states.put_joints(stamp_ns, joints)
         self.answer()
 
     def take_accepted_jump(self) -> str:
-        """Take a state that was set aside once its time is accepted; to be called ten times a s.
+        """Take the set-aside state once its time is accepted; call this ten times per second.
 
         Returns
         -------
@@ -354,7 +354,7 @@ class Commander(ABC):
             A warning about messages that were ignored, at most once a second; empty: none.
         """
         stamps = self.stamps
-        # A plant that is paused publishes nothing that could contradict it.
+        # A paused plant publishes no state that could contradict a jump.
         jump = None if self.plant.paused else stamps.accepted_jump()
         if jump is not None:
             odom, joints = jump
@@ -369,7 +369,7 @@ class Commander(ABC):
         return ""
 
     def _answer_last_state(self, joints: Stamped) -> None:
-        """Answer only the last of the states that wait after this process stood still.
+        """Answer only the last waiting state after this process stood still.
 
         An answer to one before it comes too late, and the motion of the joints before the first
         answer does not tell whether they obey it.
@@ -395,7 +395,7 @@ class Commander(ABC):
                 self.take_joints(*each)
 
     def _is_of_robot(self, joints: Any) -> bool:
-        # Those of another robot neither tell the time nor take the place of this one's.
+        # Joint states of another robot neither set the time nor replace this robot's.
         try:
             if self._decoder is not None:
                 self._decoder.require(joints)
@@ -405,7 +405,7 @@ class Commander(ABC):
         return True
 
     def _log_fault(self, kind: str, message: str) -> None:
-        """Log a fault of messages, which may come with each of them."""
+        """Log a fault of messages, at most once a period for each kind."""
         now = self._clock()
         if now - self._fault_log_times.get(kind, -_FAULT_LOG_PERIOD) >= _FAULT_LOG_PERIOD:
             self._fault_log_times[kind] = now
@@ -414,7 +414,7 @@ class Commander(ABC):
     # -- the plant ----------------------------------------------------------------------------
 
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
-        """React to a status of the plant of this name."""
+        """React to a status of the named plant."""
         for change in self.plant.take(status, name):
             if isinstance(change, PlantStopped):
                 self._give_up_goals(change)
@@ -442,7 +442,7 @@ class Commander(ABC):
 
     @abstractmethod
     def _make_status(self, state: str, message: str, goal_id: str) -> Status:
-        """Return the status of a goal that the executive does not know."""
+        """Return a status of a goal that the executive does not have."""
 
     @abstractmethod
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
@@ -450,7 +450,7 @@ class Commander(ABC):
 
     @abstractmethod
     def _stop_executive(self) -> None:
-        """Give up everything that the executive does."""
+        """Stop the executive, which gives up its goals."""
 
     @abstractmethod
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
@@ -462,11 +462,11 @@ class Commander(ABC):
 
     @abstractmethod
     def _abort_goal(self) -> str | None:
-        """Have the executive give up its goals; return the reaction of the robot, for the user."""
+        """Abort the executive's goals; return the reaction of the robot as a message."""
 
     @abstractmethod
     def answer(self) -> None:
-        """Answer the state that is ready, if one is and the commander is active."""
+        """Answer the ready state, if any, while the commander is active."""
 
     @abstractmethod
     def _react_to_change(self, change: PlantChange) -> None:
@@ -474,14 +474,14 @@ class Commander(ABC):
 
     @abstractmethod
     def _tell_plant_state(self) -> None:
-        """Have the executive know whether the plant obeys."""
+        """Tell the executive whether the plant obeys commands."""
 
     def _awaits_odom(self) -> bool:
-        """Whether an odom that comes after the joints of its state matters."""
+        """Whether the commander uses an odom that comes after the joints of its state."""
         return True
 
-    def _report_waiting(self, goal: IdentifiedGoal, message: str) -> None:  # noqa: B027
-        """Report a goal that nothing is done for yet."""
+    def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:  # noqa: B027
+        """Report that a goal waits, by a status with a message."""
 
     def _pass_on_outputs(self) -> None:  # noqa: B027
-        """Pass on the outputs that the executive has collected."""
+        """Pass the collected outputs of the executive to the host."""

@@ -22,9 +22,9 @@ from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.times import SECOND
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
-"""Topics of references for a controller; where one has a publisher, every state waits for it."""
+"""Topics of references for a controller; states wait for each topic that has a publisher."""
 
-# Python looks up the member of an enum as slowly as it calls a function; these are for every state.
+# Constants save the slow look-up of enum members for every state.
 _ACTIVE = Activity.ACTIVE
 _WHOLE = Pairing.WHOLE
 
@@ -66,7 +66,7 @@ class ControllerCommander(Commander):
         super().activate()
 
     def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Take a reference, and answer the state that it completes."""
+        """Take a reference, and answer its state if complete."""
         self.states.put_required(topic, stamp_ns, message)
         self.answer()
 
@@ -76,7 +76,8 @@ class ControllerCommander(Commander):
         if self.active and self.executive is not None and not self._waits_for_first_pose():
             overdue = self.states.overdue()
         if overdue is not None:
-            # An answer to a lost pose would come a tick late; the estimate goes on from that state.
+            # A late answer would be refused, so the state without a pose only advances the
+            # estimate.
             self._answer_state(overdue, send=overdue is _WHOLE)
         super().take_joints(stamp_ns, joints)
 
@@ -102,7 +103,7 @@ class ControllerCommander(Commander):
         else:
             self.executive.resume(saved)
         if saved:
-            self.host.log("info", "Going on to an earlier goal.")
+            self.host.log("info", "Resuming an earlier goal.")
 
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None
@@ -135,7 +136,7 @@ class ControllerCommander(Commander):
             self.executive.plant_blocked = bool(self.plant.blocked)
 
     def _waits_for_first_pose(self) -> bool:
-        """Whether the state before came when odom was not connected yet: its pose is not lost."""
+        """Whether the last state came before odom was connected: its pose is not lost."""
         if self._pose_has_come:
             return False
         before, self._odom_was_connected = self._odom_was_connected, self.host.has_publisher("odom")
@@ -176,7 +177,7 @@ class ControllerCommander(Commander):
         executive.evaluate(now, result)
 
     def _reference(self, decoder: StateDecoder) -> Reference | None:
-        """Return the reference from outside for this state; None if there is none."""
+        """Return the external reference for this state; None without external references."""
         base, joints = self.states.latest(BASE_REFERENCE), self.states.latest(JOINT_REFERENCE)
         if base is None and joints is None:
             return None

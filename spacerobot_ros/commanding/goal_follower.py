@@ -32,7 +32,7 @@ class GoalFollower:
         self.goal_id = goal_id
         self._unnamed = unnamed
         self.gait: PlannerStatus | None = None
-        """The planner's status when its first schedule for the goal began."""
+        """The planner's status at the start of its first schedule for the goal."""
         self.decision: Status | None = None
         """The status that decided the goal; None: it is still pursued."""
 
@@ -43,7 +43,7 @@ class GoalFollower:
         return status.goal_id == self.goal_id or (self._unnamed and not status.goal_id)
 
     def take(self, status: Status) -> bool:
-        """Take the next status; return whether it is the one that decides the goal."""
+        """Take the next status; return whether it decides the goal."""
         if self.decision is not None or not self.concerns(status):
             return False
         if self.gait is None and status.state is PlannerState.EXECUTING:
@@ -55,7 +55,7 @@ class GoalFollower:
 
 
 def decision_event(status: Status) -> Event | None:
-    """Return the event of a status that decides a goal; None of one that decides nothing."""
+    """Return the event of a status that decides a goal; None for other statuses."""
     if not status.state.decided:
         return None
     kind = EventKind(f"goal_{status.state.value}")

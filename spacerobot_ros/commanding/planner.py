@@ -29,7 +29,7 @@ from spacerobot_ros.planning.execution.status import (
 from spacerobot_ros.planning.execution.tracker import Setpoint
 from spacerobot_ros.planning.execution.worker import PlanningWorker
 
-# Python looks up the member of an enum as slowly as it calls a function; these are for every state.
+# Constants save the slow look-up of enum members for every state.
 _ACTIVE = Activity.ACTIVE
 _WITHOUT_POSE, _LATE_POSE = Pairing.WITHOUT_POSE, Pairing.LATE_POSE
 
@@ -42,7 +42,7 @@ class _MeasuredState:
         self.stamp_ns = 0
         self.odom: Any = None
         self.base_error: CommandError | None = None
-        """Why the last :meth:`base` could not be read."""
+        """The reason why the last :meth:`base` could not be read."""
 
     @property
     def q(self) -> Array:
@@ -91,12 +91,12 @@ class PlannerCommander(Commander):
 
     @property
     def statistics(self) -> PlannerStatistics:
-        """Plans and commands so far."""
+        """Counts of plans and commands so far."""
         return PlannerStatistics() if self.executive is None else self.executive.statistics
 
     @property
     def setpoint(self) -> Setpoint:
-        """Values of the command for the state that was answered last."""
+        """The command that answers the last state."""
         assert self.executive is not None
         return self.executive.setpoint
 
@@ -107,7 +107,7 @@ class PlannerCommander(Commander):
             self.executive.config = config
 
     def interrupt(self) -> None:
-        """Cancel the plan that is being made; may be called in any thread."""
+        """Cancel the requested plan; any thread may call this."""
         if self.executive is not None:
             self.executive.cancel_plan()
 
@@ -129,13 +129,13 @@ class PlannerCommander(Commander):
             self._publish_status(PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose."))
             return
         self._accept_goal(BASE_GOAL_KEY, goal)
-        self._report_waiting(goal, "Resuming an earlier goal.")
+        self._report_waiting_goal(goal, "Resuming an earlier goal.")
 
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None
         self.executive.propose_goal(goal)
 
-    def _report_waiting(self, goal: IdentifiedGoal, message: str) -> None:
+    def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:
         values = goal_values(goal.goal)
         self._publish_status(PlannerStatus(PlannerState.PLANNING, message, goal.goal_id, values))
 
@@ -157,7 +157,7 @@ class PlannerCommander(Commander):
             self.executive.plant_rests = self.plant.rests
 
     def _awaits_odom(self) -> bool:
-        # With a goal to plan for or to evaluate, even a pose that comes after its joints counts.
+        # A goal to plan for or to evaluate needs every pose, even after its joints.
         return self.executive is not None and self.executive.measuring
 
     def answer(self) -> None:
@@ -178,7 +178,7 @@ class PlannerCommander(Commander):
             self._log_fault("state", f"joint_states: {error}.")
             return
         if pairing is _LATE_POSE:
-            # The state was answered without it, and is planned from when the next joints come.
+            # The state was answered without its pose; a plan uses the pose at the next joints.
             executive.add_base_measurement(measured)
         else:
             executive.update(measured)

@@ -16,7 +16,7 @@ from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
 
 _NO_STAMP = -1
-"""The stamp of no message; that of a message is never negative."""
+"""The stamp that stands for a missing message; stamps of messages are never negative."""
 
 
 class Stamped(NamedTuple):
@@ -32,16 +32,16 @@ _NO_MESSAGE = Stamped(_NO_STAMP, None)
 # -- states of the present time ---------------------------------------------------------------
 
 _MIN_JUMP_DOUBT = 0.2
-"""Least wall s without a state of the old time before a time jump is accepted."""
+"""Shortest wall time without a state of the old time before a time jump is accepted, s."""
 
 _STEP_SLACK = 1.5
 """Largest distance between two states without a loss, in steps of the plant."""
 
 _PACE_SLACK = 2.0
-"""Largest ratio of the time that lost states took to the time that its pace so far explains."""
+"""Largest ratio of the time of lost states to the time expected from the plant's pace."""
 
 _MIN_CHECKS = 2
-"""Looks without a state of the old time before a time jump is accepted."""
+"""Number of checks without a state of the old time before a time jump is accepted."""
 
 _MAX_STEP_PERIODS = 100
 """Largest step of a plant with another rate, in control periods."""
@@ -49,17 +49,17 @@ _MAX_STEP_PERIODS = 100
 
 @dataclass
 class _PendingJump:
-    """A state that is stamped with another time, set aside."""
+    """The latest state with a stamp of another time, set aside."""
 
     since: float
-    """Wall time at which the first state of that time came, s."""
+    """Wall time at which the first state of the other time arrived, s."""
     joints: Stamped
     checks: int = 0
-    """Calls of :meth:`StampFilter.accepted_jump` since then."""
+    """Number of calls of :meth:`StampFilter.accepted_jump` since ``since``."""
 
 
 class StampFilter:
-    """Separates states of the plant's present time from those that are stamped with another one.
+    """Separates states of the plant's present time from states stamped with another time.
 
     A stamp is plausible
 
@@ -84,25 +84,25 @@ class StampFilter:
         self._clock = clock
         self._period_ns = round(control_period * SECOND)
         self._step_ns = self._period_ns
-        """Time between two states as far as is known, ns."""
+        """Time between two states, as known so far, ns."""
         self._max_step_ns = -1
         """Largest plausible step without a loss, ns; negative before the first state."""
         self._previous_ns, self._admission_wall = _NO_STAMP, 0.0
         self._origin_ns, self._origin_wall = 0, 0.0
-        """The first state of this time, from which its pace is measured."""
+        """The first state of the present time, from which the plant's pace is measured."""
         self._pending_jump: _PendingJump | None = None
         self._jump_odom = _NO_MESSAGE
         self._last_jump_ns = 0
-        """Size of the jump that was accepted last, ns."""
+        """Size of the latest accepted jump, ns."""
         self.now_ns = 0
-        """Stamp of the last state that was admitted, ns; 0 before the first."""
+        """Stamp of the latest admitted state, ns; 0 before the first state."""
         self.ignored = 0
         """Number of states and poses that were ignored because of their stamps."""
         self.last_ignored = ""
-        """Message for the user about the last one."""
+        """Message for the user about the latest ignored state."""
 
     def admits(self, stamp_ns: int, joints: Any) -> bool:
-        """Return whether joints are of the present time; others are set aside."""
+        """Return whether joints are of the present time; set other joints aside."""
         if not 0 <= stamp_ns - self.now_ns <= self._max_step_ns and not self._loss_explains(
             stamp_ns
         ):
@@ -115,12 +115,12 @@ class StampFilter:
         return True
 
     def would_admit(self, stamp_ns: int) -> bool:
-        """Return whether joints with this stamp would be admitted, and change nothing."""
+        """Return whether joints with a stamp would be admitted, without a change."""
         ahead = stamp_ns - self.now_ns
         return 0 <= ahead <= max(self._max_step_ns, self._max_loss_ns(self._clock()))
 
     def admits_odom(self, stamp_ns: int, odom: Any) -> bool:
-        """Return whether a pose is of the present time; others are set aside.
+        """Return whether a pose is of the present time; set other poses aside.
 
         It comes before the joints of its stamp, or after them.
         """
@@ -141,7 +141,7 @@ class StampFilter:
             self._origin_wall = self._admission_wall
 
     def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:
-        """Return odom (if it came) and joints that were set aside and whose time is now accepted.
+        """Return set-aside odom (or None) and joints once their time is accepted.
 
         To be called several times a second; None: no jump is accepted.
         """
@@ -155,7 +155,7 @@ class StampFilter:
         stamp, now = jump.joints.stamp_ns, self._clock()
         size = stamp - self.now_ns
         if size == self._last_jump_ns and 0 < size <= _MAX_STEP_PERIODS * self._period_ns:
-            # The plant's rate is another one than this commander's.
+            # The plant's rate differs from this commander's.
             self._step_ns = size
             self._max_step_ns = round(_STEP_SLACK * size)
         self._last_jump_ns = size
@@ -165,7 +165,7 @@ class StampFilter:
         return (odom if odom.stamp_ns == stamp else None), jump.joints
 
     def _loss_explains(self, stamp_ns: int) -> bool:
-        """Whether a stamp is that of a first state, or lost messages explain it."""
+        """Whether a stamp belongs to a first state, or lost messages explain the stamp."""
         now = self._clock()
         if self._max_step_ns < 0:
             self._max_step_ns = round(_STEP_SLACK * self._step_ns)
@@ -176,22 +176,22 @@ class StampFilter:
 
     def _max_loss_ns(self, now: float) -> float:
         """Return the largest plausible step at a wall time where messages were lost, ns."""
-        return self._max_step_ns + _PACE_SLACK * self._pace * (now - self._admission_wall)
+        return self._max_step_ns + _PACE_SLACK * self._simulated_pace * (now - self._admission_wall)
 
     @property
-    def _pace(self) -> float:
-        """Simulated ns per wall s of this time so far."""
+    def _simulated_pace(self) -> float:
+        """Pace of the present time: simulated ns per wall s."""
         elapsed = self._admission_wall - self._origin_wall
         return (self.now_ns - self._origin_ns) / elapsed if elapsed > 0 else 0.0
 
     @property
     def _jump_doubt(self) -> float:
-        """Wall s without a state of the old time after which a jump is accepted."""
-        pace = self._pace
+        """Wall time (s) without a state of the old time after which a jump is accepted."""
+        pace = self._simulated_pace
         return max(_MIN_JUMP_DOUBT, 4 * self._step_ns / pace if pace > 0 else 0.0)
 
     def _set_aside(self, joints: Stamped) -> None:
-        """Keep a state of another time; it replaces the one before."""
+        """Keep a state of another time, in place of an earlier kept state."""
         jump = self._pending_jump
         if jump is not None and 0 <= joints.stamp_ns - jump.joints.stamp_ns <= self._max_step_ns:
             jump.joints = joints
@@ -199,7 +199,7 @@ class StampFilter:
             self._pending_jump = _PendingJump(self._clock(), joints)
 
     def _ignore_jump(self) -> None:
-        """Count the messages that were set aside as ignored: the old time goes on."""
+        """Count the set-aside messages as ignored: the old time goes on."""
         joints = _NO_MESSAGE if self._pending_jump is None else self._pending_jump.joints
         for name, given in (("joint_states", joints), ("odom", self._jump_odom)):
             if given.message is None or given.stamp_ns == self.now_ns:
@@ -217,7 +217,7 @@ class StampFilter:
 
 
 class Pairing(str, Enum):
-    """Which messages of a state a :class:`StateSynchroniser` hands over."""
+    """The messages of a state that a :class:`StateSynchroniser` hands over."""
 
     WHOLE = "whole"
     """Joints and odom of one stamp."""
@@ -226,10 +226,10 @@ class Pairing(str, Enum):
     """Joints alone: their odom has not come."""
 
     LATE_POSE = "late pose"
-    """Odom of a state that was handed over without it before."""
+    """Odom of a state that was handed over without odom before."""
 
 
-# Python looks up the member of an enum as slowly as it calls a function; these are for every state.
+# Constants save the slow look-up of enum members for every state.
 _WHOLE, _WITHOUT_POSE, _LATE_POSE = Pairing.WHOLE, Pairing.WITHOUT_POSE, Pairing.LATE_POSE
 
 
@@ -257,16 +257,16 @@ class StateSynchroniser:
     def __init__(self, *, pose_required: bool) -> None:
         self._pose_required = pose_required
         self.odom: Any = None
-        """The latest odom; None before the first."""
+        """The latest odom; None before the first odom."""
         self.joints: Any = None
-        """The latest joints; None before the first."""
+        """The latest joints; None before the first joints."""
         self._odom_ns = self._joints_ns = _NO_STAMP
         self._odom_fresh = self._joints_fresh = self._without_pose = False
         self._required: dict[str, Stamped] = {}
         """Latest messages of the topics that are required beside odom and joints."""
 
     def require(self, topic: str, *, required: bool = True) -> None:
-        """Have states wait for a message on one more topic from now on, or no longer."""
+        """Set whether states wait for a message on a further topic."""
         if not required:
             self._required.pop(topic, None)
         else:
@@ -284,7 +284,7 @@ class StateSynchroniser:
         return contradicts
 
     def forget_pose(self) -> None:
-        """Take no later odom for a contradiction: the plant shows another state of one time.
+        """Forget the latest odom: the plant shows another state of the same time.
 
         Nor is it the pose of joints that were handed over before.
         """
@@ -298,15 +298,15 @@ class StateSynchroniser:
         self._joints_fresh = True
 
     def put_required(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Accept a message of another topic, which is required from now on."""
+        """Accept a message of a further topic, and require the topic from now on."""
         self._required[topic] = Stamped(stamp_ns, message)
 
     def latest(self, topic: str) -> Any:
-        """Return the latest message of a required topic; None if there is none."""
+        """Return the latest message of a required topic; None before its first message."""
         return self._required.get(topic, _NO_MESSAGE).message
 
     def ready(self) -> Pairing | None:
-        """Hand over the state that is ready; None if there is none, or it was handed over."""
+        """Hand over a ready state once; None without a new ready state."""
         stamp = self._joints_ns
         together = stamp == self._odom_ns
         if not self._pose_required:
@@ -326,7 +326,7 @@ class StateSynchroniser:
         return None
 
     def overdue(self) -> Pairing | None:
-        """Hand over a state that was never ready; to be called when the next joints come.
+        """Hand over a state that was never ready; call this before the next joints are put.
 
         :attr:`Pairing.WITHOUT_POSE`: its odom is missing, and states are ready without from now
         on. :attr:`Pairing.WHOLE`: another required topic is silent.
@@ -361,7 +361,7 @@ class PlantStopped:
 
 
 class PlantChange(Enum):
-    """Other changes that a plant reports."""
+    """Changes other than a stop that a plant reports."""
 
     OBEYS = "obeys"
     """Commands pass again."""
@@ -378,7 +378,7 @@ class PlantListener:
 
     @property
     def blocked(self) -> str:
-        """Reason why no goal is accepted now, for the user; empty: goals are accepted."""
+        """Message on why goals are refused at present; empty: goals are accepted."""
         status = self._status
         if status is None:
             return ""
@@ -400,7 +400,7 @@ class PlantListener:
         return self._status is not None and self._status.state is PlantState.PAUSED
 
     def take(self, status: PlantStatus, name: str = "plant") -> list[PlantStopped | PlantChange]:
-        """Take the next status of the plant of this name; return the changes to react to.
+        """Take the next status of the named plant; return the changes to react to.
 
         Statuses may be missed: the counters of a plant tell the changes in between.
         """
@@ -429,7 +429,7 @@ class PlantListener:
 
 
 def _timeout_rest(status: PlantStatus) -> PlantStopped | None:
-    """Return since when a plant rests, or has rested; None if its times are not finite."""
+    """Return the stop of a plant after a timeout; None if its times are not finite."""
     last, since = status.last_command_s, status.time_s
     last = since if last is None else last
     why = status.message

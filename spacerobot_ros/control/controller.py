@@ -29,11 +29,11 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.space_robot import SpaceRobot
 
 _BRAKE_RATE = 2.0
-"""Rate at which joints are brought to rest when the base is no longer known, 1/s."""
+"""Decay rate of joint motion when the base is no longer known, 1/s."""
 
 
 _MAX_HELD_PERIODS = 20
-"""Largest number of control periods between two commands; a longer gap is a jump of time."""
+"""Longest gap between two commands, in control periods; longer gaps are jumps of time."""
 
 
 class Mode(str, Enum):
@@ -114,7 +114,7 @@ class CoordinatedController:
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
     ) -> None:
-        """Start towards new goals; a group without a new goal keeps its earlier one.
+        """Start towards new goals; a group without a new goal keeps its earlier goal.
 
         A robot that was brought to rest has no earlier goals: such a group stays where it is.
         """
@@ -133,7 +133,7 @@ class CoordinatedController:
         self._began = time
 
     def begin_anew(self, time: float, state: ControlState) -> None:
-        """Start towards the present goals from the measured pose, not from the reference."""
+        """Restart towards the present goals from the measured pose instead of the reference."""
         goal, self.profile = self.goal, None
         joints = None if goal.joints is None else goal.joints.q
         self.set_goals(time, state, base=goal.base, end_effector=goal.end_effector, joints=joints)
@@ -148,11 +148,11 @@ class CoordinatedController:
         self.coming_to_rest = True
 
     def shift_time(self, seconds: float) -> None:
-        """Continue the reference as if time had not jumped by some s."""
+        """Shift the start of the reference by a jump of time (s)."""
         self._began += seconds
 
     def follow(self, reference: Reference) -> None:
-        """Track an external reference at the next command; the profile serves groups it lacks."""
+        """Track an external reference at the next command; the profile serves all other groups."""
         self._followed = reference
         self.coming_to_rest = False
 
@@ -180,7 +180,7 @@ class CoordinatedController:
                     self._motion,
                 )
                 self._began = time
-            # Evaluated in any case: errors and status are those of the law.
+            # The law is always evaluated, for its errors and status.
             commanded = self.law.command(state, self._reference_at(time))
             if self.coming_to_rest:
                 commanded = self.joint_rate_limits.to_rest(state)
@@ -234,7 +234,7 @@ class CoordinatedController:
         return self.law.outputs.selection.distance(self.law.error)
 
     def distance_to_goal(self) -> OutputDistance:
-        """Return the distance of the last command's outputs from where the reference ends."""
+        """Return the distance of the last command's outputs from the end of the reference."""
         return self.distance_between(self.law.state, self.goal)
 
     def distance_between(self, state: ControlState, goal: Reference) -> OutputDistance:
@@ -307,7 +307,7 @@ class CoordinatedController:
             return None
         if self._estimator is None:
             self._estimator = DeadReckoning(self.law.robot, self._control_period)
-            # A copy of the last measured state: the arrays of a state may be used again.
+            # The last measured state is copied, as callers may reuse its arrays.
             self._estimator.reset(self.law.state)
         if self._estimator.elapsed + self._control_period > self._estimation_time + 1e-9:
             self.mode = Mode.STOPPED

@@ -21,7 +21,7 @@ from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile,
 from spacerobot_ros.times import SECOND
 
 END_EFFECTOR = "end_effector"
-"""Key of the goal of the end-effector; that of the base is ``base``."""
+"""Key of the goal of the end-effector in files of goals."""
 
 GOAL_KEYS = (BASE_GOAL_KEY, END_EFFECTOR)
 """Keys of goals: frames of the robot that goal poses are for."""
@@ -87,14 +87,14 @@ class ControlExecutive:
         self._hold_here = False
         """Whether the robot holds the pose of the next measured state, without a goal."""
         self._begin_anew = False
-        """Whether the goal begins anew at the next measured state."""
+        """Whether the goal restarts at the next measured state."""
         self.plant_blocked = False
         """Whether the plant ignores commands, set by the owner. Each command then holds the pose of
         its state, so that none of them moves the robot when the plant obeys again."""
         self._abort_message = ""
         """The message of the status while the state is aborted."""
         self._pending: dict[str, IdentifiedGoal] = {}
-        """Goals that are accepted and wait for the next measured state."""
+        """Accepted goals that wait for the next measured state."""
         self._abort_requested = False
         self._goal_state = self._reported_state = ControllerState.HOLDING
         self._goal_id = ""
@@ -114,7 +114,7 @@ class ControlExecutive:
 
     @property
     def state(self) -> ControllerState:
-        """The state that is reported."""
+        """The state that statuses report."""
         match self.controller.mode:
             case Mode.MEASURED:
                 return self._goal_state
@@ -153,7 +153,7 @@ class ControlExecutive:
     def refuse(self, message: str, goal_id: str = "") -> None:
         """Report the refusal of a goal; an earlier goal is still pursued."""
         self._publish(ControllerState.REFUSED, message, goal_id)
-        self._decided(EventKind.GOAL_REFUSED, message, ControllerState.REFUSED, goal_id)
+        self._report_decision(EventKind.GOAL_REFUSED, message, ControllerState.REFUSED, goal_id)
 
     def resume(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         """Accept the goals that an earlier controller saved.
@@ -206,7 +206,7 @@ class ControlExecutive:
             return False
         self._give_up(f"Aborted by the plant: {why}")
         self._hold_here = True
-        self._report_abort()  # At once: the next measured state may be long in coming.
+        self._report_abort()  # Reported at once: the next measured state may come late.
         return True
 
     def plant_obeys_again(self) -> None:
@@ -223,7 +223,7 @@ class ControlExecutive:
     def _give_up(self, message: str) -> None:
         """Drop every goal and its file; the message is that of the status from now on."""
         pursued = self._pending or self._goal_state is ControllerState.TRACKING
-        # A decided goal stays decided: without another one the abort is about no goal.
+        # A decided goal stays decided: an abort without an undecided goal has no goal id.
         self._goal_id = self._latest_id() if pursued else ""
         self._pending.clear()
         self._abort_message = message
@@ -233,7 +233,7 @@ class ControlExecutive:
         """Report that every goal has been given up."""
         self._goal_state = self._reported_state = ControllerState.ABORTED
         self._publish(ControllerState.ABORTED, self._abort_message)
-        self._decided(EventKind.GOAL_ABORTED, self._abort_message, ControllerState.ABORTED)
+        self._report_decision(EventKind.GOAL_ABORTED, self._abort_message, ControllerState.ABORTED)
 
     # -- states -------------------------------------------------------------------------------
 
@@ -255,7 +255,7 @@ class ControlExecutive:
             A measurement is not finite.
         """
         if self._time is not None and not 0 <= time - self._time <= self._longest_gap:
-            # Time has jumped: the goal continues as if it had not.
+            # After a jump of time, the goal continues as before the jump.
             jump = time - self._time
             self.controller.shift_time(jump)
             self._monitor.shift_time(jump)
@@ -289,7 +289,7 @@ class ControlExecutive:
             if decision != Decision.NONE:
                 self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
                 self._file.delete()
-                self._decided(kind, self._message(self._goal_state), self._goal_state)
+                self._report_decision(kind, self._message(self._goal_state), self._goal_state)
         state = self.state
         if (
             state is self._reported_state
@@ -305,9 +305,10 @@ class ControlExecutive:
     # -- control that is lost -----------------------------------------------------------------
 
     def _watch_rates(self, qdot: Array) -> None:
-        """Give up if a joint stays far beyond its rate: its motor does not master it."""
+        """Give up all goals if a joint stays far beyond its rate limit: its motor does not master
+        it."""
         lost = self._monitor.check_rates(self.controller.joint_rate_limits.largest_rate_share(qdot))
-        if not lost or self._not_in_charge:
+        if not lost or self._is_not_in_charge:
             return
         rates = self.controller.joint_rate_limits.rates
         joint = int(np.argmax(np.abs(qdot) / rates))
@@ -317,8 +318,8 @@ class ControlExecutive:
         )
 
     def _watch_errors(self) -> None:
-        """Give up if the errors grow far beyond the distance of the goal."""
-        if self._not_in_charge:
+        """Give up all goals if the errors grow far beyond the distance of the goal."""
+        if self._is_not_in_charge:
             return
         if self._error_bounds is None:
             margins = self._config.error_margin
@@ -329,8 +330,8 @@ class ControlExecutive:
             self._lose_control(f"the errors grow, the robot is {away} from the reference")
 
     @property
-    def _not_in_charge(self) -> bool:
-        """Whether the robot moves for another reason than the goals of this controller."""
+    def _is_not_in_charge(self) -> bool:
+        """Whether something other than this controller's goals moves the robot."""
         return bool(self._guided or self.plant_blocked or self.controller.coming_to_rest)
 
     def _lose_control(self, why: str) -> None:
@@ -349,7 +350,7 @@ class ControlExecutive:
         self._abort_requested = self._hold_here = False
 
     def _begin_goals(self, time: float, state: ControlState) -> None:
-        """Start towards the goals that are pending."""
+        """Start towards the pending goals."""
         self._goal_id = self._latest_id()
         goals = {key: pending.goal for key, pending in self._pending.items()}
         self._pending.clear()
@@ -393,10 +394,10 @@ class ControlExecutive:
         about = self._goal_id if goal_id is None else goal_id
         self._report(ControllerStatus(state, message, about, self._command_report))
 
-    def _decided(
+    def _report_decision(
         self, kind: EventKind, message: str, state: ControllerState, goal_id: str | None = None
     ) -> None:
-        """Report the event of a goal that is decided; by default of the present one."""
+        """Report the decision about a goal as an event; by default, about the present goal."""
         about = self._goal_id if goal_id is None else goal_id
         self._report_event(Event(kind, message, state.level, goal_id=about))
 
@@ -428,7 +429,7 @@ def decided_message(state: ControllerState, distance: OutputDistance) -> str:
 
 
 _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
-"""Longest time between two states, s, or in control periods; a longer one is a jump of time."""
+"""Longest gap between two states, s, and in control periods; longer gaps are jumps of time."""
 
 _STATE_AND_EVENT_OF_DECISION = {
     Decision.REACHED: (ControllerState.REACHED, EventKind.GOAL_REACHED),

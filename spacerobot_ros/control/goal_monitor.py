@@ -18,7 +18,7 @@ Scalar = Any
 """A number or a CasADi symbol."""
 
 LOST_RATE = 1.5
-"""Ratio of a joint's rate to its largest rate beyond which control of the joint is lost."""
+"""Ratio of a joint's rate to its rate limit above which control of the joint is lost."""
 
 LOST_STATES = 3
 """Consecutive states beyond a bound after which control is lost: one may be a bad measurement."""
@@ -44,7 +44,7 @@ class Decision(IntEnum):
 
 @dataclass
 class GoalMonitor:
-    """Memory of the states since a goal was begun, and the decision that follows from them.
+    """Summary of the states since a goal began, from which its decision follows.
 
     Attributes
     ----------
@@ -63,15 +63,15 @@ class GoalMonitor:
     astray_states: Scalar = 0
 
     def begin(self, time: Scalar) -> None:
-        """Begin a goal at a time (s); joints that are too fast stay so."""
+        """Begin a goal at a time (s), and keep the count of states with too fast joints."""
         self.started, self.within_since, self.astray_states = time, _NOT_WITHIN, 0
 
     def settle_anew(self) -> None:
-        """Begin the settling time again."""
+        """Restart the settling time."""
         self.within_since = _NOT_WITHIN
 
     def shift_time(self, seconds: Scalar) -> None:
-        """Discount a jump of time (s), which is no progress of the goal."""
+        """Shift the start of the goal by a jump of time (s), and restart the settling time."""
         self.started += seconds
         self.settle_anew()
 

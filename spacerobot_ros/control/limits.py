@@ -22,11 +22,11 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
 _REFERENCE_THRUST_SHARE = 0.5
-"""Share of the thrust for references; feedback and errors of the masses need the rest."""
+"""Share of the thrust for references; feedback and mass errors need the other part."""
 
 
 _MIN_PERIODS_TO_LIMIT = 2
-"""Shortest time in which a joint may reach its largest rate, in control periods: neither the held
+"""Shortest time for a joint to reach its rate limit, in control periods: neither the held
 efforts nor the next ones may carry it beyond, even if the model is slightly wrong."""
 
 _SLOW_RATE_SHARE = 0.5
@@ -113,7 +113,7 @@ class Saturated:
 
     @property
     def limited(self) -> bool:
-        """Whether any limit was active."""
+        """Whether any limit has changed the command."""
         return bool(self.loss.wrench_B.any() or self.loss.tau.any())
 
 
@@ -212,7 +212,7 @@ class JointRateLimits:
     def apply(
         self, state: ControlState, given: Actuation, effort: Array, periods: int = 1
     ) -> Actuation:
-        """Return a command that keeps the rates: the given one, if it does.
+        """Return a command that keeps the joint rates within limits: the given one, if it does.
 
         ``effort`` (n,) are the largest joint efforts, N m or N, which ``given`` keeps; ``periods``
         is the number of control periods for which it will probably be held.

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from spacerobot_ros.scenario import Scenario
 
-_INITIAL_ROWS = 1024
+_INITIAL_ROW_COUNT = 1024
 
 _TRUE_QUANTITIES = ("pose", "twist", "q", "qdot", "effort", "momentum")
 """Quantities that are attributes of a flight."""
@@ -595,7 +595,7 @@ class _GrowingTable:
     """A table that grows by rows."""
 
     def __init__(self, size: int) -> None:
-        self._table = np.empty((_INITIAL_ROWS, size))
+        self._table = np.empty((_INITIAL_ROW_COUNT, size))
         self._count = 0
 
     def next_row(self) -> Array:

@@ -117,7 +117,7 @@ class LawOptions:
 
     singular_value_threshold: float = parameter(
         0.1,
-        "J_z is near singular where its smallest singular value (SI units) is below this",
+        "smallest singular value (SI units) of J_z below which it counts as singular",
         minimum=1e-06,
         maximum=1000000000.0,
     )
@@ -281,7 +281,7 @@ class ControlLaw(ABC):
 
     @abstractmethod
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return the results of the law's function beside the errors and ``J_z``, by name.
+        """Return the expressions of the law's results beside the errors and ``J_z``, by name.
 
         ``actuation`` (6 + n,) is the command: force (N) and torque (N m) at the origin of the base
         link in base components, then the joint efforts; other results are the law's own.

@@ -24,7 +24,7 @@ class ModelBasedOptions(LawOptions):
 
     null_space_damping: float = parameter(
         1.0,
-        "decay rate of motion that moves no output",
+        "decay rate of joint motion that moves no output",
         unit="1/s",
         minimum=0.0,
         maximum=1000000000.0,
@@ -84,7 +84,7 @@ class ModelBasedLaw(ControlLaw):
 
     @property
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
-        """None where a posture pulls: it is the reference's, or the present one."""
+        """The fixed arguments; None with a posture: it is the reference's, or the present one."""
         return None if self.options.posture_stiffness else super().fixed_inputs
 
     def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:

@@ -1,4 +1,4 @@
-"""Archives of arrays, in which manoeuvres are kept."""
+"""Archives of arrays that store manoeuvres."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from spacerobot_ros.model.description import Array
 
 
 def archive_name(key: str) -> str:
-    """Return the name of the file of a hash."""
+    """Return the file name of an archive from the hash of its key."""
     return f"{key[:32]}.npz"
 
 
 def pack_arrays(**arrays: Any) -> bytes:
-    """Return arrays and texts as an archive of numpy."""
+    """Return arrays and texts as the bytes of a numpy archive."""
     file = io.BytesIO()
     np.savez(file, **arrays)
     return file.getvalue()

@@ -50,36 +50,36 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 _ZERO_ROTATION_ANGLE = 1e-9
 
 _SAMPLED_SHAPE_COUNT = 12
-"""Shapes in general position at which a robot is tested."""
+"""Number of sampled shapes in tests of a robot."""
 
 _SINGULAR_VALUE_TOLERANCE = 1e-7
 """Singular values below this share of the largest count as zero."""
 
 _MIN_BASE_TURN = 1e-12
-"""Turn of the base a metre or radian of the joints that is none, rad."""
+"""Turn of the base per metre or radian of the joints that counts as zero, rad."""
 
 _MAX_SHAPE_GUESSES = 8
-"""Shapes from which one that puts the base somewhere is looked for."""
+"""Number of start shapes in the search for a shape with a given centre of mass."""
 
 _INTEGRATION_STEPS, _INTEGRATION_ERROR = 1000, 1e-5
 """Steps in which the turn by one joint is integrated, and the error that this may make, rad."""
 
 _JOINT_LIMIT_ROUNDING = 1e-9
-"""Rounding that a joint may be beyond its limits by, m or rad."""
+"""Rounding error by which a joint may exceed its limits, m or rad."""
 
 _QUADRATURE_NODES = 48
 """Nodes of Gauss and Legendre along the way to a shape."""
 
 _MAX_REPORTED_RANGE_FACTOR = 4.0
-"""Times the range of the joints within which a shape beyond it is worth telling."""
+"""Ratio to the joint range up to which a shape beyond the limits is reported."""
 
 _POSITION_TOLERANCE = 1e-10
-"""Distance from where the base is to be that counts as there, m."""
+"""Distance of the base from its wanted position that counts as zero, m."""
 
 
 @dataclass(frozen=True)
 class GoalSpecification:
-    """The parts of a goal that one robot's manoeuvres reach.
+    """The parts of goals that manoeuvres of one robot control.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class GoalSpecification:
         return self.turning.axes if self.attitude else np.zeros((0, 3))
 
     def require_suitable(self, robot: SpaceRobot) -> None:
-        """Refuse a robot for which no such goal can be planned.
+        """Refuse a robot that can reach no goal in the controlled parts.
 
         Raises
         ------
@@ -180,7 +180,7 @@ class GoalSpecification:
                 )
             if shape is not None and len(self.axes) and not self.turning.loops:
                 turn = self._turn_on_way_to_shape(robot, turn, state.q, shape, tolerance.attitude)
-                # The only joint is in the shape of the goal where the attitude is that of the goal.
+                # With one joint, the goal attitude fixes the final shape.
                 shape = shape if robot.n > 1 else None
         R_WB = matrix_from_quaternion(state.quaternion)
         direction = np.zeros(3) if direction_W is None else R_WB.T @ direction_W
@@ -192,7 +192,7 @@ class GoalSpecification:
                 "The position of the base depends on its attitude: optimal reaches it together "
                 "with the attitude (optimal.base_attitude 1)."
             )
-        # r + R c(q) is the centre of mass and stays: so c(q_f) is known.
+        # The centre of mass r + R c(q) is fixed, which determines c(q_f).
         r_cm = state.position + R_WB @ robot.center_of_mass(state.q)
         center = matrix_from_quaternion(goal.quaternion).T @ (r_cm - goal.position)
         if shape is not None:
@@ -209,13 +209,13 @@ class GoalSpecification:
             robot, limits, state.q, center, POSITION_SLACK * tolerance.position
         )
         center = robot.center_of_mass(likely)
-        # Three coordinates have few shapes for one centre of mass, or one.
+        # With three joints, one centre of mass has at most a few shapes.
         if robot.n <= 3:
             return BoundaryConditions(state.q, turn, likely, likely, None, direction)
         return BoundaryConditions(state.q, turn, likely, None, center, direction)
 
     def require_reachable_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
-        """Refuse attitudes that the joints cannot bring about."""
+        """Refuse attitudes that the joints cannot reach."""
         axes, name = self.turning.axes, robot.description.name
         tilt = swing_angle(turn, axes)
         if tilt > max(tolerance, _ZERO_ROTATION_ANGLE):
@@ -230,7 +230,7 @@ class GoalSpecification:
     def _turn_on_way_to_shape(
         self, robot: SpaceRobot, turn: Array, start: Array, shape: Array, tolerance: float
     ) -> Array:
-        """Return the turn (4,) on all ways to a shape (n,), where loops turn nothing.
+        """Return the turn (4,) on any path to a shape (n,), for robots whose loops turn nothing.
 
         Raises
         ------
@@ -254,7 +254,7 @@ class GoalSpecification:
 
 @dataclass(frozen=True)
 class Turning:
-    """How motions of the joints turn the base.
+    """The turns of the base that motions of the joints cause.
 
     Attributes
     ----------
@@ -274,7 +274,7 @@ class Turning:
 
     @classmethod
     def of(cls, robot: SpaceRobot) -> Turning:
-        """Find out from a few shapes in general position."""
+        """Test a robot at a few shapes in general position."""
         none = np.zeros((0, 3))
         if robot.n == 0:
             return cls(none, moves=False, loops=False)
@@ -293,7 +293,7 @@ class Turning:
 def _require_within_one_joint(
     robot: SpaceRobot, limits: MotionLimits, q: Array, axis: Array, turn: Array, tolerance: float
 ) -> None:
-    """Refuse a turn beyond those between the limits of the only joint, which is at ``q`` (1,).
+    """Refuse a turn that the only joint, at ``q`` (1,), cannot cause within its limits.
 
     The base turns about ``axis`` (3,), to and fro with the joint; the angle is an integral.
     """
@@ -357,7 +357,7 @@ def shape_for_center(
         None was found.
     """
     lower, upper = limits.lower, limits.upper
-    # The solver wants room between its bounds.
+    # The solver needs lower bounds below upper bounds.
     room = 1e-9 * (1 + np.abs(start))
     middle, half = limits.span(start)
     from scipy.optimize import least_squares  # Slow to import, and few goals need it.
@@ -401,7 +401,7 @@ def nearest_for_center(
 
 
 def _shape_without_limits(robot: SpaceRobot, near: Array, wanted: Array) -> Array:
-    """Return a shape by Newton's method, whatever the limits."""
+    """Return a shape by Newton's method, without joint limits."""
     q = near.copy()
     for _ in range(20):
         miss = wanted - robot.center_of_mass(q)
@@ -430,7 +430,7 @@ def _unreachable_center_error(
             "another attitude, or optimal.base_position 2, which ignores the position."
         )
     free = _shape_without_limits(robot, near, wanted)
-    # Three sliders have one shape for a centre of mass.
+    # With three sliders, one centre of mass has one shape.
     if (
         len(sliders_of(robot)) == robot.n == 3
         and _distance_to_center(robot, free, wanted) <= _POSITION_TOLERANCE

@@ -1,4 +1,4 @@
-"""From a smooth trajectory to commands that are held for a tick, and end on the goal exactly.
+"""Turns smooth trajectories into commands held for a tick that end at the goal exactly.
 
 The shapes at the ticks are points of the trajectory; between them the shape moves along chords,
 with velocities that are means over a tick. So joints, velocities and accelerations keep their
@@ -38,7 +38,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _WAVES_PER_JOINT = 6
-"""Waves of a joint that are added to a path."""
+"""Number of waves of a joint that can be added to a path."""
 
 _ATTITUDE_TOLERANCE = 1e-11
 """Attitude error that counts as zero, rad."""
@@ -46,16 +46,17 @@ _ATTITUDE_TOLERANCE = 1e-11
 _MAX_NEWTON_STEPS = 25
 _MAX_STRETCHES = 40
 _MAX_STRETCH_FACTOR = 1.25
-"""A manoeuvre is not made longer than this to keep its limits: another start does better."""
+"""Largest factor that stretches a manoeuvre to keep its limits: another start does
+better."""
 
 _MIN_SMOOTH_TICKS = 20
-"""Manoeuvres of fewer ticks are polygons."""
+"""Fewest ticks of a smooth manoeuvre; shorter manoeuvres are polygons."""
 
 _TICK_ROUNDING = 0.02
-"""Share of a tick by which the solver may have missed a whole number of them."""
+"""Share of a tick by which a solver's duration may miss a whole number of ticks."""
 
 _LIMIT_ROUNDING = 1e-9
-"""Rounding that a limit may be exceeded by, relative."""
+"""Relative rounding error by which a limit may be exceeded."""
 
 _FADING_ZONE = 0.02
 """Share of half a joint's range, off its ends, within which waves are smaller."""
@@ -166,7 +167,7 @@ class CommandHolder:
             if factor == math.inf:
                 if ticks >= _MIN_SMOOTH_TICKS:
                     return None
-                # A polygon of more corners may do.
+                # A polygon with more corners may reach the goal.
                 factor = 1.0
             ticks = max(ticks + 1, math.ceil(ticks * factor - 1e-9))
             if ticks > most:
@@ -183,7 +184,7 @@ class CommandHolder:
         moves_end: bool,
         clipped: bool = False,
     ) -> HeldCommands | None:
-        """Add waves to shapes (N + 1, n) until they end in the goal attitude; None if they do not.
+        """Add waves to shapes (N + 1, n) so that they end in the goal attitude; None on failure.
 
         ``moves_end``: the last shape is changed, too. ``clipped``: after every step, shapes beyond
         the joint limits are put on them, and the others make up for the change.
@@ -250,7 +251,7 @@ class CommandHolder:
         room = np.minimum(positions - limits.lower, limits.upper - positions)
         with np.errstate(divide="ignore", invalid="ignore"):
             fading = np.clip(np.nan_to_num(room / (_FADING_ZONE * half), nan=0.0), 0.0, 1.0)
-        # Smooth where it begins, so that accelerations stay small.
+        # The wave begins smoothly, so that accelerations stay small.
         return np.asarray(fading**2 * (3 - 2 * fading))
 
     def _build_ramps(self, s: Array, limits: MotionLimits) -> Array:
@@ -264,7 +265,8 @@ class CommandHolder:
         return np.where(np.isfinite(limits.velocity), limits.velocity, half), half
 
     def _first_variation(self, positions: Array, quaternions: Array, waves: Array) -> Array:
-        """Return how waves (N + 1, w, n) turn the final attitude: (3, w), base components."""
+        """Return the final turn by waves (N + 1, w, n): (3, w), base
+        components."""
         # A few hundred points of a smooth integrand are plenty for Newton's direction.
         stride = max(1, len(positions) // 200)
         chosen = np.arange(stride // 2, len(positions), stride)

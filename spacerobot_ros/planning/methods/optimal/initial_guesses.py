@@ -44,24 +44,24 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _CANDIDATES_PER_GUESS = 24
-"""Loops of one kind from which the one that ends nearest to the goal is taken."""
+"""Number of random loops of one kind, of which the nearest to the goal is the guess."""
 
 _LEAST_SIZE = 0.1
 """Least size of loops on the way to a possible end, in half ranges, from the second guess on."""
 
 _MAX_RANGE_SHARE = 0.85
-"""Share of half the joints' ranges that a guess uses at most."""
+"""Largest share of half the joints' ranges that a guess uses."""
 
 _BRAKING_TIME_FACTOR = 4.0
 """A joint that moves at the start is back on the way of its guess after this many times the time
 that it takes to brake."""
 
 Loop = Callable[[np.random.Generator, Array, int], Array]
-"""A closed path (N + 1, n) of order one at instants (N + 1,) from 0 to 1."""
+"""A function for a closed path (N + 1, n) of about unit size at instants (N + 1,) in [0, 1]."""
 
 
 class InitialGuesses:
-    """Guesses for boundary conditions, endlessly many, the same ones every time.
+    """Generates an endless, reproducible sequence of guesses for boundary conditions.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class InitialGuesses:
             ]
             shapes = self._add_loops(np.array(rounds), boundary.start, final, limits)
             candidates = self._build_trajectories(shapes, limits)
-            # The cosine of half the angle that is left.
+            # The cosine of half the remaining angle.
             near = np.abs([each.quaternions[-1] @ turn for each in candidates])
             yield candidates[int(near.argmax())]
 
@@ -110,10 +110,10 @@ class InitialGuesses:
         return start + np.outer(s**3 * (10 - 15 * s + 6 * s**2), final - start)
 
     def _add_loops(self, rounds: Array, start: Array, final: Array, limits: MotionLimits) -> Array:
-        """Return shapes (K, N + 1, n) of loops, in half ranges, on the direct way."""
+        """Return shapes (K, N + 1, n) of the direct path with loops added, in half ranges."""
         direct = self._direct_path(start, final)
         middle, half = limits.span(start)
-        # Within most of the joint limits, or as far out as the direct way is.
+        # Shapes stay within most of the joint range, or within the extent of the direct path.
         room = np.maximum(_MAX_RANGE_SHARE * half, np.abs(direct - middle))
         shapes = np.clip(direct + half * rounds, middle - room, middle + room)
         return np.clip(shapes, limits.lower, limits.upper)
@@ -216,7 +216,7 @@ def _trigonometric_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
 
 
 def _three_frequency_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
-    """A cycle of step 3 of paper 1, among any three joints (two, if there are no three)."""
+    """A cycle of step 3 of paper 1 with three random joints (two joints, if n = 2)."""
     phi = 2 * math.pi * s
     b11, b12, b21, a22, a31 = rng.normal(size=5)
     cycle = (
@@ -231,7 +231,7 @@ def _three_frequency_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
 
 
 def _square_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
-    """Out to squares in the plane of two joints, round once or twice, and back (paper 3)."""
+    """A path to a square of two joints, once or twice around it, and back (paper 3)."""
     path = np.zeros((len(s), n))
     pair = rng.permutation(n)[:2]
     corner = rng.uniform(-1, 1, len(pair))
@@ -254,10 +254,10 @@ _LOOPS: tuple[Loop, ...] = (
 
 
 _NEAREST_MANOEUVRES = 2
-"""Manoeuvres of a library that a search begins with."""
+"""Number of a library's manoeuvres that a search begins with."""
 
 _SHAPES_PER_MANOEUVRE = 41
-"""Shapes that are kept of a manoeuvre."""
+"""Number of shapes that a library stores of a manoeuvre."""
 
 
 @dataclass(frozen=True)
@@ -282,7 +282,7 @@ class SolutionLibrary:
     def from_schedules(
         cls, key: str, schedules: Sequence[GaitSchedule], turns: Array
     ) -> SolutionLibrary:
-        """Take schedules and the turns (K, 4) that they bring about."""
+        """Return the library of some schedules and their turns (K, 4)."""
         instants = np.linspace(0, 1, _SHAPES_PER_MANOEUVRE)
         shapes = [
             _interpolate(instants, np.linspace(0, 1, schedule.ticks + 1), schedule.positions)
@@ -292,7 +292,7 @@ class SolutionLibrary:
 
     @property
     def digest(self) -> str:
-        """A hash of all that it holds."""
+        """A hash of the library's content."""
         return hashlib.sha256(self.to_bytes()).hexdigest()
 
     def nearest(self, boundary: BoundaryConditions, limits: MotionLimits) -> Iterator[Array]:
@@ -317,12 +317,12 @@ class SolutionLibrary:
             yield np.clip(changed, limits.lower, limits.upper)
 
     def to_bytes(self) -> bytes:
-        """Return it as an archive of numpy."""
+        """Return the library as the bytes of a numpy archive."""
         return pack_arrays(key=self.key, turns=self.turns, shapes=self.shapes)
 
     @classmethod
     def from_bytes(cls, content: bytes) -> SolutionLibrary:
-        """Return it from an archive.
+        """Return the library from the bytes of its archive.
 
         Raises
         ------
@@ -332,7 +332,7 @@ class SolutionLibrary:
         key, turns, shapes = unpack_arrays(content, "library", "key", "turns", "shapes")
         fits = turns.shape[1:] == (4,) and shapes.ndim == 3 and len(shapes) == len(turns) > 0
         if not fits or shapes.shape[1] < 2 or not turns.dtype == shapes.dtype == np.float64:
-            raise ValueError("it holds something else than a library")
+            raise ValueError("it holds no library of manoeuvres")
         if not (np.all(np.isfinite(turns)) and np.all(np.isfinite(shapes))):
             raise ValueError("it is not finite")
         return cls(str(key), turns, shapes)
@@ -348,12 +348,12 @@ def library_key(robot: SpaceRobot, limits: MotionLimits, axes: Array, *, positio
 
 
 def library_file(key: str) -> tuple[Cache, str]:
-    """Return the cache of libraries, and the name of one in it."""
+    """Return the cache of libraries, and the file name of a library."""
     return Cache(cache_directory() / "libraries"), archive_name(key)
 
 
 def load_library(path: str, key: str) -> SolutionLibrary | None:
-    """Return the library at a path; without one, that of the cache, or None.
+    """Return the library at a path; for an empty path, the cached library or None.
 
     Raises
     ------

@@ -74,7 +74,7 @@ class JointEfforts:
     def of(
         cls, robot: SpaceRobot, options: OptimalOptions, control_period: float
     ) -> JointEfforts | None:
-        """Return those that the options limit; None: none."""
+        """Return the efforts that the options limit; None: none."""
         if options.effort_limits != 1:
             return None
         limit = robot.effort_limit.copy()
@@ -111,13 +111,13 @@ class JointEfforts:
         return float(np.abs(ends).max()) / _PLANNED_EFFORT_SHARE
 
     def slowed(self, trajectory: Trajectory) -> Trajectory:
-        """Return the same path, slowed until its efforts keep the limits."""
+        """Return the trajectory, slowed along its path until its efforts keep the limits."""
         peak = self.peak(trajectory)
         return trajectory if peak <= 1 else trajectory.retimed(math.sqrt(peak))
 
     @property
     def inequality(self) -> PathInequality:
-        """The limits as a constraint on the way, at both ends of every interval."""
+        """The limits as a path constraint at both ends of every interval."""
         n = len(self._names)
         q, qdot, qddot = (ca.SX.sym(name, n) for name in ("q", "qdot", "qddot"))
         limited = np.flatnonzero(np.isfinite(self.limit))
@@ -132,7 +132,7 @@ class JointEfforts:
 
 
 class EffortLimitedShooting(MultipleShooting):
-    """Keeps efforts within limits, too.
+    """Multiple shooting that also keeps joint efforts within limits.
 
     The problem is solved without them first: they cost time, and for most motions of most robots
     do not matter. Where the solution exceeds them, the problem with them is solved from there.
@@ -168,8 +168,8 @@ class EffortLimitedShooting(MultipleShooting):
         stop: StopRule,
         duration: DurationBounds,
     ) -> Trajectory | None:
-        """Solve as :class:`MultipleShooting` does, within the limits of the efforts."""
-        # A guess that uses the efforts just up to their limits was made for them.
+        """Solve as :class:`MultipleShooting` does, with joint efforts within limits."""
+        # A guess whose efforts just reach their limits was made for these limits.
         if not _AT_LIMITS_FROM <= self._efforts.peak(guess) <= 1 + _AT_LIMITS_BEYOND:
             solution = super().solve(boundary, limits, guess, stop, duration)
             if solution is None or self._efforts.peak(solution) <= 1:

@@ -75,10 +75,10 @@ from spacerobot_ros.version import __version__
 _MAX_CORRECTION_INTERVALS = 40
 
 _MAX_STARTS_IN_MOTION = 12
-"""Guesses that are tried for a manoeuvre from moving joints: the robot flies on meanwhile."""
+"""Largest number of guesses for a manoeuvre from moving joints: the robot flies on meanwhile."""
 
 _ZERO_ERROR = 1e-10
-"""Errors up to this are zero: the robot is at the goal; rad, m and joint coordinates."""
+"""Largest error that counts as zero: the robot is at the goal; rad, m and joint coordinates."""
 
 _MAX_CACHED_END_ERROR = 1e-7
 """Largest error at the ends of a cached manoeuvre, rad, m and joint coordinates."""
@@ -189,7 +189,7 @@ class OptimalGait(GaitMethod):
         return SolutionLibrary.from_schedules(self._library_key, schedules, np.array(turns))
 
     def store_library(self, library: SolutionLibrary) -> Path | None:
-        """Put a library where plans find it; return where, None if that is not possible."""
+        """Store a library in the cache of plans; return its path, None on failure."""
         cache, name = library_file(self._library_key)
         return cache.store(name, self._library_key, library.to_bytes())
 
@@ -213,7 +213,7 @@ class OptimalGait(GaitMethod):
         shape, kind = self._goal_shape(goal), self._kind_of(goal)
         same_shape = self._specification.same_shape and not goal.end_effectors
         if request.motion is not None and shape is None and same_shape:
-            # The shape of now is one on the way.
+            # The present shape is a shape on the path.
             shape = request.motion.remaining[-1]
         boundary = kind.specification.boundary_conditions(
             self.robot,
@@ -222,7 +222,7 @@ class OptimalGait(GaitMethod):
             self._limits,
             self._constraints.direction_W,
         )
-        # Where a goal needs the margin, the manoeuvre ends in it.
+        # A manoeuvre ends within the margin if its goal does.
         limits = self._limits.within(margin, q, boundary.likely)
         if request.motion is not None:
             return self._plan_in_motion(request, request.motion, boundary, limits, cancellation)
@@ -261,7 +261,7 @@ class OptimalGait(GaitMethod):
                 f"{found.starts} start(s); a longer one may find a faster manoeuvre."
             )
         schedule = self._build_schedule(state, goal, found.held.positions, notes)
-        # The result of a busy machine is not to be flown on a quiet one.
+        # A result of a busy machine is not cached, as an idle machine finds a better one.
         if self._cache is not None and key is not None and not found.cut_short:
             kept_plan = _CachedPlan(schedule.positions, notes)
             self._cache.store(archive_name(key), key, kept_plan.to_bytes())
@@ -275,15 +275,15 @@ class OptimalGait(GaitMethod):
         limits: MotionLimits,
         cancellation: Cancellation,
     ) -> GaitSchedule:
-        """Plan from moving joints; the rest of the motion so far is the first guess."""
+        """Plan from moving joints; the remaining previous motion is the first guess."""
         too_fast = np.abs(motion.velocity) > limits.velocity * (1 + _LIMIT_ROUNDING)
         if too_fast.any():
             names = ", ".join(np.array(self.robot.joint_names)[too_fast])
-            raise PlanningError(f"Joints move faster than optimal may: {names}.")
+            raise PlanningError(f"Joints move faster than the velocity limits of optimal: {names}.")
         chosen, again = self.options, request.previous is not None
         duration = chosen.duration
         if again and duration > 0:
-            # The same manoeuvre goes on, and is to be over when it was.
+            # The previous manoeuvre continues, and keeps its end time.
             duration = (len(motion.remaining) - 1) * self.control_period
         budget = replace(
             chosen,
@@ -345,7 +345,7 @@ class OptimalGait(GaitMethod):
         return replace(self._schedule_of(goal, positions, path, notes), controls=controls)
 
     def _list_active_limits(self, positions: Array, velocity: Array | float) -> str:
-        """Return the limits that held commands come near to, with their joints."""
+        """Return the active limits of held commands, with the joints at each limit."""
         if len(positions) < 2:
             return "nothing"
         speed, change = self._limits.shares(positions, self.control_period, velocity)

@@ -27,7 +27,7 @@ TOLERANCE = 1e-5
 
 _IPOPT_OPTIONS = {
     "print_time": False,
-    # Compiled functions have no derivatives beyond those that they are.
+    # Compiled functions cannot be differentiated, so the solver must not ask for it.
     "no_nlp_grad": True,
     "calc_lam_p": False,
     "ipopt.print_level": 0,
@@ -35,7 +35,7 @@ _IPOPT_OPTIONS = {
     "ipopt.linear_solver": "mumps",
     "ipopt.mu_strategy": "monotone",
     "ipopt.constr_viol_tol": 1e-6,
-    # Steps are not solved for a second time to the last bit.
+    # Iterative refinement of steps is off.
     "ipopt.fast_step_computation": "yes",
 }
 
@@ -93,7 +93,7 @@ class MultipleShooting:
     def __init__(self, stages: Stages, intervals: int, tolerance: float = TOLERANCE) -> None:
         self.intervals = intervals
         self.iterations, self.converged = 0, False
-        """Steps of the solver for the last solution, and whether it has converged on that."""
+        """Number of the solver's steps for its last solution, and whether the solver converged."""
         self.turn = stages.turn
         self._program = program(stages, intervals)
         # The solver's matrices are small: threads of its linear algebra would wait for each other.
@@ -171,7 +171,7 @@ class MultipleShooting:
         return self._unpack_trajectory(x)
 
     def _initial_variables(self, guess: Trajectory) -> Array:
-        """Return the variables of a guess."""
+        """Return the initial values of the program's variables by a guess."""
         h, v = guess.step, guess.velocities
         a = np.diff(v, axis=0) / h
         return _pack_knots(
@@ -222,7 +222,7 @@ class _SolverMonitor(ca.Callback):
         self.construct("watch", {})
 
     def begin(self, stop: StopRule) -> None:
-        """Begin with the next problem."""
+        """Prepare the monitor for the next problem."""
         self.best, self._least, self._stop, self._iterates = None, math.inf, stop, 0
 
     def get_n_in(self) -> int:
@@ -238,7 +238,7 @@ class _SolverMonitor(ca.Callback):
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)])
 
     def has_eval_buffer(self) -> bool:
-        """Return that iterates are read where the solver has them: they come by the thousand."""
+        """Return True, as iterates are read from the solver's memory: they come by the thousand."""
         return True
 
     def eval_buffer(

@@ -29,7 +29,7 @@ class OptimalOptions:
     )
     max_velocity: tuple[float, ...] = parameter(
         (),
-        "speed limit of every joint, below the URDF's; []: the URDF's",
+        "speed limit of every joint, if below the URDF's; []: the URDF's",
         unit="m/s or rad/s",
         minimum=0.0,
         maximum=1e9,
@@ -149,7 +149,7 @@ _SMOOTH_BODY_EXPONENT = 8
 """Exponent of the smooth bodies that stand for boxes of shapes."""
 
 _UNBOUNDED_FROM = 1e6
-"""Bounds of a box beyond this, m or rad, are none where a joint has no limits."""
+"""Bounds of a box beyond this, m or rad, do not count for joints without limits."""
 
 _CONSTRAINT_RESERVE = 0.02
 """Distance of a solution from its path constraints, relative: they are imposed at steps alone."""
@@ -324,11 +324,11 @@ class Trajectory:
         return np.asarray(q + self.step * (v0 * tau + (v1 - v0) * tau**2 / 2))
 
     def retimed(self, factor: float) -> Trajectory:
-        """Return the same path, travelled in ``factor`` times the time."""
+        """Return the trajectory along the same path in ``factor`` times its duration."""
         return replace(self, step=self.step * factor, velocities=self.velocities / factor)
 
     def at_full_speed(self, limits: MotionLimits, shortest: float) -> Trajectory:
-        """Return the same path, as fast as the limits allow, in ``shortest`` seconds or more."""
+        """Return the trajectory along the same path at full speed, in at least ``shortest`` s."""
         speed = float((np.abs(self.velocities) / limits.velocity).max())
         change = np.abs(np.diff(self.velocities, axis=0)) / self.step / limits.acceleration
         factor = max(speed, float(np.sqrt(change.max())), shortest / self.duration)
@@ -356,7 +356,7 @@ class _SmoothBody:
         ]
         if not bounded:
             raise ParameterError("A box of optimal.keep_out holds all shapes of the robot.")
-        # A side beyond the joint limits is as good at a finite distance: no joint gets there.
+        # No joint gets beyond its limits, so a distant side may move to a finite distance.
         width = robot.upper - robot.lower
         lower = np.maximum(lower, robot.lower - width)[bounded]
         upper = np.minimum(upper, robot.upper + width)[bounded]
@@ -466,11 +466,11 @@ class PathConstraints:
 
     @property
     def imposed_base_rate(self) -> float:
-        """The bound on the base rate that a solution is held to at its steps, rad/s."""
+        """The bound on the base rate at the steps of a solution, rad/s."""
         return self.base_rate * (1 - _CONSTRAINT_RESERVE)
 
     def slowed(self, guess: Trajectory) -> Trajectory:
-        """Return a guess that turns the base no faster than it may."""
+        """Return a guess slowed to the bound on the base rate."""
         if self.base_rate == 0:
             return guess
         fastest = _largest_base_rate(guess.quaternions, guess.step)

@@ -56,7 +56,7 @@ _NO_PATH_FOUND = "the solver found no path within the limits"
 _NO_HELD_COMMANDS = "held commands could not be brought to the goal within the limits"
 
 _MIN_TICKS = 2
-"""A manoeuvre has at least as many: one begins to move, another one stops."""
+"""Fewest ticks of a manoeuvre: one begins to move, another one stops."""
 
 _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
 """A gentle manoeuvre has as many ticks or takes as long, s, whichever is less: it corrects a
@@ -93,13 +93,13 @@ _AGREEING_COST_TOLERANCE = 3e-3
 solver leave as much between them."""
 
 _AGREEING_SOLUTIONS_WITH_LIBRARY = 2
-"""Solutions that are the best one and enough, where a library has the first guesses."""
+"""Number of agreeing solutions that end a search with first guesses from a library."""
 
 _MAX_FULL_GRID_STARTS = 3
-"""Guesses that are tried on the full grid where nothing came of the coarse one."""
+"""Number of guesses on the full grid after a coarse grid without solutions."""
 
 _LIMIT_SHARE_IN_GIVEN_TIME = 0.99
-"""Share of velocities and accelerations that is planned with where the time cannot stretch."""
+"""Share of velocity and acceleration limits for manoeuvres of a given duration."""
 
 
 _ACCELERATION_SHARES_IN_MOTION = (0.98, 1.0)
@@ -124,12 +124,12 @@ _MIN_TICKS_IN_MOTION = 4
 """Control periods that a manoeuvre in motion takes at least."""
 
 _ADDITIONAL_TICKS = (0, 1, 3, 7)
-"""Control periods by which it is made longer where its commands exceed a limit."""
+"""Control periods that lengthen a manoeuvre in motion whose commands exceed a limit."""
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """A manoeuvre that was found.
+    """A found manoeuvre, as held commands with results of its search.
 
     Attributes
     ----------
@@ -182,7 +182,7 @@ class _Progress:
     _began: float = field(default_factory=lambda: time.monotonic())
 
     def stop_rule(self, *, found: bool) -> StopRule:
-        """Return when the solver stops; until something is found it may go on for longer."""
+        """Return the stop rule of the solver, with more time until a first solution."""
         deadline = last_call = math.inf
         if self.options.time_budget > 0:
             deadline, last_call = (
@@ -199,7 +199,7 @@ class _Progress:
     def report(self, step: str, result: str, iterations: int) -> None:
         """Log the result of a guess, and the progress of the search."""
         seconds = time.monotonic() - self._began
-        # Where no guess led to anything on the coarse grid, some are tried on the full one as well.
+        # Without a coarse solution, some guesses are tried on the full grid as well.
         most = max(self.options.starts, self.starts)
         log_progress(
             _LOG,
@@ -212,7 +212,7 @@ class _Progress:
         costs = np.array([self.cost(each) for each in solutions])
         agreeing = self.options.agreeing
         if self.library is not None:
-            # Solutions for goals nearby have agreed before.
+            # A library's guesses come from solutions that agreed for nearby goals.
             agreeing = min(agreeing, _AGREEING_SOLUTIONS_WITH_LIBRARY)
         same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING_COST_TOLERANCE)))
         return 0 < agreeing <= same
@@ -281,7 +281,7 @@ class ManoeuvreSearch:
         full = self.solver(intervals, boundary.center is not None)
         coarser = intervals // _COARSE_GRID_RATIO
         found: list[Manoeuvre] = []
-        # A single answer is had at less cost without a detour.
+        # A single answer costs less without a coarse grid.
         if options.answers > 1 and coarser >= _MIN_COARSE_INTERVALS:
             coarse = self.solver(coarser, boundary.center is not None, _COARSE_TOLERANCE)
             found = self._search_from_guesses(progress, coarse, full, options.starts)
@@ -332,7 +332,7 @@ class ManoeuvreSearch:
                 progress.rejection = _NO_PATH_FOUND
             else:
                 solutions.append(solution)
-            # A search that is cut short within its last start is cut short, too.
+            # A search may also be cut short within its last start.
             cut_short = progress.cut_short(found=bool(solutions))
             going_on = len(solutions) < enough and not progress.agreed(solutions)
             if going_on and number < starts and not cut_short:
@@ -351,7 +351,7 @@ class ManoeuvreSearch:
         grid: MultipleShooting,
         full: MultipleShooting,
     ) -> list[Manoeuvre]:
-        """Return manoeuvres made of the best solutions on a grid, after a step to the full one.
+        """Return manoeuvres from the best solutions on a grid, refined on the full grid.
 
         Where the search ended because solutions agree, the next one is refined only if it promises
         a shorter time than the refined best one.
@@ -442,7 +442,7 @@ class ManoeuvreSearch:
             solution = solver.solve(boundary, limits, guess, stop, duration)
             if solution is None or solver.converged or self._constraints.base_rate > 0:
                 return solution
-            # A solution that has not converged has time to spare.
+            # A solution without convergence is not yet as fast as possible.
             return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest))
         guess = guess.retimed(T / guess.duration)
         solution = solver.solve(boundary, limits, guess, stop, DurationBounds(T, T))
@@ -451,7 +451,7 @@ class ManoeuvreSearch:
         return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest))
 
     def _slow_to_effort_limits(self, trajectory: Trajectory) -> Trajectory:
-        """Return the same path, slow enough for the efforts of the joints."""
+        """Return the trajectory, slowed to the effort limits of the joints."""
         return trajectory if self._efforts is None else self._efforts.slowed(trajectory)
 
     def _make_held_commands(self, progress: _Progress, trajectory: Trajectory | None) -> Manoeuvre:
@@ -535,7 +535,7 @@ class MotionSearch:
             cancellation.raise_if_requested()
             if len(candidates) >= options.answers or _durations_agree(candidates):
                 break
-        # The rest of a motion is short: the coarse grid is fine enough for it.
+        # The remaining motion is short, so a coarse grid is fine enough.
         fine = coarse if options.answers == 1 else full
         for candidate in sorted(candidates, key=lambda each: each.duration)[
             :_MAX_REFINED_SOLUTIONS_IN_MOTION
@@ -560,7 +560,7 @@ class MotionSearch:
         )
 
     def _planned_speed_limit(self, limits: MotionLimits) -> Array:
-        """Return the velocities (n,) that are planned with at most."""
+        """Return the largest planned velocities (n,)."""
         given_up = np.minimum(
             _VELOCITY_RESERVE_IN_MOTION * limits.velocity, limits.acceleration * self._period / 4
         )

@@ -138,7 +138,7 @@ class Stages:
         compiling: bool = False,
         end_effectors: ca.Function | None = None,
     ) -> Stages:
-        """Derive them, or take them from the cache.
+        """Derive the functions of a robot's problem, or read them from the cache.
 
         Parameters
         ----------
@@ -169,24 +169,24 @@ class Stages:
             p.append(ca.SX.sym("end_effectors", end_effectors.size1_in(2)))
             reached.append(end_effectors(X, s, p[-1]))
         ends = Block.of("end", ca.vertcat(X, s), ca.vertcat(*p), ca.vertcat(*reached))
-        interval = _kept_interval(robot, constraints, inequalities, compiling=compiling)
-        path = interval.rows - _dynamics(n)
+        interval = _cached_interval(robot, constraints, inequalities, compiling=compiling)
+        path = interval.rows - _count_dynamics_rows(n)
         return cls(n, begins, interval, ends, path, turn_function(robot))
 
 
-def _dynamics(joints: int) -> int:
+def _count_dynamics_rows(joints: int) -> int:
     """Return the number of rows of an interval that are its dynamics."""
     return 2 * joints + 4
 
 
-def _kept_interval(
+def _cached_interval(
     robot: SpaceRobot,
     constraints: PathConstraints,
     inequalities: Sequence[PathInequality],
     *,
     compiling: bool,
 ) -> Block:
-    """Return the functions of an interval from the cache, or derive them."""
+    """Return the block of an interval from the cache, or derive it."""
     q, X, direction = ca.SX.sym("q", robot.n), ca.SX.sym("X", 4), ca.SX.sym("d", 3)
     on_knots = constraints.symbolic(q, X, direction)
     facts = [
@@ -218,13 +218,16 @@ def _interval(
     X_next, s_next, v_next = ca.SX.sym("X+", 4), ca.SX.sym("s+", n), ca.SX.sym("v+", n)
     h, direction = ca.SX.sym("h"), ca.SX.sym("direction", 3)
     z = ca.vertcat(h, X, s, v, a, X_next, s_next, v_next)
-    rotation, (rotation_jac, rotation_hess) = _rotation(robot), _rotation_derivatives(robot)
+    rotation, (rotation_jac, rotation_hess) = (
+        _rotation(robot),
+        _rotation_derivative_functions(robot),
+    )
 
-    points = [_at(tau, s, h * v, h * v_next) for tau in GAUSS]
+    points = [_state_within_interval(tau, s, h * v, h * v_next) for tau in GAUSS]
     rates = [rotation(point) for point in points]
     motion = ca.vertcat(v_next - v - h * a, s_next - s - h * v_next)
 
-    # The attitude, by the chain rule: only the terms with the robot's inertia are large.
+    # The attitude is derived by the chain rule, as only terms with the robot's inertia are large.
     w = [ca.SX.sym(f"w_{i}", 3) for i in range(len(GAUSS))]
     by_attitude = ca.SX.sym("lambda_X", 4)
     inner = ca.vertcat(X, *w)
@@ -280,12 +283,12 @@ def _path(
             rows.append(1 - ca.sumsqr(w / fastest))
     for each in inequalities:
         for tau in each.instants:
-            point = _at(tau, s, h * v, h * v_next)
+            point = _state_within_interval(tau, s, h * v, h * v_next)
             rows.append(each.function(point[:n], point[n:] / h, a))
     return ca.vertcat(*rows)
 
 
-def _at(tau: float, s: ca.SX, u: ca.SX, u_next: ca.SX) -> ca.SX:
+def _state_within_interval(tau: float, s: ca.SX, u: ca.SX, u_next: ca.SX) -> ca.SX:
     """Return shape and step (2 n,) in an interval with vertex s, tau of the way."""
     change = u_next - u
     return ca.vertcat(s + (tau - 1 / 2) * u + tau**2 / 2 * change, u + tau * change)
@@ -298,7 +301,7 @@ def _rotation(robot: SpaceRobot) -> ca.Function:
     return ca.Function("rotation", [ca.vertcat(q, u)], [-solve_positive_definite(D, D_q @ u)])
 
 
-def _rotation_derivatives(robot: SpaceRobot) -> tuple[ca.Function, ca.Function]:
+def _rotation_derivative_functions(robot: SpaceRobot) -> tuple[ca.Function, ca.Function]:
     """Return the Jacobian of the rotation w, and the Hessian of ``mu' w``.
 
     By differentiating ``D w + D_q u = 0`` once and twice.
@@ -330,13 +333,13 @@ def turn_function(robot: SpaceRobot) -> ca.Function:
     """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, base components."""
     q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
     rotation = _rotation(robot)
-    rates = [rotation(_at(tau, q + u / 2, u, u_next)) for tau in GAUSS]
+    rates = [rotation(_state_within_interval(tau, q + u / 2, u, u_next)) for tau in GAUSS]
     return ca.Function("turn", [q, u, u_next], [ca.cse(magnus(*rates))])
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the variables of N intervals are: the step, then knot after knot ``X, s, v, a``.
+    """Indices of the variables of N intervals: the step, then knot after knot ``X, s, v, a``.
 
     The last knot has no acceleration.
     """
@@ -374,8 +377,8 @@ class Program:
 
 
 @dataclass(frozen=True)
-class _Placed:
-    """A block at all its places.
+class _PlacedBlock:
+    """A block placed at every interval or end of the program.
 
     Attributes
     ----------
@@ -399,7 +402,7 @@ class _Placed:
         p = ca.repmat(self.parameters, 1, count)
         results = function.map(count)(z, p, *more)
         results = results if isinstance(results, (list, tuple)) else [results]
-        # A row of nonzeros, where the result is one, becomes a column.
+        # A single row of nonzeros becomes a column.
         return [ca.vec(result.nz[:]) for result in results]
 
     def multipliers(self, lam_g: ca.MX) -> ca.MX:
@@ -410,7 +413,7 @@ class _Placed:
 
 
 def program(stages: Stages, intervals: int) -> Program:
-    """Put the stages of a problem together."""
+    """Assemble the program from the stages of a problem."""
     n, N = stages.joints, intervals
     layout = Layout(n, N)
     X, s, v, a = layout.knots()
@@ -428,19 +431,19 @@ def program(stages: Stages, intervals: int) -> Program:
     equalities = first + N * dynamics + stages.end.rows
     of_path = equalities + np.arange(N * stages.path).reshape(N, stages.path)
     placed = [
-        _Placed(
+        _PlacedBlock(
             stages.beginning,
             np.hstack([zero[:1], s[:1], v[:1]]),
             np.arange(first)[np.newaxis],
             p["start"],
         ),
-        _Placed(
+        _PlacedBlock(
             stages.interval,
             np.hstack([zero, X[:-1], s[:-1], v[:-1], a, X[1:], s[1:], v[1:]]),
             np.hstack([of_intervals, of_path]),
             p["direction"],
         ),
-        _Placed(
+        _PlacedBlock(
             stages.end,
             np.hstack([X[-1:], s[-1:]]),
             of_end,
@@ -451,7 +454,7 @@ def program(stages: Stages, intervals: int) -> Program:
     change = ca.reshape(x[a.ravel().tolist()], n, N) / ca.repmat(p["typical"], 1, N)
     f = p["weights"][0] * N * x[0] + p["weights"][1] * ca.sumsqr(change) / N
 
-    g = _gathered(rows, [(each.rows, each.called(each.block.values, x)[0]) for each in placed])
+    g = _gather_rows(rows, [(each.rows, each.called(each.block.values, x)[0]) for each in placed])
     values, jacobian = _jacobian(placed, x, rows)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", rows)
     of_objective = ca.triu(ca.hessian(lam_f * f, x)[0])
@@ -467,7 +470,7 @@ def program(stages: Stages, intervals: int) -> Program:
     )
 
 
-def _gathered(rows: int, parts: Sequence[tuple[Indices, ca.MX]]) -> ca.MX:
+def _gather_rows(rows: int, parts: Sequence[tuple[Indices, ca.MX]]) -> ca.MX:
     """Return rows (rows,) from their places and values, part after part."""
     order = np.empty(rows, dtype=np.int64)
     places = np.concatenate([places.ravel() for places, _ in parts])
@@ -475,45 +478,47 @@ def _gathered(rows: int, parts: Sequence[tuple[Indices, ca.MX]]) -> ca.MX:
     return ca.vertcat(*(values for _, values in parts))[order.tolist()]
 
 
-def _jacobian(placed: Sequence[_Placed], x: ca.MX, rows: int) -> tuple[ca.MX, ca.MX]:
+def _jacobian(placed: Sequence[_PlacedBlock], x: ca.MX, rows: int) -> tuple[ca.MX, ca.MX]:
     """Return g and its Jacobian."""
     values, nonzeros, at_row, at_column = [], [], [], []
     for each in placed:
         g, J = each.called(each.block.jacobian, x)
         values.append((each.rows, g))
         nonzeros.append(J)
-        i, j = _places(each.block.jacobian.sparsity_out(1))
+        i, j = _nonzero_indices(each.block.jacobian.sparsity_out(1))
         at_row.append(each.rows[:, i].ravel())
         at_column.append(each.variables[:, j].ravel())
-    return _gathered(rows, values), _scattered(
+    return _gather_rows(rows, values), _scatter_nonzeros(
         (rows, x.numel()), np.concatenate(at_row), np.concatenate(at_column), nonzeros
     )
 
 
-def _hessian(placed: Sequence[_Placed], x: ca.MX, lam_g: ca.MX) -> ca.MX:
+def _hessian(placed: Sequence[_PlacedBlock], x: ca.MX, lam_g: ca.MX) -> ca.MX:
     """Return the upper triangle of the Hessian of ``lambda' g``."""
     nonzeros, at_row, at_column = [], [], []
     for each in placed:
         (H,) = each.called(each.block.hessian, x, each.multipliers(lam_g))
         nonzeros.append(H)
-        i, j = _places(each.block.hessian.sparsity_out(0))
+        i, j = _nonzero_indices(each.block.hessian.sparsity_out(0))
         places = np.sort([each.variables[:, i].ravel(), each.variables[:, j].ravel()], axis=0)
         at_row.append(places[0])
         at_column.append(places[1])
     size = x.numel()
-    return _scattered((size, size), np.concatenate(at_row), np.concatenate(at_column), nonzeros)
+    return _scatter_nonzeros(
+        (size, size), np.concatenate(at_row), np.concatenate(at_column), nonzeros
+    )
 
 
-def _places(sparsity: ca.Sparsity) -> tuple[Indices, Indices]:
+def _nonzero_indices(sparsity: ca.Sparsity) -> tuple[Indices, Indices]:
     """Return rows and columns of the nonzeros, in their order."""
     rows, columns = (np.array(each, dtype=np.int64) for each in sparsity.get_triplet())
     return rows, columns
 
 
-def _scattered(
+def _scatter_nonzeros(
     shape: tuple[int, int], rows: Indices, columns: Indices, nonzeros: Sequence[ca.MX]
 ) -> ca.MX:
-    """Return the sparse matrix with these nonzeros; those of the same place are added."""
+    """Return the sparse matrix of nonzeros; nonzeros with equal indices are added."""
     places, number = np.unique(columns * shape[0] + rows, return_inverse=True)
     at_row, at_column = (each.tolist() for each in (places % shape[0], places // shape[0]))
     sparsity = ca.Sparsity.triplet(*shape, at_row, at_column)
