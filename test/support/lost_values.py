@@ -6,8 +6,8 @@ in programs that :class:`support.warm_python.WarmPython` runs: its default is ta
 ``test/passage/lost_values.yaml`` names for each option and parameter a test that fails then.
 
 With ``SPACEROBOT_TEST_USES=FILE`` the tests that give a value are written to that file. Run as a
-module this finds tests for values that have none in the table:
-``PYTHONPATH=.:test python -m support.lost_values``.
+module this finds tests for values that have none in the table, among the quick tests of some
+folders or of all: ``PYTHONPATH=.:test python -m support.lost_values test/viewer``.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ USES = "SPACEROBOT_TEST_USES"
 
 TESTS = Path(__file__).resolve().parents[1]
 FILE = TESTS / "passage" / "lost_values.yaml"
+
+_TRIED = 8
+"""Tests that are tried for a value before it is left without one."""
 
 _OF_OTHER_NODES = (
     *("plant.tf_period", "plant.tf_links", "coordinated_control.world_frame"),
@@ -221,10 +224,10 @@ def notices(test: str, loss: str) -> bool:
     return done.returncode == 1
 
 
-def _uses(folder: Path) -> dict[str, list[str]]:
-    """Return the quick tests that give each value, by running all of them."""
+def _uses(folder: Path, paths: list[str]) -> dict[str, list[str]]:
+    """Return the quick tests of some folders that give each value, by running all of them."""
     file = folder / "uses"
-    words = [sys.executable, "-m", "pytest", "-q", "-n", "2", "-p", "no:cacheprovider"]
+    words = [sys.executable, "-m", "pytest", "-q", "-n", "2", "-p", "no:cacheprovider", *paths]
     subprocess.run(words, cwd=TESTS.parent, env=os.environ | {USES: str(file)}, check=False)
     found: dict[str, list[str]] = {}
     for line in file.read_text().splitlines():
@@ -239,15 +242,19 @@ def _shows_no_effect(test: str) -> bool:
 
 
 def main() -> None:
-    """Find a test for each value that has none, among those that give it."""
+    """Find a test for each value that has none, among those that give it; some stay without."""
     entries = table()
     with tempfile.TemporaryDirectory() as folder:
-        uses = _uses(Path(folder))
+        uses = _uses(Path(folder), sys.argv[1:])
     for loss in losses():
         if loss not in entries:
-            tests = sorted(dict.fromkeys(uses.get(loss, [])), key=_shows_no_effect)
-            entries[loss] = next((test for test in tests if notices(test, loss)), "")
-            print(loss, entries[loss] or f"MISSING ({len(tests)} tests)", sep=": ", flush=True)
+            used = uses.get(loss.removeprefix("unit of "), [])
+            tests = sorted(dict.fromkeys(used), key=_shows_no_effect)
+            found = next((test for test in tests[:_TRIED] if notices(test, loss)), "")
+            if not found:
+                continue
+            entries[loss] = found
+            print(loss, found, sep=": ", flush=True)
             FILE.write_text(yaml.safe_dump(entries, width=100), "utf-8")
 
 
