@@ -1,13 +1,29 @@
-"""Parameters and plans stay what users' files and earlier flights rely on."""
+"""Parameters, plans and reports stay what users' files and earlier flights rely on."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
-from support.expected import PARAMETERS, PLANS, differences, parameters, plans
+import pytest
+from support.expected import (
+    ANALYSED,
+    BAGS,
+    PARAMETERS,
+    PLANS,
+    REPORTS,
+    differences,
+    parameters,
+    plans,
+)
+from support.figure_prints import analysis_prints, report_prints
 
 WRITE = "If this is wanted, `make expected` writes the file anew."
+
+
+def _some_quick(names: Sequence[str], *quick: str) -> list[Any]:
+    return [n if n in quick else pytest.param(n, marks=pytest.mark.slow) for n in names]
 
 
 def as_kept(found: dict[str, Any]) -> Any:
@@ -37,6 +53,20 @@ def test_every_parameter_is_kept() -> None:
 
 def test_plans_stay_as_they_are() -> None:
     problems = differences(as_kept(plans()), json.loads(PLANS.read_text("utf-8")))
+    assert not problems, "\n".join([*problems[:40], WRITE])
+
+
+@pytest.mark.parametrize("name", _some_quick(BAGS, "servicer_thrusters", "sliding_masses"))
+def test_reports_stay_as_they_are(name: str) -> None:
+    kept = json.loads(REPORTS.read_text("utf-8"))[name]
+    problems = differences(report_prints(name), kept)
+    assert not problems, "\n".join([*problems[:40], WRITE])
+
+
+@pytest.mark.parametrize("name", _some_quick(ANALYSED, "planar_chain"))
+def test_pictures_of_robots_stay_as_they_are(name: str) -> None:
+    kept = json.loads(REPORTS.read_text("utf-8"))[f"analysis of {name}"]
+    problems = differences(analysis_prints(name), kept)
     assert not problems, "\n".join([*problems[:40], WRITE])
 
 

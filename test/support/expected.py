@@ -1,6 +1,6 @@
-"""What users' files and earlier flights rely on: the parameters, and the plans of some goals.
+"""What users' files and earlier flights rely on: parameters, plans of some goals, and reports.
 
-``test/expected`` keeps both; a test compares. Where a change is wanted, ``make expected`` writes
+``test/expected`` keeps them; a test compares. Where a change is wanted, ``make expected`` writes
 them anew, and the difference shows what has changed for users.
 """
 
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from support.figure_prints import analysis_prints, report_prints
 from support.planar_trees import random_tree
 
 from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
@@ -37,6 +38,9 @@ from spacerobot_ros.viewer.server import ViewerConfig
 
 FOLDER = Path(__file__).parents[1] / "expected"
 PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"
+REPORTS = FOLDER / "reports.json"
+BAGS = ("arm_attitude", "planar_chain", "servicer_thrusters", "sliding_masses")
+ANALYSED = ("planar_chain", "three_joint_arm")
 
 _CONFIGURATIONS = {
     "plant": PlantConfig,
@@ -259,8 +263,10 @@ def differences(found: Any, kept: Any, where: str = "") -> list[str]:
 
 
 def main() -> None:
-    """Write both files."""
-    for path, content in ((PARAMETERS, parameters()), (PLANS, plans())):
+    """Write the files."""
+    reports = {name: report_prints(name) for name in BAGS}
+    reports |= {f"analysis of {name}": analysis_prints(name) for name in ANALYSED}
+    for path, content in ((PARAMETERS, parameters()), (PLANS, plans()), (REPORTS, reports)):
         path.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
         print(path)
 
