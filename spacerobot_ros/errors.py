@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from enum import Enum
 
-_LONGEST_MESSAGE = 2000
+_MAX_MESSAGE_LENGTH = 2000
 
 
 def printable(text: str) -> str:
@@ -26,8 +26,8 @@ class SpaceRobotError(Exception):
 
     def __init__(self, message: str = "") -> None:
         line = printable(str(message))
-        if len(line) > _LONGEST_MESSAGE:
-            half = _LONGEST_MESSAGE // 2
+        if len(line) > _MAX_MESSAGE_LENGTH:
+            half = _MAX_MESSAGE_LENGTH // 2
             line = f"{line[:half]} ... {line[-half:]}"
         super().__init__(line)
 

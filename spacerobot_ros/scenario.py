@@ -53,14 +53,14 @@ COMMANDERS = ("planner", "coordinated_control")
 _PARAMETERS_OF_EVERY_NODE = ("autostart", "use_sim_time")
 """Parameters that every node has besides those of its configuration."""
 
-_GOAL_NAMES = ("goal", "end_effector_goal")
+_GOAL_KEYS = ("goal", "end_effector_goal")
 _SCENARIO_KEYS = (
     "description",
     "published",
     "published_method",
     "kills",
     "goal_joint_positions",
-    *(f"{goal}_{part}" for goal in _GOAL_NAMES for part in ("position", "orientation", "rotvec")),
+    *(f"{goal}_{part}" for goal in _GOAL_KEYS for part in ("position", "orientation", "rotvec")),
 )
 
 _LONGEST_TF_PERIOD = 0.1
@@ -226,7 +226,7 @@ class Scenario:
 
     def _goal_poses(self) -> dict[str, list[float]]:
         """Return positions (3,) and quaternions (4,) of the goals by their keys in a file."""
-        goals = zip(_GOAL_NAMES, (self.goal, self.end_effector_goal), strict=True)
+        goals = zip(_GOAL_KEYS, (self.goal, self.end_effector_goal), strict=True)
         poses = {name: goal for name, goal in goals if goal is not None}
         return {
             f"{name}_{part}": values.tolist()

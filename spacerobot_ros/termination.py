@@ -33,10 +33,10 @@ _MESSAGE_BY_SIGNAL = {
     signal.SIGHUP: "Hung up.",
 }
 
-_UNWINDING_TIME = 1.2
+_LONGEST_UNWINDING_TIME = 1.2
 """Wall time within which the main thread must end after a signal's exception, s."""
 
-_NOTICE_TIME = 5.0
+_LONGEST_NOTICE_TIME = 5.0
 """Wall time in which work must notice a request, s: a plan may have to end first."""
 
 _TIME_WITHOUT_PARENT = 1.7
@@ -99,7 +99,7 @@ class _Guard:
         self._since = 0.0
         self._notice_by: float | None = None
         self._end_by: float | None = None
-        self._lifeline, self._parent = _own_lifeline()
+        self._lifeline_read_end, self._parent = _parent_lifeline()
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._writer, False)
         self._handlers = {
@@ -108,13 +108,13 @@ class _Guard:
             # nohup has a process ignore the end of its terminal.
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
         }
-        if self._lifeline is not None:
+        if self._lifeline_read_end is not None:
             signal.signal(_PARENT_ENDED_SIGNAL, lambda *_: None)
             _die_with_parent()
         self._wakeup = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
         self._thread = threading.Thread(target=self._watch_for_end, name="termination", daemon=True)
         self._thread.start()
-        if self._lifeline is not None and os.getppid() != self._parent:
+        if self._lifeline_read_end is not None and os.getppid() != self._parent:
             self._on_parent_end()
 
     def remove(self) -> None:
@@ -157,21 +157,21 @@ class _Guard:
             return False
         self._since = time.monotonic()
         self.number = number
-        grace = _UNWINDING_TIME if self.request is None else _NOTICE_TIME
+        grace = _LONGEST_UNWINDING_TIME if self.request is None else _LONGEST_NOTICE_TIME
         self._notice_by = self._since + grace
         return True
 
     def _watch_for_end(self) -> None:
         poll = select.poll()
         poll.register(self._reader, select.POLLIN)
-        if self._lifeline is not None:
-            poll.register(self._lifeline, select.POLLIN | select.POLLHUP)
+        if self._lifeline_read_end is not None:
+            poll.register(self._lifeline_read_end, select.POLLIN | select.POLLHUP)
         handled = False
         while True:
             deadline = self._deadline()
             wait = None if deadline is None else max(0.0, 1e3 * (deadline - time.monotonic()))
             for file, _ in poll.poll(wait):
-                if file == self._lifeline:
+                if file == self._lifeline_read_end:
                     poll.unregister(file)
                     self._on_parent_end()
                     continue
@@ -305,7 +305,7 @@ def child_options(environment: Mapping[str, str] | None = None) -> dict[str, Any
 
     The child has to be guarded. ``environment`` is its own, else that of this process.
     """
-    reader = _lifeline()
+    reader = _lifeline_read_end()
     variables = os.environ if environment is None else environment
     return {
         "env": {**variables, _LIFELINE_VARIABLE: f"{reader}:{os.getpid()}"},
@@ -453,13 +453,13 @@ os._exit(code)
 
 
 @cache
-def _lifeline() -> int:
+def _lifeline_read_end() -> int:
     """Return the read end of a pipe for children; its write end closes when this process ends."""
     reader, _ = os.pipe()
     return reader
 
 
-def _own_lifeline() -> tuple[int | None, int]:
+def _parent_lifeline() -> tuple[int | None, int]:
     """Return the pipe (None: no pipe) that the parent process holds open, and the parent's id."""
     text = os.environ.pop(_LIFELINE_VARIABLE, "")
     if not text:

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-_POSE = (*(f"position.{x}" for x in "xyz"), *(f"orientation.{x}" for x in "xyzw"))
-_TWIST = (*(f"linear.{x}" for x in "xyz"), *(f"angular.{x}" for x in "xyz"))
-_WRENCH = (*(f"force.{x}" for x in "xyz"), *(f"torque.{x}" for x in "xyz"))
-_MOMENTA = ("linear_x", "linear_y", "linear_z", "angular_x", "angular_y", "angular_z")
+_POSE_MEMBERS = (*(f"position.{x}" for x in "xyz"), *(f"orientation.{x}" for x in "xyzw"))
+_TWIST_MEMBERS = (*(f"linear.{x}" for x in "xyz"), *(f"angular.{x}" for x in "xyz"))
+_WRENCH_MEMBERS = (*(f"force.{x}" for x in "xyz"), *(f"torque.{x}" for x in "xyz"))
+_MOMENTUM_LABELS = ("linear_x", "linear_y", "linear_z", "angular_x", "angular_y", "angular_z")
 
 
 @dataclass(frozen=True)
@@ -114,70 +114,70 @@ def _joint_states(prefix: str) -> tuple[StateField, ...]:
 
 def _odometry(prefix: str) -> tuple[StateField, ...]:
     return (
-        StateField("pose.pose", f"{prefix}_pose", _POSE),
-        StateField("twist.twist", f"{prefix}_twist", _TWIST),
+        StateField("pose.pose", f"{prefix}_pose", _POSE_MEMBERS),
+        StateField("twist.twist", f"{prefix}_twist", _TWIST_MEMBERS),
     )
 
 
-_PLANT = ("plant",)
-_USER = ("user",)
-_ARRAY = "std_msgs/msg/Float64MultiArray"
-_JOINTS = "sensor_msgs/msg/JointState"
-_ODOMETRY = "nav_msgs/msg/Odometry"
-_POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
-_STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
-_STRING = "std_msgs/msg/String"
-_TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
+_PUBLISHED_BY_PLANT = ("plant",)
+_PUBLISHED_BY_USER = ("user",)
+_ARRAY_TYPE = "std_msgs/msg/Float64MultiArray"
+_JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
+_ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
+_POSE_STAMPED_TYPE = "geometry_msgs/msg/PoseStamped"
+_STATUS_TYPE = "diagnostic_msgs/msg/DiagnosticStatus"
+_STRING_TYPE = "std_msgs/msg/String"
+_TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
+_WRENCH_STAMPED_TYPE = "geometry_msgs/msg/WrenchStamped"
 
 # The plant publishes its state in this order: the clock first, so that a subscriber that sees a
 # state has seen its time; odom and joint_states late, because they set the commanders off.
 _TOPIC_TABLE = (
-    Topic("/clock", "rosgraph_msgs/msg/Clock", _PLANT, "simulated time"),
+    Topic("/clock", "rosgraph_msgs/msg/Clock", _PUBLISHED_BY_PLANT, "simulated time"),
     Topic(
         "base_pose",
-        _POSE_STAMPED,
-        _PLANT,
+        _POSE_STAMPED_TYPE,
+        _PUBLISHED_BY_PLANT,
         "pose of the base link in the world: the truth, every `base_pose_period`",
-        state=(StateField("pose", "pose", _POSE),),
+        state=(StateField("pose", "pose", _POSE_MEMBERS),),
         every_tick=False,
     ),
     Topic(
         "end_effector_pose",
-        _POSE_STAMPED,
-        _PLANT,
+        _POSE_STAMPED_TYPE,
+        _PUBLISHED_BY_PLANT,
         "pose of the link `end_effector_frame` in the world: the truth",
         when="the robot has that link",
-        state=(StateField("pose", "end_effector_pose", _POSE),),
+        state=(StateField("pose", "end_effector_pose", _POSE_MEMBERS),),
     ),
     Topic(
         "momentum",
-        _ARRAY,
-        _PLANT,
+        _ARRAY_TYPE,
+        _PUBLISHED_BY_PLANT,
         "linear momentum (kg m/s), angular momentum about the centre of mass (kg m^2/s), both in "
         "the world, and kinetic energy (J), summed over the bodies",
-        state=(StateField("data", "momentum", entries=(*_MOMENTA, "kinetic_energy")),),
+        state=(StateField("data", "momentum", entries=(*_MOMENTUM_LABELS, "kinetic_energy")),),
     ),
     Topic(
         "momentum_expected",
-        _ARRAY,
-        _PLANT,
+        _ARRAY_TYPE,
+        _PUBLISHED_BY_PLANT,
         "expected momenta: those of the beginning plus the impulses of the thrusters",
         when="actuation is effort",
-        state=(StateField("data", "expected_momenta", entries=_MOMENTA),),
+        state=(StateField("data", "expected_momenta", entries=_MOMENTUM_LABELS),),
     ),
     Topic(
         "odom_true",
-        _ODOMETRY,
-        _PLANT,
+        _ODOMETRY_TYPE,
+        _PUBLISHED_BY_PLANT,
         "the truth beside what odom then measures",
         when="the sensors err",
         state=_odometry("true"),
     ),
     Topic(
         "joint_states_true",
-        _JOINTS,
-        _PLANT,
+        _JOINT_STATE_TYPE,
+        _PUBLISHED_BY_PLANT,
         "the truth beside what joint_states then measures",
         when="the sensors err",
         state=_joint_states("true"),
@@ -185,32 +185,32 @@ _TOPIC_TABLE = (
     ),
     Topic(
         "odom",
-        _ODOMETRY,
-        _PLANT,
+        _ODOMETRY_TYPE,
+        _PUBLISHED_BY_PLANT,
         "measured pose of the base link in the world, and its twist in its own frame",
         state=_odometry("measured"),
     ),
     Topic(
         "joint_states",
-        _JOINTS,
-        _PLANT,
+        _JOINT_STATE_TYPE,
+        _PUBLISHED_BY_PLANT,
         "measured positions and velocities of the joints, and the efforts of their actuators",
         state=_joint_states("measured"),
         frame="base",
     ),
     Topic(
         "base_wrench_realised",
-        _WRENCH_STAMPED,
-        _PLANT,
+        _WRENCH_STAMPED_TYPE,
+        _PUBLISHED_BY_PLANT,
         "mean wrench of the thrusters in the last tick, in answer to base_wrench",
         when="`thrusters` is set",
-        state=(StateField("wrench", "thruster_wrench", _WRENCH),),
+        state=(StateField("wrench", "thruster_wrench", _WRENCH_MEMBERS),),
         frame="base",
     ),
     Topic(
         "thrusters",
-        _JOINTS,
-        _PLANT,
+        _JOINT_STATE_TYPE,
+        _PUBLISHED_BY_PLANT,
         "of each thruster by name: position, for how long it was on since the beginning (s); "
         "velocity, for what part of the last tick; effort, its mean force in it (N)",
         when="`thrusters` is set",
@@ -224,21 +224,27 @@ _TOPIC_TABLE = (
     ),
     Topic(
         "/tf",
-        _TRANSFORMS,
-        _PLANT,
+        _TRANSFORMS_TYPE,
+        _PUBLISHED_BY_PLANT,
         "base link in the world and links in their parents, as odom and joint_states have them, "
         "every `tf_period`",
         when="tf2_msgs is installed; in bags always",
     ),
     Topic(
         "/tf_static",
-        _TRANSFORMS,
-        _PLANT,
+        _TRANSFORMS_TYPE,
+        _PUBLISHED_BY_PLANT,
         "the links that fixed joints hold in their parents",
         when="likewise, and the robot has such links",
         latched=True,
     ),
-    Topic("robot_description", _STRING, _PLANT, "the URDF of the robot", latched=True),
+    Topic(
+        "robot_description",
+        _STRING_TYPE,
+        _PUBLISHED_BY_PLANT,
+        "the URDF of the robot",
+        latched=True,
+    ),
     Topic(
         "markers",
         "visualization_msgs/msg/MarkerArray",
@@ -252,44 +258,51 @@ _TOPIC_TABLE = (
         "refused commands, limits, momentum, faults, deadlines; ignored states; silent nodes; what "
         "was recorded and lost",
     ),
-    Topic("fault_injection", _STRING, _USER, "faults for the plant, one a line, or `clear`"),
+    Topic(
+        "fault_injection",
+        _STRING_TYPE,
+        _PUBLISHED_BY_USER,
+        "faults for the plant, one a line, or `clear`",
+    ),
     Topic(
         "joint_commands",
-        _JOINTS,
+        _JOINT_STATE_TYPE,
         ("planner", "coordinated_control"),
         "velocities or efforts (by `actuation`), by joint name, stamped with the state that they "
         "answer, of all joints in any order",
     ),
     Topic(
         "base_wrench",
-        _WRENCH_STAMPED,
+        _WRENCH_STAMPED_TYPE,
         ("coordinated_control",),
         "thruster force and torque wanted at the origin of the base link, in its frame",
     ),
-    Topic("goal_pose", _POSE_STAMPED, _USER, "where the base is to be, in the world"),
+    Topic(
+        "goal_pose", _POSE_STAMPED_TYPE, _PUBLISHED_BY_USER, "where the base is to be, in the world"
+    ),
     Topic(
         "goal_joint_states",
-        _JOINTS,
-        _USER,
+        _JOINT_STATE_TYPE,
+        _PUBLISHED_BY_USER,
         "the shape that later goals are to end in; without joints: any",
     ),
     Topic(
         "end_effector/goal_pose",
-        _POSE_STAMPED,
-        _USER,
+        _POSE_STAMPED_TYPE,
+        _PUBLISHED_BY_USER,
         "where the end-effector is to be, in the world",
     ),
     Topic(
         "joint_reference",
-        _JOINTS,
+        _JOINT_STATE_TYPE,
         ("planner",),
         "joint positions and velocities for coordinated control to track",
         when="`output` is reference",
     ),
     Topic(
         "base_reference",
-        _ODOMETRY,
-        _USER,
+        _ODOMETRY_TYPE,
+        _PUBLISHED_BY_USER,
         "a moving reference of the base for coordinated control, one for every state",
     ),
     Topic(
@@ -308,7 +321,7 @@ _TOPIC_TABLE = (
     ),
     Topic(
         "plant/status",
-        _STATUS,
+        _STATUS_TYPE,
         ("plant",),
         "state of the plant, why, and the injected faults that are active: at once on every "
         "change; `state` is inactive, running, resting, paused, latched or failed",
@@ -316,21 +329,21 @@ _TOPIC_TABLE = (
     ),
     Topic(
         "planner/status",
-        _STATUS,
+        _STATUS_TYPE,
         ("planner",),
         "state of the planner, why, its goal and the remaining error",
         latched=True,
     ),
     Topic(
         "controller/status",
-        _STATUS,
+        _STATUS_TYPE,
         ("coordinated_control",),
         "state of the controller, why, its goal, errors, and what saturation cost",
         latched=True,
     ),
     Topic(
         "replay/status",
-        _STATUS,
+        _STATUS_TYPE,
         ("replay",),
         "where a replay is: `state` is playing, paused or ended, `position_s` and `duration_s` "
         "from its beginning, `rate`; on every change, and five times a second",
@@ -340,20 +353,20 @@ _TOPIC_TABLE = (
     Topic(
         "replay/seek",
         "std_msgs/msg/Float64",
-        _USER,
+        _PUBLISHED_BY_USER,
         "where a replay is to go on, s from its beginning",
         when="a bag is replayed",
     ),
     Topic(
         "events",
-        _STATUS,
+        _STATUS_TYPE,
         ("plant", "planner", "coordinated_control", "recorder", "replay"),
         "one record for each change of state: `event` is its kind, `time` simulated, `wall_time` "
         "since the epoch (not in a lockstep run in one process), both in s",
     ),
     Topic(
         "heartbeat",
-        _STATUS,
+        _STATUS_TYPE,
         ("plant", "planner", "coordinated_control", "recorder", "replay"),
         "five times a second of wall time from every active node: `name`, `hardware_id` (what "
         "others depend on it for), `message` (active, busy or inactive); in bags only on request",
@@ -366,7 +379,7 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TOPIC_TABLE}
 GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
 """Topics with absolute names; a stack in a namespace remaps them into the namespace."""
 
-NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/heartbeat")
+TOPICS_NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/heartbeat")
 """Endings of topics that are recorded only on request."""
 
 

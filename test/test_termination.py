@@ -150,7 +150,7 @@ def test_a_second_signal_ends_it_at_once() -> None:
 def test_a_request_that_nobody_notices_ends_the_process() -> None:
     text = """
 from spacerobot_ros import termination
-termination._NOTICE_TIME = 0.2
+termination._LONGEST_NOTICE_TIME = 0.2
 with guarded(), ended_on_request() as requested:
     ready()
     time.sleep(600)

@@ -12,7 +12,7 @@ from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotErro
 from spacerobot_ros.times import SECOND
 
 _LATEST_TIME_NS = 2**63 - 1
-_SHOWN_AFTER_JUMP_NS = SECOND
+_MAX_AGE_SHOWN_AFTER_JUMP_NS = SECOND
 """Greatest age of a message that is published again after a jump of the replay, ns."""
 
 _MAX_REPLAYED_TOPICS = 1000
@@ -320,8 +320,8 @@ class Playback:
             The bag turns out damaged.
         """
         at = min(max(bag_ns, self._start_ns), self._last_ns)
-        recent = max(at - _SHOWN_AFTER_JUMP_NS, self._start_ns)
-        last = {message.topic: message for message in self._latched_before(at)}
+        recent = max(at - _MAX_AGE_SHOWN_AFTER_JUMP_NS, self._start_ns)
+        last = {message.topic: message for message in self._latched_messages_before(at)}
         begins = at == self._start_ns and not self._timeline.running
         for message in self._messages_between(
             set(self._topic_by_channel), recent, at if begins else at - 1
@@ -365,7 +365,7 @@ class Playback:
         return message
 
     def _messages(self, start_ns: int) -> Generator[ReplayMessage, None, None]:
-        earlier = {message.topic: message for message in self._latched_before(start_ns)}
+        earlier = {message.topic: message for message in self._latched_messages_before(start_ns)}
         in_time = self._messages_between(set(self._topic_by_channel), start_ns, self._end_ns)
         first = next(in_time, None)
         if first is None:
@@ -374,7 +374,7 @@ class Playback:
         yield first
         yield from in_time
 
-    def _latched_before(self, time_ns: int) -> Iterator[ReplayMessage]:
+    def _latched_messages_before(self, time_ns: int) -> Iterator[ReplayMessage]:
         """Yield the messages of latched topics before a time; the last of each counts."""
         latched = {n for t in self.topics if t.latched for n in self._bag.channel_ids(t.name)}
         if latched and time_ns > self._bag.start_time_ns:

@@ -43,7 +43,7 @@ _DefaultT = TypeVar("_DefaultT")
 
 _STRING_TYPE = "std_msgs/msg/String"
 
-_DECODABLE_BYTES, _DECODABLE_RATIO = 16_000_000, 50
+_MAX_DECODED_BYTES, _MAX_DECODED_TO_FILE_RATIO = 16_000_000, 50
 """Largest size of a decoded topic, whose objects take ten times as much: bytes, or how many times
 the size of the file."""
 
@@ -104,7 +104,9 @@ class Bag:
         self.path = path
         with open_bag(path) as file:
             self._summary = read_summary(path, file)
-            self._max_decoded_bytes = max(_DECODABLE_BYTES, _DECODABLE_RATIO * file_size(file))
+            self._max_decoded_bytes = max(
+                _MAX_DECODED_BYTES, _MAX_DECODED_TO_FILE_RATIO * file_size(file)
+            )
         self._message_types = MessageTypes()
         self._series_by_topic: dict[str, TopicSeries] = {}
         self._prismatic_by_namespace: dict[str, dict[str, bool]] = {}

@@ -42,7 +42,7 @@ _WAITING, _ON_CLOCK, _ON_WALL_TIME = (
     RecordingState.ON_CLOCK,
     RecordingState.ON_WALL_TIME,
 )
-_DROPPING = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED)
+_STATES_THAT_DROP_MESSAGES = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED)
 
 
 class _EarlyMessage(NamedTuple):
@@ -103,7 +103,7 @@ class Recording:
     @property
     def running(self) -> bool:
         """Whether messages are recorded."""
-        return self.state not in _DROPPING
+        return self.state not in _STATES_THAT_DROP_MESSAGES
 
     @property
     def messages_waiting(self) -> int:

@@ -130,7 +130,7 @@ def is_complete(path: Path) -> bool:
         return False
 
 
-def _whole_records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
+def _complete_records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
     """Iterate over the records between two bytes of a file, up to the first incomplete one."""
     # Only reading is inside the try: errors of the caller must not be caught.
     with suppress(ValueError):
@@ -157,13 +157,13 @@ class _ReadableRecords:
                 what = "holds nothing yet" if empty else "is not an MCAP file"
                 raise RecordingError(f"{self._path} {what}: there is nothing to salvage.")
             whole, allowance = len(start), InflationLimit(size)
-            for place, opcode, body in _whole_records(file, len(start), size):
+            for place, opcode, body in _complete_records(file, len(start), size):
                 whole = place + RECORD_HEADER.size + len(body)
                 if opcode == Opcode.HEADER:
                     with suppress(*DAMAGE_ERRORS):
                         self.profile = parse_record(Header.read, body, place).profile
                 elif opcode == Opcode.CHUNK:
-                    yield from self._chunk(body, place, allowance)
+                    yield from self._records_in_chunk(body, place, allowance)
                 elif opcode == Opcode.DATA_END:
                     # The summary repeats earlier records.
                     return
@@ -171,7 +171,7 @@ class _ReadableRecords:
                     yield opcode, body
             self.lost_bytes = size - whole
 
-    def _chunk(
+    def _records_in_chunk(
         self, body: bytes, place: int, allowance: InflationLimit
     ) -> Iterator[tuple[int, bytes]]:
         try:
@@ -193,7 +193,7 @@ class _SalvagedBag:
         self._file = file
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._chunk = bytearray()
+        self._records_in_chunk = bytearray()
         self._entries: dict[int, list[int]] = {}
 
     def add(self, opcode: int, body: bytes) -> None:
@@ -232,17 +232,17 @@ class _SalvagedBag:
             self._entries[channel_id] = []
             channel = self._channels[channel_id]
             if channel.schema_id in self._schemas:
-                self._chunk += encode(self._schemas[channel.schema_id])
-            self._chunk += encode(channel)
-        self._entries[channel_id] += log_time_ns, len(self._chunk)
-        self._chunk += RECORD_HEADER.pack(Opcode.MESSAGE, len(body)) + body
-        if len(self._chunk) >= _CHUNK_SIZE:
+                self._records_in_chunk += encode(self._schemas[channel.schema_id])
+            self._records_in_chunk += encode(channel)
+        self._entries[channel_id] += log_time_ns, len(self._records_in_chunk)
+        self._records_in_chunk += RECORD_HEADER.pack(Opcode.MESSAGE, len(body)) + body
+        if len(self._records_in_chunk) >= _CHUNK_SIZE:
             self._flush()
 
     def _flush(self) -> None:
         if any(self._entries.values()):
-            self._file.append_chunk(self._chunk, self._entries)
-            self._chunk = bytearray()
+            self._file.append_chunk(self._records_in_chunk, self._entries)
+            self._records_in_chunk = bytearray()
             for entries in self._entries.values():
                 entries.clear()
 

@@ -365,7 +365,7 @@ def export(
         try:
             rows = write(_tables_by_file_name(tables), made)
             result = made / "tables.mat" if format is ExportFormat.MAT else made
-            result.chmod(0o777 & ~_umask() if result.is_dir() else 0o666 & ~_umask())
+            result.chmod(0o777 & ~_read_umask() if result.is_dir() else 0o666 & ~_read_umask())
             _move_into_place(result, target)
         finally:
             shutil.rmtree(made, ignore_errors=True)
@@ -400,7 +400,7 @@ def _move_into_place(made: Path, target: Path) -> None:
         made.replace(target)
 
 
-def _umask() -> int:
+def _read_umask() -> int:
     mask = os.umask(0o077)
     os.umask(mask)
     return mask

@@ -26,7 +26,7 @@ class Checkout:
 
     @classmethod
     def pair(cls, other: Path | None) -> tuple[Checkout, Checkout | None]:
-        """Return this checkout, and the one in another folder unless that is None.
+        """Return this checkout and the checkout in another folder; None without a folder.
 
         Raises
         ------
@@ -108,7 +108,7 @@ def compare(
     assert there is not None
     found: dict[Checkout, list[Figures]] = {here: [], there: []}
     for number in range(rounds):
-        # Each is first in every other round: warming up affects both alike.
+        # The checkouts take turns to be first, so that warming up affects both alike.
         for checkout in (here, there) if number % 2 == 0 else (there, here):
             figures = measure(checkout)
             found[checkout].append(
@@ -125,6 +125,6 @@ def compare(
 
 
 def _medians(rounds: Sequence[Figures]) -> dict[str, float]:
-    """Return the median of each figure that all rounds have."""
+    """Return the median over all rounds of each figure."""
     names = [name for name in rounds[0] if all(name in each for each in rounds)]
     return {name: statistics.median(each[name] for each in rounds) for name in names}

@@ -26,16 +26,16 @@ from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 
-_STEP = 0.001
+_INTEGRATION_STEP = 0.001
 """Integration step of the dynamics benchmark, s."""
 
-_STEPS = 1000
-"""Steps in one call of either engine."""
+_STEPS_PER_CALL = 1000
+"""Number of steps in one call of an engine."""
 
-_ROUNDS = 21
+_DYNAMICS_ROUNDS = 21
 
 _MIN_INERTIA = 1e-12
-"""MuJoCo has no point masses, kg m^2."""
+"""Least moment of inertia in MuJoCo, which has no point masses, kg m^2."""
 
 
 def median_cpu_times(
@@ -85,18 +85,21 @@ def dynamics_benchmark() -> dict[str, float | str]:
     result: dict[str, float | str] = {"compiler": compiler or "none (virtual machine)"}
     runs: dict[str, tuple[Callable[[], object], int]] = {}
     if compiler:
-        runs["step_us"] = _plant_steps(robot), _STEPS
-    with _virtual_machine():
-        # Built anew, because functions are compiled where a model is built.
-        runs["step_without_compiler_us"] = (_plant_steps(SpaceRobot(robot.description)), _STEPS)
+        runs["step_us"] = _plant_steps_function(robot), _STEPS_PER_CALL
+    with _build_functions_for_virtual_machine():
+        # The model is built again, because its functions are compiled at construction.
+        runs["step_without_compiler_us"] = (
+            _plant_steps_function(SpaceRobot(robot.description)),
+            _STEPS_PER_CALL,
+        )
     try:
         import mujoco
     except ImportError:
         result["mujoco"] = "not installed: no comparison"
     else:
         result["mujoco"] = mujoco.__version__
-        runs["mujoco_step_us"] = _mujoco_steps(mujoco, robot), _STEPS
-    result |= median_cpu_times(runs, _ROUNDS)
+        runs["mujoco_step_us"] = _mujoco_steps_function(mujoco, robot), _STEPS_PER_CALL
+    result |= median_cpu_times(runs, _DYNAMICS_ROUNDS)
     for ratio, name in (
         ("ratio_to_mujoco", "step_us"),
         ("ratio_to_mujoco_without_compiler", "step_without_compiler_us"),
@@ -106,15 +109,15 @@ def dynamics_benchmark() -> dict[str, float | str]:
     return result
 
 
-def _rates(n: int) -> Array:
+def _slow_joint_rates(n: int) -> Array:
     """Return joint rates (n,), rad/s: slow enough to stay within the limits in all rounds."""
     return 0.02 * np.cos(np.arange(n))
 
 
-def _plant_steps(robot: SpaceRobot) -> Callable[[], None]:
+def _plant_steps_function(robot: SpaceRobot) -> Callable[[], None]:
     """Return a function that takes a thousand steps of the plant."""
-    start = InitialState(joint_velocities=_rates(robot.n))
-    plant = EffortPlant(robot, _STEPS * _STEP, start, _STEP)
+    start = InitialState(joint_velocities=_slow_joint_rates(robot.n))
+    plant = EffortPlant(robot, _STEPS_PER_CALL * _INTEGRATION_STEP, start, _INTEGRATION_STEP)
     nothing = np.zeros(robot.n)
 
     def run() -> None:
@@ -124,16 +127,16 @@ def _plant_steps(robot: SpaceRobot) -> Callable[[], None]:
     return run
 
 
-def _mujoco_steps(mujoco: Any, robot: SpaceRobot) -> Callable[[], None]:
+def _mujoco_steps_function(mujoco: Any, robot: SpaceRobot) -> Callable[[], None]:
     """Return a function that takes a thousand steps of MuJoCo in the same motion."""
-    model = mujoco_model(mujoco, robot.description, _STEP)
+    model = mujoco_model(mujoco, robot.description, _INTEGRATION_STEP)
     data = mujoco.MjData(model)
-    rates = _rates(robot.n)
+    rates = _slow_joint_rates(robot.n)
     twist = np.concatenate(robot.base_twist([0, 0, 0, 1], np.zeros(robot.n), rates))
     data.qvel[:6] = twist  # The base is not rotated: world and base components are the same.
     for name, rate in zip(robot.joint_names, rates, strict=True):
         data.joint(name).qvel[:] = rate
-    return lambda: mujoco.mj_step(model, data, nstep=_STEPS)
+    return lambda: mujoco.mj_step(model, data, nstep=_STEPS_PER_CALL)
 
 
 def mujoco_model(mujoco: Any, description: RobotDescription, step: float) -> Any:
@@ -153,7 +156,7 @@ def mujoco_model(mujoco: Any, description: RobotDescription, step: float) -> Any
 
 
 @contextmanager
-def _virtual_machine() -> Iterator[None]:
+def _build_functions_for_virtual_machine() -> Iterator[None]:
     """Have functions that are built in this context run in CasADi's virtual machine."""
     before = os.environ.get("SPACEROBOT_COMPILE")
     os.environ["SPACEROBOT_COMPILE"] = "0"
@@ -168,27 +171,27 @@ def _virtual_machine() -> Iterator[None]:
 
 # -- flights in SIMD lanes -------------------------------------------------------------------
 
-_COUNT = 2000
-"""Flights in lanes, in one round."""
+_LANE_FLIGHTS = 2000
+"""Number of flights in SIMD lanes in one round."""
 
-_ROLLED = 64
-"""Flights of MuJoCo's rollout in one round: one thread flies them one after another."""
+_MUJOCO_FLIGHTS = 64
+"""Number of flights of MuJoCo's rollout in one round."""
 
 _LANE_ROUNDS = 5
 
-_MANY = 10_000
-"""Flights of which the whole time is measured."""
+_TIMED_FLIGHTS = 10_000
+"""Number of flights whose total CPU time is measured."""
 
 _MASS_SPREAD = 0.05
 """Largest relative change of masses and inertias."""
 
 _COMPARED_FLIGHTS = 50
-"""Number of flights that the plant flies as well, for comparison."""
+"""Number of flights compared with flights of the plant."""
 
 
 @dataclass(frozen=True)
-class _Case:
-    """A robot and its commands.
+class _LaneCase:
+    """A robot and its commands in the lanes benchmark.
 
     Attributes
     ----------
@@ -254,10 +257,10 @@ def lanes_benchmark(show: Callable[[str], None]) -> dict[str, float | str]:
     arm = 0.3 * (np.sin(phases) - np.sin(phases[0]))
     efforts = 2.0 * np.cos(np.linspace(0, 6, 50))[:, None] * np.ones(servicer.n)
     cases = (
-        _Case("sliders velocity", sliders, "velocity", 0.05, 780, shapes),
-        _Case("servicer velocity", servicer, "velocity", 0.05, 780, arm),
-        _Case("servicer effort", servicer, "effort", 0.01, 50, efforts),
-        _Case("sliders effort", sliders, "effort", 0.01, 50, efforts[:, :3]),
+        _LaneCase("sliders velocity", sliders, "velocity", 0.05, 780, shapes),
+        _LaneCase("servicer velocity", servicer, "velocity", 0.05, 780, arm),
+        _LaneCase("servicer effort", servicer, "effort", 0.01, 50, efforts),
+        _LaneCase("sliders effort", sliders, "effort", 0.01, 50, efforts[:, :3]),
     )
     for case in cases:
         found = _measure_case(case)
@@ -265,28 +268,28 @@ def lanes_benchmark(show: Callable[[str], None]) -> dict[str, float | str]:
         figures |= {f"{case.name}: {name}": value for name, value in found.items()}
         show(_case_text(case.name, found))
     began = time.process_time()
-    cases[0].campaign(_MANY, 1)
+    cases[0].campaign(_TIMED_FLIGHTS, 1)
     figures["sliders velocity: cpu_s_of_10000_flights_of_39_s"] = time.process_time() - began
     show(
-        f"{_MANY} open-loop flights of {cases[0].ticks * cases[0].control_period:g} s: "
+        f"{_TIMED_FLIGHTS} open-loop flights of {cases[0].ticks * cases[0].control_period:g} s: "
         f"{time.process_time() - began:.2f} s of CPU time, drawing and errors among it"
     )
     show(f"engine: {figures['engine']}")
     return figures
 
 
-def _measure_case(case: _Case) -> dict[str, float | str]:
+def _measure_case(case: _LaneCase) -> dict[str, float | str]:
     few = case.flights(_COMPARED_FLIGHTS, 2)
     result, plant = fly_lanes(few), fly_one_by_one(few)
     largest = max(
         float(np.abs(getattr(result, name) - getattr(plant, name)).max()) for name in ("pose", "q")
     )
     runs: dict[str, tuple[Callable[[], object], int]] = {
-        "lanes_us": (lambda: case.campaign(_COUNT, 0), _COUNT * case.ticks),
-        "plant_us": (_plant_run(case), case.ticks),
+        "lanes_us": (lambda: case.campaign(_LANE_FLIGHTS, 0), _LANE_FLIGHTS * case.ticks),
+        "plant_us": (_plant_flight_function(case), case.ticks),
     }
-    if case.actuation == "effort" and (rollout := _rollout(case)) is not None:
-        runs["mujoco_us"] = (rollout, _ROLLED * case.ticks)
+    if case.actuation == "effort" and (rollout := _mujoco_rollout_function(case)) is not None:
+        runs["mujoco_us"] = (rollout, _MUJOCO_FLIGHTS * case.ticks)
     found: dict[str, float | str] = {**median_cpu_times(runs, _LANE_ROUNDS)}
     for name in ("plant", "mujoco"):
         if f"{name}_us" in runs:
@@ -310,7 +313,7 @@ def _case_text(name: str, found: Mapping[str, Any]) -> str:
     return f"{text}; largest difference {found['largest_difference_to_plant']:.1e}"
 
 
-def _plant_run(case: _Case) -> Callable[[], None]:
+def _plant_flight_function(case: _LaneCase) -> Callable[[], None]:
     """Return a function that flies one flight by the plant, tick by tick."""
     kind: Callable[..., VelocityPlant | EffortPlant]
     kind = EffortPlant if case.actuation == "effort" else VelocityPlant
@@ -328,7 +331,7 @@ def _plant_run(case: _Case) -> Callable[[], None]:
     return run
 
 
-def _rollout(case: _Case) -> Callable[[], object] | None:
+def _mujoco_rollout_function(case: _LaneCase) -> Callable[[], object] | None:
     """Return the flights by MuJoCo's rollout under the same efforts; None without MuJoCo."""
     try:
         import mujoco
@@ -345,6 +348,6 @@ def _rollout(case: _Case) -> Callable[[], object] | None:
     size = mujoco.mj_stateSize(model, state.mjSTATE_FULLPHYSICS)
     start = np.zeros(size)
     mujoco.mj_getState(model, data, start, state.mjSTATE_FULLPHYSICS)
-    starts = np.tile(start, (_ROLLED, 1))
+    starts = np.tile(start, (_MUJOCO_FLIGHTS, 1))
     spec = int(state.mjSTATE_QFRC_APPLIED)
     return lambda: rollout.rollout(model, data, starts, forces, control_spec=spec)

@@ -31,25 +31,25 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
 from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance
 
-_PERIOD = 0.05
+_PLAN_CONTROL_PERIOD = 0.05
 """Control period of the plans, s."""
 
 _MIN_GOAL_ANGLE = 0.05
 """Smallest rotation of a goal, rad."""
 
 _START_SCATTER = 0.3
-"""Largest distance of a start from the case's, m or rad a joint."""
+"""Largest difference of a start's joint position from the case's, m or rad."""
 
 # -- flights ----------------------------------------------------------------------------------
 
-_SHORT_FLIGHT = 5.0
-"""Simulated time of the flight that is subtracted: start, planning, end, s."""
+_SUBTRACTED_FLIGHT_TIME = 5.0
+"""Simulated time of a short flight, which is subtracted from a long one, s."""
 
 _SLIDING_PERIOD, _TIME_BEFORE_CYCLES, _CYCLE_PERIOD = 0.05, 100.0, 3.0
 """Of sliding_masses with ``lie_bracket``: control period, time before the cycles, one cycle, s."""
 
 _MIN_CYCLES = 170
-"""Fewer cycles have too large loops for the rotation of the goal."""
+"""Least number of cycles; with fewer, the loops are too large for the rotation of the goal."""
 
 _PLANNED_SCENARIOS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("sliding_masses", "lie_bracket", {}),
@@ -107,14 +107,15 @@ def tick_times(ticks: int) -> dict[str, float]:
 
 def _stack_tick(words: list[str], longest: float) -> float:
     """Return the CPU time of a tick of ``spacerobot run`` in this process, us."""
-    _fly_by_command(words, _SHORT_FLIGHT)  # Imports, and compiles.
-    short_time, short_ticks = _fly_by_command(words, _SHORT_FLIGHT)
+    # The first flight imports modules and compiles functions.
+    _fly_by_command(words, _SUBTRACTED_FLIGHT_TIME)
+    short_time, short_ticks = _fly_by_command(words, _SUBTRACTED_FLIGHT_TIME)
     long_time, long_ticks = _fly_by_command(words, longest)
     return 1e6 * (long_time - short_time) / (long_ticks - short_ticks)
 
 
 def _fly_by_command(words: list[str], longest: float) -> tuple[float, int]:
-    """Fly; return the CPU time, s, and the number of ticks."""
+    """Run a flight by command; return its CPU time, s, and its number of ticks."""
     with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
         result = Path(folder, "result.json")
         if math.isfinite(longest):
@@ -129,7 +130,7 @@ def _fly_by_command(words: list[str], longest: float) -> tuple[float, int]:
 
 
 def _imported_package() -> Any:
-    """Return the package as a program of a user imports it."""
+    """Return the package, imported as in a user's program."""
     return import_module("spacerobot_ros")
 
 
@@ -226,9 +227,9 @@ def plans(
     robot, chosen_case = SpaceRobot.from_file(urdf), CASES[case]
     chosen = {**chosen_case.options, **options, "cache": 0}
     if OptimalOptions().time_budget > 0:
-        # A version whose plans depend on the machine's speed: as on a fast machine.
+        # Plans of older versions depend on the machine's speed: assume a fast machine.
         chosen["time_budget"] = 1e6
-    method = OptimalGait(robot, _PERIOD, options=OptimalOptions(**chosen))
+    method = OptimalGait(robot, _PLAN_CONTROL_PERIOD, options=OptimalOptions(**chosen))
     goals = list(requests(robot, chosen_case, count + 1, seed))
     if library:
         solutions = method.build_library(requests(robot, chosen_case, library, seed + 1))
@@ -237,7 +238,7 @@ def plans(
             file = Path(folder, "library.npz")
             file.write_bytes(solutions.to_bytes())
             chosen["library"] = str(file)
-            method = OptimalGait(robot, _PERIOD, options=OptimalOptions(**chosen))
+            method = OptimalGait(robot, _PLAN_CONTROL_PERIOD, options=OptimalOptions(**chosen))
     times: list[float] = []
     durations: list[float] = []
     for request in goals:
@@ -267,7 +268,7 @@ def first_plan(urdf: str) -> dict[str, float]:
     from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions
 
     robot = SpaceRobot.from_file(urdf)
-    method = OptimalGait(robot, _PERIOD, options=OptimalOptions(cache=0))
+    method = OptimalGait(robot, _PLAN_CONTROL_PERIOD, options=OptimalOptions(cache=0))
     q = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
     goal = Goal.checked(np.zeros(3), quaternion_from_rotvec(_FIRST_GOAL_ROTVEC))

@@ -1,4 +1,4 @@
-"""Plans of ``optimal`` without its cache: by this checkout, another one, and a long search."""
+"""Plans of ``optimal`` without its cache, compared with another checkout and with a long search."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from spacerobot_ros.benchmarks.measurements import CASES
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import robot_file
 
-_SEED = 7
+_GOAL_SEED = 7
 
-_DURATION_RATIOS = (1.01, 1.02, 1.03)
-"""Ratios of durations below which goals are counted."""
+_DURATION_RATIO_BOUNDS = (1.01, 1.02, 1.03)
+"""Bounds of duration ratios; goals with ratios below each bound are counted."""
 
 _LARGE_ROBOTS = ("seven_joint_arm", "quadruped", "dual_arm")
-"""Robots of 7, 12 and 14 joints."""
+"""Robots with 7, 12 and 14 joints in the benchmark of first plans."""
 
-_NEXT_PROCESSES = 3
-"""Number of processes with the cache of the first one, of which medians are taken."""
+_PROCESSES_AFTER_FIRST = 3
+"""Number of processes after the first one, which use its cache; medians are taken."""
 
 Plans = Mapping[str, list[float]]
 
@@ -93,7 +93,7 @@ def _measured_plans(checkout: Checkout, robot: str, goals: int, **arguments: Any
     """Return the plans of a number of goals; ``arguments`` are further ones of ``plans``."""
     arguments = {"options": {}, **arguments}
     plans: Plans = checkout.measure(
-        "plans", urdf=str(robot_file(robot)), case=robot, count=goals, seed=_SEED, **arguments
+        "plans", urdf=str(robot_file(robot)), case=robot, count=goals, seed=_GOAL_SEED, **arguments
     )
     return plans
 
@@ -101,12 +101,12 @@ def _measured_plans(checkout: Checkout, robot: str, goals: int, **arguments: Any
 def _compare_durations(
     plans: Plans, others: Plans, whose: str, show: Callable[[str], None]
 ) -> dict[str, float]:
-    """Return figures of the durations beside those of others, and show them."""
+    """Return and show figures that compare plan durations with those of other plans."""
     here, there = (np.array(each["duration_s"]) for each in (plans, others))
     figures = duration_figures(here, there)
     shares = ", ".join(
         f"{100 * figures[f'share_below_{limit:g}']:.0f} % at most {100 * (limit - 1):.0f} %"
-        for limit in _DURATION_RATIOS
+        for limit in _DURATION_RATIO_BOUNDS
     )
     show(f"... durations beside those {whose}: {shares} longer; at most {figures['worst']:.3f}")
     return figures
@@ -120,7 +120,7 @@ def duration_figures(here: Array, there: Array) -> dict[str, float]:
     ratio = np.where(np.isnan(there), np.where(np.isnan(here), 1.0, 0.0), here / there)
     ratio = np.where(np.isnan(ratio), np.inf, ratio)
     shares = {
-        f"share_below_{limit:g}": float(np.mean(ratio <= limit)) for limit in _DURATION_RATIOS
+        f"share_below_{limit:g}": float(np.mean(ratio <= limit)) for limit in _DURATION_RATIO_BOUNDS
     }
     return {**shares, "worst": float(ratio.max()), "best": float(ratio.min())}
 
@@ -164,7 +164,7 @@ def _first_plans(checkout: Checkout, name: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="spacerobot_") as cache:
         first, *others = (
             checkout.measure("first_plan", cache=cache, urdf=str(robot_file(name)))
-            for _ in range(1 + _NEXT_PROCESSES)
+            for _ in range(1 + _PROCESSES_AFTER_FIRST)
         )
     return {
         "joints": first["joints"],

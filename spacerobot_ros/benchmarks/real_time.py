@@ -41,13 +41,13 @@ _MEMORY_PERIOD = 1.0
 
 _LONGEST_IDLE_END = 5.0
 
-_WARM_UP = 0.25
-"""Part of the time after which memory should not grow any more."""
+_WARM_UP_SHARE = 0.25
+"""Share of the flight after which memory must not grow."""
 
-_PRIORITIES = {"plant": 30, "planner": 20, "coordinated_control": 20, "recorder": 10}
+_PRIORITY_BY_NODE = {"plant": 30, "planner": 20, "coordinated_control": 20, "recorder": 10}
 """Priorities of the kernel's real-time scheduling, where it is allowed; `chrt -f` sets the same."""
 
-_GOAL = Goal.checked([0.2, -0.15, 0.05], quaternion_from_rotvec([0.1, -0.05, 0.02]))
+_FLIGHT_GOAL = Goal.checked([0.2, -0.15, 0.05], quaternion_from_rotvec([0.1, -0.05, 0.02]))
 _COUNTED_STATE_TOPICS = ("/clock", "/odom", "/joint_states", "/momentum")
 
 
@@ -55,7 +55,7 @@ _COUNTED_STATE_TOPICS = ("/clock", "/odom", "/joint_states", "/momentum")
 def stack_in_processes(
     scenario: Scenario,
 ) -> Iterator[tuple[MultiProcessStack, Path, Callable[[], bool]]]:
-    """Have the nodes of a scenario in processes of their own.
+    """Run the nodes of a scenario in separate processes.
 
     Yields the stack, its bag, and a function that returns whether a signal has requested the end.
     """
@@ -111,7 +111,7 @@ class RealTimeFigures:
 
     @property
     def missed(self) -> float:
-        """Part of all deadlines that was missed."""
+        """Share of all deadlines that was missed."""
         late = self.ticks_late + self.ticks_skipped + self.commands_late + self.commands_missing
         return late / (2 * self.ticks)
 
@@ -137,7 +137,7 @@ class RealTimeFigures:
         )
 
     def figures(self) -> dict[str, float]:
-        """Return all numbers by name, with the rate in it."""
+        """Return all figures by name; the names contain the rate."""
         return {
             f"real_time_{self.rate:g}_{each.name}": getattr(self, each.name)
             for each in fields(self)
@@ -182,7 +182,7 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
     ):
         idle = idle_process.apply_async(_wait_for_ticks, (1.0 / rate, duration))
         prioritised = prioritise(stack)
-        stack.start(_GOAL)
+        stack.start(_FLIGHT_GOAL)
         began = sampled = time.monotonic()
 
         def sample_memory() -> bool:
@@ -199,12 +199,12 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
         idle_delays = 0, math.nan
         with suppress(multiprocessing.TimeoutError):
             idle_delays = idle.get(_LONGEST_IDLE_END)
-        return _figures(
+        return _flight_figures(
             rate, read_bag(bag), published, memory, idle_delays, prioritised=prioritised
         )
 
 
-def _figures(
+def _flight_figures(
     rate: float,
     bag: Bag,
     published: int,
@@ -222,7 +222,7 @@ def _figures(
     stamps = bag["/joint_states"].stamp
     states = round((stamps[-1] - stamps[0]) * rate) + 1
     lost = max(states - bag.message_count(topic) for topic in _COUNTED_STATE_TOPICS)
-    settled = memory[int(_WARM_UP * len(memory)) :]
+    settled = memory[int(_WARM_UP_SHARE * len(memory)) :]
     third = max(len(settled) // 3, 1)
     return RealTimeFigures(
         rate=rate,
@@ -245,7 +245,7 @@ def _figures(
 
 
 def _timing_reports(bag: Bag) -> Iterator[tuple[float, int, dict[str, str]]]:
-    """Yield of each report of the plant's timing: time (s), ticks skipped so far, its values."""
+    """Yield time (s), ticks skipped so far and values of each report of the plant's timing."""
     skipped = 0
     for time_ns, array in bag["/diagnostics"].messages():
         for status in array.status:
@@ -259,18 +259,18 @@ def prioritise(stack: MultiProcessStack) -> bool:
     """Have the kernel let the plant go first, then its commander; return whether it does."""
     try:
         for name, process in stack.processes.items():
-            priority = os.sched_param(_PRIORITIES[name])
+            priority = os.sched_param(_PRIORITY_BY_NODE[name])
             for thread in Path(f"/proc/{process.pid}/task").iterdir():
                 os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, priority)
-    except (AttributeError, OSError):  # Not on every system, and not for everybody.
+    except (AttributeError, OSError):  # Not every system and user has real-time priorities.
         return False
     return True
 
 
 def _wait_for_ticks(period: float, duration: float) -> tuple[int, float]:
-    """Only wait for ticks, with a period and for a duration, s: delays are those of the machine.
+    """Wait for ticks of a period for a duration, s, to measure the delays of the machine itself.
 
-    Return how often it was late by more than a period, and the most beyond that, ms.
+    Return the number of delays above a period, and the largest excess, ms.
     """
     Thread(target=_end_with_parent, daemon=True).start()
     began = time.perf_counter()
@@ -307,13 +307,13 @@ def _resident_memory(stack: MultiProcessStack) -> float:
 # -- beside a viewer -------------------------------------------------------------------------
 
 _SETTLING_TIME = 10.0
-"""Wall time after the start or end of a viewer and its browser that does not count, s."""
+"""Wall time without measurements after a viewer starts or ends, s."""
 
 _GOAL_PERIOD = 15.0
-"""Wall time from one goal to the next, s: a robot at rest is not drawn again."""
+"""Wall time between goals, s; goals keep the robot moving, so that it is drawn again."""
 
 _GOAL_POSITIONS = ((0.0, 0.0, 0.0), (0.3, 0.1, -0.1))
-"""Positions of the base, which goals name in turns, m."""
+"""Base positions of the goals, used in turn, m."""
 
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _BROWSER_OPTIONS = (
@@ -374,12 +374,12 @@ def viewer_benchmark(
                 if client is not None:
                     counts.append((client.count - before) / seconds)
         finish(stack, stopped)
-        table = _deadlines(read_bag(bag))
+        table = _read_deadline_counts(read_bag(bag))
     updates = min(counts)
     figures = {"viewer_updates_per_s": updates}
     shares = []
     for viewed, which in ((False, "without"), (True, "with")):
-        turns = [_between(table, start, end) for each, start, end in spans if each == viewed]
+        turns = [_counts_between(table, start, end) for each, start, end in spans if each == viewed]
         deadlines, missed = np.sum(turns, axis=0)
         figures[f"viewer_missed_{which}_percent"] = percent = 100.0 * missed / max(deadlines, 1)
         figures[f"viewer_deadlines_{which}"] = deadlines
@@ -393,7 +393,7 @@ def viewer_benchmark(
 
 
 class _GoalSender:
-    """Goals that are sent in turns, so that the robot moves."""
+    """Sends goals periodically, so that the robot moves."""
 
     def __init__(self, stack: MultiProcessStack) -> None:
         self._stack, self._positions = stack, cycle(_GOAL_POSITIONS)
@@ -436,12 +436,12 @@ class _CountingClient:
         self._thread.start()
 
     def _count_messages(self) -> None:
-        with suppress(Exception):  # It is closed.
+        with suppress(Exception):  # The connection is closed.
             for _ in self._connection:
                 self.count += 1
 
     def close(self) -> None:
-        """Disconnect."""
+        """Disconnect from the page's server."""
         self._connection.close()
         self._thread.join(5.0)
 
@@ -468,10 +468,10 @@ def _viewer_and_browser(folder: Path) -> Iterator[_CountingClient]:
         yield client
 
 
-def _deadlines(bag: Bag) -> Array:
+def _read_deadline_counts(bag: Bag) -> Array:
     """Return a row (time s, deadlines, missed ones) for each report of the plant's timing.
 
-    All are counted from the beginning.
+    All counts begin at the start of the flight.
     """
     rows = []
     for time_s, skipped, values in _timing_reports(bag):
@@ -482,7 +482,7 @@ def _deadlines(bag: Bag) -> Array:
     return np.array(rows, float)
 
 
-def _between(table: Array, start: float, end: float) -> Array:
+def _counts_between(table: Array, start: float, end: float) -> Array:
     """Return the counts (2,) between two times, s, by a table of counts from the beginning."""
     rows = np.clip(np.searchsorted(table[:, 0], (start, end)), 0, len(table) - 1)
     return np.asarray(np.ptp(table[rows, 1:], axis=0))

@@ -22,22 +22,22 @@ from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.processes import MultiProcessStack
 
 GOAL_PERIOD = 12.0
-"""Wall s from one goal to the next."""
+"""Wall time between goals, s."""
 
 _SAMPLE_PERIOD = 2.0
-_WARM_UP = 0.25
-"""Part of the time that does not count: buffers fill, first plans are made."""
+_WARM_UP_SHARE = 0.25
+"""Share of the flight that is not evaluated, while buffers fill and first plans are made."""
 
 _MAX_SLOPE_SAMPLES = 400
-"""A slope is the median over all pairs: of more samples only every second, third, ... counts."""
+"""Largest number of samples for a slope, which is a median over pairs; more are thinned out."""
 
-_SEED = 13
+_GOAL_SEED = 13
 _MAX_GOAL_DISTANCE, _MAX_GOAL_ROTATION = 0.05, 0.0001
 """Largest coordinates of goals, m and rad."""
 
 _KIB_PER_MIB = 1024.0
 
-QUANTITIES: Mapping[str, tuple[str, float, float]] = {
+SAMPLED_QUANTITIES: Mapping[str, tuple[str, float, float]] = {
     "rss": ("MiB", 1.0, 6.0),
     "pss": ("MiB", 1.0, 6.0),
     "descriptors": ("", 0.5, 0.0),
@@ -101,11 +101,11 @@ def robust_slope(times: Floats, values: Floats) -> float:
 
 def trend_of(process: str, quantity: str, times: Floats, values: Floats) -> Trend:
     """Return the trend of the samples (n,) of one quantity at times (n,), s, after the warm-up."""
-    is_warm = times >= times[0] + _WARM_UP * (times[-1] - times[0])
+    is_warm = times >= times[0] + _WARM_UP_SHARE * (times[-1] - times[0])
     t, x = times[is_warm], values[is_warm]
     tenth = max(1, len(t) // 10)
     duration = float(t[-1] - t[0])
-    _, allowed_growth, hourly_growth = QUANTITIES[quantity]
+    _, allowed_growth, hourly_growth = SAMPLED_QUANTITIES[quantity]
     return Trend(
         process,
         quantity,
@@ -152,12 +152,12 @@ def soak_benchmark(
     trends = [
         trend_of(process, quantity, times, samples[process][quantity])
         for process in samples
-        for quantity in QUANTITIES
+        for quantity in SAMPLED_QUANTITIES
     ]
-    for line in _table(trends, goals, float(times[-1])):
+    for line in _trend_lines(trends, goals, float(times[-1])):
         show(line)
     if picture is not None:
-        _draw(picture, times, samples)
+        _draw_samples(picture, times, samples)
     return {
         "duration_s": float(times[-1]),
         "goals": goals,
@@ -177,12 +177,12 @@ def _fly_and_sample(
     stack: MultiProcessStack, duration: float, stopped: Callable[[], bool]
 ) -> tuple[Floats, dict[str, dict[str, Floats]], dict[str, int]]:
     """Return the times, the samples by process and quantity, and counts of the goals' results."""
-    rng = random.Random(_SEED)
+    rng = random.Random(_GOAL_SEED)
     pids = {name: process.pid for name, process in stack.processes.items()}
     pids["supervisor"] = os.getpid()
     times: list[float] = []
     samples: dict[str, dict[str, list[float]]] = {
-        name: {quantity: [] for quantity in QUANTITIES} for name in pids
+        name: {quantity: [] for quantity in SAMPLED_QUANTITIES} for name in pids
     }
     goals: dict[str, int] = {}
     began = time.monotonic()
@@ -194,7 +194,7 @@ def _fly_and_sample(
             next_sample = now + _SAMPLE_PERIOD
             times.append(now)
             for name, pid in pids.items():
-                for quantity, value in zip(QUANTITIES, _sample(pid), strict=True):
+                for quantity, value in zip(SAMPLED_QUANTITIES, _sample_process(pid), strict=True):
                     samples[name][quantity].append(value)
         if now >= next_goal:
             next_goal += GOAL_PERIOD
@@ -221,7 +221,7 @@ def _count_result(stack: MultiProcessStack, goals: dict[str, int]) -> None:
         goals[status.state.value] = goals.get(status.state.value, 0) + 1
 
 
-def _sample(pid: int) -> Iterator[float]:
+def _sample_process(pid: int) -> Iterator[float]:
     """Yield the quantities of a process in their order."""
     status = process_facts(pid)
     yield int(status["VmRSS"].split()[0]) / _KIB_PER_MIB
@@ -230,13 +230,15 @@ def _sample(pid: int) -> Iterator[float]:
     yield int(status["Threads"])
 
 
-def _table(trends: Sequence[Trend], goals: Mapping[str, int], duration: float) -> Iterator[str]:
+def _trend_lines(
+    trends: Sequence[Trend], goals: Mapping[str, int], duration: float
+) -> Iterator[str]:
     """Yield the trends as lines for the user."""
     results = ", ".join(f"{count} {state}" for state, count in sorted(goals.items()))
     yield f"{duration:.0f} s in separate processes, a goal every {GOAL_PERIOD:g} s: {results}"
     yield f"{'process':<22}{'':<13}{'first':>9}{'last':>9}{'growth':>9}{'allowed':>9}"
     for trend in trends:
-        unit = QUANTITIES[trend.quantity][0]
+        unit = SAMPLED_QUANTITIES[trend.quantity][0]
         yield (
             f"{trend.process:<22}{trend.quantity:<13}{trend.first:>9.2f}{trend.last:>9.2f}"
             f"{trend.growth:>9.2f}{trend.allowed:>9.2f} {unit:<4}{'' if trend.flat else 'GROWS'}"
@@ -245,13 +247,15 @@ def _table(trends: Sequence[Trend], goals: Mapping[str, int], duration: float) -
     yield f"{len(growing)} of {len(trends)} grow." if growing else "All are flat."
 
 
-def _draw(file: Path, times: Floats, samples: Mapping[str, Mapping[str, Floats]]) -> None:
+def _draw_samples(file: Path, times: Floats, samples: Mapping[str, Mapping[str, Floats]]) -> None:
     """Draw the samples, one panel for each quantity."""
     from matplotlib.figure import Figure  # It takes half a second to import.
 
     figure = Figure(figsize=(9, 9), layout="constrained")
     for axes, (quantity, (unit, _, _)) in zip(
-        figure.subplots(len(QUANTITIES), sharex=True), QUANTITIES.items(), strict=True
+        figure.subplots(len(SAMPLED_QUANTITIES), sharex=True),
+        SAMPLED_QUANTITIES.items(),
+        strict=True,
     ):
         for process, of in samples.items():
             axes.plot(times / 60, of[quantity], label=process, linewidth=1)

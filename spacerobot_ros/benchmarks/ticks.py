@@ -44,7 +44,7 @@ from spacerobot_ros.simulation import VelocityPlant
 from spacerobot_ros.simulation.trials import robot_state_of
 from spacerobot_ros.times import SECOND
 
-_ROUNDS = 5
+_DYNAMICS_ROUNDS = 5
 _EXCHANGED_TOPICS: tuple[tuple[str, type[Any], int, int], ...] = (
     ("/clock", Clock, 0, 1),
     ("base_pose", PoseStamped, 0, 20),
@@ -81,7 +81,7 @@ def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float 
     flights: dict[str, list[_Speed]] = {"recorded": [], "unrecorded": [], "minimal": []}
     with ros(private=True), tempfile.TemporaryDirectory() as folder:
         bag = Path(folder, "bench.mcap")
-        for _ in range(_ROUNDS):
+        for _ in range(_DYNAMICS_ROUNDS):
             flights["minimal"].append(_exchange_speed(ticks, bag))
             bag.unlink()
             flights["recorded"].append(_stack_speed(ticks, bag))
@@ -96,7 +96,7 @@ def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float 
         _Speed(*np.median(speeds, axis=0).tolist()) for speeds in flights.values()
     )
     recorder_share = 1 - unrecorded.cpu_us / stack.cpu_us
-    tick = _plant_tick()
+    tick = _plant_tick_cpu_time()
     figures: dict[str, float | str] = {
         "ticks_per_s": stack.ticks_per_s,
         "bare_ticks_per_s": minimal.ticks_per_s,
@@ -111,7 +111,7 @@ def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float 
     }
     show(
         f"lockstep, recorded: {stack.ticks_per_s:.0f} ticks/s, {stack.cpu_us:.1f} us of CPU time a "
-        f"tick (medians of {_ROUNDS})"
+        f"tick (medians of {_DYNAMICS_ROUNDS})"
     )
     show(
         f"minimal exchange with as many topics and a raw recorder: {minimal.ticks_per_s:.0f} "
@@ -258,7 +258,7 @@ def _message_with_lists(kind: type[Any], n: int) -> Any:
     return message
 
 
-def _plant_tick() -> float:
+def _plant_tick_cpu_time() -> float:
     """Return the CPU time of one tick of the sliding-mass plant without ROS, us."""
     robot = SpaceRobot.from_file(robot_file("sliding_masses"))
     plant = VelocityPlant(robot, 0.05)
@@ -268,7 +268,7 @@ def _plant_tick() -> float:
         for _ in range(_PLANT_TICKS):
             plant.step(command)
 
-    return median_cpu_times({"tick": (run, _PLANT_TICKS)}, _ROUNDS)["tick"]
+    return median_cpu_times({"tick": (run, _PLANT_TICKS)}, _DYNAMICS_ROUNDS)["tick"]
 
 
 def _planning_times() -> Iterator[tuple[str, float, float]]:

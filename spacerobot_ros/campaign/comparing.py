@@ -36,7 +36,7 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
         ours, theirs = getattr(first, key), getattr(second, key)
         if ours != theirs:
             raise ParameterError(f"{sentence}'{key}' is {ours} and {theirs}.")
-    # In order, because the third number of a draw is that of the third dispersion.
+    # The order counts, because numbers are assigned to dispersions in order.
     for ours_is, theirs_is in zip_longest(first.dispersions, second.dispersions):
         a, b = (
             "nothing" if each is None else f"{each.name}: {each.distribution}"
@@ -67,7 +67,7 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
             f"'{first.campaign.name}' and '{second.campaign.name}' have flown no common draw: fly "
             "more flights of one of them."
         )
-    # Metrics that only one of them requires are compared too, if both have them.
+    # Metrics required by one campaign only are compared too, if both have them.
     names = list(dict.fromkeys([*first.shown_metrics, *second.shown_metrics]))
     names = [name for name in names if name in first.columns and name in second.columns]
     pairs = (

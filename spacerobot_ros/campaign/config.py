@@ -20,7 +20,7 @@ from spacerobot_ros.resources import suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario, number_in, scenario_or_robot
 
 SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
-"""Samplers; the last one, for sensitivity indices of all orders, is SALib's, the others scipy's."""
+"""Names of samplers; saltelli, for sensitivity indices, is from SALib, the others from scipy."""
 
 FIXED_SIZE_SAMPLERS = ("latin_hypercube", "saltelli")
 """Samplers whose draws depend on the number of flights."""
@@ -57,7 +57,7 @@ class Distribution:
         if self.choices:
             last = len(self.choices) - 1
             return [self.choices[min(int(u * (last + 1)), last)] for u in shares.tolist()]
-        # Values that are not finite are refused by the flight that draws them.
+        # Infinite values are refused when a flight draws them.
         with np.errstate(all="ignore"):
             found = np.asarray(
                 _load_scipy_distribution(self.name).ppf(shares, **self.arguments), dtype=float
@@ -150,7 +150,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         known: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
-                continue  # It is refused as a key, with a message of its own.
+                continue  # An unhashable key is refused elsewhere with its own message.
             if key.value in known:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"the key '{key.value}' is there twice", key.start_mark
@@ -255,7 +255,7 @@ def _read_scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
     if "method" in section:
         scenario = scenario.with_method(str(section["method"]))
     for node in ("plant", *scenario.commanders):
-        scenario.config(node)  # Refused here, before anything is flown.
+        scenario.config(node)  # The parameters are refused before the first flight.
     if not scenario.lockstep:
         raise ParameterError("campaigns are flown in lockstep: leave plant.time_mode out.")
     return scenario
@@ -436,5 +436,5 @@ def passes_criteria(
 
 
 def meets_criterion(criterion: Criterion, metrics: Mapping[str, float]) -> bool:
-    """Return whether a metric is there and within its criterion."""
+    """Return whether a metric has a value that meets the criterion."""
     return criterion.minimum <= metrics.get(criterion.metric, math.nan) <= criterion.maximum

@@ -35,9 +35,9 @@ _ABOUT_FILE, _CAMPAIGN_FILE, _SCENARIO_FILE = "about.json", "campaign.yaml", "sc
 _FLIGHTS_FOLDER = "flights"
 
 _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
-"""Wall time (s) and number of rows after which rows are written: a kill loses no more of them."""
+"""Wall time (s) and number of rows after which rows are written; a kill loses only later rows."""
 
-VERSIONS = json.dumps(
+VERSIONS_JSON = json.dumps(
     {"spacerobot_ros": __version__, "numpy": np.__version__, "python": platform.python_version()}
 )
 
@@ -86,7 +86,7 @@ class Dataset:
             (self.folder / _FLIGHTS_FOLDER).mkdir(parents=True, exist_ok=True)
             self._lock()
             for left in (self.folder / _FLIGHTS_FOLDER).glob(".*"):
-                left.unlink()  # An earlier process was killed while it wrote this.
+                left.unlink()  # An earlier process was killed while it wrote this file.
             done = self.flown_numbers()
             self._write_description(
                 campaign, max([campaign.flights, *(number + 1 for number in done)])
@@ -114,7 +114,7 @@ class Dataset:
         )
 
     def _require_no_other_files(self) -> None:
-        """Refuse a folder with other files than those of a campaign that was about to begin."""
+        """Raise an error for a folder with files that do not belong to a campaign."""
         if not self.folder.exists():
             return
         if not self.folder.is_dir():
@@ -137,7 +137,7 @@ class Dataset:
         facts = {
             "name": campaign.name,
             "fingerprint": _fingerprint_of(campaign),
-            "versions": VERSIONS,
+            "versions": VERSIONS_JSON,
             "scenario": campaign.scenario.name,
         }
         content = {"campaign": section}
@@ -180,7 +180,7 @@ class Dataset:
         Raises
         ------
         ParameterError
-            It holds none.
+            The folder holds no campaign.
         """
         facts = self._read_identity()
         try:
@@ -212,7 +212,7 @@ class Dataset:
     # -- rows ---------------------------------------------------------------------------------
 
     def flown_numbers(self) -> set[int]:
-        """Return the numbers of the flights that are there."""
+        """Return the numbers of the flights in the dataset."""
         found: set[int] = set()
         for part in self._row_files():
             found.update(_read_row_file(part, ["flight"])["flight"].to_pylist())
@@ -258,13 +258,13 @@ class Dataset:
         Raises
         ------
         ParameterError
-            There are none.
+            The dataset has no rows.
         """
         arrow = require_module("pyarrow")
         parts = [_read_row_file(part) for part in self._row_files()]
         if not parts:
             raise ParameterError(f"The folder {self.folder} has no flights yet.")
-        # Parts that an earlier version has written may lack columns.
+        # Files of earlier versions may lack columns.
         return arrow.concat_tables(parts, promote_options="default").sort_by("flight")
 
     def _row_files(self) -> Sequence[Path]:
@@ -316,7 +316,7 @@ def _record_of_row(row: Row) -> dict[str, Any]:
         "plan_time_s": row.plan_time,
         "engine": row.engine,
         "fallback": row.fallback,
-        "versions": VERSIONS,
+        "versions": VERSIONS_JSON,
     }
 
 

@@ -21,10 +21,10 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model.description import Array
 
 _MIN_PROBABILITY = 1e-12
-"""Least distance of shares from 0 and 1, where many distributions are infinite."""
+"""Least cumulative probability of a drawn value, because many distributions are infinite at 0."""
 
 _BLOCK_SIZE = 256
-"""Number of draws that are made together."""
+"""Number of draws that are computed together."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class Draws:
     Raises
     ------
     ParameterError
-        The sampler cannot make so few.
+        The sampler needs more flights.
     """
 
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
         self._block, self._made = -1, list[Draw]()
-        """The block of draws that was made last."""
+        """The block of draws computed last."""
         self.shares = self._sampler_shares()
         """(N, D) cumulative probabilities of the values; None with the sampler ``random``, with
         which each flight draws from a generator of its own."""
@@ -115,10 +115,10 @@ class Draws:
 
         kinds = {"latin_hypercube": qmc.LatinHypercube, "sobol": qmc.Sobol, "halton": qmc.Halton}
         rng = np.random.default_rng(np.random.SeedSequence(campaign.seed))
-        # The name before scipy 1.15, which later ones take, too.
+        # Argument name before scipy 1.15; later versions also accept it.
         engine = kinds[campaign.sampler](d=size, seed=rng)
         if campaign.sampler == "sobol":
-            # Any number of them: only a power of two is balanced.
+            # Any number of flights is allowed, though only powers of two are balanced.
             power = int(np.ceil(np.log2(max(1, campaign.flights))))
             return np.asarray(engine.random_base2(power))[: campaign.flights]
         return np.asarray(engine.random(campaign.flights))
@@ -185,6 +185,6 @@ def import_salib(module: str) -> Any:
 
 def sobol_problem(names: Sequence[str]) -> dict[str, Any]:
     """Return the problem definition of SALib: quantities of these names, from 0 to 1."""
-    # An array, because SALib 1.5 passes the names to pandas, and pandas 3 takes no list.
+    # The names are an array, because pandas 3 accepts no list from SALib 1.5.
     listed = np.array(list(names), dtype=object)
     return {"num_vars": len(listed), "names": listed, "bounds": [[0, 1]] * len(listed)}

@@ -50,7 +50,7 @@ from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
 _STATES_PER_FLIGHT = 40
-"""States of a flight along a schedule that are evaluated, beside its last one."""
+"""Number of evaluated states of a flight along a schedule, besides its last state."""
 
 _MAX_BATCH_TICKS = 4_000_000
 """Largest number of ticks of one batch, whose schedules are in memory."""
@@ -65,7 +65,7 @@ _END_POSITION_TOLERANCE = 1e-6
 _GAIN_PREFIX = "coordinated_control.gains."
 """Prefix of the controller's parameters that may differ from lane to lane."""
 
-_COMMON_TO_LANES = (
+_PARAMETERS_COMMON_TO_LANES = (
     "plant.tick_rate",
     "plant.integration_step",
     "plant.thrusters",
@@ -77,7 +77,7 @@ _COMMON_TO_LANES = (
 )
 """Prefixes of the plant's parameters that all lanes share."""
 
-_COMMON_TO_SCHEDULES = (
+_PARAMETERS_COMMON_TO_SCHEDULES = (
     "plant.tick_rate",
     "plant.integration_step",
     "plant.actuation",
@@ -116,13 +116,13 @@ class _ReadyDraw:
 
     @property
     def schedule(self) -> GaitSchedule:
-        """The schedule of the plan."""
+        """Schedule of the draw's plan."""
         assert self.plan is not None
         return self.plan.schedule
 
 
 class LanesEngine:
-    """Many flights at once, in SIMD lanes."""
+    """Engine that flies many draws at once in SIMD lanes."""
 
     name = LANES
     efficient_flights = 64
@@ -161,7 +161,7 @@ class LanesEngine:
                 return
             try:
                 ready = lanes.prepare_draw(campaign, draw, drawn_flight(campaign, draw, common))
-            except Exception as error:  # The error becomes a row.
+            except Exception as error:  # The error is reported as a row.
                 yield Row.of_error(draw, error, self.name)
                 continue
             if isinstance(ready, Fallback):
@@ -187,7 +187,8 @@ class LanesEngine:
         try:
             flights = lanes.flights(campaign, batch)
             result = fly_lanes(flights)
-        except SpaceRobotError as error:  # Of one of them: each is flown by itself.
+        # The error is of one draw, so each draw is flown by itself.
+        except SpaceRobotError as error:
             yield from (Fallback(each.draw, str(error)) for each in batch)
             return
         taken = (time.perf_counter() - began) / len(batch)
@@ -226,7 +227,7 @@ class _ScheduledLanes:
             return "the planner plans again on the way"
         dispersed = [each.name for each in campaign.dispersions]
         for name in dispersed:
-            if name.startswith(_COMMON_TO_SCHEDULES):
+            if name.startswith(_PARAMETERS_COMMON_TO_SCHEDULES):
                 return f"'{name}' is dispersed, and all lanes share it"
         noisy = sensors.joint_noise or any(sensors.joint_bias)
         if noisy or any(name.startswith("plant.sensors.joint") for name in dispersed):
@@ -309,7 +310,7 @@ class _ScheduledLanes:
             peak_rate=result.peak_rate[row],
             peak_effort=np.zeros(flights.robot.n),
             peak_wrench=np.zeros(2),
-            # The joints are on the schedule at every tick: nothing disturbs or limits them.
+            # The joints follow the schedule exactly at every tick.
             lowest=schedule.positions.min(axis=0),
             highest=schedule.positions.max(axis=0),
             momentum_drift=momentum_drift(result.momentum[row, : end + 1]),
@@ -342,7 +343,7 @@ class _ControlledLanes:
         for dispersion in campaign.dispersions:
             name = dispersion.name
             own = name.startswith("coordinated_control.") and not name.startswith(_GAIN_PREFIX)
-            if own or name.startswith(_COMMON_TO_LANES):
+            if own or name.startswith(_PARAMETERS_COMMON_TO_LANES):
                 return f"'{name}' is dispersed, and all lanes share it"
         try:
             law = build_controller(nominal_robots(scenario).controller, scenario.controller).law
@@ -495,7 +496,7 @@ def _plan_key(flight: DrawnFlight) -> str:
     """Return a text of the values, beside the planner's, that determine a plan without noise."""
     scenario = flight.scenario
     plant = replace(scenario.plant, sensors=replace(scenario.plant.sensors, seed=0))
-    # At rest the plan does not depend on the masses of the plant's robot, which is only measured.
+    # Plans from rest do not depend on the masses of the plant's robot.
     moving = any(plant.linear_momentum) or any(plant.angular_momentum)
     masses = None
     if flight.inertial is not None and (moving or plant.initial_center_of_mass):

@@ -37,7 +37,7 @@ class _OneByOneEngine(ABC):
     def fly(
         self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
     ) -> Iterator[Row]:
-        """Yield a row for each draw; fewer where it is stopped."""
+        """Yield a row for each draw until the campaign is stopped."""
         common = DrawnFlight.of(campaign.scenario)
         for draw in draws:
             if stopped():
@@ -47,7 +47,7 @@ class _OneByOneEngine(ABC):
                 if stopped() and flown.outcome is Outcome.INTERRUPTED:
                     return
                 yield Row.of(campaign, draw, flown.measures, self.name)
-            except Exception as error:  # It is a row, with its reason.
+            except Exception as error:  # The error becomes a row with its message as the reason.
                 yield Row.of_error(draw, error, self.name)
 
     @abstractmethod
@@ -58,7 +58,7 @@ class _OneByOneEngine(ABC):
 
 
 class FlightsEngine(_OneByOneEngine):
-    """The real plant, planner and controller, without ROS."""
+    """Engine that flies plant, planner and controller without ROS."""
 
     name = "flights"
 
@@ -101,7 +101,7 @@ def nominal_robots(scenario: Scenario) -> Robots:
     def build(node: str, config: RobotConfig) -> SpaceRobot | None:
         text = config.robot_description
         if not (config.robot or text):
-            text = plant  # The robot of commanders that name none.
+            text = plant  # Commanders without a robot parameter use the plant's robot.
         error, seed = 0.0, 0
         if isinstance(config, BelievedRobotConfig):
             error, seed = config.model_error, config.model_error_seed
@@ -110,23 +110,23 @@ def nominal_robots(scenario: Scenario) -> Robots:
     return Robots.of(scenario, build)
 
 
-_last_method: tuple[SpaceRobot, PlannerConfig, GaitMethod] | None = None
+_last_planner_method: tuple[SpaceRobot, PlannerConfig, GaitMethod] | None = None
 """Robot, configuration and gait method of the last planner: the solvers of a method serve all
 flights, and no plan depends on another."""
 
 
 def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
-    """Return the method of a planner: that of the last flight if its planner was equal."""
-    global _last_method
-    if _last_method is not None and _last_method[0] is robot:
-        known, method = _last_method[1:]
+    """Return the gait method of a planner; an equal planner reuses the last flight's method."""
+    global _last_planner_method
+    if _last_planner_method is not None and _last_planner_method[0] is robot:
+        known, method = _last_planner_method[1:]
         if known is config or known == config:
             return method
     method = build_method(
         *(config.method, robot, config.control_period, config.integration_step),
         config.method_options,
     )
-    _last_method = robot, config, method
+    _last_planner_method = robot, config, method
     return method
 
 
@@ -139,14 +139,14 @@ def plant_robot(flight: DrawnFlight) -> SpaceRobot:
 
 @lru_cache(maxsize=32)
 def _build_robot(node: str, text: str, name: str, error: float, seed: int) -> SpaceRobot | None:
-    # Of each node its own: a robot's functions have buffers.
+    # Each node has its own robot, because a robot's functions have buffers.
     if error:
         return robot_of(BelievedRobotConfig(text, name, error, seed))
     return robot_of(RobotConfig(text, name))
 
 
 class RosEngine(_OneByOneEngine):
-    """The whole stack, flown by ``spacerobot run`` in a process and with a bag for each draw."""
+    """Engine that runs ``spacerobot run`` for each draw, in a process and with a bag."""
 
     name = "ros"
 

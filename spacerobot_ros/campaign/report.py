@@ -98,7 +98,7 @@ class Results:
             if name in _TEXT_COLUMNS or column.type == text:
                 columns[name] = column.to_pylist()
             else:
-                # Missing numbers become NaN; a seed may have more digits than a double.
+                # Missing numbers become NaN; seeds beyond 2^53 are rounded.
                 columns[name] = column.cast("double", safe=False).to_numpy()
         return cls(campaign, folder, columns["flight"], columns, len(Draws(campaign)))
 
@@ -323,7 +323,7 @@ def _outcomes_section(results: Results) -> str:
     fallbacks = Counter(text for text in results.columns.get("fallback", ()) if text)
     for reason, count in fallbacks.most_common(6):
         line = f"{count} flight{'s' if count > 1 else ''} "
-        if reason.endswith("."):  # The sentence of an error.
+        if reason.endswith("."):  # The reason is the sentence of an error.
             line += f"used engine 'flights': {reason}"
         else:
             line += f"{reason} and used engine 'flights'"
@@ -403,7 +403,7 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
         return ""
     figure, axes = figure_with_axes(len(chosen), 3, 2.4)
     passed = results.passed
-    # The largest number of points on a page.
+    # At most 2000 points, drawn at random, are plotted.
     few = np.random.default_rng(0).permutation(len(results))[:2000]
     for panel, each in zip(axes, chosen, strict=True):
         x, y = results.drawn_numbers[each.cause][few], results.columns[each.metric][few]

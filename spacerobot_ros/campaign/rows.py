@@ -14,10 +14,10 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Measures, metrics_of
 
 LANES = "lanes"
-"""The engine that flies many at once."""
+"""Name of the engine that flies many draws at once in SIMD lanes."""
 
 FLIGHTS = "flights"
-"""The engine that flies draws one by one, the fallback of the others."""
+"""Name of the engine that flies draws one by one, to which other engines fall back."""
 
 ERROR = "error"
 """The outcome of a draw that could not be flown."""
@@ -91,10 +91,7 @@ class Fallback:
 
 
 class Engine(Protocol):
-    """Flies draws.
-
-    ``efficient_flights``: number of flights that take as long as fewer.
-    """
+    """Flies draws. ``efficient_flights`` is the number below which fewer flights take as long."""
 
     name: str
     efficient_flights: int

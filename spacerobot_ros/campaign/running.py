@@ -40,7 +40,7 @@ class Progress:
 
     @property
     def seconds_left(self) -> float:
-        """Wall time that is left, s; infinite before the first flight."""
+        """Estimated wall time left, s; infinite before the first flight."""
         return (self.total - self.done) / self.rate if self.rate else float("inf")
 
 
@@ -115,7 +115,7 @@ def _fly_rows(
     if not numbers:
         return
     if not cluster.workers and not cluster.scheduler:
-        selected = (draws[number] for number in numbers)  # Each is made when it is flown.
+        selected = (draws[number] for number in numbers)  # Each draw is made when it is flown.
         for row in fly_all(engine_by_name(engine), campaign, selected, stopped):
             yield [row]
         return
@@ -192,7 +192,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     SpaceRobotError
         The drawn values are refused, or the bag cannot be written.
     """
-    from spacerobot_ros.session.run import run_scenario  # Loads ROS.
+    from spacerobot_ros.session.run import run_scenario  # This import loads ROS.
 
     dataset = Dataset(folder)
     campaign = dataset.campaign()

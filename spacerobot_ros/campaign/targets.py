@@ -26,12 +26,12 @@ AXES = ("x", "y", "z")
 
 _INDEXED_NAME_PATTERN = re.compile(r"(.+)\[([^\]]+)\]")
 _FAULT_NAME_PATTERN = re.compile(r"faults\[(\d+)\]\.(at|until|value)")
-_SAME_IN_ALL_FLIGHTS = (
+_PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
     *("plant.robot", "plant.robot_description", "plant.time_mode", "plant.resume_bag"),
     *("planner.resume_file", "coordinated_control.resume_file"),
 )
 """Parameters that are the same in all flights of a campaign."""
-_POSE_NAMES = ("goal", "end_effector_goal", "initial")
+_POSE_TARGET_NAMES = ("goal", "end_effector_goal", "initial")
 
 KINDS_OF_TARGETS = (
     ("NODE.PARAMETER", "a parameter of a node; NODE.PARAMETER[i] a number of a list, by joint too"),
@@ -174,13 +174,13 @@ def targets_of(name: str, scenario: Scenario) -> list[Target]:
         return _mass_property_targets(kind, dot, rest, scenario)
     if kind == "com":
         return _center_targets(rest, scenario)
-    if kind in _POSE_NAMES:
+    if kind in _POSE_TARGET_NAMES:
         return [_pose_target(name, kind, rest, scenario)]
     match = _FAULT_NAME_PATTERN.fullmatch(name)
     if match is not None:
         return [_fault_target(name, int(match[1]), match[2], scenario)]
     known = [f"{node}.{p.name}" for node in CONFIGS for p in declared(CONFIGS[node])]
-    known += ["mass", "inertia", "com", *_POSE_NAMES, "faults[0].at", "faults[0].until"]
+    known += ["mass", "inertia", "com", *_POSE_TARGET_NAMES, "faults[0].at", "faults[0].until"]
     kinds = "; ".join(names for names, _ in KINDS_OF_TARGETS)
     raise ParameterError(
         f"'{name}' is nothing that can be dispersed; there are {kinds}.{suggestion(name, known)}"
@@ -202,7 +202,7 @@ def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Ta
     value = values_of(scenario.config(node))[bare]
     if isinstance(value, bool) or declaration.texts:
         raise ParameterError(f"'{name}' is neither a number nor a text: it cannot be dispersed.")
-    if name in _SAME_IN_ALL_FLIGHTS:
+    if name in _PARAMETERS_EQUAL_IN_ALL_FLIGHTS:
         raise ParameterError(f"'{name}' is the same in all flights of a campaign.")
     if isinstance(value, tuple) and bare.startswith("initial_orientation"):
         raise ParameterError(f"'{name}' is a quaternion: disperse initial.rotvec.x, y and z.")

@@ -44,12 +44,12 @@ _MIN_FIRST_TASK_FLIGHTS, _MAX_TASK_FLIGHTS = 4, 2000
 _MAX_WORKER_DEATHS = 2
 """Workers that may die during a flight; then it is reported as killed and not repeated."""
 
-_PACKAGE = "spacerobot_ros"
+_PACKAGE_NAME = "spacerobot_ros"
 
 _POLL_PERIOD = 0.2
 """Longest wall time between two looks at tasks, signals and the dataset, s."""
 
-_NO_WORKER_WARNING = 5.0
+_NO_WORKER_WARNING_DELAY = 5.0
 """Wall time without a worker after which a warning is printed, s."""
 
 _THREAD_COUNT_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -291,7 +291,7 @@ class DaskWorkers:
         workers = sum(threads.values())
         now = time.monotonic()
         self._empty_since = math.inf if workers else min(self._empty_since, now)
-        if now - self._empty_since > _NO_WORKER_WARNING:
+        if now - self._empty_since > _NO_WORKER_WARNING_DELAY:
             warn_once("The scheduler has no worker: the flights wait for one.")
         return max(1, workers)
 
@@ -335,7 +335,7 @@ class DaskWorkers:
                 raise
             raise SpaceRobotError(
                 "The scheduler or a worker cannot load the task "
-                f"({str(error).splitlines()[0]}): all of them need {_PACKAGE}[campaign] "
+                f"({str(error).splitlines()[0]}): all of them need {_PACKAGE_NAME}[campaign] "
                 f"{__version__}."
             ) from error
         return made
@@ -350,11 +350,11 @@ class DaskWorkers:
         if not joined:
             return
         # A function of the standard library, which every worker can load.
-        found = self._client.run(find_spec, _PACKAGE, workers=joined, on_error="return")
+        found = self._client.run(find_spec, _PACKAGE_NAME, workers=joined, on_error="return")
         for address, spec in found.items():
             if spec is None:
                 raise SpaceRobotError(
-                    f"The worker at {address} has no {_PACKAGE}: install it there."
+                    f"The worker at {address} has no {_PACKAGE_NAME}: install it there."
                 )
             if not isinstance(spec, Exception):  # It may be gone again.
                 self._checked.add(address)

@@ -30,7 +30,7 @@ _rounds_option = click.option(
 )
 
 
-class _Benchmarks(DefaultGroup):
+class _BenchmarkGroup(DefaultGroup):
     """Command group of the benchmarks, with the options that version 0.2.0 had instead."""
 
     default = "ticks"
@@ -50,7 +50,7 @@ class _Benchmarks(DefaultGroup):
         return super().parse_args(ctx, args or [self.default])
 
 
-@click.group("bench", cls=_Benchmarks)
+@click.group("bench", cls=_BenchmarkGroup)
 def bench_command() -> None:
     """Measure the speed of the package on this machine.
 

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 _ENGINES = ("auto", "lanes", "flights", "ros")
 
 
-class _Campaigns(DefaultGroup):
+class _CampaignGroup(DefaultGroup):
     default = "fly"
 
 
-@click.group("campaign", cls=_Campaigns)
+@click.group("campaign", cls=_CampaignGroup)
 def campaign_command() -> None:
     """Fly a scenario many times with dispersed parameters.
 

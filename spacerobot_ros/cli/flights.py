@@ -209,10 +209,12 @@ def up_command(
     from spacerobot_ros.scenario import scenario_or_robot
 
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
-    from spacerobot_ros.session.run import keep_up
+    from spacerobot_ros.session.run import run_until_stopped
 
     with viewing_if(view, chosen.parameters("viewer"), namespace):
-        recorded = keep_up(chosen, bag, click.echo, processes=processes, namespace=namespace)
+        recorded = run_until_stopped(
+            chosen, bag, click.echo, processes=processes, namespace=namespace
+        )
     if recorded is not None:
         click.echo(f"bag         {recorded}")
 

@@ -11,7 +11,7 @@ from spacerobot_ros.cli import start
 from spacerobot_ros.cli.errors import sentences
 from spacerobot_ros.version import __version__
 
-_MODULES = {
+_COMMAND_NAMES_BY_MODULE = {
     "bags": ("export", "figures", "replay", "report", "salvage", "verify"),
     "bench": ("bench",),
     "campaign": ("campaign",),
@@ -22,7 +22,7 @@ _MODULES = {
 """Names of the commands in each module of this folder: ``NAME_command`` is the attribute."""
 
 COMMANDS: dict[str, str] = dict(
-    sorted((name, module) for module, names in _MODULES.items() for name in names)
+    sorted((name, module) for module, names in _COMMAND_NAMES_BY_MODULE.items() for name in names)
 )
 """Modules by the names of their commands."""
 

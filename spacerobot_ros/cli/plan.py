@@ -78,7 +78,7 @@ def plan_command(
     """
     from spacerobot_ros.simulation.trials import PlanEvaluation, compare, fastest, try_method
 
-    problem = problem_of(scenario, goal, settings)
+    problem = problem_of_scenario(scenario, goal, settings)
     method = method or problem.config.method
     if count is not None:
         _plan_random_goals(problem, [method] if beside is None else [method, beside], count, within)
@@ -97,7 +97,7 @@ def plan_command(
         click.echo(f"{scenario}, {method}: {trial.duration:.6g} s, ends {left}")
         click.echo(f"planned in {trial.plan_time:.3f} s")
     if json_file is not None:
-        content = json_of(problem, trial)
+        content = plan_json(problem, trial)
         if comparing:
             content["compared"] = {
                 name: each.duration if isinstance(each, PlanEvaluation) else str(each)
@@ -124,7 +124,7 @@ def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:
     return describe_remaining_error(trial.error, trial.controls - {"shape"})
 
 
-def problem_of(
+def problem_of_scenario(
     name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] = ()
 ) -> PlanningProblem:
     """Return the planning problem of a scenario, or of a robot (a name or a URDF file) at rest.
@@ -148,7 +148,7 @@ def problem_of(
     return goal.apply_to(scenario_or_robot(name).with_settings(settings)).problem()
 
 
-def json_of(problem: PlanningProblem, trial: PlanEvaluation) -> dict[str, Any]:
+def plan_json(problem: PlanningProblem, trial: PlanEvaluation) -> dict[str, Any]:
     """Return the content of the file that ``--json`` names."""
     from spacerobot_ros.model.rotations import rotvec_from_quaternion
 
@@ -284,7 +284,7 @@ def library_command(
     from spacerobot_ros.planning.methods.optimal.method import OptimalGait
     from spacerobot_ros.simulation.trials import robot_state_of
 
-    problem = problem_of(scenario, settings=settings)
+    problem = problem_of_scenario(scenario, settings=settings)
     method = problem.method("optimal")
     assert isinstance(method, OptimalGait)
     goals = _random_goals(problem, count, within)

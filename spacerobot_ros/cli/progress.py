@@ -42,7 +42,7 @@ class Display:
             if self._flies or not self._visible:
                 return
             if self._bar is None or progress.starts <= self._bar.pos:
-                self._begin(f"planning {self._label}", progress.max_starts)
+                self._begin_bar(f"planning {self._label}", progress.max_starts)
             self._bar.length = progress.max_starts
             self._bar.update(progress.starts - self._bar.pos, progress.message)
 
@@ -53,7 +53,7 @@ class Display:
                 return
             if not self._flies:
                 self._flies = True
-                self._begin(f"flying {self._label}", _BAR_STEPS)
+                self._begin_bar(f"flying {self._label}", _BAR_STEPS)
             steps = max(0, round(_BAR_STEPS * min(now / end, 1.0)) - self._bar.pos)
             self._bar.update(steps, f"{now:.1f} of {end:.1f} s")
 
@@ -61,16 +61,16 @@ class Display:
         """Print a line above the progress bar."""
         with self._lock:
             if self._visible:
-                self._finish()
+                self._finish_bar()
                 click.echo(message, err=True)
 
     def close(self) -> None:
         """Finish the progress bar."""
         with self._lock:
-            self._finish()
+            self._finish_bar()
 
-    def _begin(self, label: str, length: int) -> None:
-        self._finish()
+    def _begin_bar(self, label: str, length: int) -> None:
+        self._finish_bar()
         self._bar = click.progressbar(
             length=length,
             label=label,
@@ -83,7 +83,7 @@ class Display:
         )
         self._bar.__enter__()
 
-    def _finish(self) -> None:
+    def _finish_bar(self) -> None:
         bar, self._bar = self._bar, None
         if bar is not None:
             bar.__exit__(None, None, None)

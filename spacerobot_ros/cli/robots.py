@@ -44,10 +44,10 @@ def analyze_command(
 
     model = SpaceRobot.from_file(robot_file(robot))
     found = analyze(model, None if shape is None else _parse_shape(shape))
-    for line in lines_of(found):
+    for line in analysis_lines(found):
         click.echo(line)
     if json_file is not None:
-        write_json(json_file, json_of(found))
+        write_json(json_file, analysis_json(found))
     from spacerobot_ros.report.figures import PictureFormat
     from spacerobot_ros.report.planning_figures import draw_analysis
 
@@ -67,7 +67,7 @@ def _parse_shape(text: str) -> list[float]:
         raise ParameterError(f"--shape is '{text}'; it must be numbers, one a joint.") from None
 
 
-def lines_of(found: Analysis) -> list[str]:
+def analysis_lines(found: Analysis) -> list[str]:
     """Return the findings as lines that fit a screen."""
     robot = found.robot
     base = robot.description.bodies[0].inertia.mass
@@ -82,7 +82,7 @@ def lines_of(found: Analysis) -> list[str]:
     return lines
 
 
-def json_of(found: Analysis) -> dict[str, Any]:
+def analysis_json(found: Analysis) -> dict[str, Any]:
     """Return the findings for JSON; infinite condition numbers and limits are null."""
     robot = found.robot
     finite = _finite_conditions(found)
@@ -208,7 +208,7 @@ def new_command(robot: str, out: Path | None) -> None:
     from spacerobot_ros.model import SpaceRobot
     from spacerobot_ros.planning.analysis import analyze
     from spacerobot_ros.resources import is_path, robot_file
-    from spacerobot_ros.session.own_robot import first_problem, remarks, scenario_text
+    from spacerobot_ros.session.own_robot import first_problem, scenario_text, urdf_remarks
     from spacerobot_ros.simulation.trials import compare, fastest
 
     file = robot_file(robot)
@@ -216,9 +216,9 @@ def new_command(robot: str, out: Path | None) -> None:
     name = file.name.split(".")[0]
     with display(name):
         known = analyze(model)
-    for line in lines_of(known):
+    for line in analysis_lines(known):
         click.echo(line)
-    for remark in remarks(model.description):
+    for remark in urdf_remarks(model.description):
         click.echo(f"{'note':<13}{remark}")
     click.echo()
     problem = first_problem(name, model, file)

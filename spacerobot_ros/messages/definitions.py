@@ -209,15 +209,15 @@ class MessageTypes:
         """Add the types of another store; ValueError where the bag has defined one otherwise."""
         own = self._store
         for name, (_, fields) in store.fielddefs.items():
-            if name in own.fielddefs and _field_kinds(own.fielddefs[name][1]) != _field_kinds(
-                fields
-            ):
+            if name in own.fielddefs and _types_of_fields(
+                own.fielddefs[name][1]
+            ) != _types_of_fields(fields):
                 raise ValueError(f"Type '{name}' is already present with different definition.")
         for name in store.fielddefs.keys() - own.fielddefs.keys():
             own.fielddefs[name], own.types[name] = store.fielddefs[name], store.types[name]
 
 
-def _field_kinds(fields: Any) -> list[Any]:
+def _types_of_fields(fields: Any) -> list[Any]:
     return [(name.lower(), kind) for name, kind in fields]
 
 
@@ -230,7 +230,7 @@ def _type_store(type_name: str, text: bytes) -> tuple[Typestore, Any]:
         return store, store.get_msgdef(type_name)
     # The parser raises any kind of error, depending on the text.
     except Exception as error:
-        raise ValueError(_one_line(error)) from error
+        raise ValueError(_error_in_one_line(error)) from error
 
 
 def _parse_definition(type_name: str, text: bytes) -> Any:
@@ -244,14 +244,14 @@ def _parse_definition(type_name: str, text: bytes) -> Any:
     try:
         types = get_types_from_msg(text.decode(), type_name)
     except Exception as error:
-        raise ValueError(_one_line(error)) from error
+        raise ValueError(_error_in_one_line(error)) from error
     if type_name not in types:
         raise ValueError(f"it does not define {type_name}")
     _FieldCounts(types).of(type_name, 0)
     return types
 
 
-def _one_line(error: Exception) -> str:
+def _error_in_one_line(error: Exception) -> str:
     words = " ".join(str(error).split()) or type(error).__name__
     return words if len(words) <= 200 else f"{words[:200]} ..."
 

@@ -45,10 +45,10 @@ from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
 from spacerobot_ros.nodes.common.streams import StreamTaps, Take
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp
-from spacerobot_ros.topics import NOT_RECORDED
+from spacerobot_ros.topics import TOPICS_NOT_RECORDED
 from spacerobot_ros.version import __version__
 
-_CLOCK = "/clock"
+_CLOCK_TOPIC = "/clock"
 """Topic of the clock before remaps."""
 
 _SHARED_TOPICS = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
@@ -59,7 +59,7 @@ _DESCRIPTION_TOPIC = "robot_description"
 _TEXT_TYPE = "std_msgs/msg/String"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
-_PARAMETER_RECORDS = {
+_PARAMETER_RECORD_BY_TOPIC = {
     "odom": "plant",
     "planner/status": "planner",
     "controller/status": "coordinated_control",
@@ -119,7 +119,7 @@ class RecorderNode(FlightNode):
             max_duration_ns=round(config.max_duration * SECOND),
         )
         self.recording = Recording(writer, config.clock_wait, self._on_failure)
-        self._clock_topic = self.resolve_topic_name(_CLOCK)
+        self._clock_topic = self.resolve_topic_name(_CLOCK_TOPIC)
         self._chosen_topics = {self.resolve_topic_name(topic) for topic in config.topics.split()}
         self._shared_topics = {self._clock_topic, *map(self.resolve_topic_name, _SHARED_TOPICS)}
         self._parameter_requests = {}
@@ -283,12 +283,12 @@ class RecorderNode(FlightNode):
         if topic in self._shared_topics:
             return True
         namespace = self.get_namespace().rstrip("/")
-        ours = topic.startswith(f"{namespace}/") and not topic.endswith(NOT_RECORDED)
+        ours = topic.startswith(f"{namespace}/") and not topic.endswith(TOPICS_NOT_RECORDED)
         return ours and type_name != _CLOCK_TYPE
 
     def _ask_for_parameters(self, topic: str, publishers: Sequence[Any]) -> None:
         """Request the parameters of a topic's publisher for the bag, unless the bag has them."""
-        for name, title in _PARAMETER_RECORDS.items():
+        for name, title in _PARAMETER_RECORD_BY_TOPIC.items():
             if not topic.endswith(f"/{name}"):
                 continue
             record = f"parameters{topic.removesuffix(f'/{name}')}/{title}"
@@ -505,7 +505,7 @@ def _recording_callback(
     topic: str,
     kind: Any,
     channel: int,
-    clock: str = _CLOCK,
+    clock: str = _CLOCK_TOPIC,
 ) -> Take:
     """Return the callback of a topic's messages: the clock sets the time of all others."""
     record, time_of = recording.record, stamps.time_ns

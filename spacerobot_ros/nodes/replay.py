@@ -41,14 +41,14 @@ _MAX_MESSAGES_AT_ONCE = 500
 _LONGEST_DELIVERY = Duration(seconds=2)
 """Longest wait for readers to receive the last messages."""
 
-_LONGEST_WAIT_NS = 3600 * SECOND
+_LONGEST_TIMER_PERIOD_NS = 3600 * SECOND
 """Longest period of a timer, ns; gaps between messages in a bag may be longer."""
 
-_DEEPEST_QUEUE = 10_000
+_MAX_QUEUE_DEPTH = 10_000
 """Largest queue depth, because a bag may state any depth and the middleware allocates it."""
 
-_CLOCK = "/clock"
-_STATUS, _SEEK = "replay/status", "replay/seek"
+_CLOCK_TOPIC = "/clock"
+_STATUS_TOPIC, _SEEK_TOPIC = "replay/status", "replay/seek"
 
 _STATUS_PERIOD = 0.2
 """Wall time between two status messages, s."""
@@ -111,8 +111,8 @@ class ReplayNode(FlightNode):
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/resume", self._on_resume)
         self.create_service(Trigger, "~/step", self._on_step)
-        self._status_topic = self.create_publisher(DiagnosticStatus, _STATUS, LATCHED)
-        self.create_subscription(Float64, _SEEK, self._on_seek, STREAM)
+        self._status_topic = self.create_publisher(DiagnosticStatus, _STATUS_TOPIC, LATCHED)
+        self.create_subscription(Float64, _SEEK_TOPIC, self._on_seek, STREAM)
 
     def activate(self) -> None:
         """Wait for readers, then continue the replay."""
@@ -165,11 +165,11 @@ class ReplayNode(FlightNode):
     def _create_publishers(self, new_names: dict[str, str]) -> None:
         own_clock = self.config.clock > 0
         if own_clock:
-            self._clock_publisher = self.create_publisher(ClockMessage, _CLOCK, STREAM)
+            self._clock_publisher = self.create_publisher(ClockMessage, _CLOCK_TOPIC, STREAM)
             self._last_clock = -1
-        own = {self.resolve_topic_name(name) for name in (_STATUS, _SEEK)}
+        own = {self.resolve_topic_name(name) for name in (_STATUS_TOPIC, _SEEK_TOPIC)}
         for topic in self._playback.topics:
-            if own_clock and topic.name == _CLOCK:
+            if own_clock and topic.name == _CLOCK_TOPIC:
                 continue
             if topic.name in own:
                 continue  # The bag recorded the status of another replay, which is left out.
@@ -223,7 +223,7 @@ class ReplayNode(FlightNode):
             self._timer.cancel()
             return
         # Longer waits are split: the next call finds no message due and sets the timer again.
-        self._timer.timer_period_ns = min(max(due - self._now(), 1), _LONGEST_WAIT_NS)
+        self._timer.timer_period_ns = min(max(due - self._now(), 1), _LONGEST_TIMER_PERIOD_NS)
         self._timer.reset()
 
     def _send_due_messages(self) -> None:
@@ -232,12 +232,12 @@ class ReplayNode(FlightNode):
             for message in self._playback.take_due(self._now(), _MAX_MESSAGES_AT_ONCE):
                 self._send(message)
         except RecordingError as error:
-            self._end_with(error)
+            self._end_with_error(error)
             return
         self._set_timer()
         self._end_if_done()
 
-    def _end_with(self, error: RecordingError) -> None:
+    def _end_with_error(self, error: RecordingError) -> None:
         self._timer.cancel()
         self.get_logger().error(f"The replay has ended: {error}")
         self.on_end(_BAD_BAG_EXIT_CODE)
@@ -322,7 +322,7 @@ class ReplayNode(FlightNode):
             for message in self._playback.seek(bag_ns, self._now()):
                 self._send(message)
         except RecordingError as error:
-            self._end_with(error)
+            self._end_with_error(error)
 
     def _publish_status(self) -> None:
         """Publish position, rate and state of the replay."""
@@ -379,7 +379,7 @@ def _publisher_qos(qos: QosProfile) -> QoSProfile:
     latched = qos.durability == "transient_local"
     best_effort = qos.reliability == "best_effort"
     return QoSProfile(
-        depth=min(qos.depth, _DEEPEST_QUEUE) or (1 if latched else STREAM.depth),
+        depth=min(qos.depth, _MAX_QUEUE_DEPTH) or (1 if latched else STREAM.depth),
         reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

@@ -27,7 +27,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
 
-_LOOK_PERIOD = 0.2
+_STATUS_CHECK_PERIOD = 0.2
 """Wall time between two calls of a ``look`` function, s."""
 
 _LONGEST_DELIVERY = 5.0
@@ -177,7 +177,10 @@ class MissionClient:
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
 
     def follow(
-        self, executor: EventsExecutor, look: Callable[[], bool], period: float = _LOOK_PERIOD
+        self,
+        executor: EventsExecutor,
+        look: Callable[[], bool],
+        period: float = _STATUS_CHECK_PERIOD,
     ) -> Outcome:
         """Spin until the goal is decided, or until ``look``, called every ``period`` s, is true.
 

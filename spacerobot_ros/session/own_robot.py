@@ -21,19 +21,19 @@ from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.trials import PlanningProblem
 
-_FIRST_TURN = math.radians(5.0)
+_LARGEST_FIRST_ROTATION = math.radians(5.0)
 """Largest turn of the base in the first scenario of a robot, rad."""
 
 _MAX_USUAL_LIMIT = 4 * math.pi
 """Largest usual joint limit, rad; larger ones may be in degrees."""
 
-_EASY_SHARE_OF_ROOM = 0.5
+_LARGEST_SHARE_OF_DISTANCE_TO_LIMIT = 0.5
 """Largest share of the distance to its limits that a joint uses in the first rotation."""
 
-_LARGEST_ROOM = 1.0
+_LARGEST_COUNTED_DISTANCE_TO_LIMIT = 1.0
 """Largest distance to a joint limit that counts, m or rad: linearisation fails beyond it."""
 
-_LEAST_TURN = math.radians(0.2)
+_LEAST_ROTATION_WITHOUT_LOOPS = math.radians(0.2)
 """Smallest first rotation without loops of the joints, rad."""
 
 _ROTATION_TO_TOLERANCE = 50.0
@@ -46,7 +46,7 @@ _LEAST_USUAL_SPEED, _LARGEST_USUAL_SPEED = 1e-3, 50.0
 """Usual joint speeds, m/s or rad/s."""
 
 
-def remarks(robot: RobotDescription) -> Iterator[str]:
+def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
     """Yield notes on unusual values of a URDF, each with a remedy.
 
     The robot flies all the same; errors are refused when the file is read.
@@ -172,15 +172,18 @@ def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
     turn it less, it is smaller, about the axis that they turn it most about.
     """
     room = np.minimum(robot.upper - shape, shape - robot.lower)
-    F = robot.connection(shape)[3:] * np.minimum(room, _LARGEST_ROOM)
-    usual = _FIRST_TURN * (axes if len(axes) == 1 else np.eye(3)[::-1])
+    F = robot.connection(shape)[3:] * np.minimum(room, _LARGEST_COUNTED_DISTANCE_TO_LIMIT)
+    usual = _LARGEST_FIRST_ROTATION * (axes if len(axes) == 1 else np.eye(3)[::-1])
     for turn in usual:
         ways = np.linalg.pinv(F, rcond=1e-6) @ turn
-        if np.allclose(F @ ways, turn, atol=1e-9) and np.abs(ways).max() <= _EASY_SHARE_OF_ROOM:
+        if (
+            np.allclose(F @ ways, turn, atol=1e-9)
+            and np.abs(ways).max() <= _LARGEST_SHARE_OF_DISTANCE_TO_LIMIT
+        ):
             return np.asarray(turn)
     U, sizes, _ = np.linalg.svd(F, full_matrices=False)
-    angle = min(_FIRST_TURN, _EASY_SHARE_OF_ROOM * float(sizes[0]))
-    if angle < _LEAST_TURN:
+    angle = min(_LARGEST_FIRST_ROTATION, _LARGEST_SHARE_OF_DISTANCE_TO_LIMIT * float(sizes[0]))
+    if angle < _LEAST_ROTATION_WITHOUT_LOOPS:
         return np.asarray(usual[0])
     axis = np.round(U[:, 0] * np.sign(U[np.argmax(np.abs(U[:, 0])), 0]), 3) + 0.0
     degrees = float(f"{math.degrees(angle):.2g}")

@@ -39,7 +39,7 @@ _LONGEST_START = 60.0
 _LONGEST_END = 10.0
 """Wall time after a signal at which a node that still runs is killed, s."""
 
-_WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+_SETTINGS_WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Settings without shared memory: Fast DDS could keep writing to a killed node's memory."""
 
 _FASTDDS_FILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
@@ -65,10 +65,10 @@ _LONGEST_RECORDING_DELAY = 1.0
 """Wall time for the recorder to receive the last messages of the plant, s."""
 
 
-_SHORT_PATIENCE = 0.5
+_LONGEST_ANSWER_AFTER_INTERRUPT = 0.5
 """Longest wait for an answer after an interrupt, wall s."""
 
-_LOOK_PERIOD = 0.05
+_CONNECTION_CHECK_PERIOD = 0.05
 """Wall time from one check of the connections to the next, s."""
 
 _CHILD_MODULE = "spacerobot_ros.session.child"
@@ -148,25 +148,25 @@ class MultiProcessStack(Stack):
         overrides = {k: list(v) if isinstance(v, tuple) else v for k, v in overrides.items()}
         module, folder = NODE_TYPES[name].__module__, Path(self._folder.name)
         words = node_words(name, module, overrides, folder, self.namespace)
-        with self._log_of(name).open("wb") as log:
+        with self._log_file_of(name).open("wb") as log:
             self.processes[name] = start_child(words, self._environment(), stdout=log, stderr=log)
 
     def _environment(self) -> dict[str, str]:
         """Return the environment of a node; variables that the user has set stay."""
-        environment = {**_WITHOUT_SHARED_MEMORY, **os.environ}
+        environment = {**_SETTINGS_WITHOUT_SHARED_MEMORY, **os.environ}
         if not any(name in environment for name in _FASTDDS_FILE_VARIABLES):
             file = Path(self._folder.name, "fastdds.xml")
             file.write_text(_FASTDDS_SETTINGS, "utf-8")
             environment |= dict.fromkeys(_FASTDDS_FILE_VARIABLES, str(file))
         return environment
 
-    def _log_of(self, name: str) -> Path:
+    def _log_file_of(self, name: str) -> Path:
         """Return the file that receives standard output and error of a node."""
         return Path(self._folder.name, f"{name}.txt")
 
     def _last_line(self, name: str) -> str:
         # Python ends the report of a crash with a long list of modules.
-        text = self._log_of(name).read_text("utf-8", errors="replace").strip()
+        text = self._log_file_of(name).read_text("utf-8", errors="replace").strip()
         lines = [line for line in text.splitlines() if not line.startswith("Extension mod")]
         return lines[-1] if lines else "it wrote nothing."
 
@@ -205,7 +205,7 @@ class MultiProcessStack(Stack):
             self._change_states(Transition.TRANSITION_DEACTIVATE, ["plant"])
         self._spin_for(0.0 if interrupted else _LONGEST_RECORDING_DELAY)
         if "planner" in present:
-            self._ask_statistics(_SHORT_PATIENCE if interrupted else _LONGEST_START)
+            self._ask_statistics(_LONGEST_ANSWER_AFTER_INTERRUPT if interrupted else _LONGEST_START)
         ended: dict[str, int] = {}
         for group in ([name for name in present if name != "recorder"], ["recorder"]):
             ended |= self._end_nodes([name for name in group if name in present])
@@ -220,7 +220,7 @@ class MultiProcessStack(Stack):
         left = [process for process in self.processes.values() if process.poll() is None]
         for process in left:
             process.send_signal(signal.SIGTERM)
-        end = time.monotonic() + _SHORT_PATIENCE
+        end = time.monotonic() + _LONGEST_ANSWER_AFTER_INTERRUPT
         for process in left:
             end_child(process, {0: max(0.0, end - time.monotonic())})
         self.executor.shutdown()
@@ -273,16 +273,16 @@ class MultiProcessStack(Stack):
     def _connected(self) -> bool:
         """Ask every node for its connections; return whether all endpoints are matched."""
         requests = {name: Trigger.Request() for name in self.names}
-        answers = self._call_all(self._get_connections, requests)
+        answers = self._call_services(self._get_connections, requests)
         nodes = {name: Connections.from_json(answer.message) for name, answer in answers.items()}
-        self._spin_for(_LOOK_PERIOD)
+        self._spin_for(_CONNECTION_CHECK_PERIOD)
         recorder = nodes.get("recorder")
         recorded = () if recorder is None else dict(recorder.subscriptions)
         return self._all_connected(nodes, recorded)
 
     def _change_states(self, transition: int, names: Sequence[str]) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
-        answers = self._call_all(self._change_state, dict.fromkeys(names, request))
+        answers = self._call_services(self._change_state, dict.fromkeys(names, request))
         for name, answer in answers.items():
             if not answer.success:
                 raise SpaceRobotError(f"The {name} refuses: {self._last_line(name)}")
@@ -291,14 +291,16 @@ class MultiProcessStack(Stack):
         """Request the planner's statistics; an interrupted planner may be busy."""
         request = {"planner": Trigger.Request()}
         try:
-            answer = self._call_all({"planner": self._get_statistics}, request, patience)["planner"]
+            answer = self._call_services({"planner": self._get_statistics}, request, patience)[
+                "planner"
+            ]
         except _AnswerLateError:
             if patience < _LONGEST_START:
                 return
             raise
         self._statistics = PlannerStatistics.from_json(answer.message)
 
-    def _call_all(
+    def _call_services(
         self,
         services: Mapping[str, Client],
         requests: Mapping[str, Any],

@@ -176,7 +176,7 @@ _LONGEST_DISCOVERY = 10.0
 _LONGEST_STATUS_WAIT = 1.0
 """Wall time to wait for the status of earlier goals, which is no answer to the new one, s."""
 
-_LOOK_PERIOD = 0.1
+_CHECK_PERIOD = 0.1
 
 
 class _StatusPrinter:
@@ -193,7 +193,7 @@ class _StatusPrinter:
                 self._show(self._shown)
 
 
-def keep_up(
+def run_until_stopped(
     scenario: Scenario,
     bag: Path | None,
     show: Callable[[str], None],
@@ -282,7 +282,7 @@ def send_goal(
                     late = timeout > 0 and time.monotonic() - began > timeout
                     return stopped() or late
 
-                outcome = client.follow(executor, look, _LOOK_PERIOD)
+                outcome = client.follow(executor, look, _CHECK_PERIOD)
                 statuses.show()
                 return outcome
         finally:

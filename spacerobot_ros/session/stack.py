@@ -28,12 +28,12 @@ from spacerobot_ros.nodes import (
     PlantNode,
     RecorderNode,
 )
-from spacerobot_ros.nodes.common.streams import Connections, unconnected
+from spacerobot_ros.nodes.common.streams import Connections, unconnected_topics
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.session.mission_client import MissionClient
-from spacerobot_ros.topics import GLOBAL_TOPICS, NOT_RECORDED
+from spacerobot_ros.topics import GLOBAL_TOPICS, TOPICS_NOT_RECORDED
 
 _DISCOVERY_TIMEOUT = 10.0
 
@@ -178,7 +178,7 @@ class Stack(ABC):
     def _all_connected(self, nodes: Mapping[str, Connections], recorded: Iterable[str]) -> bool:
         """Whether nodes and client are connected, and all topics to record are in ``recorded``."""
         client = Connections.of(self.client.node)
-        if unconnected([*nodes.values(), client]):
+        if unconnected_topics([*nodes.values(), client]):
             return False
         if self.bag is None:
             return True
@@ -188,7 +188,7 @@ class Stack(ABC):
         if chosen:
             published &= {self.client.node.resolve_topic_name(topic) for topic in chosen}
         else:
-            published = {topic for topic in published if not topic.endswith(NOT_RECORDED)}
+            published = {topic for topic in published if not topic.endswith(TOPICS_NOT_RECORDED)}
         return published <= set(recorded)
 
 

@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spacerobot_ros.benchmarks.real_time import _between, real_time_flight
+from spacerobot_ros.benchmarks.real_time import _counts_between, real_time_flight
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_deadlines_are_counted_between_two_times() -> None:
     table = np.array([[0.0, 0, 0], [1.0, 200, 1], [2.0, 400, 1], [3.0, 600, 5], [4.0, 800, 6]])
-    assert _between(table, 1.0, 3.0).tolist() == [400, 4]
-    assert _between(table, 0.5, 2.5).tolist() == [400, 4], "by whole reports"
-    assert _between(table, 3.5, 99.0).tolist() == [0, 0]
+    assert _counts_between(table, 1.0, 3.0).tolist() == [400, 4]
+    assert _counts_between(table, 0.5, 2.5).tolist() == [400, 4], "by whole reports"
+    assert _counts_between(table, 3.5, 99.0).tolist() == [0, 0]
 
 
 @pytest.mark.slow

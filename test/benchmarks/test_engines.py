@@ -12,8 +12,8 @@ from spacerobot_ros.model.compilation import c_compiler, cxx_compiler
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engines, "_ROUNDS", 3)
-    monkeypatch.setattr(engines, "_STEPS", 100)
+    monkeypatch.setattr(engines, "_DYNAMICS_ROUNDS", 3)
+    monkeypatch.setattr(engines, "_STEPS_PER_CALL", 100)
 
 
 @pytest.mark.slow
@@ -43,7 +43,12 @@ def test_without_mujoco_and_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(cxx_compiler() is None, reason="there is no C++ compiler")
 def test_figures_of_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (("_COUNT", 400), ("_ROLLED", 8), ("_LANE_ROUNDS", 3), ("_MANY", 400)):
+    for name, value in (
+        ("_LANE_FLIGHTS", 400),
+        ("_MUJOCO_FLIGHTS", 8),
+        ("_LANE_ROUNDS", 3),
+        ("_TIMED_FLIGHTS", 400),
+    ):
         monkeypatch.setattr(engines, name, value)
     lines: list[str] = []
     figures = engines.lanes_benchmark(lines.append)

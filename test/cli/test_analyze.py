@@ -13,7 +13,7 @@ from support.command_line import CliRunner, Result
 from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.cli.robots import json_of, lines_of
+from spacerobot_ros.cli.robots import analysis_json, analysis_lines
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS
 from spacerobot_ros.planning.analysis import analyze
@@ -69,16 +69,16 @@ def test_the_robots_of_the_papers(
 def test_the_papers_nominal_shape() -> None:
     shape = [0.0, -math.pi / 4, math.pi / 2]
     findings = analyze(SpaceRobot.from_file(robot_file("three_joint_arm")), shape)
-    found = json_of(findings)
+    found = analysis_json(findings)
     M = np.array(found["curvature_matrix"])
     assert np.linalg.cond(M) == pytest.approx(3.60, abs=5e-3)
     assert found["at_shape"]["condition"] == pytest.approx(3.60, abs=5e-3)
     assert found["shape"] == shape
-    assert any("condition 3.6" in line for line in lines_of(findings))
+    assert any("condition 3.6" in line for line in analysis_lines(findings))
 
 
 def test_the_best_shape_is_better_than_the_papers() -> None:
-    found = json_of(analyze(SpaceRobot.from_file(robot_file("three_joint_arm"))))
+    found = analysis_json(analyze(SpaceRobot.from_file(robot_file("three_joint_arm"))))
     assert found["at_shape"]["condition"] < 3.60
     over = found["condition_over_shapes"]
     assert over["best"] <= over["median"]
@@ -87,12 +87,12 @@ def test_the_best_shape_is_better_than_the_papers() -> None:
 
 def test_masses_and_limits_are_those_of_the_urdf() -> None:
     findings = analyze(SpaceRobot.from_file(robot_file("planar_chain")))
-    found = json_of(findings)
+    found = analysis_json(findings)
     assert found["mass_kg"] == pytest.approx(144.0)
     assert [joint["name"] for joint in found["joints"]] == ["pin_1", "pin_2"]
     # A joint without limits has none.
     assert [joint["lower"] for joint in found["joints"]] == [None, None]
-    assert "144 kg, of which the base 120 kg" in lines_of(findings)[0]
+    assert "144 kg, of which the base 120 kg" in analysis_lines(findings)[0]
 
 
 @pytest.mark.slow

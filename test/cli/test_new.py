@@ -17,7 +17,7 @@ from spacerobot_ros.model.description import JointLimits
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.resources import resource_names, robot_file
 from spacerobot_ros.scenario import load_scenario
-from spacerobot_ros.session.own_robot import first_shape, first_turn, remarks
+from spacerobot_ros.session.own_robot import first_shape, first_turn, urdf_remarks
 from spacerobot_ros.simulation.trials import try_method
 
 
@@ -131,12 +131,12 @@ def test_the_first_turn_is_one_that_the_joints_make_without_loops(name: str) -> 
 def test_what_to_mind_is_remarked(before: str, after: str, remark: str) -> None:
     text = robot_file("planar_chain").read_text("utf-8")
     assert before in text
-    assert any(remark in each for each in remarks(parse_robot(text.replace(before, after))))
+    assert any(remark in each for each in urdf_remarks(parse_robot(text.replace(before, after))))
 
 
 def test_limits_in_degrees_are_remarked() -> None:
     text = robot_file("surveyor").read_text("utf-8").replace('lower="-2.9"', 'lower="-166"')
-    found = [each for each in remarks(parse_robot(text)) if "not in degrees" in each]
+    found = [each for each in urdf_remarks(parse_robot(text)) if "not in degrees" in each]
     assert len(found) == 1
     assert "'shoulder_yaw' turns from -166 to 2.9 rad" in found[0]
 

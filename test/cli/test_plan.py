@@ -14,7 +14,7 @@ from support.command_line import CliRunner, Result
 from spacerobot_ros import fly, load_scenario
 from spacerobot_ros import plan as python_plan
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.cli.plan import problem_of
+from spacerobot_ros.cli.plan import problem_of_scenario
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.simulation.trials import random_goals, try_goals
@@ -176,7 +176,7 @@ def test_random_goals_are_met(
 ) -> None:
     monkeypatch.delenv("SPACEROBOT_COMPILE")
     settings = [*options, "planner.optimal.answers=1", "planner.optimal.cache=0"]
-    problem = problem_of(robot, settings=settings)
+    problem = problem_of_scenario(robot, settings=settings)
     goals = random_goals(problem, 20, within[0], np.radians(within[1]))
     (record,) = try_goals(problem, goals, ["optimal"])
     assert (record.reached, record.missed, record.refused) == (20, 0, [])

@@ -10,7 +10,7 @@ from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.meshes import mesh_file
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.session.own_robot import remarks
+from spacerobot_ros.session.own_robot import urdf_remarks
 
 INERTIAL = """<inertial><mass value="{mass}"/>
     <inertia ixx="{ixx}" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>"""
@@ -407,7 +407,7 @@ def test_what_a_link_is_welded_to_makes_up_for_its_inertia(tmp_path: Path) -> No
         load_robot(file_with(tmp_path, text))
     fixed = text.replace('name="mount" type="revolute"', 'name="mount" type="fixed"')
     robot = load_robot(file_with(tmp_path, fixed))
-    found = [each for each in remarks(robot) if "of no body" in each]
+    found = [each for each in urdf_remarks(robot) if "of no body" in each]
     assert found == [next(each for each in found if "'tool'" in each and "welded" in each)]
 
 

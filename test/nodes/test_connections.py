@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import PlantNode
-from spacerobot_ros.nodes.common.streams import Connections, unconnected
+from spacerobot_ros.nodes.common.streams import Connections, unconnected_topics
 
 PLANT = Connections((("/odom", 2), ("/clock", 1)), (("/joint_commands", 1),))
 PLANNER = Connections((("/joint_commands", 2),), (("/odom", 1),))
@@ -19,19 +19,21 @@ RECORDER = Connections((), (("/odom", 1), ("/clock", 1), ("/joint_commands", 1))
 
 
 def test_all_have_met_or_the_topics_say_who_has_not() -> None:
-    assert unconnected([PLANT, PLANNER, RECORDER]) == set()
+    assert unconnected_topics([PLANT, PLANNER, RECORDER]) == set()
     early = Connections((("/odom", 1), ("/clock", 1)), PLANT.subscriptions)
-    assert unconnected([early, PLANNER, RECORDER]) == {"/odom"}, "a publisher knows one reader"
+    assert unconnected_topics([early, PLANNER, RECORDER]) == {"/odom"}, (
+        "a publisher knows one reader"
+    )
     deaf = Connections((), (("/odom", 1), ("/clock", 0), ("/joint_commands", 1)))
-    assert unconnected([PLANT, PLANNER, deaf]) == {"/clock"}, "a reader knows no publisher"
+    assert unconnected_topics([PLANT, PLANNER, deaf]) == {"/clock"}, "a reader knows no publisher"
     # Readers from elsewhere are no matter.
     more = Connections((("/odom", 7), ("/clock", 7)), PLANT.subscriptions)
-    assert unconnected([more, PLANNER, RECORDER]) == set()
+    assert unconnected_topics([more, PLANNER, RECORDER]) == set()
 
 
 def test_two_readers_of_one_node_are_two() -> None:
     twice = Connections((), (("/clock", 1), ("/clock", 1)))
-    assert unconnected([PLANT, PLANNER, RECORDER, twice]) == {"/clock"}
+    assert unconnected_topics([PLANT, PLANNER, RECORDER, twice]) == {"/clock"}
 
 
 @pytest.fixture
@@ -51,7 +53,7 @@ def test_a_node_answers_with_its_endpoints(harness: Harness, plant: PlantNode) -
     assert not {"/rosout", "/parameter_events"} & {topic for topic, _ in found.publishers}
     probe.create_publisher(String, "fault_injection", 10)
     harness.connect()
-    assert unconnected([Connections.of(plant), Connections.of(probe)]) == set()
+    assert unconnected_topics([Connections.of(plant), Connections.of(probe)]) == set()
 
 
 def _odometry() -> Any:

@@ -27,7 +27,7 @@ from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
-from spacerobot_ros.nodes.common.messages import KnownFrames, chained
+from spacerobot_ros.nodes.common.messages import KnownFrames, compose_poses
 from spacerobot_ros.nodes.plant.publisher import TransformPublisher
 from spacerobot_ros.resources import resource_names, robot_file
 from spacerobot_ros.simulation.actuators import build_plant
@@ -197,7 +197,7 @@ def test_chains_of_frames_end_in_the_world_or_nowhere() -> None:
     assert frames.pose("b", "world", own) == pytest.approx([0, 0, 2, 0, 0, 1, 0])
     assert frames.pose("x", "world", own) is None
     assert frames.pose("moon", "world", own) is None
-    aside = chained(up, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
+    aside = compose_poses(up, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
     assert aside == pytest.approx([0, 1, 1, 0, 0, half, half])
 
 
@@ -288,7 +288,7 @@ def test_a_goal_in_a_frame_of_the_robot_is_one_in_the_world(harness: Harness, fr
     flight.ticks(2)
     base = np.array([*away, *turned])
     links = ForwardKinematics(load_robot(robot_file("sliding_masses")))
-    pose = base if frame != LINK else chained(base, links.transforms[0])
+    pose = base if frame != LINK else compose_poses(base, links.transforms[0])
     # The base where it is now, as it looks from the frame, and 3 cm ahead of that.
     there = np.linalg.inv(homogeneous(pose)) @ homogeneous(base)
     there[:3, 3] += 0.03 * there[:3, 0]

@@ -46,10 +46,10 @@ from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND, first_time_ns, set_stamp
 
-_LOOK_PERIOD = 0.1
+_WAITING_STATE_CHECK_PERIOD = 0.1
 """Wall time between two checks of postponed state messages, s."""
 
-_COMPLAINT_PERIOD = 5.0
+_FOREIGN_STATUS_LOG_PERIOD = 5.0
 """Least wall time between log lines about foreign publishers of plant/status, s."""
 
 _LONGEST_DIAGNOSTICS_PERIOD = 1.0
@@ -109,8 +109,8 @@ class CommanderNode(FlightNode):
         self._inputs: dict[str, Subscription] = {}
         self._subscribe_states()
         self.create_timer(
-            _LOOK_PERIOD,
-            self._look_at_waiting_messages,
+            _WAITING_STATE_CHECK_PERIOD,
+            self._process_waiting_messages,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         self.create_service(Trigger, "~/abort", self._on_abort)
@@ -266,7 +266,7 @@ class CommanderNode(FlightNode):
         if foreign:
             self._doubted = True
             now = time.monotonic()
-            if now - self._last_complaint > _COMPLAINT_PERIOD:
+            if now - self._last_complaint > _FOREIGN_STATUS_LOG_PERIOD:
                 self._last_complaint = now
                 self.log(
                     "error",
@@ -346,7 +346,7 @@ class CommanderNode(FlightNode):
                 found.append(Stamped(first_time_ns(taken[0]), taken[0]))
         return found
 
-    def _look_at_waiting_messages(self) -> None:
+    def _process_waiting_messages(self) -> None:
         """Process waiting statuses, and a postponed state once its time is accepted."""
         assert self._statuses is not None
         commander, handle = self.commander, self._statuses.handle

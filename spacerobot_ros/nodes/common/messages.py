@@ -190,7 +190,7 @@ def goal_of(
     goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], shape)
     if pose is None:
         return goal
-    moved = chained(pose, np.concatenate([goal.position, goal.quaternion]))
+    moved = compose_poses(pose, np.concatenate([goal.position, goal.quaternion]))
     return Goal.checked(moved[:3], moved[3:], shape)
 
 
@@ -203,7 +203,7 @@ def goal_description(part: str, goal_id: str, message: PoseStamped, goal: Goal) 
     return f"Goal {goal_id} of the {part}: ({position}) m, ({quaternion}){given}."
 
 
-def chained(outer: Array, inner: Array) -> Array:
+def compose_poses(outer: Array, inner: Array) -> Array:
     """Return the composition (7,) of two poses; ``inner`` is relative to ``outer``."""
     position = outer[:3] + matrix_from_quaternion(outer[3:]) @ inner[:3]
     return np.concatenate([position, quaternion_multiply(outer[3:], inner[3:])])
@@ -277,7 +277,7 @@ class KnownFrames:
             if frame not in parents:
                 return None
             frame, step = parents[frame]
-            pose = chained(step, pose)
+            pose = compose_poses(step, pose)
         return None
 
     def _received_parents(self) -> dict[str, tuple[str, Array]]:

@@ -54,7 +54,7 @@ AUTOSTART = Parameter(
 )
 """Parameter of every node: whether it starts by itself."""
 
-_CAN_SHUT_DOWN = (
+_STATES_THAT_CAN_SHUT_DOWN = (
     State.PRIMARY_STATE_UNCONFIGURED,
     State.PRIMARY_STATE_INACTIVE,
     State.PRIMARY_STATE_ACTIVE,
@@ -305,7 +305,7 @@ class FlightNode(LifecycleNode):
         real one.
         """
         try:
-            self._require_free(parameter_list)
+            self._require_changeable(parameter_list)
             changes = typed(self._parameters_declared, parameter_list)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
@@ -333,7 +333,7 @@ class FlightNode(LifecycleNode):
 
     def finalize(self) -> None:
         """Shut the node down unless it has been shut down before."""
-        if self.lifecycle_state in _CAN_SHUT_DOWN:
+        if self.lifecycle_state in _STATES_THAT_CAN_SHUT_DOWN:
             self.trigger_shutdown()
 
     def destroy_node(self) -> None:
@@ -402,7 +402,7 @@ class FlightNode(LifecycleNode):
         if result is TransitionCallbackReturn.FAILURE:
             self._destroy_configured()
         if result is TransitionCallbackReturn.SUCCESS:
-            self._fix_parameters(fixed=True)
+            self._set_parameters_read_only(fixed=True)
         return self._report_transition(result, EventKind.CONFIGURED)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -497,7 +497,7 @@ class FlightNode(LifecycleNode):
 
     def _destroy_configured(self) -> None:
         """Destroy the entities of configure; the services of every ROS node stay."""
-        self._fix_parameters(fixed=False)
+        self._set_parameters_read_only(fixed=False)
         self.raw_streams[:] = self._permanent_streams
         destroy = {
             Timer: self.destroy_timer,
@@ -509,12 +509,12 @@ class FlightNode(LifecycleNode):
             if entity not in self._permanent:
                 next(act for kind, act in destroy.items() if isinstance(entity, kind))(entity)
 
-    def _fix_parameters(self, *, fixed: bool) -> None:
+    def _set_parameters_read_only(self, *, fixed: bool) -> None:
         """Make the parameters that :meth:`configure` reads constant, or writable again."""
         declared = self._parameters_declared.values()
         fix(self, (each for each in declared if each.read_only), fixed=fixed)
 
-    def _require_free(self, changes: list[RosParameter]) -> None:
+    def _require_changeable(self, changes: list[RosParameter]) -> None:
         """Raise ParameterError if a requested change concerns a parameter that is constant now."""
         for change in changes:
             if change.name == AUTOSTART.name:

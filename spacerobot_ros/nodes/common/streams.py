@@ -13,7 +13,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-_MIDDLEWARE = ("/rosout", "/parameter_events")
+_MIDDLEWARE_TOPICS = ("/rosout", "/parameter_events")
 
 Matches = tuple[tuple[str, int], ...]
 """Topic of each endpoint, and the number of endpoints matched with it."""
@@ -50,7 +50,7 @@ class Connections:
         return cls(_without_middleware(publishers), _without_middleware(subscriptions))
 
 
-def unconnected(nodes: Iterable[Connections]) -> set[str]:
+def unconnected_topics(nodes: Iterable[Connections]) -> set[str]:
     """Return the topics on which endpoints of these nodes are not all matched."""
     nodes = list(nodes)
     writers = Counter(topic for node in nodes for topic, _ in node.publishers)
@@ -66,7 +66,9 @@ def unconnected(nodes: Iterable[Connections]) -> set[str]:
 
 def _without_middleware(matches: Iterable[Iterable[object]]) -> Matches:
     pairs = (tuple(pair) for pair in matches)
-    return tuple((str(topic), int(str(met))) for topic, met in pairs if topic not in _MIDDLEWARE)
+    return tuple(
+        (str(topic), int(str(met))) for topic, met in pairs if topic not in _MIDDLEWARE_TOPICS
+    )
 
 
 Take = Callable[[bytes], None]

@@ -23,16 +23,16 @@ TOPIC = "heartbeat"
 HEARTBEAT_PERIOD = 0.2
 """Wall s between two heartbeats of an active node."""
 
-_LOOK_PERIOD = 0.1
+_SILENCE_CHECK_PERIOD = 0.1
 """Wall time between two checks for silent nodes, s."""
 
-_STANDSTILL = 0.3
+_SUSPENSION_TIME = 0.3
 """Wall time between two checks beyond which this node itself was suspended, s."""
 
 _REPORT_PERIOD = 1.0
 """Wall s between two diagnostics while a node is silent."""
 
-_HEARTBEATS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
+_HEARTBEAT_QOS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Role(str, Enum):
@@ -122,7 +122,7 @@ class Watchdog:
     def look(self) -> list[Silence]:
         """Return the nodes that have become silent since the last call."""
         now = self._clock()
-        if now - self._looked > _STANDSTILL:
+        if now - self._looked > _SUSPENSION_TIME:
             for name in self._heard:
                 self._heard[name] = now
         self._looked = now
@@ -159,7 +159,7 @@ class Liveness:
         on_silence: Callable[[Silence], None],
     ) -> None:
         self._node, self._role, self._on_silence = node, role, on_silence
-        self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, _HEARTBEATS)
+        self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, _HEARTBEAT_QOS)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers: list[Timer] = []
         self._watched = {each.value for each in depends_on}
@@ -176,8 +176,10 @@ class Liveness:
         self._timeout = timeout
         if self._watched and timeout:
             node = self._node
-            node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, _HEARTBEATS)
-            self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", _HEARTBEATS)
+            node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, _HEARTBEAT_QOS)
+            self._diagnostics = node.create_publisher(
+                DiagnosticArray, "/diagnostics", _HEARTBEAT_QOS
+            )
 
     def begin(self) -> None:
         """Give heartbeats, and watch, from now on."""
@@ -189,7 +191,9 @@ class Liveness:
         self._timers.append(beat)
         if self._watched and self._timeout:
             self._watchdog = Watchdog(self._timeout)
-            self._timers.append(node.create_timer(_LOOK_PERIOD, self._look, clock=self._steady))
+            self._timers.append(
+                node.create_timer(_SILENCE_CHECK_PERIOD, self._look, clock=self._steady)
+            )
             self._next_report = 0.0
         self.beat()
 

@@ -43,14 +43,14 @@ from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS
 
-_LOOK_PERIOD = 0.1
+_READER_CHECK_PERIOD = 0.1
 """Wall time between two checks for new subscribers and commanders, s."""
 
 _MAX_UNCONFIRMED_TICKS = STREAM.depth // 2
 """Ticks that a lockstep plant takes at most before all readers confirm that they have their states:
 a reader that has fallen further behind than what publishers keep would lose some."""
 
-_REST_RATE = 1e-3
+_MAX_RATE_AT_REST = 1e-3
 """Joint rates of a robot at rest, m/s or rad/s."""
 
 _LONGEST_REST = 0.8
@@ -130,7 +130,7 @@ class PlantNode(FlightNode):
                 "robot of this package, or 'robot_description' to a URDF text."
             )
         self._period_ns = config.period_ns
-        initial, self._tick = self._resumed_state(robot)
+        initial, self._tick = self._initial_state_and_tick(robot)
         self.plant = build_plant(robot, config, initial)
         self.plant.tick = self._tick
         self._reported = ReportedState(self.plant, config)
@@ -161,7 +161,7 @@ class PlantNode(FlightNode):
                 source.topic,
                 partial(self._on_command, reader),
                 # In lockstep the first command of a tick counts, whichever node publishes it.
-                None if self._real_time is None else self._number_taker(source.senders),
+                None if self._real_time is None else self._message_number_callback(source.senders),
             )
         self.create_subscription(String, "fault_injection", self._on_fault, STREAM)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -183,12 +183,14 @@ class PlantNode(FlightNode):
         if self._real_time is None:
             self._publisher.has_new_readers()
             self._look_for_commanders()
-            self._wall_timers = [self.create_timer(_LOOK_PERIOD, self._on_look_round, clock=steady)]
+            self._wall_timers = [
+                self.create_timer(_READER_CHECK_PERIOD, self._on_look_round, clock=steady)
+            ]
         else:
             self._real_time.start(steady.now().nanoseconds, self._tick)
             self._wall_timers = [
                 self.create_timer(self._real_time.period, self._on_wall_tick, clock=steady),
-                self.create_timer(_LOOK_PERIOD, self._on_real_time_look, clock=steady),
+                self.create_timer(_READER_CHECK_PERIOD, self._on_real_time_look, clock=steady),
             ]
         self._look_at_status()
         self._publish()
@@ -237,7 +239,7 @@ class PlantNode(FlightNode):
         end, began = time.monotonic() + _LONGEST_REST, self._tick
 
         def at_rest() -> bool:
-            return self._tick > began and bool(np.all(np.abs(self.plant.qdot) <= _REST_RATE))
+            return self._tick > began and bool(np.all(np.abs(self.plant.qdot) <= _MAX_RATE_AT_REST))
 
         while not at_rest() and time.monotonic() < end and self.is_active:
             executor.spin_once(timeout_sec=0.02)
@@ -270,7 +272,7 @@ class PlantNode(FlightNode):
         record = StatusRecord(name, status.level, status.message, status.to_values())
         self._status.take(record.encoded())
 
-    def _resumed_state(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:
+    def _initial_state_and_tick(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:
         """Return the initial state (None: as configured) and its tick."""
         path = self.config.resume_bag
         if not path:
@@ -381,7 +383,7 @@ class PlantNode(FlightNode):
 
     # -- commands -----------------------------------------------------------------------------
 
-    def _number_taker(self, senders: PublisherTracker) -> Callable[[int], None]:
+    def _message_number_callback(self, senders: PublisherTracker) -> Callable[[int], None]:
         note = senders.note
         return lambda number: note(number, self._tick * self._period_ns)
 

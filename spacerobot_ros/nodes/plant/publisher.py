@@ -41,10 +41,10 @@ from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import set_stamp, stamp_bytes
 from spacerobot_ros.topics import TOPICS, Topic
 
-PROPELLANT = "propellant_kg"
+PROPELLANT_KEY = "propellant_kg"
 """Diagnostics key of the propellant used."""
 
-_ROUNDING = 1e-9
+_MOMENTUM_ROUNDING = 1e-9
 """Largest momentum change by rounding, divided by the mass, m/s and m^2/s."""
 
 _LOG_PERIOD = 5.0
@@ -210,7 +210,7 @@ class PlantReport:
         change = plant.momentum[:6] - plant.expected_momenta
         linear, angular = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
         # The threshold exceeds rounding errors of bodies that move at up to 1 m/s.
-        leaks = max(linear, angular) > _ROUNDING * plant.robot.total_mass
+        leaks = max(linear, angular) > _MOMENTUM_ROUNDING * plant.robot.total_mass
         return diagnostic_status(
             self._name("momentum"),
             _ERROR if leaks else _OK,
@@ -246,7 +246,7 @@ class PlantReport:
             _WARN if sentences else _OK,
             "; ".join(sentences) or "the wanted wrench is given",
             {
-                PROPELLANT: f"{thrusters.propellant:.9g}",
+                PROPELLANT_KEY: f"{thrusters.propellant:.9g}",
                 "pulses": int(thrusters.pulses.sum()),
                 "unmet_ticks": thrusters.unmet_ticks,
                 "unmet_force_N": f"{force:.6g}",
@@ -279,7 +279,7 @@ def timing_status(name: str, real_time: RealTime) -> DiagnosticStatus:
     )
 
 
-MARKERS = "visualization_msgs/msg/MarkerArray"
+MARKER_ARRAY_TYPE = "visualization_msgs/msg/MarkerArray"
 
 _LONGEST_WAIT = 0.5
 """Longest wait for readers, wall s."""
@@ -436,7 +436,9 @@ class LinkMarkers:
                 markers.append(shape_marker(shape, world_frame, link.name, len(markers)))
                 self._poses.append((index, shape.pose))
         self._publisher: Any = node.create_publisher(MarkerArray, "markers", STREAM)
-        self._template = MessageTemplate(MARKERS, serialize_message(MarkerArray(markers=markers)))
+        self._template = MessageTemplate(
+            MARKER_ARRAY_TYPE, serialize_message(MarkerArray(markers=markers))
+        )
         self._targets = [
             self._template.floats(f"markers[{i}].pose.position.x", 7) for i in range(len(markers))
         ]

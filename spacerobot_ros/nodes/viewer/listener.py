@@ -42,10 +42,10 @@ from spacerobot_ros.viewer.state import Firing, Measured, Momenta, Part, StackSt
 LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of streams: only the last message is kept, without acknowledgement."""
 
-_SILENT_AFTER = 1.5
+_SILENCE_TIMEOUT = 1.5
 """Wall time without a heartbeat after which an active node counts as silent, s."""
 
-_FORGOTTEN_AFTER = 60.0
+_TIME_UNTIL_SILENT_NODE_IS_HIDDEN = 60.0
 """Wall time after which a silent node and its last reports are no longer shown, s."""
 
 _JITTER_NS = 200_000
@@ -121,7 +121,7 @@ class Listener:
         self._expected = Latest(streams, Float64MultiArray, "momentum_expected")
         self._thrusters = Latest(streams, JointState, "thrusters")
         self._names: Sequence[str] = ()
-        self._beats: dict[str, _Beat] = {}
+        self._beats: dict[str, _Heartbeat] = {}
         self._statuses: dict[str, Any] = {}
         self._reporters: dict[str, str] = {}
         """Full name of the node that published a status, by kind of status."""
@@ -174,7 +174,7 @@ class Listener:
         silent = {
             name: now - beat.at
             for name, beat in beats
-            if beat.pulse is Pulse.ACTIVE and now - beat.at > _SILENT_AFTER
+            if beat.pulse is Pulse.ACTIVE and now - beat.at > _SILENCE_TIMEOUT
         }
         inactive = tuple(name for name, beat in beats if beat.pulse is Pulse.INACTIVE and beat.role)
         statuses = {
@@ -316,12 +316,12 @@ class Listener:
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
         with suppress(ValueError):  # The heartbeat is of another package.
             pulse = Pulse(message.message)
-            self._beats[message.name] = _Beat(time.monotonic(), pulse, message.hardware_id)
+            self._beats[message.name] = _Heartbeat(time.monotonic(), pulse, message.hardware_id)
             self._hidden = {name: by for name, by in self._hidden.items() if by != message.name}
 
     def _hide_lost_nodes(self, now: float) -> None:
         """Hide the reports of nodes that have long been silent, and of a replay that is over."""
-        if now - self._last_call > _SILENT_AFTER:
+        if now - self._last_call > _SILENCE_TIMEOUT:
             # This process was suspended, so the other nodes were not silent.
             gap = now - self._last_call
             self._beats = {n: replace(b, at=b.at + gap) for n, b in self._beats.items()}
@@ -332,7 +332,9 @@ class Listener:
         for name, beat in tuple(self._beats.items()):
             is_replay = beat.role == Role.REPLAY.value
             over = is_replay and a_plant_runs and not beat.is_alive(now)
-            if not over and (beat.pulse is Pulse.BUSY or now - beat.at <= _FORGOTTEN_AFTER):
+            if not over and (
+                beat.pulse is Pulse.BUSY or now - beat.at <= _TIME_UNTIL_SILENT_NODE_IS_HIDDEN
+            ):
                 continue
             del self._beats[name]
             self._hidden[name] = name
@@ -343,7 +345,7 @@ class Listener:
 
 
 @dataclass(frozen=True)
-class _Beat:
+class _Heartbeat:
     """The last heartbeat of a node: time of arrival, wall s, pulse and role."""
 
     at: float
@@ -353,5 +355,5 @@ class _Beat:
     def is_alive(self, now: float) -> bool:
         """Whether the node is active and not silent."""
         return self.pulse is Pulse.BUSY or (
-            self.pulse is Pulse.ACTIVE and now - self.at <= _SILENT_AFTER
+            self.pulse is Pulse.ACTIVE and now - self.at <= _SILENCE_TIMEOUT
         )

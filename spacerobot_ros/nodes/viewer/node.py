@@ -67,12 +67,12 @@ _ROSOUT_QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
 )
-_LEAST_LOG_LEVEL = 30
+_LEAST_SHOWN_LOG_LEVEL = 30
 """Least level of shown log messages (rcl_interfaces/Log)."""
 
 _GOAL_TOPICS: Mapping[Part, str] = {"base": "goal_pose", "end_effector": "end_effector/goal_pose"}
 
-_SERVICES: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
+_SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
     Request.ABORT: (("planner", "controller"), "abort", None),
     Request.STOP: (("plant",), "abort", None),
     Request.REARM: (("plant",), "rearm", None),
@@ -87,10 +87,10 @@ _SERVICES: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
 _NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
 """Nodes whose parameters the page reads."""
 
-_LONGEST_MEETING = 4.0
+_LONGEST_MATCHING_WAIT = 4.0
 """Wall time that a goal waits for subscribers that are known but not matched yet, s."""
 
-_LONGEST_ANSWER = 5.0
+_LONGEST_GOAL_ANSWER_WAIT = 5.0
 """Wall time within which a planner or controller answers a goal, s."""
 
 _MICROSECOND_NS = 1000
@@ -262,7 +262,7 @@ class ViewerNode(FlightNode):
             return
         self._full_names[key] = name
         # Discovery of a service takes some seconds after its client is created.
-        for keys, service, data in _SERVICES.values():
+        for keys, service, data in _SERVICE_BY_REQUEST.values():
             if key in keys:
                 self._client(Trigger if data is None else SetBool, f"{name}/{service}")
         if key in _NODES_WITH_PARAMETERS:
@@ -285,8 +285,8 @@ class ViewerNode(FlightNode):
         own = self.get_namespace().strip("/").replace("/", ".")
         if own and not message.name.startswith(f"{own}."):
             return  # The log line is of another stack.
-        if message.level >= _LEAST_LOG_LEVEL and message.name != self.get_logger().name:
-            level = 1 if message.level == _LEAST_LOG_LEVEL else 2
+        if message.level >= _LEAST_SHOWN_LOG_LEVEL and message.name != self.get_logger().name:
+            level = 1 if message.level == _LEAST_SHOWN_LOG_LEVEL else 2
             self._note(printable(message.msg), level, printable(message.name))
 
     def _on_parameter_change(self, message: ParameterEvent) -> None:
@@ -353,7 +353,7 @@ class ViewerNode(FlightNode):
     def _carry_out(self, action: Action, state: StackState) -> None:
         match action:
             case Fly(goals):
-                self._goals_to_send = goals, time.monotonic() + _LONGEST_MEETING
+                self._goals_to_send = goals, time.monotonic() + _LONGEST_MATCHING_WAIT
             case Inject(text):
                 self._fault_topic.publish(String(data=text))
                 self._note(f"Sent to the plant: {text}", source="page")
@@ -384,7 +384,7 @@ class ViewerNode(FlightNode):
                 # Planner and controller answer with the next state.
                 state.plant is not None and state.plant.state is PlantState.PAUSED
             ):
-                self._unanswered_goal = goal_id, now + _LONGEST_ANSWER
+                self._unanswered_goal = goal_id, now + _LONGEST_GOAL_ANSWER_WAIT
             elif now >= until:
                 self._unanswered_goal = None
                 self._note(
@@ -410,14 +410,14 @@ class ViewerNode(FlightNode):
             self._note("Goal sent.", source="page")
             stamp = message.header.stamp
             goal_id = GoalIds().of(stamp.sec, stamp.nanosec)
-            self._unanswered_goal = goal_id, time.monotonic() + _LONGEST_ANSWER
+            self._unanswered_goal = goal_id, time.monotonic() + _LONGEST_GOAL_ANSWER_WAIT
         editor = self._page.editor
         if self._checker.cancel() and not editor.moving:
             editor.show_check(Check(Verdict.UNCHECKED, "It was sent before it was checked."))
 
     def _call_service(self, request: Request) -> None:
         """Call the service of a request on every node that has it."""
-        keys, service, data = _SERVICES[request]
+        keys, service, data = _SERVICE_BY_REQUEST[request]
         called = False
         for key in keys:
             name = self._full_names.get(key)
