@@ -128,11 +128,11 @@ def test_options_of_a_stack_that_stays_up(
 ) -> None:
     kept: list[Any] = []
 
-    def keep_up(scenario: Any, bag: Path | None, show: Any, **named: Any) -> Path | None:
+    def run_until_stopped(scenario: Any, bag: Path | None, show: Any, **named: Any) -> Path | None:
         kept.append((scenario, bag, named))
         return bag
 
-    monkeypatch.setattr(session, "keep_up", keep_up)
+    monkeypatch.setattr(session, "run_until_stopped", run_until_stopped)
     line = "up planar_chain --rate 2.5 --bag b.mcap --processes --namespace left --view"
     result = call(*line.split(), "--set", "planner.tick_rate=12.5")
     assert result.output.split() == ["bag", "b.mcap"]
