@@ -66,7 +66,7 @@ class Starts:
 
     @classmethod
     def of(cls, robot: SpaceRobot, initial: Sequence[InitialState]) -> Starts:
-        """Return the rows of initial states.
+        """Return initial states as rows.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class SensorErrors:
 
     @classmethod
     def of(cls, robot: SpaceRobot, each: Sequence[SensorConfig]) -> SensorErrors:
-        """Return the rows of configurations."""
+        """Return sensor configurations as rows."""
         zero = (0.0, 0.0, 0.0)
         return cls(
             np.array([[getattr(one, name) for name in NOISES] for one in each]).reshape(-1, 6),

@@ -41,10 +41,10 @@ _BLOCK_BYTES = 32 * 2**20
 """Memory of a block of flights, including noise and commands."""
 
 _MAX_BLOCK_GROUPS = 64
-"""Largest number of groups in a block: more gain nothing."""
+"""Largest number of lane groups in a block: more gain nothing."""
 
 _CHUNK_TICKS = 2000
-"""Ticks that are flown, and for which noise is drawn, between two checks for signals."""
+"""Number of ticks, with their noise, between two checks for signals."""
 
 _PROGRAMS = {
     HeldCommands: Program.HELD,
@@ -83,7 +83,7 @@ def _fly_in_lanes(flights: Flights) -> BatchResult:
     model, p = flights.robot.symbolic_model(inertial)
     tick = CompiledTick.of(flights, model)
     fit = _regular_starts(flights)
-    # For the plant's message about each irregular start.
+    # The scalar plant gives the message about each irregular start.
     result = fly_one_by_one(flights, np.flatnonzero(~fit).tolist())
     failures = dict(result.failures)
     rows = np.flatnonzero(fit)
@@ -281,7 +281,7 @@ class _Block:
             if not alive.any():
                 break
             end = min(begin + _CHUNK_TICKS, flights.ticks)
-            # The state at the end is measured too.
+            # The sensors measure the state at the end, too.
             last = end + (end == flights.ticks)
             normals = self._noise.draw_ticks(begin, last, alive)
             if normals is not None:
@@ -349,7 +349,7 @@ class _Block:
                         result.fallback_ticks[self._flown[index]] += 1
 
     def _command_lane(self, group: int, lane: int, index: int, result: BatchResult) -> None:
-        """Take the command from the controller itself."""
+        """Compute a lane's command by the controller itself."""
         controller, row = self._tick.controller, int(self._rows_of_lanes[index])
         assert controller is not None
         state = ControlState.unstack(self._memory[group, self._rows["measured"], lane])
@@ -442,7 +442,7 @@ def _pad_table(table: Array, ticks: int, dimensions: int, count: int) -> Array:
 
 
 def _aligned_array(shape: tuple[int, ...], value: float = 0.0) -> Array:
-    """Return equal numbers that begin where a vector register can be loaded from."""
+    """Return an array of equal numbers, aligned for vector registers."""
     count = int(np.prod(shape))
     memory = np.full(count + 8, value)
     offset = (-memory.ctypes.data % 64) // 8
@@ -469,7 +469,7 @@ class SensorNoise:
 
     @property
     def affects_commands(self) -> bool:
-        """Whether commands depend on errors: along schedules, on those of joints."""
+        """Whether commands depend on sensor errors: along schedules, on those of joints."""
         errors = self._errors
         if errors is None:
             return False

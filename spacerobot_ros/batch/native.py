@@ -36,7 +36,7 @@ from spacerobot_ros.simulation import effort_plant, velocity_plant
 _SOURCE_FOLDER = Path(__file__).resolve().parent
 
 _CASADI_SELECTION = re.compile(r"\((\w+)\?(\w+):0\)")
-"""How CasADi writes a number that is zero unless a condition holds."""
+"""CasADi's text for a number that is zero unless a condition holds."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ UNITS: dict[str, VectorUnit] = {
 """Vector registers by the name of the processor's flag, the widest first."""
 
 _PORTABLE_UNIT = VectorUnit("two at a time", 2, (), "")
-"""For other processors, whose registers the compiler chooses."""
+"""The vector unit of other processors, whose registers the compiler chooses."""
 
 
 @lru_cache(maxsize=1)
@@ -97,11 +97,11 @@ class Pending(IntEnum):
 
     NOTHING = 0
     COMMIT = 1
-    """To commit a tick, after some lanes have been stepped by the scalar plant."""
+    """To commit a tick, after the scalar plant has stepped some lanes."""
     TICK = 2
-    """To step, after some lanes have got their command from the controller."""
+    """To step, after the controller has computed the commands of some lanes."""
     FIRE = 3
-    """To fire thrusters, after some lanes have got their allocation."""
+    """To fire thrusters, after the scalar allocation of some lanes."""
 
 
 _JOB_MEMBERS = (
@@ -206,7 +206,7 @@ class CompiledTick:
         key = (*key, vector_unit(), compilation_settings())
         program = flights.program
         if isinstance(program, Controlled):
-            # All parameters but the gains, which each flight has of its own, are in the function.
+            # The function has all parameters as constants, except the gains of each flight.
             values = values_of(program.config).items()
             parameters = [each for each in values if not each[0].startswith("gains.")]
             believed = program.robot or flights.robot
@@ -228,7 +228,7 @@ class CompiledTick:
         whole = make(robot, Composition(model, ca.MX), flights.substeps)
         inputs = whole.mx_in()
         outputs = dict(zip(names.outputs, whole.call(inputs, True, False), strict=True))
-        # Reports need all but the poses of links.
+        # Reports need all results except the poses of links.
         reported = tuple(name for name in names.outputs if not name.startswith("link"))
         arguments = {"FLIGHT": (*names.inputs, "p"), "REPORT": (*names.inputs, "p")}
         results = {"FLIGHT": names.flight, "REPORT": reported}

@@ -72,7 +72,7 @@ def _fly_row(
     config = SensorConfig() if flights.sensors is None else flights.sensors.config(row)
     faulty = FaultyPlant(plant, (), period, wrench=flights.actuation == "effort")
     sensors = Sensors(faulty, config, period)
-    ends = False  # Whether the flight ends with the tick of the decision about its goal.
+    ends = False  # Whether the flight ends at the tick of the decision about its goal.
     match flights.program:
         case FollowedSchedule() as program:
             command = _schedule_commands(flights, program, row)

@@ -157,7 +157,7 @@ def plan(
             options["end_effector_pose"] = end_effector_pose
             options["end_effector"] = end_effector
         if method is None:
-            # The options of a method that is not named are those of `optimal`.
+            # Without a method's name, options are options of `optimal`.
             of_method = options.keys() - signature(planning.plan).parameters.keys()
             method = "optimal" if of_method else PlannerConfig().method
         return planning.plan(what, goal, method=method, **{**chosen, **options})
@@ -170,7 +170,9 @@ def plan(
         scenario = scenario.with_end_effectors(hands, frozenset(asked))
     settings: dict[str, Any] = {} if method is None else {"method": method}
     name = method or scenario.planner.method
-    method_options(name, options)  # Refused here, by the names that were given.
+    method_options(
+        name, options
+    )  # Names are checked here, so that a message has the names as given.
     settings |= {f"{name}.{option}": value for option, value in options.items()}
     problem = scenario.with_overrides("planner", settings).problem()
     state, tolerance = robot_state_of(problem.plant()), problem.config.tolerance
@@ -179,7 +181,7 @@ def plan(
 
 
 def _is_scenario(what: SpaceRobot | Scenario | str | Path, *, aimed: bool) -> bool:
-    """Whether a name is a scenario's; one that is also a robot's is so without a goal."""
+    """Whether a name is a scenario's; a goal turns a shared name into a robot's."""
     if isinstance(what, SpaceRobot | Scenario):
         return isinstance(what, Scenario)
     name = str(what)
@@ -212,7 +214,7 @@ def _changed_goal(
     position: npt.ArrayLike | None,
     rotvec: npt.ArrayLike | None,
 ) -> Goal:
-    """Return a goal, or the one before, with another position or attitude."""
+    """Return the given goal, or the earlier goal with another position or attitude."""
     made = before
     if isinstance(goal, Goal):
         made = goal

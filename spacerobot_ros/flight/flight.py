@@ -53,10 +53,10 @@ _QUANTITY_SIZES = {
     **dict.fromkeys(("pose", "momentum", "measured_pose", "end_effector_pose"), 7),
     **dict.fromkeys(("twist", "measured_twist", "expected_momenta"), 6),
 }
-"""Numbers in a sample; those of other quantities are one for each joint."""
+"""Numbers per sample by quantity; other quantities have one number per joint."""
 
 _FLOWN_STATES = frozenset(("executing", "reached", "failed", "aborted"))
-"""States of a status whose goal is, or was, flown to."""
+"""States of a status whose goal the robot flies to, or has flown to."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class Flight:
 
     @property
     def quantities(self) -> dict[str, Array]:
-        """The other quantities, (N, size) each.
+        """The quantities without an attribute of their own, (N, size) each.
 
         Names are those of :class:`~spacerobot_ros.simulation.sensors.ReportedState`:
         measured states (only where sensors err), the end-effector, thrusters, expected momenta.
@@ -272,7 +272,7 @@ class Flight:
 
     @property
     def corrections(self) -> int:
-        """New plans after the first that count as corrections."""
+        """Number of new plans that count as corrections."""
         return self.status.corrections if isinstance(self.status, PlannerStatus) else 0
 
     @property
@@ -286,12 +286,12 @@ class Flight:
 
     @property
     def error(self) -> PoseError | None:
-        """Error of the last true pose to the goal; None without one of them."""
+        """Error of the last true pose to the goal; None without a pose or a goal."""
         return pose_error(self.signal("pose"), self.goal)
 
     @property
     def end_effector_error(self) -> PoseError | None:
-        """Error of the last pose of the end-effector to its goal; None without one of them."""
+        """Error of the end-effector's last pose to its goal; None without a pose or a goal."""
         return pose_error(self.signal("end_effector_pose"), self.end_effector_goal)
 
     @property
@@ -443,7 +443,7 @@ class Flight:
 
 
 def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:
-    """Return the error of the last of some poses (N, 7) to a goal; None without one of them."""
+    """Return the error of the last pose to a goal; None without a pose or a goal."""
     if goal is None or not len(poses):
         return None
     return PoseError.between(poses.values[-1, :3], poses.values[-1, 3:], goal)
@@ -458,7 +458,7 @@ def _turns_end_effector(status: Status | None) -> bool:
 
 
 def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
-    """Return the goal of a status, as it was sent; None where the status names none."""
+    """Return the sent goal of a status; None for a status without a goal."""
     for sent in reversed(goals):
         if status.goal_id and status.goal_id == sent.goal_id:
             return sent.goal
@@ -477,7 +477,7 @@ def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
 
 
 def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal | None:
-    """Return the goal that was flown to last, or else the one that was sent last."""
+    """Return the last goal of the flight, or otherwise the last sent goal."""
     for status in reversed(list(statuses)):
         if status.state.value in _FLOWN_STATES:
             goal = reported_goal(status, goals)
@@ -512,7 +512,7 @@ class FlightLog:
         self._thrusters = thrusters_in(plant)
         self._propellant = np.zeros(1)
         true = {"pose": plant.pose, "twist": plant.twist, "q": plant.q, "qdot": plant.qdot}
-        # What sensors without error measure are the true arrays.
+        # Measurements of sensors without error are the true arrays.
         unused = ("true_",) if reported.sensors.used else ("true_", "measured_")
         sources = {
             **{name: x for name, x in reported.quantities.items() if not name.startswith(unused)},

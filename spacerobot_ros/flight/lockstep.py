@@ -57,10 +57,10 @@ Progress = Callable[[float, float], bool]
 whether the flight is to end."""
 
 _PROGRESS_PERIOD = 0.2
-"""Wall s between two looks at whether the flight is to end."""
+"""Wall time between two calls of the progress function, s."""
 
 _TICKS_PER_CLOCK_READ = 64
-"""Ticks between two looks at the wall clock."""
+"""Number of ticks between two reads of the wall clock."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Robots:
 
 
 def require_flyable(scenario: Scenario) -> None:
-    """Refuse what only the nodes can do: wall time, other processes, files to go on from.
+    """Refuse a scenario that only nodes can fly: wall time, other processes, files to go on from.
 
     Raises
     ------
@@ -199,7 +199,7 @@ class _Host:
 
 
 class _LockstepFlight:
-    """One flight in the making."""
+    """One flight in lockstep, tick by tick."""
 
     def __init__(self, scenario: Scenario, robots: Robots) -> None:
         config = scenario.plant

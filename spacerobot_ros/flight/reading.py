@@ -129,7 +129,7 @@ class FlightBag:
     # -- signals ------------------------------------------------------------------------------
 
     def signal(self, name: str, fields: Sequence[str], width: int) -> Signal:
-        """Return numbers of a topic over time, without messages that lack one of them.
+        """Return fields of a topic over time, without messages that lack a field.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class FlightBag:
     # -- reports ------------------------------------------------------------------------------
 
     def statuses(self, commander: str) -> Iterator[tuple[int, Status | str]]:
-        """Go through the statuses of a commander, each with its log time in ns.
+        """Yield the statuses of a commander with their log times, ns.
 
         A status of another package is its message alone.
         """
@@ -223,7 +223,7 @@ class FlightBag:
                 yield time_ns, message.message
 
     def events(self) -> Iterator[tuple[int, str, Event]]:
-        """Go through the events with their log times (ns) and nodes."""
+        """Yield the events with their log times (ns) and nodes."""
         for time_ns, recorded in self.messages("events"):
             message = read_status(recorded)
             try:
@@ -502,7 +502,7 @@ def recorded_scenario(bag: Bag) -> Scenario:
 
 
 def _sent_goal(about: Mapping[str, str], name: str) -> Goal | None:
-    """Return a goal exactly as it was sent."""
+    """Return a recorded goal with all digits as sent."""
     if f"{name}_position" not in about:
         return None
     position, quaternion = (

@@ -34,7 +34,7 @@ _MAX_TICKS_PER_STATE, _MAX_SILENT_TICKS = 10, 20_000
 """A recorder that was paused for a while leaves a gap; stamps of no flight leave a larger one."""
 
 _TOPICS_COMPARED_FIRST = ("joint_states", "odom")
-"""Topics in which a difference is looked for first, because it explains those in the others."""
+"""Topics to compare first: their differences explain differences in other topics."""
 
 Floats = NDArray[np.float64]
 
@@ -185,7 +185,7 @@ class _RecordedPlant:
         description = parse_robot(urdf.decode(errors="replace"))
         names = recorded.joint_names
         if names != list(description.joint_names):
-            # Before equations are derived of whatever robot there is.
+            # This check comes before the slow derivation of the robot's equations.
             raise RecordingError(
                 f"The joint states in the bag {bag.path} are of {', '.join(names)}; its robot has "
                 f"{', '.join(description.joint_names)}."
@@ -320,7 +320,7 @@ def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
                 for each, words in zip(topic.state, labels, strict=True)
             ]
         )
-        # A message with another number of values than it should have.
+        # The message has a wrong number of values.
         table[np.isnan(table).any(axis=1)] = np.nan
         flat = [label for words in labels for label in words]
         published.append(_PublishedTopic(topic, series.topic, ticks, table, flat))
@@ -439,7 +439,7 @@ def _resimulate(
             break
         for text in flight.injections.get(tick, ()):
             with suppress(ParameterError):
-                plant.inject(text)  # One that is refused changes nothing.
+                plant.inject(text)  # A refused command changes nothing.
         now = tick * flight.config.period_ns
         for source, by_tick in zip(commands.sources, recorded, strict=True):
             if tick in by_tick:
@@ -481,7 +481,7 @@ def _require_no_reset(
 
 
 class _Comparison:
-    """The published states beside those of the re-simulation."""
+    """The comparison of published and re-simulated states."""
 
     def __init__(
         self,
