@@ -439,7 +439,7 @@ def _resimulate(
             break
         for text in flight.injections.get(tick, ()):
             with suppress(ParameterError):
-                plant.inject(text)  # A refused command changes nothing.
+                plant.inject(text)  # A refused fault line changes nothing.
         now = tick * flight.config.period_ns
         for source, by_tick in zip(commands.sources, recorded, strict=True):
             if tick in by_tick:
