@@ -99,6 +99,11 @@ hostile-bags: $(STAMP)/test ## read bags that were made to harm their reader, ea
 reports: $(STAMP)/test ## fly every scenario, make its report, open it in Chromium at desktop and phone width
 	$(BIN)/python3 -m pytest -m slow -rP test/report/test_every_report.py
 
+CLEAR_GOALS ?= 50
+.PHONY: clear-plans
+clear-plans: $(STAMP)/test ## plan CLEAR_GOALS random goals each of six robots with and without clearance, and list distances
+	SPACEROBOT_CLEAR_GOALS=$(CLEAR_GOALS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_clear_plans.py
+
 COUNT ?= 2000
 SEED ?= 1
 ONLY ?= many

@@ -110,6 +110,8 @@ setup(
             "ros-jazzy-common-interfaces",
             "ros-jazzy-rclpy[fastrtps]",
         ],
+        # Exact distances between links; pin, which the tests use, brings it as well.
+        "collision": ["coal"],
         # The 3D view of reports is MeshCat's. Only its script is used, but the package brings much.
         "viewer": ["meshcat", *MESHES, *VIEWER],
         "campaign": CAMPAIGN,

@@ -57,6 +57,9 @@ class Proof(Enum):
     MOMENTUM = "momentum"
     """The goal needs the centre of mass to move, which it cannot do at zero momentum."""
 
+    COLLISION = "collision"
+    """Links are in contact, or nearer than the clearance, in the shape of the goal."""
+
     RANK = "rank"
     """No motion of the joints rotates the base as the goal requires."""
 

@@ -21,6 +21,7 @@ from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.shared_parameters import BelievedRobotConfig, RobotConfig, robot_of
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import build_method
@@ -125,6 +126,7 @@ def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
     method = build_method(
         *(config.method, robot, config.control_period, config.integration_step),
         config.method_options,
+        Clearance.wanted(robot.description, config.clearance),
     )
     _last_planner_method = robot, config, method
     return method

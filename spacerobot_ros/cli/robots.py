@@ -26,6 +26,10 @@ _MAX_LISTED_JOINTS = 12
 """Largest number of listed joints; further joints are only counted."""
 
 
+_MOST_DISTANCES = 3
+"""Pairs of links whose distances are listed, nearest first."""
+
+
 @click.command("analyze")
 @click.argument("robot")
 @click.option("--shape", metavar="'Q1 Q2 ...'", help="Shape to analyse, m or rad [the best].")
@@ -79,7 +83,7 @@ def analysis_lines(found: Analysis) -> list[str]:
     for method, objection in found.objections.items():
         lines.append(f"{method:<13}{'no: ' + objection if objection else 'yes'}")
     lines.append(f"{'auto':<13}{found.chosen or 'no method suits this robot'}")
-    return lines
+    return [*lines, "", *_distance_lines(found)]
 
 
 def analysis_json(found: Analysis) -> dict[str, Any]:
@@ -113,6 +117,10 @@ def analysis_json(found: Analysis) -> dict[str, Any]:
         },
         "planar": _finding_json(found.planar),
         "sliding": _finding_json(found.sliding),
+        "distances": [
+            {"links": list(pair), "distance_m": distance}
+            for pair, distance in found.geometry.distances_of_links(found.shape).items()
+        ],
         "methods": found.objections,
         "auto": found.chosen or None,
     }
@@ -192,6 +200,22 @@ def _finite_conditions(found: Analysis) -> list[float]:
 
 def _finite_or_none(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
+
+
+def _distance_lines(found: Analysis) -> list[str]:
+    geometry = found.geometry
+    distances = geometry.distances_of_links(found.shape)
+    lines = [f"{len(distances)} pairs of links may come into contact"]
+    if distances:
+        lines[0] += ", with distances at this shape of"
+    lines += [f"  {d:.3g} m  {pair}" for pair, d in list(distances.items())[:_MOST_DISTANCES]]
+    if len(distances) > _MOST_DISTANCES:
+        lines.append(f"  and more of {len(distances) - _MOST_DISTANCES} others")
+    lines += [f"not counted: {pair} ({why})" for pair, why in geometry.ignored.items()]
+    lines += geometry.notes
+    if not geometry.exact and distances:
+        lines.append("Distances are bounds, since the package coal is not installed.")
+    return [f"{'distances' if not i else '':<13}{line}" for i, line in enumerate(lines)]
 
 
 @click.command("new")

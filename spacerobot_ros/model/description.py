@@ -73,7 +73,7 @@ class Inertia:
 
 @dataclass(frozen=True)
 class Shape:
-    """A visual primitive of a link.
+    """A visual or collision primitive of a link.
 
     ``kind`` is ``box`` (sizes x, y, z), ``cylinder`` (radius, length), ``sphere`` (radius) or
     ``mesh`` (scale x, y, z; ``resource`` is its URI); sizes in m, ``rgba`` in 0..1.
@@ -88,11 +88,12 @@ class Shape:
 
 @dataclass(frozen=True)
 class Link:
-    """A named frame with mass properties and visuals, both optional."""
+    """A named frame with mass properties, visuals and collision shapes, all optional."""
 
     name: str
     inertia: Inertia = field(default_factory=Inertia)
     shapes: tuple[Shape, ...] = ()
+    collisions: tuple[Shape, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ class RobotDescription:
 
     ``bodies`` are in topological order, the base first; the movable joints are those of
     ``bodies[1:]`` that follow no other, in that order. ``frames`` maps every link to its body and
-    its pose in it.
+    its pose in it. ``disabled_collisions`` are pairs of links whose contact does not count.
     """
 
     name: str
@@ -169,6 +170,7 @@ class RobotDescription:
     bodies: tuple[Body, ...]
     frames: dict[str, tuple[int, Pose]]
     urdf: str
+    disabled_collisions: frozenset[frozenset[str]] = frozenset()
 
     @property
     def base_link(self) -> str:

@@ -23,6 +23,10 @@ class RobotConfig:
         "", "URDF file, or the name of a robot of this package (sliding_masses, ...)"
     )
 
+    def described(self, robot: RobotDescription) -> RobotDescription:
+        """Return the robot with what this configuration says of it beside its URDF."""
+        return robot
+
     def assumed_robot(self, robot: RobotDescription) -> RobotDescription:
         """Return the robot with the mass properties that the configured node assumes."""
         return robot
@@ -77,6 +81,7 @@ def robot_from_text(text: str, config: RobotConfig) -> SpaceRobot:
 
 
 def _with_model_error(true: RobotDescription, config: RobotConfig) -> SpaceRobot:
+    true = config.described(true)
     believed = config.assumed_robot(true)
     # Models with other mass properties share their compiled functions.
     return SpaceRobot(believed, None if believed is true else SymbolicModels.of(true))

@@ -40,6 +40,7 @@ from spacerobot_ros.model.description import (
 from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
 from spacerobot_ros.model.meshes import mesh_beside, with_mesh_files
 from spacerobot_ros.model.rotations import matrix_from_rpy
+from spacerobot_ros.model.srdf import with_srdf
 from spacerobot_ros.resources import suggestion
 
 _MAX_NUMBER = 1e12
@@ -61,7 +62,8 @@ def load_robot(path: str | Path) -> RobotDescription:
     """Read the robot of a URDF file, or of a xacro file (by its suffix), which is expanded.
 
     Paths of meshes that are relative to the file, or in a package that is not installed and is a
-    folder around the file, become absolute in the text that the robot keeps.
+    folder around the file, become absolute in the text that the robot keeps. Where an SRDF of the
+    same name is beside it, pairs of links that it disables do not count as contacts.
 
     Raises
     ------
@@ -81,7 +83,9 @@ def load_robot(path: str | Path) -> RobotDescription:
         text = _expand_xacro(path)
     try:
         folder = path.resolve().parent
-        return parse_robot(with_mesh_files(text, lambda mesh: mesh_beside(mesh, folder)))
+        robot = parse_robot(with_mesh_files(text, lambda mesh: mesh_beside(mesh, folder)))
+        beside = path.with_name(f"{path.name.split('.')[0]}.srdf")
+        return with_srdf(robot, beside) if beside.is_file() else robot
     except RobotDescriptionError as error:
         remedy = ""
         if path.suffix != ".xacro" and ("<xacro:" in text or "${" in text):
@@ -226,8 +230,11 @@ def _read_link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
         if mass < 0:
             raise RobotDescriptionError(f"The mass of {where} is negative ({mass} kg).")
         inertia = Inertia(mass, np.zeros(3), about).moved(pose)
-    shapes = tuple(_read_shape(visual, colours, where) for visual in link.findall("visual"))
-    return Link(name, inertia, shapes)
+    shapes, collisions = (
+        tuple(_read_shape(each, colours, where) for each in link.findall(tag))
+        for tag in ("visual", "collision")
+    )
+    return Link(name, inertia, shapes, collisions)
 
 
 def describe_inertia_flaw(about: Array) -> str:
@@ -264,8 +271,8 @@ def _read_colour(color: Element, where: str) -> tuple[float, ...]:
     return tuple(_read_numbers(color, "rgba", "", f"a color of {where}").tolist())
 
 
-def _read_shape(visual: Element, colours: dict[str, tuple[float, ...]], where: str) -> Shape:
-    geometry = visual.find("geometry")
+def _read_shape(element: Element, colours: dict[str, tuple[float, ...]], where: str) -> Shape:
+    geometry = element.find("geometry")
     assert geometry is not None
     (form,) = geometry
     attributes = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}
@@ -281,7 +288,7 @@ def _read_shape(visual: Element, colours: dict[str, tuple[float, ...]], where: s
                 "Give lengths in m."
             )
     rgba: tuple[float, ...] = Shape.rgba
-    if (material := visual.find("material")) is not None:
+    if (material := element.find("material")) is not None:
         color = material.find("color")
         if color is not None:
             rgba = _read_colour(color, where)
@@ -291,7 +298,7 @@ def _read_shape(visual: Element, colours: dict[str, tuple[float, ...]], where: s
     return Shape(
         form.tag,
         tuple(size.tolist()),
-        _read_pose(visual, where),
+        _read_pose(element, where),
         (red, green, blue, opacity),
         form.get("filename", "") if form.tag == "mesh" else "",
     )
@@ -453,13 +460,15 @@ _OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": 
 
 _ELEMENTS_READ = {
     "robot": ("link", "joint", "material"),
-    "link": ("inertial", "visual"),
+    "link": ("inertial", "visual", "collision"),
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
     "material": ("color",),
 }
 """Tags of the elements to read, by the tag of their parent; other elements are ignored."""
 
 _GEOMETRIES = ("box", "cylinder", "sphere", "mesh")
+_KNOWN_FORMS = [[name] for name in _GEOMETRIES]
+_GEOMETRY_REMEDY = f"a <geometry> with one of {', '.join(_GEOMETRIES)}"
 
 
 @dataclass(frozen=True)
@@ -509,7 +518,8 @@ _ATTRIBUTES = {
 
 _REQUIRED_ELEMENTS = {
     "inertial": {"mass": '<mass value="..."/> in kg'},
-    "visual": {"geometry": f"a <geometry> with one of {', '.join(_GEOMETRIES)}"},
+    "visual": {"geometry": _GEOMETRY_REMEDY},
+    "collision": {"geometry": _GEOMETRY_REMEDY},
     "joint": {"parent": '<parent link="..."/>', "child": '<child link="..."/>'},
 }
 """Required elements by their parent, and the text to write."""
@@ -537,6 +547,11 @@ def _checked_root(text: str) -> Element:
     for element in [root, *root.findall("link"), *root.findall("joint")]:
         unused = {child.tag for child in element} - set(_ELEMENTS_READ[element.tag])
         _remove_children(element, unused)
+    for link in root.findall("link"):
+        for collision in link.findall("collision"):
+            # Other programs write forms of their own, such as capsules.
+            if [each.tag for each in collision.iterfind("geometry/*")][0:1] not in _KNOWN_FORMS:
+                link.remove(collision)
     if not root.get("name"):
         raise _MalformedError("the <robot> has no name", '<robot name="...">')
     for kind in ("link", "joint"):
@@ -606,7 +621,7 @@ def _require_element(element: Element, where: str) -> None:
         if element.find(child) is None:
             raise _MalformedError(f"the {owner} has no <{child}>", remedy)
     for tag, count in Counter(child.tag for child in element).items():
-        if count > 1 and tag != "visual" and element.tag != "geometry":
+        if count > 1 and tag not in ("visual", "collision") and element.tag != "geometry":
             raise _MalformedError(f"the {owner} has {count} elements <{tag}>", "one of them")
     if element.tag == "geometry":
         _require_geometry(element, where)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -54,6 +55,8 @@ class Analysis:
         The tests of papers 3 and 1.
     objections
         Reason why a method does not suit the robot, by name of the method; None if it does.
+    geometry
+        The solids of the robot, and the pairs of them whose distance counts.
     """
 
     robot: SpaceRobot
@@ -65,6 +68,7 @@ class Analysis:
     planar: Controllability
     sliding: Controllability
     objections: dict[str, str | None]
+    geometry: CollisionGeometry
 
     @property
     def chosen(self) -> str:
@@ -109,6 +113,7 @@ def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis
             for name, method in METHODS.items()
             if method is not AutoGait
         },
+        CollisionGeometry(robot.description),
     )
 
 

@@ -13,6 +13,7 @@ from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
+from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
@@ -40,6 +41,7 @@ def plan(
     control_period: float = 0.05,
     tolerance: Tolerance = _DEFAULT_TOLERANCE,
     integration_step: float = DEFAULT_INTEGRATION_STEP,
+    clearance: float = DEFAULT_CLEARANCE,
     **options: Any,
 ) -> GaitSchedule:
     """Plan a gait: ``plan("sliding_masses", position=(0.3, 0, 0.1), rotvec=(0.5, 0, 0))``.
@@ -65,6 +67,8 @@ def plan(
     control_period, tolerance, integration_step
         Duration of a command (s), largest error at the goal, and longest step of the prediction
         (s): the plant's, for a flight that ends where the plan does.
+    clearance
+        Smallest distance of links on the way, m; 0: contacts are not looked at.
 
     Raises
     ------
@@ -90,7 +94,14 @@ def plan(
             )
     goal = goal.for_robot(robot.description)
     options_of_method = {method: method_options(method, options)}
-    planner = build_method(method, robot, control_period, integration_step, options_of_method)
+    planner = build_method(
+        method,
+        robot,
+        control_period,
+        integration_step,
+        options_of_method,
+        Clearance.wanted(robot.description, clearance),
+    )
     return planner.plan(PlanRequest(_start_state(robot, start), goal, tolerance))
 
 

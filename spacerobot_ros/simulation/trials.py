@@ -24,6 +24,7 @@ from spacerobot_ros.planning import (
     RobotState,
     build_method,
 )
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
@@ -69,7 +70,14 @@ class PlanningProblem:
     def method(self, name: str) -> GaitMethod:
         """Build a gait method with its options."""
         step = self.config.integration_step
-        return build_method(name, self.robot, self.control_period, step, self.config.method_options)
+        return build_method(
+            name,
+            self.robot,
+            self.control_period,
+            step,
+            self.config.method_options,
+            Clearance.wanted(self.robot.description, self.config.clearance),
+        )
 
     def plant(self) -> VelocityPlant:
         """Return the plant in the initial state."""

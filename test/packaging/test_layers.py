@@ -35,6 +35,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("simulation",),
         ("control",),  # above planning, whose goals it takes
         ("planning",),
+        ("collision",),
         ("model",),
         ("events", "parameters", "resources", "termination"),
         ("times", "topics", "version"),
@@ -163,7 +164,7 @@ def test_everything_that_is_imported_is_known_to_these_tests() -> None:
         *("ament_index_python", "casadi", "click", "lz4", "matplotlib", "mcap", "meshcat"),
         *("mujoco", "numpy", "pandas", "rosbags", "rosidl_parser", "rpyutils", "scipy"),
         *("viser", "websockets", "xacro", "xarray", "yaml", "zstandard"),
-        *("collada", "dask", "distributed", "trimesh"),
+        *("coal", "collada", "dask", "distributed", "trimesh"),
     }
     others = {name.split(".")[0] for module in sources() for name in imports(module)} - known
     assert others <= needed

@@ -14,6 +14,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
@@ -98,6 +99,8 @@ class GaitMethod(ABC):
         Longest Runge-Kutta step of the predicted attitude, s; the plant's, for equal numbers.
     options
         An instance of the method's ``Options``; None: the defaults.
+    clearance
+        Smallest distance that schedules keep between links; None: any.
 
     Attributes
     ----------
@@ -129,8 +132,10 @@ class GaitMethod(ABC):
         control_period: float,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
         options: Any = None,
+        clearance: Clearance | None = None,
     ) -> None:
         self.robot = robot
+        self.clearance = clearance
         self.control_period = control_period
         self.integration_step = integration_step
         self.options = self.Options() if options is None else options
@@ -184,10 +189,19 @@ class GaitMethod(ABC):
         partial: bool = False,
         remaining: float = 0.0,
         progress: object = None,
+        is_clear: bool = False,
     ) -> GaitSchedule:
-        """Return shapes (N + 1, n) at the ticks as a schedule of this method."""
+        """Return shapes (N + 1, n) at the ticks as a schedule of this method.
+
+        Raises
+        ------
+        PlanningError
+            Links come too near to each other; ``is_clear``: that has been checked.
+        """
         if self.name != END_EFFECTOR_METHOD:
             self._require_goal_of_base(goal)
+        if not is_clear:
+            self._require_clear(positions)
         return GaitSchedule(
             method=self.name,
             joint_names=self.robot.joint_names,
@@ -240,6 +254,24 @@ class GaitMethod(ABC):
                 f"{self.name} plans for the pose of the base, and the goal is for {names}: "
                 f"{END_EFFECTOR_METHOD} plans for end-effectors."
             )
+
+    def _require_clear(self, positions: Array) -> None:
+        """Refuse shapes (K, n) on the way, with straight lines in between, where links come too
+        near to each other.
+        """
+        if clause := self._too_near(positions):
+            raise PlanningError(f"On the way {clause}.")
+
+    def _too_near(self, positions: Array, *, at_ticks: bool = True) -> str:
+        """Return the clause that says where links come too near; empty: nowhere.
+
+        ``positions`` (K, n) are shapes with straight lines in between, ``at_ticks`` or not.
+        """
+        if self.clearance is None:
+            return ""
+        found = self.clearance.approaches(positions)
+        period = self.control_period if at_ticks else None
+        return self.clearance.clause(found[0], period) if found else ""
 
     def _require_rest(self, state: RobotState) -> None:
         """Refuse an unsuitable robot, and a robot whose total momentum is not zero."""

@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.shared_parameters import CommanderConfig
+from spacerobot_ros.model.srdf import with_srdf
 from spacerobot_ros.parameters import parameter, registered
+from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
@@ -28,6 +31,18 @@ class PlannerConfig(CommanderConfig):
         "commands",
         "joint_commands (velocities) for the plant, or joint_reference for a controller",
         choices=("commands", "reference"),
+    )
+    clearance: float = parameter(
+        DEFAULT_CLEARANCE,
+        "smallest distance that plans keep between links that no joint connects; 0: contacts are "
+        "not looked at",
+        unit="m",
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    srdf: str = parameter(
+        "",
+        "SRDF file with pairs of links whose contact does not count; '': NAME.srdf beside the URDF",
     )
     max_corrections: int = parameter(
         3, "new plans after the first", minimum=0, maximum=1000, read_only=False
@@ -91,6 +106,10 @@ class PlannerConfig(CommanderConfig):
         "plan in a thread, from rest, while states are answered; false: states wait (lockstep)",
     )
     options: Mapping[str, Any] = registered(METHODS)
+
+    def described(self, robot: RobotDescription) -> RobotDescription:
+        """Return the robot with the disabled pairs of the SRDF."""
+        return with_srdf(robot, self.srdf) if self.srdf else robot
 
     @property
     def replanning(self) -> float:

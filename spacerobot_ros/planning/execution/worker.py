@@ -15,6 +15,7 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
@@ -168,6 +169,7 @@ class PlanningWorker:
             config.control_period,
             config.integration_step,
             config.method_options,
+            Clearance.wanted(robot.description, config.clearance),
         )
         self._remaining_joints: tuple[PlanningTask, GaitMethod] | None = None
         """The latest method without stuck joints, and its task."""
@@ -257,6 +259,7 @@ class PlanningWorker:
             method=config.method,
             options=config.method_options,
             required=task.required,
+            clearance=Clearance.wanted(self._robot.description, config.clearance),
         )
         self._remaining_joints = task, method
         return method

@@ -37,6 +37,10 @@ from spacerobot_ros.planning.methods.nominal_shape import (
     NominalShapeChooser,
 )
 
+_MAX_SHRINKS = 14
+"""A cycle on which links come too near to each other is tried this often, each time half as large.
+"""
+
 _MAX_CYCLE_TRIALS = 6
 """Attempts for a cycle that would not bring the base nearer, each half as large as before."""
 
@@ -112,7 +116,11 @@ class AreaLoopGait(GaitMethod):
     def _setup(self) -> None:
         robot, chosen = self.robot, self.options
         self._nominal = NominalShapeChooser(
-            robot, chosen.largest_edge, chosen.joints, chosen.nominal
+            robot,
+            chosen.largest_edge,
+            chosen.joints,
+            chosen.nominal,
+            None if self.clearance is None else self.clearance.is_roomy,
         )
         self.require_suitable(robot)
         self._nominal.prepare()
@@ -198,6 +206,7 @@ class AreaLoopGait(GaitMethod):
                 f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
                 f"{flown} are flown."
             )
+        share = self._shrink_until_clear(gait, S, share, nominal)
         for _ in range(_MAX_CYCLE_TRIALS):
             path = edge_path(share * S, nominal.longest)
             after = self._add_legs(gait, self._edge_ends(path, nominal))
@@ -229,6 +238,28 @@ class AreaLoopGait(GaitMethod):
             },
             cycles,
         )
+
+    def _shrink_until_clear(
+        self, gait: _PlannedMotion, S: Array, share: float, nominal: NominalShape
+    ) -> float:
+        """Return a share of areas ``S`` (3,), up to a given one, on whose loop links keep clear.
+
+        Raises
+        ------
+        PlanningError
+            Links come too near on small loops, too.
+        """
+        if self.clearance is None:
+            return share
+        too_near = ""
+        for _ in range(_MAX_SHRINKS):
+            path = edge_path(share * S, nominal.longest)
+            loop = self._add_legs(gait, self._edge_ends(path, nominal))
+            too_near = self._too_near(loop.positions[len(gait.positions) - 1 :])
+            if not too_near:
+                return share
+            share /= 2
+        raise PlanningError(f"In the smallest of {_MAX_SHRINKS} loops {too_near}.")
 
     def _count_cycles_left(self, missing: float, share: float, enough: float) -> float:
         """Return the number of cycles left for a missing turn (rad), to first order.

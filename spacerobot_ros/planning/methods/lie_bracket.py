@@ -42,6 +42,9 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
 _MIN_CYCLE_TICKS = 12
 _MAX_REFINEMENTS = 20
+_SMALLER = 1.4
+"""Factor by which a cycle on which links come too near is made smaller."""
+
 _PATH_POSES_PER_STEP = 100
 """Fewest poses of the predicted path in each step; a step has at most twice as many."""
 
@@ -113,6 +116,7 @@ class LieBracketGait(GaitMethod):
         slide = self._slide_shapes(state.q, z_f)
         t1 = (len(slide) - 1) * self.control_period or self.options.t1
         attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)
+        self._require_clear(slide)
         cycle, n, notes = self._plan_turn(attitudes[-1], z_f, request)
         turn = np.tile(cycle[1:], (n, 1)) if n else np.empty((0, self.robot.n))
         path = self._predict_path(state, slide, attitudes, cycle, n)
@@ -120,7 +124,8 @@ class LieBracketGait(GaitMethod):
             "zf": [float(z_f[i]) for i in self.sliders],
             "c": [2 * float((z_f - state.q)[i]) / t1 for i in self.sliders],
         }
-        return self._schedule_of(goal, np.vstack([slide, turn]), path, symbols | notes)
+        positions = np.vstack([slide, turn])
+        return self._schedule_of(goal, positions, path, symbols | notes, is_clear=True)
 
     def final_shape(self, state: RobotState, goal: Goal, enough: float = 0.0) -> Array:
         """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the present one.
@@ -301,8 +306,11 @@ class LieBracketGait(GaitMethod):
         amplitudes = self._cycle_amplitudes(alpha)
         robot, longest = self.robot, self.options.longest
         room = np.minimum(z_f - robot.lower, robot.upper - z_f)
+        too_near = ""
         while True:
             if n * self.ticks_a_cycle * self.control_period > longest:
+                if too_near:
+                    raise PlanningError(f"In loops of the sliders {too_near}.")
                 raise PlanningError(
                     f"The turn would take more than {longest:.6g} s within the strokes and "
                     f"rates of the sliders at the final shape {np.round(z_f, 4).tolist()}; "
@@ -318,7 +326,10 @@ class LieBracketGait(GaitMethod):
                     float(np.max(rate[active] / robot.velocity_limit[active], initial=0.0)),
                 )
             if excess <= 1.0:
-                return _TurnStep(shapes, n, alpha, amplitudes)
+                too_near = self._too_near(shapes)
+                if not too_near:
+                    return _TurnStep(shapes, n, alpha, amplitudes)
+                excess = _SMALLER
             # Amplitudes go as 1/sqrt(n).
             n = math.ceil(min(n * min(excess, 1e6) ** 2 * 1.001, 1e12)) + 1
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
@@ -46,6 +47,10 @@ _HELD_JOINT_TOLERANCE = 1e-3
 """Motion of held joints up to which a chosen nominal shape still applies, m or rad."""
 
 _NEIGHBOUR_OFFSETS = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)))
+
+
+RoomTest = Callable[[Array], npt.NDArray[np.bool_]]
+"""Whether links have room to move (N,) at shapes (N, n)."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +98,8 @@ class NominalShapeChooser:
         Names of the three joints, separated by spaces; empty: the best three.
     nominal
         The shape (n,), m or rad; empty: the best one.
+    is_roomy
+        Returns for shapes (N, n) whether links have room to move (N,); None: everywhere.
 
     Raises
     ------
@@ -101,9 +108,15 @@ class NominalShapeChooser:
     """
 
     def __init__(
-        self, robot: SpaceRobot, largest_edge: float, joints: str, nominal: Sequence[float]
+        self,
+        robot: SpaceRobot,
+        largest_edge: float,
+        joints: str,
+        nominal: Sequence[float],
+        is_roomy: RoomTest | None = None,
     ) -> None:
         self._robot = robot
+        self._is_roomy = is_roomy
         self._largest_edge = largest_edge
         self._triples = _list_triples(robot, joints.split())
         self._given_shape = (
@@ -156,7 +169,7 @@ class NominalShapeChooser:
         if self._given_shape is not None:
             chosen = given_nominal(robot, self._given_shape, self._triples, self._largest_edge)
         else:
-            chosen = best_nominal(robot, q, self._triples, self._largest_edge)
+            chosen = best_nominal(robot, q, self._triples, self._largest_edge, self._is_roomy)
         names = [robot.joint_names[i] for i in chosen.joints]
         least = int(np.argmin(chosen.longest))
         if chosen.longest[least] < _MIN_EDGE:
@@ -192,16 +205,24 @@ def given_nominal(
 
 
 def best_nominal(
-    robot: SpaceRobot, held: Array, triples: Sequence[tuple[int, int, int]], largest_edge: float
+    robot: SpaceRobot,
+    held: Array,
+    triples: Sequence[tuple[int, int, int]],
+    largest_edge: float,
+    is_roomy: RoomTest | None = None,
 ) -> NominalShape:
     """Return the best nominal shape over all triples; other joints stay as in ``held`` (n,).
 
-    Boxes of the longest edges fit round it into the limits.
+    Boxes of the longest edges fit round it into the limits. Links have room there, as ``is_roomy``
+    says, if they have anywhere.
     """
     triples = _select_best_triples(robot, triples, largest_edge)
     points = _GRID_POINTS.get(len(triples), 5)
     return max(
-        (_best_shape_of_triple(robot, held, triple, largest_edge, points) for triple in triples),
+        (
+            _best_shape_of_triple(robot, held, triple, largest_edge, points, is_roomy)
+            for triple in triples
+        ),
         key=lambda nominal: float(_worst_axis_turn(nominal.M, nominal.longest)),
     )
 
@@ -223,7 +244,12 @@ def _select_best_triples(
 
 
 def _best_shape_of_triple(
-    robot: SpaceRobot, held: Array, triple: tuple[int, int, int], largest_edge: float, points: int
+    robot: SpaceRobot,
+    held: Array,
+    triple: tuple[int, int, int],
+    largest_edge: float,
+    points: int,
+    is_roomy: RoomTest | None,
 ) -> NominalShape:
     chosen = list(triple)
     lower, upper = (bound[chosen] for bound in shape_box(robot))
@@ -232,7 +258,14 @@ def _best_shape_of_triple(
     at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     for _ in range(_GRID_REFINEMENTS):
         matrices, longest = _matrices_and_edges(robot, held, chosen, at, largest_edge)
-        best = _most_central_index(at, _worst_axis_turn(matrices, longest), (lower + upper) / 2)
+        measures = _worst_axis_turn(matrices, longest)
+        if is_roomy is not None:
+            shapes = np.tile(held, (len(at), 1))
+            shapes[:, chosen] = at
+            roomy = is_roomy(shapes)
+            if roomy.any():
+                measures = np.where(roomy, measures, 0.0)
+        best = _most_central_index(at, measures, (lower + upper) / 2)
         step = step / 2
         at = np.clip(at[best] + step * _NEIGHBOUR_OFFSETS, lower, upper)
     # The search ends with the best point in the centre of its neighbourhood.

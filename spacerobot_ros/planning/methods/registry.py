@@ -9,6 +9,7 @@ from typing import Any
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured, require_known
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
 from spacerobot_ros.planning.methods.auto import AutoGait, CandidateMethod
@@ -32,10 +33,11 @@ def build_method(
     control_period: float,
     integration_step: float,
     options: Mapping[str, Any],
+    clearance: Clearance | None = None,
 ) -> GaitMethod:
     """Return a method for a robot; ``options`` holds instances of ``Options`` by method.
 
-    A method that is not among them has its defaults.
+    A method that is not among them has its defaults. Schedules keep the clearance, if there is one.
 
     Raises
     ------
@@ -46,11 +48,13 @@ def build_method(
     """
     method = METHODS[name]
     if method is not AutoGait:
-        return method(robot, control_period, integration_step, options.get(name))
+        return method(robot, control_period, integration_step, options.get(name), clearance)
     candidates = {
         other: CandidateMethod(
             entry,
-            partial(build_method, other, robot, control_period, integration_step, options),
+            partial(
+                build_method, other, robot, control_period, integration_step, options, clearance
+            ),
         )
         for other, entry in METHODS.items()
         if entry is not AutoGait

@@ -22,6 +22,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.parameters import declared
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
@@ -54,6 +55,8 @@ class RemainingJointsGait(GaitMethod):
         tried.
     required
         Parts of the goal that a schedule must control.
+    clearance
+        As for any :class:`GaitMethod`.
     """
 
     name: ClassVar[str] = "remaining_joints"
@@ -68,8 +71,9 @@ class RemainingJointsGait(GaitMethod):
         method: str,
         options: Mapping[str, Any],
         required: frozenset[Controlled] = frozenset(),
+        clearance: Clearance | None = None,
     ) -> None:
-        super().__init__(robot, control_period, integration_step)
+        super().__init__(robot, control_period, integration_step, clearance=clearance)
         self._stuck = dict(stuck)
         self._is_stuck = np.array([name in stuck for name in robot.joint_names], dtype=np.bool_)
         self._names = list(dict.fromkeys((method, "auto")))
@@ -151,7 +155,12 @@ class RemainingJointsGait(GaitMethod):
             self._remaining = SpaceRobot(self.robot.description.with_locked(self._stuck))
         if name not in self._methods:
             self._methods[name] = build_method(
-                name, self._remaining, self.control_period, self.integration_step, self._options
+                name,
+                self._remaining,
+                self.control_period,
+                self.integration_step,
+                self._options,
+                self.clearance and self.clearance.of(self._remaining.description),
             )
         return self._methods[name]
 

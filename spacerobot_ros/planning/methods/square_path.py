@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -122,7 +123,11 @@ class SquarePathGait(GaitMethod):
         self._phase = PlanarPhase(robot)
         centre = np.array([chosen.centre_1, chosen.centre_2])
         self._search = SquareSearch(
-            robot, self._phase, chosen.most_loops, centre if chosen.given_centre else None
+            robot,
+            self._phase,
+            chosen.most_loops,
+            centre if chosen.given_centre else None,
+            lambda shapes: self._too_near(shapes, at_ticks=False),
         )
 
     @classmethod
@@ -264,15 +269,24 @@ class SquareSearch:
         The wanted turn may take this many loops.
     centre
         (2,) where all squares are centred, rad; None: where the curvature is largest.
+    too_near
+        Returns the clause that says where links come too near on straight lines between shapes
+        (K, n); empty: nowhere.
     """
 
     def __init__(
-        self, robot: SpaceRobot, phase: PlanarPhase, most_loops: int, centre: Array | None
+        self,
+        robot: SpaceRobot,
+        phase: PlanarPhase,
+        most_loops: int,
+        centre: Array | None,
+        too_near: Callable[[Array], str] = lambda shapes: "",
     ) -> None:
         self._robot = robot
         self._phase = phase
         self._most_loops = most_loops
         self._centre = centre
+        self._too_near = too_near
         # scipy.optimize loads slowly, so it is loaded here and not during the first plan.
         from scipy.optimize import brentq
 
@@ -283,39 +297,65 @@ class SquareSearch:
         """Return the loop for a turn ``wanted`` (rad), with other joints at ``psi_e`` (n,).
 
         Of all pairs of joints it is the one that takes the fewest loops, and of those the one
-        with the smallest square.
+        with the smallest square; where links come too near on all of these, it takes more loops
+        round smaller squares.
 
         Raises
         ------
         PlanningError
-            No square within the joint limits turns the base far enough.
+            No square within the joint limits turns the base far enough, or links come too near on
+            all of them.
         """
         pairs = itertools.combinations(self._movable, 2)
         found = [candidates for pair in pairs if (candidates := self._growing_squares(psi_e, pair))]
         largest = max(found, key=lambda candidates: candidates.largest, default=None)
         if largest is None or largest.largest * self._most_loops < abs(wanted):
             raise PlanningError(self._describe_refusal(wanted, largest))
-        loops = math.ceil(abs(wanted) / largest.largest)
+        fewest = math.ceil(abs(wanted) / largest.largest)
+        obstacle = ""
+        for loops in range(fewest, self._most_loops + 1):
+            for loop in self._squares(psi_e, wanted, found, largest, loops):
+                too_near = self._too_near(np.vstack([psi_e, loop.corners, loop.corners[0], psi_e]))
+                if not too_near:
+                    return loop
+                obstacle = obstacle or too_near
+        raise PlanningError(
+            f"On square loops within the joint limits links come too near to each other, up to "
+            f"most_loops = {self._most_loops} of them: {obstacle}."
+        )
+
+    def _squares(
+        self,
+        psi_e: Array,
+        wanted: float,
+        found: list[_SquareFamily],
+        largest: _SquareFamily,
+        loops: int,
+    ) -> Iterator[SquareLoop]:
+        """Yield the squares that turn the base by ``wanted`` (rad) in a number of loops, the
+        smallest first.
+        """
         target = abs(wanted) / loops
         solved = [
             (candidates, *self._solve_for_side(candidates, target))
             for candidates in found
             if candidates is largest or candidates.largest >= target
         ]
-        candidates, row, side = min(solved, key=lambda square: square[2])
-        clockwise = candidates.phases[row] * wanted < 0
-        corners = np.tile(psi_e, (4, 1))
-        corners[:, candidates.pair] = square_corners(candidates.centres[[row]], np.array([side]))[0]
-        corners = corners[::-1] if clockwise else corners
-        nearest = int(np.argmin(np.linalg.norm(corners - psi_e, axis=1)))
-        return SquareLoop(
-            candidates.pair,
-            candidates.centres[row],
-            side,
-            loops,
-            clockwise,
-            np.roll(corners, -nearest, axis=0),
-        )
+        for candidates, row, side in sorted(solved, key=lambda square: square[2]):
+            clockwise = candidates.phases[row] * wanted < 0
+            corners = np.tile(psi_e, (4, 1))
+            squares = square_corners(candidates.centres[[row]], np.array([side]))
+            corners[:, candidates.pair] = squares[0]
+            corners = corners[::-1] if clockwise else corners
+            nearest = int(np.argmin(np.linalg.norm(corners - psi_e, axis=1)))
+            yield SquareLoop(
+                candidates.pair,
+                candidates.centres[row],
+                side,
+                loops,
+                clockwise,
+                np.roll(corners, -nearest, axis=0),
+            )
 
     def _describe_refusal(self, wanted: float, largest: _SquareFamily | None) -> str:
         """Return the message for a turn without a loop; ``largest`` turns the base farthest."""

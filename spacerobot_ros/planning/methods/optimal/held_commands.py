@@ -30,6 +30,7 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
+from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -83,8 +84,8 @@ class ManoeuvreModel:
         The model, the prediction of the base motion, and the duration of a command, s.
     axes
         (m, 3) directions in the base along which the attitude is reached.
-    constraints, efforts
-        Constraints of the path; no efforts: any.
+    constraints, efforts, distances
+        Constraints of the path; no efforts, no distances: any.
     end_effectors
         Rows of the end-effectors that are to be reached; None: none are.
     """
@@ -96,6 +97,7 @@ class ManoeuvreModel:
     constraints: PathConstraints
     efforts: JointEfforts | None = None
     end_effectors: EndEffectorRows | None = None
+    distances: DistanceLibrary | None = None
 
 
 class CommandHolder:

@@ -58,6 +58,7 @@ from spacerobot_ros.planning.methods.optimal.initial_guesses import (
     load_library,
 )
 from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
+from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     CandidateError,
@@ -137,6 +138,7 @@ class OptimalGait(GaitMethod):
             self._specification.axes,
             self._constraints,
             self._efforts,
+            distances=None if self.clearance is None else DistanceLibrary(self.clearance),
         )
         self._base_goals = self._goal_kind(self._specification, self._model)
         self._end_effector_goals: dict[tuple[object, ...], _GoalKind] = {}
@@ -342,7 +344,8 @@ class OptimalGait(GaitMethod):
             notes["predicted_end_effector_position_error"] = left.farthest_end_effector
             notes["predicted_end_effector_attitude_error"] = left.most_turned_end_effector
         notes["limited_by"] = self._list_active_limits(positions, velocity)
-        return replace(self._schedule_of(goal, positions, path, notes), controls=controls)
+        schedule = self._schedule_of(goal, positions, path, notes, is_clear=True)
+        return replace(schedule, controls=controls)
 
     def _list_active_limits(self, positions: Array, velocity: Array | float) -> str:
         """Return the active limits of held commands, with the joints at each limit."""
@@ -378,6 +381,8 @@ class OptimalGait(GaitMethod):
             numbers["base"] = np.array(parts, dtype=float)
         if self._efforts is not None:
             numbers["effort"] = self._efforts.limit
+        if self.clearance is not None:
+            numbers["clearance"] = self.clearance.facts
         if self._library is not None:
             digest = bytes.fromhex(self._library.digest)
             numbers["library"] = np.frombuffer(digest, np.uint8).astype(float)
@@ -458,6 +463,8 @@ class OptimalGait(GaitMethod):
             if np.abs(rows[0]).max() > _MAX_CACHED_END_ERROR:
                 raise CandidateError("it ends with end-effectors elsewhere")
         self._constraints.check(positions, attitudes, period)
+        if self.clearance is not None and (near := self.clearance.approaches(positions)):
+            raise CandidateError(self.clearance.clause(near[0], period))
 
 
 @dataclass(frozen=True)

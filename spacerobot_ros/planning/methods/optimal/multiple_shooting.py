@@ -40,6 +40,10 @@ _IPOPT_OPTIONS = {
 }
 
 
+_WARM_OPTIONS = {"ipopt.mu_init": 1e-3, "ipopt.bound_push": 1e-4, "ipopt.bound_frac": 1e-4}
+"""With distances: the guess is a solution without some of them, which is not to be left far."""
+
+
 @dataclass(frozen=True)
 class StopRule:
     """Conditions on which a solver stops before it has converged.
@@ -107,6 +111,7 @@ class MultipleShooting:
             self._program.problem,
             {
                 **_IPOPT_OPTIONS,
+                **(_WARM_OPTIONS if stages.distances is not None else {}),
                 "ipopt.tol": tolerance,
                 "jac_g": self._program.jac_g,
                 "hess_lag": self._program.hess_lag,
@@ -197,6 +202,7 @@ def _pack_parameters(
         [
             *(boundary.start, boundary.turn, boundary.direction, center, boundary.end_effectors),
             *(typical, weights),
+            limits.distances,
         ]
     )
 

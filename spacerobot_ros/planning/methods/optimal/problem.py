@@ -208,13 +208,15 @@ class BoundaryConditions:
 @dataclass(frozen=True)
 class MotionLimits:
     """Bounds (n,) of the joints: ``lower`` and ``upper`` in m or rad, ``velocity`` a second,
-    ``acceleration`` a second squared.
+    ``acceleration`` a second squared; ``distances`` (K,) are the smallest ones, m, of the pairs of
+    links that a solver keeps apart.
     """
 
     lower: Array
     upper: Array
     velocity: Array
     acceleration: Array
+    distances: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> MotionLimits:

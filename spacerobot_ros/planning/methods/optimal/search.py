@@ -35,6 +35,10 @@ from spacerobot_ros.planning.methods.optimal.held_commands import (
 )
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses, SolutionLibrary
 from spacerobot_ros.planning.methods.optimal.joint_efforts import EffortLimitedShooting
+from spacerobot_ros.planning.methods.optimal.kept_distances import (
+    ROUNDS,
+    KeptDistances,
+)
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     TOLERANCE,
     DurationBounds,
@@ -84,6 +88,16 @@ _MAX_REFINED_SOLUTIONS = 2
 _MAX_REFINED_COST_RATIO = 1.1
 """Largest ratio of the cost of a coarse solution to the best one at which it is refined, too: the
 coarse grid underestimates some costs by more than others."""
+
+_MAX_ITERATIONS_APART = 80
+"""Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most."""
+
+_DISTANCE_INSTANTS = 80
+"""Instants of a manoeuvre at which links are kept apart on a grid at least: between the knots of a
+coarse one they would come too near."""
+
+_DEEP_CONTACT = -0.02
+"""Distance of links below which their way round is looked for on a coarse grid, m."""
 
 _SAME_COST_TOLERANCE = 1e-3
 """Relative difference of costs below which two solutions count as the same."""
@@ -137,22 +151,30 @@ class Manoeuvre:
         Its commands.
     duration
         s.
-    solution_time
-        Duration before it was made into held commands, s.
+    solution
+        The trajectory that was made into held commands.
     starts
         Guesses that were tried.
     solutions
         Durations of all manoeuvres that were found, s.
     cut_short
         Whether the wall time was used up before the search had come to its end.
+    kept_apart
+        Number of pairs of links that the solver was told to keep apart.
     """
 
     held: HeldCommands
     duration: float
-    solution_time: float
+    solution: Trajectory
     starts: int = 1
     solutions: list[float] = field(default_factory=list)
     cut_short: bool = False
+    kept_apart: int = 0
+
+    @property
+    def solution_time(self) -> float:
+        """Duration before it was made into held commands, s."""
+        return self.solution.duration
 
 
 @dataclass
@@ -167,6 +189,8 @@ class _Progress:
         Guesses that were tried, and the reason against the last candidate.
     shortest
         Duration of the fastest solution so far, s.
+    kept
+        The pairs of links that are kept apart; None: no clearance is asked for.
     """
 
     boundary: BoundaryConditions
@@ -179,6 +203,7 @@ class _Progress:
     starts: int = 0
     rejection: str = ""
     shortest: float = math.inf
+    kept: KeptDistances | None = None
     _began: float = field(default_factory=lambda: time.monotonic())
 
     def stop_rule(self, *, found: bool) -> StopRule:
@@ -242,9 +267,10 @@ class ManoeuvreSearch:
         self._robot, self._period, self._axes = model.robot, model.control_period, model.axes
         self._constraints, self._efforts = model.constraints, model.efforts
         self._end_effectors = model.end_effectors
+        self._distances = model.distances
         self._holder = CommandHolder(model)
         self._stages: dict[tuple[bool, bool], Stages] = {}
-        self._solvers: dict[tuple[int, bool, float], MultipleShooting] = {}
+        self._solvers: dict[tuple[int, bool, float, tuple[int, ...]], MultipleShooting] = {}
 
     def search(
         self,
@@ -268,7 +294,7 @@ class ManoeuvreSearch:
         NotFoundError
             None was found.
         PlanningError
-            None is as short as is asked for.
+            None is as short as is asked for, or links are too near at an end.
         PlanningCancelled
             The search was cancelled.
         """
@@ -277,20 +303,12 @@ class ManoeuvreSearch:
                 f"Manoeuvres take at least {_MIN_TICKS} control periods of {self._period:g} s, "
                 f"more than optimal.longest = {options.longest:g} s."
             )
+        kept = None if self._distances is None else self._distances.begin(boundary)
         progress = _Progress(boundary, limits, quaternion, options, cancellation, library, gentle)
-        full = self.solver(intervals, boundary.center is not None)
-        coarser = intervals // _COARSE_GRID_RATIO
-        found: list[Manoeuvre] = []
-        # A single answer costs less without a coarse grid.
-        if options.answers > 1 and coarser >= _MIN_COARSE_INTERVALS:
-            coarse = self.solver(coarser, boundary.center is not None, _COARSE_TOLERANCE)
-            found = self._search_from_guesses(progress, coarse, full, options.starts)
-            if not found and not progress.cut_short(found=False):
-                found = self._search_from_guesses(
-                    progress, full, full, min(options.starts, _MAX_FULL_GRID_STARTS)
-                )
-        else:
-            found = self._search_from_guesses(progress, full, full, options.starts)
+        found = self._search_on_grids(progress, intervals)
+        if found and kept is not None:
+            progress.kept = kept
+            found = self._keep_clear(progress, found, intervals)
         cut_short = progress.cut_short(found=bool(found))
         if not found:
             within = f" within optimal.time_budget {options.time_budget:g} s" if cut_short else ""
@@ -304,6 +322,131 @@ class ManoeuvreSearch:
         best = min(found, key=lambda one: one.duration)
         durations = [one.duration for one in found]
         return replace(best, starts=progress.starts, solutions=durations, cut_short=cut_short)
+
+    def _search_on_grids(self, progress: _Progress, intervals: int) -> list[Manoeuvre]:
+        """Return manoeuvres with a number of intervals, from guesses on a coarse grid first."""
+        options = progress.options
+        full = self._get_solver(progress, intervals)
+        coarser = intervals // _COARSE_GRID_RATIO
+        # A single answer costs less without a coarse grid.
+        if options.answers > 1 and coarser >= _MIN_COARSE_INTERVALS:
+            coarse = self._get_solver(progress, coarser, _COARSE_TOLERANCE)
+            found = self._search_from_guesses(progress, coarse, full, options.starts)
+            if found or progress.cut_short(found=False):
+                return found
+            return self._search_from_guesses(
+                progress, full, full, min(options.starts, _MAX_FULL_GRID_STARTS)
+            )
+        return self._search_from_guesses(progress, full, full, options.starts)
+
+    def _keep_clear(
+        self, progress: _Progress, found: list[Manoeuvre], intervals: int
+    ) -> list[Manoeuvre]:
+        """Return manoeuvres that keep clear: those that were found, if the fastest one does, or
+        others near to them, or others from new guesses; none where none is found.
+        """
+        kept = progress.kept
+        assert kept is not None
+        in_order = sorted(found, key=lambda one: one.duration)
+        if not kept.approaches(in_order[0].held.positions):
+            return found
+        freed: list[Manoeuvre] = []
+        for each in in_order:
+            if freed and each.duration >= freed[0].duration:
+                break
+            near = replace(progress, kept=kept.copy())
+            try:
+                freed.append(self._make_clear(near, each, intervals))
+            except CandidateError as reason:
+                progress.rejection = str(reason)
+                assert near.kept is not None
+                kept.include(near.kept)
+            progress.cancellation.raise_if_requested()
+        if freed or progress.cut_short(found=False):
+            return freed
+        progress.limits = kept.within(progress.limits)
+        return self._search_on_grids(progress, intervals)
+
+    def _make_clear(self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int) -> Manoeuvre:
+        """Return a manoeuvre near to one that comes too near; itself, if it keeps clear.
+
+        Raises
+        ------
+        CandidateError
+            None was found.
+        """
+        kept = progress.kept
+        assert kept is not None
+        near = kept.approaches(manoeuvre.held.positions)
+        if not near:
+            return manoeuvre
+        coarser = intervals // _COARSE_GRID_RATIO
+        if near[0].distance > _DEEP_CONTACT or coarser < _MIN_COARSE_INTERVALS:
+            return self._clear_on_grid(progress, manoeuvre, intervals, TOLERANCE)
+        # The way round is far: it is found on a coarse grid first.
+        clear = self._clear_on_grid(progress, manoeuvre, coarser, _COARSE_TOLERANCE)
+        try:
+            iterations = min(progress.options.iterations, _MAX_ITERATIONS_APART)
+            brief = replace(progress, options=replace(progress.options, iterations=iterations))
+            refined = self._clear_on_grid(brief, clear, intervals, TOLERANCE)
+        except CandidateError:
+            return clear
+        return min(refined, clear, key=lambda one: one.duration)
+
+    def _clear_on_grid(
+        self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int, tolerance: float
+    ) -> Manoeuvre:
+        """Return a manoeuvre near to another one that keeps clear, solved for on a grid.
+
+        Raises
+        ------
+        CandidateError
+            None was found.
+        """
+        kept = progress.kept
+        assert kept is not None
+        solution, near = manoeuvre.solution, kept.approaches(manoeuvre.held.positions)
+        for _ in range(ROUNDS):
+            kept.add(near)
+            solution = self._solve_apart(progress, solution, intervals, tolerance)
+            made = self._make_held_commands(progress, solution)
+            near = kept.approaches(made.held.positions)
+            if not near:
+                return replace(made, kept_apart=len(kept.pairs))
+        raise CandidateError(kept.message(near[0], self._period))
+
+    def _solve_apart(
+        self,
+        progress: _Progress,
+        trajectory: Trajectory,
+        intervals: int,
+        tolerance: float = TOLERANCE,
+    ) -> Trajectory:
+        """Return a solution near to a trajectory that keeps pairs of links apart.
+
+        Raises
+        ------
+        CandidateError
+            There is none.
+        """
+        kept = progress.kept
+        assert kept is not None
+        within = replace(progress, limits=kept.within(progress.limits))
+        solver = self._get_solver(within, intervals, tolerance)
+        guess = _build_guesses(self._robot, solver).resample(trajectory)
+        solution = self._solve_from_guess(within, solver, guess, progress.stop_rule(found=False))
+        progress.cancellation.raise_if_requested()
+        result = _NO_PATH_FOUND if solution is None else f"{solution.duration:.6g} s"
+        progress.report(f"{len(kept.pairs)} pair(s) apart", result, solver.iterations)
+        if solution is None:
+            raise CandidateError(_NO_PATH_FOUND)
+        return solution
+
+    def _get_solver(
+        self, progress: _Progress, intervals: int, tolerance: float = TOLERANCE
+    ) -> MultipleShooting:
+        pairs = progress.kept.pairs if progress.kept is not None else ()
+        return self.solver(intervals, progress.boundary.center is not None, tolerance, pairs)
 
     def _search_from_guesses(
         self, progress: _Progress, grid: MultipleShooting, full: MultipleShooting, starts: int
@@ -378,6 +521,9 @@ class ManoeuvreSearch:
                     refined = self._solve_from_guess(progress, full, guess, stop)
                     progress.cancellation.raise_if_requested()
                 manoeuvre = self._make_held_commands(progress, refined)
+                if progress.kept is not None:
+                    near = replace(progress, kept=progress.kept.copy())
+                    manoeuvre = self._make_clear(near, manoeuvre, full.intervals)
                 found.append(manoeuvre)
                 costs.append(cost)
                 result = f"{manoeuvre.duration:.6g} s"
@@ -387,12 +533,19 @@ class ManoeuvreSearch:
         return found
 
     def solver(
-        self, intervals: int, position: bool, tolerance: float = TOLERANCE
+        self,
+        intervals: int,
+        position: bool,
+        tolerance: float = TOLERANCE,
+        pairs: tuple[int, ...] = (),
     ) -> MultipleShooting:
-        """Return the solver with a number of intervals, with or without a position."""
-        key = intervals, position, tolerance
+        """Return the solver with a number of intervals, with or without a position, which keeps
+        pairs of links apart.
+        """
+        key = intervals, position, tolerance, pairs
         if key not in self._solvers:
-            of = partial(self._get_stages, position)
+            instants = max(2, math.ceil(_DISTANCE_INSTANTS / intervals))
+            of = partial(self._get_stages, position, pairs, instants)
             self._solvers[key] = (
                 MultipleShooting(of(), intervals, tolerance)
                 if self._efforts is None
@@ -400,7 +553,13 @@ class ManoeuvreSearch:
             )
         return self._solvers[key]
 
-    def _get_stages(self, position: bool, inequalities: Sequence[PathInequality] = ()) -> Stages:
+    def _get_stages(
+        self,
+        position: bool,
+        pairs: tuple[int, ...],
+        instants: int,
+        inequalities: Sequence[PathInequality] = (),
+    ) -> Stages:
         key = position, bool(inequalities)
         if key not in self._stages:
             self._stages[key] = Stages.of(
@@ -412,7 +571,9 @@ class ManoeuvreSearch:
                 compiling=self._compiling,
                 end_effectors=self._end_effectors and self._end_effectors.function,
             )
-        return self._stages[key]
+        if not pairs or self._distances is None:
+            return self._stages[key]
+        return self._stages[key].keeping(self._distances.of(pairs), instants)
 
     def _solve_from_guess(
         self,
@@ -471,7 +632,7 @@ class ManoeuvreSearch:
         attitudes = quaternion_multiply(progress.quaternion, held.quaternions)
         self._constraints.check(held.positions, attitudes, self._period)
         duration = (len(held.positions) - 1) * self._period
-        return Manoeuvre(held, duration, trajectory.duration)
+        return Manoeuvre(held, duration, trajectory)
 
 
 class MotionSearch:
@@ -482,14 +643,17 @@ class MotionSearch:
     model
         Model and constraints of the manoeuvres.
     solver
-        Returns the solver with a number of intervals, with or without a position.
+        Returns the solver with a number of intervals, with or without a position, of a tolerance,
+        which keeps pairs of links apart.
     """
 
     def __init__(
-        self, model: ManoeuvreModel, solver: Callable[[int, bool], MultipleShooting]
+        self,
+        model: ManoeuvreModel,
+        solver: Callable[[int, bool, float, tuple[int, ...]], MultipleShooting],
     ) -> None:
         self._robot, self._period = model.robot, model.control_period
-        self._constraints = model.constraints
+        self._constraints, self._distances = model.constraints, model.distances
         self._holder = CommandHolder(model)
         self._solver = solver
 
@@ -515,12 +679,11 @@ class MotionSearch:
             The search was cancelled.
         """
         boundary = replace(boundary, velocity=self._initial_velocity(motion, limits))
-        full = self._solver(intervals, boundary.center is not None)
-        coarse = full
+        kept = None if self._distances is None else self._distances.begin(boundary)
+        coarser = intervals
         if intervals >= _COARSE_GRID_RATIO_IN_MOTION * _MIN_COARSE_INTERVALS_IN_MOTION:
-            coarse = self._solver(
-                intervals // _COARSE_GRID_RATIO_IN_MOTION, boundary.center is not None
-            )
+            coarser = intervals // _COARSE_GRID_RATIO_IN_MOTION
+        coarse = self._solver(coarser, boundary.center is not None, TOLERANCE, ())
         stop = StopRule(options.iterations, cancellation)
         candidates: list[Trajectory] = []
         starts, rejection = 0, _NO_PATH_FOUND
@@ -536,13 +699,13 @@ class MotionSearch:
             if len(candidates) >= options.answers or _durations_agree(candidates):
                 break
         # The remaining motion is short, so a coarse grid is fine enough.
-        fine = coarse if options.answers == 1 else full
+        finer = coarser if options.answers == 1 else intervals
         for candidate in sorted(candidates, key=lambda each: each.duration)[
             :_MAX_REFINED_SOLUTIONS_IN_MOTION
         ]:
             try:
-                held = self._make_held_commands(
-                    fine, boundary, limits, candidate, motion, options, stop
+                held = self._keep_clear(
+                    finer, boundary, limits, candidate, motion, options, stop, kept
                 )
                 attitudes = quaternion_multiply(quaternion, held.quaternions)
                 self._constraints.check(held.positions, attitudes, self._period)
@@ -553,11 +716,49 @@ class MotionSearch:
                 cancellation.raise_if_requested()
             duration = (len(held.positions) - 1) * self._period
             durations = [each.duration for each in candidates]
-            return Manoeuvre(held, duration, candidate.duration, starts, durations)
+            return Manoeuvre(held, duration, candidate, starts, durations)
         raise NotFoundError(
             f"No manoeuvre to the goal that begins in motion was found from {starts} start(s): "
             f"{rejection}."
         )
+
+    def _keep_clear(
+        self,
+        intervals: int,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        candidate: Trajectory,
+        motion: InitialMotion,
+        options: OptimalOptions,
+        stop: StopRule,
+        kept: KeptDistances | None,
+    ) -> HeldCommands:
+        """Return a candidate as held commands that keep clear.
+
+        Raises
+        ------
+        CandidateError
+            There are none that reach the goal within the limits.
+        """
+        position = boundary.center is not None
+        solver = self._solver(intervals, position, TOLERANCE, ())
+        held = self._make_held_commands(solver, boundary, limits, candidate, motion, options, stop)
+        if kept is None:
+            return held
+        kept = kept.copy()
+        for _ in range(ROUNDS):
+            near = kept.approaches(held.positions)
+            if not near:
+                return held
+            kept.add(near)
+            solver = self._solver(intervals, position, TOLERANCE, kept.pairs)
+            within = kept.within(limits)
+            held = self._make_held_commands(
+                solver, boundary, within, candidate, motion, options, stop
+            )
+        if near := kept.approaches(held.positions):
+            raise CandidateError(kept.message(near[0], self._period))
+        return held
 
     def _planned_speed_limit(self, limits: MotionLimits) -> Array:
         """Return the largest planned velocities (n,)."""

@@ -25,7 +25,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 
@@ -33,6 +33,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from spacerobot_ros.collision.rows import DistanceRows
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cached_function, source_hash
 from spacerobot_ros.model.description import Array
@@ -117,6 +118,9 @@ class Stages:
         Rows of the interval that are inequalities, ``>= 0``: the last ones of it.
     turn
         ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step that begins at q.
+    distances
+        Distances of pairs of links in an interval, less the smallest ones that are allowed, both
+        as its rows and ``>= 0``; None: none.
     """
 
     joints: int
@@ -125,6 +129,7 @@ class Stages:
     end: Block
     path: int
     turn: ca.Function
+    distances: Block | None = None
 
     @classmethod
     def of(
@@ -172,6 +177,12 @@ class Stages:
         interval = _cached_interval(robot, constraints, inequalities, compiling=compiling)
         path = interval.rows - _count_dynamics_rows(n)
         return cls(n, begins, interval, ends, path, turn_function(robot))
+
+    def keeping(self, rows: Sequence[DistanceRows], instants: int) -> Stages:
+        """Return the problem in which pairs of links keep distances, too, at a number of instants
+        in each interval.
+        """
+        return replace(self, distances=_distances(self.joints, rows, instants))
 
 
 def _count_dynamics_rows(joints: int) -> int:
@@ -260,6 +271,41 @@ def _interval(
         ca.vertcat(motion, X_next - stepped, kept),
         ca.vertcat(ca.jacobian(motion, z), attitude_jac, ca.jacobian(kept, z)),
         ca.hessian(plain, z)[0] + attitude_hess,
+    )
+
+
+def _distances(n: int, pairs: Sequence[DistanceRows], instants: int) -> Block:
+    """Return the distances at equally spaced instants of an interval, by the chain rule.
+
+    The last instant is the end of the interval.
+    """
+    # In MX, whose functions call those of the pairs: made anew for every choice of pairs.
+    h, s, v, v_next = ca.MX.sym("h"), *(ca.MX.sym(name, n) for name in ("s", "v", "v+"))
+    z, least = ca.vertcat(h, s, v, v_next), ca.MX.sym("least", len(pairs))
+    multipliers = ca.MX.sym("lambda", least.numel() * instants)
+    values, jacobian, hessian = [], [], ca.MX(z.numel(), z.numel())
+    unit = ca.DM.eye(n)
+    of_instants = ca.vertsplit(multipliers, least.numel())
+    for number, by_row in enumerate(of_instants, 1):
+        tau = number / instants
+        # The point is s + h (b v + c v+).
+        b, c = tau - 1 / 2 - tau**2 / 2, tau**2 / 2
+        point = s + h * (b * v + c * v_next)
+        P = ca.horzcat(b * v + c * v_next, unit, b * h * unit, c * h * unit)
+        J = ca.vertcat(*(rows.jacobian(point) for rows in pairs))
+        values.append(ca.vertcat(*(rows.values(point) for rows in pairs)) - least)
+        jacobian.append(J @ P)
+        curvature = ca.MX(n, n)
+        for rows, multiplier in zip(pairs, ca.vertsplit(by_row), strict=True):
+            curvature += rows.hessian(point, multiplier)
+        slope = (J.T @ by_row).T
+        bend = ca.vertcat(ca.horzcat(0, ca.DM(1, n), b * slope, c * slope), ca.MX(3 * n, 1 + 3 * n))
+        hessian += ca.triu(P.T @ curvature @ P) + bend
+    z_p, J = [z, least], ca.vertcat(*jacobian)
+    return Block(
+        ca.Function("distances", z_p, [ca.vertcat(*values)]),
+        ca.Function("distances_jac", z_p, [ca.vertcat(*values), J]),
+        ca.Function("distances_hess", [*z_p, multipliers], [hessian]),
     )
 
 
@@ -418,9 +464,12 @@ def program(stages: Stages, intervals: int) -> Program:
     layout = Layout(n, N)
     X, s, v, a = layout.knots()
     x = ca.MX.sym("x", layout.size)
+    kept = 0 if stages.distances is None else stages.distances.rows
     goals = int(stages.end.values.size1_in(1)) - 7
     sizes = {"start": n, "turn": 4, "direction": 3, "center": 3, "end_effectors": goals}
     sizes |= {"typical": n, "weights": 2}
+    if stages.distances is not None:
+        sizes["distances"] = int(stages.distances.values.numel_in(1))
     p = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
     zero = np.zeros((N, 1), dtype=np.int64)
 
@@ -450,7 +499,11 @@ def program(stages: Stages, intervals: int) -> Program:
             ca.vertcat(p["turn"], p["center"], p["end_effectors"]),
         ),
     ]
-    rows = equalities + N * stages.path
+    rows = equalities + N * (stages.path + kept)
+    if stages.distances is not None:
+        of_distances = equalities + N * stages.path + np.arange(N * kept).reshape(N, kept)
+        variables = np.hstack([zero, s[:-1], v[:-1], v[1:]])
+        placed.append(_PlacedBlock(stages.distances, variables, of_distances, p["distances"]))
     change = ca.reshape(x[a.ravel().tolist()], n, N) / ca.repmat(p["typical"], 1, N)
     f = p["weights"][0] * N * x[0] + p["weights"][1] * ca.sumsqr(change) / N
 

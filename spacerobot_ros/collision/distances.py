@@ -1,0 +1,126 @@
+"""Distances of two solids: exact by coal, or bounds by the rounded boxes around them.
+
+J. Pan, S. Chitta, D. Manocha, "FCL: a general purpose library for collision and proximity queries",
+ICRA, 2012, whose successor coal is.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from spacerobot_ros.collision.rounded_box import separation
+from spacerobot_ros.model.description import Array
+
+if TYPE_CHECKING:
+    from spacerobot_ros.collision.geometry import Solid
+
+_LOG = logging.getLogger(__name__)
+
+
+class DistanceFunction(Protocol):
+    """Distances (N,) in m of two solids, by their numbers, at poses of their links.
+
+    Attitudes are (N, 3, 3), positions (N, 3) in m, both in a common frame. A negative distance is
+    the depth of the contact. Where ``exact`` is false, distances are lower bounds.
+    """
+
+    exact: bool
+
+    def __call__(
+        self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
+    ) -> Array:
+        """Return the distances."""
+        ...
+
+
+def distance_function(solids: Sequence[Solid]) -> DistanceFunction:
+    """Return exact distances, or bounds where the package coal is not installed."""
+    coal = _coal()
+    return EnclosureDistances(solids) if coal is None else ExactDistances(solids, coal)
+
+
+@lru_cache(maxsize=1)
+def _coal() -> Any:
+    """Return the module coal; None: it is not installed, which is logged once."""
+    try:
+        import coal
+    except ImportError:
+        _LOG.warning(
+            "Distances between links are those of spheres, capsules and boxes around them, since "
+            "the package coal is not installed: `pip install 'spacerobot_ros[collision]'`."
+        )
+        return None
+    return coal
+
+
+class ExactDistances:
+    """Distances of the shapes themselves, and of the convex hulls of meshes, by coal."""
+
+    exact = True
+
+    def __init__(self, solids: Sequence[Solid], coal: Any) -> None:
+        self._coal = coal
+        self._geometries = [self._geometry(solid) for solid in solids]
+
+    def _geometry(self, solid: Solid) -> tuple[Any, Array, Array]:
+        """Return the shape, and its attitude and position in the frame of its link."""
+        coal, shape = self._coal, solid.shape
+        match shape.kind:
+            case "sphere":
+                made = coal.Sphere(shape.size[0])
+            case "box":
+                made = coal.Box(*shape.size)
+            case "cylinder":
+                made = coal.Cylinder(*shape.size)
+            case _:
+                assert solid.vertices is not None
+                points = coal.StdVec_Vec3s()
+                points.extend(list(solid.vertices))
+                if np.linalg.matrix_rank(solid.vertices - solid.vertices[0], tol=1e-9) == 3:
+                    return coal.Convex.convexHull(points, True, "Qt"), np.eye(3), np.zeros(3)
+                box = solid.enclosure
+                sides = 2 * (box.half + box.radius)
+                return coal.Box(*sides.tolist()), box.pose.R, box.pose.r
+        return made, shape.pose.R, shape.pose.r
+
+    def __call__(
+        self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
+    ) -> Array:
+        """Return the distances."""
+        coal = self._coal
+        (one, R_a, r_a), (other, R_b, r_b) = self._geometries[first], self._geometries[second]
+        compute = coal.ComputeDistance(one, other)
+        request, result = coal.DistanceRequest(), coal.DistanceResult()
+        # Of one solid in the frame of the other.
+        R_ab = np.swapaxes(R_1 @ R_a, 1, 2) @ (R_2 @ R_b)
+        between = (r_2 + R_2 @ r_b) - (r_1 + R_1 @ r_a)
+        r_ab = np.einsum("nba,nb->na", R_1 @ R_a, between)
+        here, there = coal.Transform3s.Identity(), coal.Transform3s.Identity()
+        found = np.empty(len(R_1))
+        for k in range(len(R_1)):
+            there.setRotation(R_ab[k])
+            there.setTranslation(r_ab[k])
+            result.clear()
+            found[k] = compute(here, there, request, result)
+        return found
+
+
+class EnclosureDistances:
+    """Lower bounds of distances: those of the rounded boxes around the solids."""
+
+    exact = False
+
+    def __init__(self, solids: Sequence[Solid]) -> None:
+        self._enclosures = [solid.enclosure for solid in solids]
+
+    def __call__(
+        self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
+    ) -> Array:
+        """Return the bounds."""
+        one, other = self._enclosures[first], self._enclosures[second]
+        return separation(one, R_1, r_1, other, R_2, r_2)

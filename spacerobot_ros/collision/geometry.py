@@ -1,0 +1,285 @@
+"""Collision geometry: the solids of a robot, and the pairs of them that may come into contact.
+
+A link has the shapes of its ``<collision>`` elements, or, where it has none, those of its
+``<visual>`` elements. A mesh counts as its convex hull, which encloses it, open or not.
+
+Pairs of one rigid body are left out, pairs of neighbouring bodies, pairs that an SRDF disables, and
+pairs that are in contact at each of 1000 random shapes: their contact is a matter of how the robot
+is drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.collision.distances import DistanceFunction, distance_function
+from spacerobot_ros.collision.rounded_box import RoundedBox
+from spacerobot_ros.errors import MeshError
+from spacerobot_ros.model.description import Array, JointKind, RobotDescription, Shape
+from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.meshes import shape_mesh
+
+_SHAPES, _SEED = 1000, 0
+"""Random shapes at which a pair is in contact that always is, and the seed of their draw."""
+
+_HALF_RANGE = {JointKind.PRISMATIC: 1.0}
+"""Half the range that is drawn from of a joint without limits, m; pi for joints that turn."""
+
+
+class LinkPair(NamedTuple):
+    """Names of two links."""
+
+    first: str
+    second: str
+
+    def __str__(self) -> str:
+        return f"'{self.first}' and '{self.second}'"
+
+
+@dataclass(frozen=True)
+class Solid:
+    """One convex solid of a robot.
+
+    Attributes
+    ----------
+    link
+        Name of its link.
+    body
+        Index of the rigid body that the link is part of; 0: the base.
+    shape
+        Its description in the URDF.
+    enclosure
+        A rounded box around it, in the frame of the link.
+    vertices
+        (V, 3) vertices of a mesh's convex hull in the frame of the link, m; None: no mesh.
+    """
+
+    link: str
+    body: int
+    shape: Shape
+    enclosure: RoundedBox
+    vertices: Array | None = field(default=None, repr=False)
+
+
+Poses = tuple[Array, Array]
+"""Attitudes ``R_BL`` (N, L, 3, 3) and positions ``r_BL_B`` (N, L, 3) of the links of a robot."""
+
+
+class CollisionGeometry:
+    """The solids of a robot, and the distances between them.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+
+    Attributes
+    ----------
+    solids
+        All solids, link by link.
+    pairs
+        (P, 2) indices of the solids whose distances count.
+    ignored
+        Reason why a pair of links does not count, for those that are neither of one body nor of
+        neighbouring ones.
+    notes
+        Sentences on links whose shape is not what the user may expect.
+    """
+
+    def __init__(self, robot: RobotDescription) -> None:
+        self.robot = robot
+        self._kinematics = ForwardKinematics(robot)
+        self.solids, self.notes = _solids_of(robot)
+        self.ignored: dict[LinkPair, str] = {}
+        links = self._kinematics.links
+        self._link_of = np.array([links.index(each.link) for each in self.solids], dtype=int)
+        self._centers = np.array([each.enclosure.pose.r for each in self.solids]).reshape(-1, 3)
+        self._radii = np.array([each.enclosure.bounding_radius for each in self.solids])
+        self.pairs = self._distinct_pairs()
+        self._leave_out(self._always_in_contact())
+
+    @cached_property
+    def _distance(self) -> DistanceFunction:
+        # Where bounding balls never come near, the library of distances need not be imported.
+        return distance_function(self.solids)
+
+    @property
+    def exact(self) -> bool:
+        """Whether distances are those of the shapes themselves rather than of their enclosures."""
+        return self._distance.exact
+
+    def links_of(self, pair: int) -> LinkPair:
+        """Return the links of a pair."""
+        first, second = (self.solids[i].link for i in self.pairs[pair])
+        return LinkPair(first, second)
+
+    def poses(self, shapes: Array) -> Poses:
+        """Return the poses of all links at shapes (N, n), m or rad."""
+        return self._kinematics.link_poses(shapes)
+
+    def lower_bounds(self, poses: Poses) -> Array:
+        """Return lower bounds (N, P), m, of the distances of all pairs, by balls around solids."""
+        R, r = poses
+        centers = r[:, self._link_of] + np.einsum(
+            "nsab,sb->nsa", R[:, self._link_of], self._centers
+        )
+        first, second = self.pairs.T
+        apart = np.linalg.norm(centers[:, first] - centers[:, second], axis=2)
+        return np.asarray(apart - self._radii[first] - self._radii[second])
+
+    def distances(self, pair: int, poses: Poses) -> Array:
+        """Return the distances (N,) of a pair, m; negative where it is in contact: the depths."""
+        R, r = poses
+        i, j = self.pairs[pair]
+        a, b = self._link_of[i], self._link_of[j]
+        return self._distance(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
+
+    def nearest(self, shape: Array) -> tuple[float, int] | None:
+        """Return the smallest distance at a shape (n,), m, and its pair; None without pairs."""
+        if not len(self.pairs):
+            return None
+        poses = self.poses(shape[np.newaxis])
+        bounds = self.lower_bounds(poses)[0]
+        best, nearest = np.inf, 0
+        for pair in np.argsort(bounds, kind="stable"):
+            if bounds[pair] >= best:
+                break
+            distance = float(self.distances(int(pair), poses)[0])
+            if distance < best:
+                best, nearest = distance, int(pair)
+        return best, nearest
+
+    def distances_of_links(self, shape: Array) -> dict[LinkPair, float]:
+        """Return the distances of links at a shape (n,), m, the smallest first."""
+        poses = self.poses(shape[np.newaxis])
+        found: dict[LinkPair, float] = {}
+        for pair in range(len(self.pairs)):
+            links, distance = self.links_of(pair), float(self.distances(pair, poses)[0])
+            found[links] = min(distance, found.get(links, np.inf))
+        return dict(sorted(found.items(), key=lambda each: each[1]))
+
+    # -- pairs --------------------------------------------------------------------------------
+
+    def _distinct_pairs(self) -> npt.NDArray[np.int64]:
+        """Return the pairs of solids on different bodies that no joint connects and no SRDF
+        disables.
+        """
+        disabled = self.robot.disabled_collisions
+        parents = [body.parent for body in self.robot.bodies]
+        found = []
+        for j, second in enumerate(self.solids):
+            for i, first in enumerate(self.solids[:j]):
+                bodies = first.body, second.body
+                if bodies[0] == bodies[1] or parents[bodies[0]] == bodies[1]:
+                    continue
+                if parents[bodies[1]] == bodies[0]:
+                    continue
+                if frozenset({first.link, second.link}) in disabled:
+                    self.ignored[LinkPair(first.link, second.link)] = "disabled by the SRDF"
+                    continue
+                found.append((i, j))
+        return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+    def _always_in_contact(self) -> npt.NDArray[np.bool_]:
+        """Return for every pair (P,) whether it is in contact at all random shapes."""
+        contact = np.ones(len(self.pairs), dtype=np.bool_)
+        if not len(self.pairs):
+            return contact
+        poses = self.poses(_random_shapes(self.robot))
+        contact[self.lower_bounds(poses).max(axis=0) > 0] = False
+        R, r = poses
+        for pair in np.flatnonzero(contact):
+            # Most pairs come apart within the first shapes.
+            for part in (slice(0, 10), slice(10, 100), slice(100, None)):
+                if self.distances(int(pair), (R[part], r[part])).max() > 0:
+                    contact[pair] = False
+                    break
+        return contact
+
+    def _leave_out(self, contact: npt.NDArray[np.bool_]) -> None:
+        for pair in np.flatnonzero(contact):
+            self.ignored.setdefault(self.links_of(int(pair)), "always in contact")
+        self.pairs = self.pairs[~contact]
+
+    # -- motion -------------------------------------------------------------------------------
+
+    def reaches(self, shapes: Array) -> Array:
+        """Return how far solids move against each other: at most ``reaches @ |dtheta|`` (P,), m.
+
+        ``reaches`` (P, m) is the largest distance of a point of the pair from each of the moving
+        joints at any of the shapes (N, n), for joints between the two; zero for others.
+        """
+        bodies = self.robot.bodies
+        travel = np.abs(self.moving_positions(shapes)).max(axis=0)
+        reach = np.zeros((len(self.solids), len(bodies) - 1))
+        for number, solid in enumerate(self.solids):
+            _, pose = self.robot.frames[solid.link]
+            middle = pose @ solid.enclosure.pose
+            far = float(np.linalg.norm(middle.r)) + solid.enclosure.bounding_radius
+            index = solid.body
+            while index > 0:
+                body = bodies[index]
+                assert body.joint is not None
+                slides = body.joint.kind is JointKind.PRISMATIC
+                reach[number, index - 1] = 1.0 if slides else far
+                far += float(np.linalg.norm(body.origin.r)) + slides * travel[index - 1]
+                index = body.parent
+        first, second = reach[self.pairs[:, 0]], reach[self.pairs[:, 1]]
+        return np.where((first > 0) & (second > 0), 0.0, first + second)
+
+    def moving_positions(self, shapes: Array) -> Array:
+        """Return the positions (N, m) of all moving joints at shapes (N, n), m or rad."""
+        G, b = self.robot.coupling
+        return np.asarray(shapes @ G.T + b)
+
+
+def _random_shapes(robot: RobotDescription) -> Array:
+    half = np.array([_HALF_RANGE.get(joint.kind, np.pi) for joint in robot.movable_joints])
+    lower, upper = robot.limits("lower"), robot.limits("upper")
+    low = np.where(np.isfinite(lower), lower, np.minimum(upper, half) - 2 * half)
+    high = np.where(np.isfinite(upper), upper, low + 2 * half)
+    return np.random.default_rng(_SEED).uniform(low, high, (_SHAPES, len(half)))
+
+
+# -- solids -------------------------------------------------------------------------------------
+
+
+def _solids_of(robot: RobotDescription) -> tuple[tuple[Solid, ...], tuple[str, ...]]:
+    solids: list[Solid] = []
+    notes: list[str] = []
+    drawn = [link.name for link in robot.links if link.shapes and not link.collisions]
+    if drawn and any(link.collisions for link in robot.links):
+        names = ", ".join(f"'{name}'" for name in drawn[:3]) + ", ..." * (len(drawn) > 3)
+        notes.append(f"Links without <collision> have the shapes of their <visual>: {names}.")
+    elif drawn:
+        notes.append("No link has a <collision>: distances are those of the <visual> shapes.")
+    for link in robot.links:
+        body = robot.frames[link.name][0]
+        for shape in link.collisions or link.shapes:
+            if shape.kind == "mesh":
+                try:
+                    vertices = _hull(shape_mesh(shape).vertices)
+                except MeshError as error:
+                    notes.append(f"Contacts of link '{link.name}' are not all noticed: {error}")
+                    continue
+                enclosure = RoundedBox.around(shape, vertices)
+                solids.append(Solid(link.name, body, shape, enclosure, vertices))
+            elif max(shape.size) > 0:
+                solids.append(Solid(link.name, body, shape, RoundedBox.around(shape)))
+    return tuple(solids), tuple(notes)
+
+
+def _hull(points: Array) -> Array:
+    """Return the points (V, 3) that are corners of the convex hull; of a flat one, all points."""
+    # Slow to import, and few robots have meshes.
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except QhullError:
+        return points

@@ -1,0 +1,180 @@
+"""Clearance of plans: how near the bodies of a robot may come to each other on the way."""
+
+from __future__ import annotations
+
+import logging
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.collision import Approach, CollisionGeometry, PathCheck
+from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.model.description import Array, RobotDescription
+
+_LOG = logging.getLogger(__name__)
+
+DEFAULT_CLEARANCE = 0.0
+"""Smallest distance between two links of a plan, m; 0: contacts are not looked at."""
+
+_EXACT = 1e-6
+"""Error of a distance, m."""
+
+_ROOM_FOR_LOOPS = 5.0
+"""Distance of links in a shape round which loops go, in clearances."""
+
+_NEARER = 0.5
+"""Share of the clearance from which on a start is refused: a flight that has ended at the clearance
+may be a little nearer."""
+
+
+class Clearance:
+    """The smallest distance that plans of one robot keep between its links.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    distance
+        Smallest distance of links that no joint connects, m.
+    """
+
+    def __init__(self, robot: RobotDescription, distance: float) -> None:
+        self._robot = robot
+        self.distance = distance
+        self._warned: set[str] = set()
+
+    @classmethod
+    def wanted(cls, robot: RobotDescription, distance: float) -> Clearance | None:
+        """Return the clearance of a robot that is asked for; None: none, by a distance of zero.
+
+        Raises
+        ------
+        ParameterError
+            The distance is negative or not finite.
+        """
+        if not 0.0 <= distance < np.inf:
+            raise ParameterError(f"clearance is {distance}; it must be a distance in m, 0 or more.")
+        return cls(robot, distance) if distance else None
+
+    def of(self, robot: RobotDescription) -> Clearance:
+        """Return the same clearance of another robot."""
+        return Clearance(robot, self.distance)
+
+    @cached_property
+    def geometry(self) -> CollisionGeometry:
+        """The solids of the robot."""
+        return CollisionGeometry(self._robot)
+
+    @cached_property
+    def _check(self) -> PathCheck:
+        return PathCheck(self.geometry)
+
+    @property
+    def facts(self) -> Array:
+        """The numbers that plans depend on: the distance, pairs, and the solids around bodies."""
+        geometry = self.geometry
+        solids = [each.enclosure for each in geometry.solids]
+        return np.concatenate(
+            [
+                [self.distance, float(geometry.exact)],
+                geometry.pairs.ravel(),
+                *(np.concatenate([x.pose.R.ravel(), x.pose.r, x.half, [x.radius]]) for x in solids),
+            ]
+        )
+
+    def required(self, start: Array) -> Array:
+        """Return the distances (P,) that all pairs keep from a start (n,) on, m.
+
+        A pair that is nearer than the clearance at the start does not come nearer than there.
+        Links that are in contact at the start are not looked at (minus infinity), with a warning.
+
+        Raises
+        ------
+        PlanningError
+            Links are much nearer at the start than the clearance; the message names them.
+        """
+        geometry = self.geometry
+        required = np.full(len(geometry.pairs), self.distance)
+        if not len(required):
+            return required
+        poses = geometry.poses(start[np.newaxis])
+        for pair in np.flatnonzero(geometry.lower_bounds(poses)[0] <= self.distance).tolist():
+            distance = float(geometry.distances(pair, poses)[0])
+            if distance <= 0:
+                required[pair] = -np.inf
+                self._warn_of_contact(str(geometry.links_of(pair)))
+            elif distance < _NEARER * self.distance:
+                raise PlanningError(
+                    f"Links {geometry.links_of(pair)} are {distance:.3g} m apart at the start, "
+                    f"nearer than planner.clearance = {self.distance:g} m: make it smaller, or "
+                    "have an SRDF disable the pair (planner.srdf)."
+                )
+            else:
+                required[pair] = min(self.distance, distance)
+        return required - _EXACT
+
+    def _warn_of_contact(self, links: str) -> None:
+        if links not in self._warned:
+            self._warned.add(links)
+            _LOG.warning(
+                "Links %s are in contact at the start: their contact is ignored. If they only look "
+                "so, have an SRDF disable the pair (planner.srdf).",
+                links,
+            )
+
+    def is_roomy(self, shapes: Array) -> npt.NDArray[np.bool_]:
+        """Return for shapes (N, n) whether all links are far enough for loops (N,)."""
+        geometry, room = self.geometry, _ROOM_FOR_LOOPS * self.distance
+        roomy = np.ones(len(shapes), dtype=np.bool_)
+        if not len(geometry.pairs):
+            return roomy
+        R, r = geometry.poses(shapes)
+        near = geometry.lower_bounds((R, r)) < room
+        for pair in np.flatnonzero(near.any(axis=0)).tolist():
+            at = np.flatnonzero(near[:, pair] & roomy)
+            roomy[at] = geometry.distances(pair, (R[at], r[at])) >= room
+        return roomy
+
+    def approaches(self, positions: Array, required: Array | None = None) -> list[Approach]:
+        """Return the nearest approaches of pairs that come too near, nearest first.
+
+        Parameters
+        ----------
+        positions
+            (N + 1, n) shapes at the ticks, m or rad.
+        required
+            (P,) distances that are to be kept, m; None: those :meth:`required` from the first
+            shape on.
+        """
+        if not len(self.geometry.pairs):
+            return []
+        if required is None:
+            required = self.required(positions[0])
+        return self._check.approaches(positions, required)
+
+    def clause(self, approach: Approach, control_period: float | None) -> str:
+        """Return a clause about a path that comes too near; no control period: of no times."""
+        when = ""
+        if control_period is not None:
+            when = f" after {approach.tick * control_period:.4g} s,"
+        shape = np.round(approach.shape, 3).tolist()
+        return (
+            f"{approach}{when} at the shape {shape}, and planner.clearance is {self.distance:g} m"
+        )
+
+    def require_shape(self, start: Array, shape: Array) -> None:
+        """Check that links do not come too near in the shape (n,) of a goal.
+
+        Raises
+        ------
+        UnreachableError
+            They do; the message says which.
+        """
+        found = self.approaches(shape[np.newaxis], self.required(start))
+        if found:
+            raise UnreachableError(
+                f"The shape of the goal is in collision: {found[0]}; planner.clearance is "
+                f"{self.distance:g} m.",
+                Proof.COLLISION,
+            )

@@ -1,0 +1,230 @@
+"""Solids and pairs of robots, and their distances against Pinocchio's."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spacerobot_ros.collision import CollisionGeometry, LinkPair
+from spacerobot_ros.collision import distances as distances_module
+from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.model import load_robot, parse_robot
+from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.srdf import with_srdf
+from spacerobot_ros.resources import robot_file
+
+INERTIAL = (
+    '<inertial><mass value="{}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    "</inertial>"
+)
+
+
+def link(name: str, *elements: str, mass: float = 2.0) -> str:
+    return f'<link name="{name}">{INERTIAL.format(mass)}{"".join(elements)}</link>'
+
+
+def joint(name: str, parent: str, child: str, xyz: str, kind: str = "revolute") -> str:
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}" rpy="0.1 0 0.2"/><axis xyz="0 1 0"/>'
+        '<limit lower="-1" upper="2" velocity="1" effort="1"/></joint>'
+    )
+
+
+def solid(tag: str, geometry: str, xyz: str = "0 0 0") -> str:
+    return f'<{tag}><origin xyz="{xyz}" rpy="0.2 0.1 0"/><geometry>{geometry}</geometry></{tag}>'
+
+
+def chain(*elements: tuple[str, ...]) -> str:
+    """Return the URDF of links a, b, ... 1 m apart, each on the one before."""
+    names = "abcdefgh"[: len(elements)]
+    text = "".join(link(name, *each) for name, each in zip(names, elements, strict=True))
+    for i in range(1, len(names)):
+        text += joint(f"j{i}", names[i - 1], names[i], "1 0 0.1")
+    return f'<robot name="chain">{text}</robot>'
+
+
+BALL = solid("visual", '<sphere radius="0.1"/>')
+
+
+def test_collision_shapes_come_before_visual_ones() -> None:
+    small = solid("collision", '<box size="0.1 0.2 0.3"/>', "0 0 0.5")
+    robot = parse_robot(chain((BALL,), (BALL, small, small), (BALL,)))
+    geometry = CollisionGeometry(robot)
+    kinds = [(each.link, each.shape.kind) for each in geometry.solids]
+    assert kinds == [("a", "sphere"), ("b", "box"), ("b", "box"), ("c", "sphere")]
+    assert [len(each.shapes) for each in robot.links] == [1, 1, 1]
+    assert geometry.notes == (
+        "Links without <collision> have the shapes of their <visual>: 'a', 'c'.",
+    )
+
+
+def test_pairs_of_one_body_and_of_neighbours_do_not_count() -> None:
+    text = chain((BALL,), (BALL,), (BALL,)).replace(
+        "</robot>",
+        link("tool", BALL) + joint("weld", "c", "tool", "0 0.3 0", kind="fixed") + "</robot>",
+    )
+    geometry = CollisionGeometry(parse_robot(text))
+    assert [geometry.links_of(i) for i in range(len(geometry.pairs))] == [
+        LinkPair("a", "c"),
+        LinkPair("a", "tool"),
+    ]
+
+
+def test_pairs_that_are_always_in_contact_do_not_count() -> None:
+    wide = solid("visual", '<sphere radius="2.6"/>')
+    geometry = CollisionGeometry(parse_robot(chain((wide,), (), (BALL,), (BALL,))))
+    # c is always within 2 m of a; d comes out of it.
+    assert geometry.ignored == {LinkPair("a", "c"): "always in contact"}
+    assert [geometry.links_of(i) for i in range(len(geometry.pairs))] == [LinkPair("a", "d")]
+
+
+def srdf(tmp_path: Path, *lines: str) -> Path:
+    path = tmp_path / "chain.srdf"
+    path.write_text(f'<robot name="chain">{"".join(lines)}</robot>')
+    return path
+
+
+def test_pairs_that_an_srdf_disables_do_not_count(tmp_path: Path) -> None:
+    robot = parse_robot(chain((BALL,), (BALL,), (BALL,), (BALL,)))
+    disabled = '<disable_collisions link1="c" link2="a" reason="Never"/>'
+    geometry = CollisionGeometry(with_srdf(robot, srdf(tmp_path, disabled)))
+    assert geometry.ignored == {LinkPair("a", "c"): "disabled by the SRDF"}
+    assert len(geometry.pairs) == 2
+    quiet = '<disable_default_collisions link="d"/><enable_collisions link1="a" link2="d"/>'
+    geometry = CollisionGeometry(with_srdf(robot, srdf(tmp_path, quiet)))
+    assert geometry.ignored == {LinkPair("b", "d"): "disabled by the SRDF"}
+
+
+def test_an_srdf_beside_the_urdf_is_read(tmp_path: Path) -> None:
+    (tmp_path / "chain.urdf").write_text(chain((BALL,), (BALL,), (BALL,)))
+    srdf(tmp_path, '<disable_collisions link1="a" link2="c"/>')
+    robot = load_robot(tmp_path / "chain.urdf")
+    assert robot.disabled_collisions == {frozenset({"a", "c"})}
+    assert robot.with_locked({"j1": 0.3}).disabled_collisions == robot.disabled_collisions
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<robot", "is no XML"),
+        ("<sdf/>", "its root element is <sdf>"),
+        (
+            '<robot><disable_collisions link1="a" link2="bb"/></robot>',
+            "link2 is 'bb', but the robot has no such link. Did you mean 'b'?",
+        ),
+        ('<robot><disable_collisions link1="a"/></robot>', "link2 is ''"),
+    ],
+)
+def test_a_damaged_srdf_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    robot = parse_robot(chain((BALL,), (BALL,)))
+    path = tmp_path / "chain.srdf"
+    path.write_text(text)
+    with pytest.raises(RobotDescriptionError, match=re.escape(message)):
+        with_srdf(robot, path)
+    with pytest.raises(RobotDescriptionError, match="cannot be read"):
+        with_srdf(robot, tmp_path / "none.srdf")
+
+
+def test_a_mesh_that_is_missing_is_named() -> None:
+    mesh = solid("collision", '<mesh filename="package://nowhere/arm.stl"/>')
+    geometry = CollisionGeometry(parse_robot(chain((BALL,), (mesh,), (BALL,))))
+    (note,) = [each for each in geometry.notes if "mesh" in each]
+    assert note.startswith("Contacts of link 'b' are not all noticed: The mesh 'package://nowhere")
+    assert [each.link for each in geometry.solids] == ["a", "c"]
+
+
+def test_a_flat_open_mesh_counts_as_its_hull(tmp_path: Path) -> None:
+    (tmp_path / "plate.obj").write_text("v 0 0 0\nv 2 0 0\nv 2 1 0\nv 0 1 0\nf 1 2 3\n")
+    plate = f'<collision><geometry><mesh filename="{tmp_path}/plate.obj"/></geometry></collision>'
+    other = '<collision><origin xyz="0 0 0"/><geometry><sphere radius="0.25"/></geometry>'
+    text = chain((plate,), (), (f"{other}</collision>",)).replace("0.1 0 0.2", "0 0 0")
+    geometry = CollisionGeometry(parse_robot(text))
+    # The ball is at (2, 0, 0.2), above a corner of the plate.
+    distance, _ = geometry.nearest(np.zeros(2)) or (np.nan, 0)
+    assert distance == pytest.approx(0.2 - 0.25, abs=1e-5)
+    distance, _ = geometry.nearest(np.array([-1.0, 1.0])) or (np.nan, 0)
+    assert distance > 0.3
+
+
+@pytest.mark.parametrize("name", ["dual_arm", "servicer"])
+def test_distances_are_those_of_pinocchio(name: str) -> None:
+    pinocchio = pytest.importorskip("pinocchio")
+    path = str(robot_file(name))
+    robot = load_robot(path)
+    geometry = CollisionGeometry(robot)
+    model = pinocchio.buildModelFromUrdf(path)
+    solids = pinocchio.buildGeomFromUrdf(model, path, pinocchio.GeometryType.VISUAL)
+    solids.addAllCollisionPairs()
+    data, of_solids = model.createData(), pinocchio.GeometryData(solids)
+    order = [robot.joint_names.index(each) for each in list(model.names)[1:]]
+    low, high = robot.limits("lower"), robot.limits("upper")
+    for q in np.random.default_rng(3).uniform(low, high, (3, len(low))):
+        pinocchio.computeDistances(model, data, solids, of_solids, q[order])
+        truth: dict[frozenset[str], float] = {}
+        for pair, result in zip(solids.collisionPairs, of_solids.distanceResults, strict=True):
+            names = frozenset(
+                solids.geometryObjects[i].name.rsplit("_", 1)[0] for i in (pair.first, pair.second)
+            )
+            truth[names] = min(truth.get(names, np.inf), result.min_distance)
+        found: dict[frozenset[str], float] = {}
+        poses = geometry.poses(q[np.newaxis])
+        for number in range(len(geometry.pairs)):
+            names = frozenset(geometry.links_of(number))
+            distance = float(geometry.distances(number, poses)[0])
+            assert geometry.lower_bounds(poses)[0, number] <= distance + 1e-6
+            found[names] = min(found.get(names, np.inf), distance)
+        assert len(found) >= 15
+        for names, distance in found.items():
+            assert distance == pytest.approx(truth[names], abs=1e-5), names
+        nearest = geometry.nearest(q)
+        assert nearest is not None
+        assert nearest[0] == pytest.approx(min(found.values()), abs=1e-9)
+
+
+def test_without_coal_distances_are_bounds(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot = load_robot(robot_file("surveyor"))
+    exact = CollisionGeometry(robot)
+    monkeypatch.setitem(sys.modules, "coal", None)
+    distances_module._coal.cache_clear()
+    try:
+        bounds = CollisionGeometry(robot)
+        again = CollisionGeometry(robot)
+        assert not bounds.exact
+        assert not again.exact
+    finally:
+        monkeypatch.undo()
+        distances_module._coal.cache_clear()
+    assert [each.message for each in caplog.records if "coal" in each.message] == [
+        "Distances between links are those of spheres, capsules and boxes around them, since the "
+        "package coal is not installed: `pip install 'spacerobot_ros[collision]'`."
+    ]
+    assert exact.exact
+    # The box around the bus and that around the arm are always in contact.
+    assert set(exact.ignored) == set()
+    assert set(bounds.ignored) == {LinkPair("base_link", "upper_arm")}
+    numbers = {tuple(pair): number for number, pair in enumerate(exact.pairs.tolist())}
+    rng = np.random.default_rng(7)
+    low, high = robot.limits("lower"), robot.limits("upper")
+    poses = exact.poses(rng.uniform(low, high, (20, len(low))))
+    loose = 0.0
+    for number, pair in enumerate(bounds.pairs.tolist()):
+        true = exact.distances(numbers[tuple(pair)], poses)
+        difference = true - bounds.distances(number, poses)
+        assert difference.min() > -1e-5
+        loose = max(loose, float(difference.max()))
+    assert 0.001 < loose < 0.3
+
+
+def test_a_robot_without_shapes_has_no_pairs() -> None:
+    robot: RobotDescription = parse_robot(chain((), (), ()))
+    geometry = CollisionGeometry(robot)
+    assert len(geometry.pairs) == 0
+    assert geometry.nearest(np.zeros(2)) is None
+    assert geometry.notes == ()

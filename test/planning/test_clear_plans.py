@@ -1,0 +1,148 @@
+"""Random goals of six robots: with clearance, plans keep it, and most of the others stay.
+
+Distances are those of Pinocchio and coal at 400 instants of the held commands.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+import numpy as np
+import pinocchio
+import pytest
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning import (
+    GaitSchedule,
+    Goal,
+    PlanRequest,
+    RobotState,
+    Tolerance,
+    method_options,
+)
+from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.methods.optimal import OptimalGait
+from spacerobot_ros.resources import robot_file
+
+GOALS = int(os.environ.get("SPACEROBOT_CLEAR_GOALS", "2"))
+CLEARANCE = 0.01
+ROBOTS = ("three_joint_arm", "seven_joint_arm", "servicer", "surveyor", "quadruped", "dual_arm")
+
+
+class Distances:
+    """Distances of a robot by Pinocchio, whose model has the convex hulls of meshes."""
+
+    def __init__(self, robot: SpaceRobot, clearance: Clearance, start: Array) -> None:
+        path = str(robot_file(robot.description.name))
+        self._model = pinocchio.buildModelFromUrdf(path)
+        share = str(robot_file("surveyor").resolve().parents[2])
+        self._solids = pinocchio.buildGeomFromUrdf(
+            self._model, path, pinocchio.GeometryType.VISUAL, package_dirs=[share]
+        )
+        for each in self._solids.geometryObjects:
+            if hasattr(each.geometry, "buildConvexHull"):
+                each.geometry.buildConvexHull(True, "Qt")
+                each.geometry = each.geometry.convex
+        required, geometry = clearance.required(start), clearance.geometry
+        looked_at = {
+            frozenset(geometry.links_of(p)) for p in range(len(required)) if required[p] > -np.inf
+        }
+        names = [each.name.rsplit("_", 1)[0] for each in self._solids.geometryObjects]
+        for i, first in enumerate(names):
+            for j, second in enumerate(names[:i]):
+                if frozenset({first, second}) in looked_at:
+                    self._solids.addCollisionPair(pinocchio.CollisionPair(j, i))
+        self._order = [robot.joint_names.index(each) for each in list(self._model.names)[1:]]
+        self._data = self._model.createData()
+        self._of_solids = pinocchio.GeometryData(self._solids)
+
+    def nearest(self, schedule: GaitSchedule) -> float:
+        ticks = np.arange(schedule.ticks + 1)
+        at = np.linspace(0, schedule.ticks, 400)
+        shapes = np.column_stack([np.interp(at, ticks, x) for x in schedule.positions.T])
+        best = np.inf
+        for q in shapes:
+            pinocchio.computeDistances(
+                self._model, self._data, self._solids, self._of_solids, q[self._order]
+            )
+            found = [each.min_distance for each in self._of_solids.distanceResults]
+            best = min([best, *found])
+        return best
+
+
+@dataclass
+class Row:
+    """Plans without and with clearance to one goal: duration (s), CPU (s), distance (m)."""
+
+    plain: tuple[float, float, float] | None
+    clear: tuple[float, float, float] | None
+    same: bool
+
+
+def row(robot: SpaceRobot, request: PlanRequest, distances: Distances) -> Row:
+    options = method_options("optimal", {"cache": 0})
+    found: list[tuple[float, float, float] | None] = []
+    schedules: list[Any] = []
+    for clearance in (None, Clearance(robot.description, CLEARANCE)):
+        method = OptimalGait(robot, 0.05, 0.01, options, clearance)
+        began = time.process_time()
+        try:
+            schedule = method.plan(request)
+        except PlanningError as refusal:
+            print(f"  {robot.description.name}: {refusal}", flush=True)
+            found.append(None)
+            schedules.append(None)
+            continue
+        cpu = time.process_time() - began
+        found.append((schedule.duration, cpu, distances.nearest(schedule)))
+        schedules.append(schedule)
+    same = None not in schedules and np.array_equal(schedules[0].positions, schedules[1].positions)
+    return Row(found[0], found[1], same)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROBOTS)
+def test_plans_to_random_goals_keep_clear(name: str) -> None:
+    robot = SpaceRobot.from_file(robot_file(name))
+    rng = np.random.default_rng(20260)
+    start = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
+    distances = Distances(robot, Clearance(robot.description, CLEARANCE), start)
+    rows = []
+    for number in range(GOALS):
+        axis = rng.normal(size=3)
+        turn = rng.uniform(0.05, 0.5) * axis / np.linalg.norm(axis)
+        low, high = np.maximum(robot.lower, -1.0), np.minimum(robot.upper, 1.0)
+        # Every third goal has a shape, if links keep clear in it.
+        shape = rng.uniform(low, high) if number % 3 == 2 else None
+        if shape is not None:
+            nearest = Clearance(robot.description, CLEARANCE).geometry.nearest(shape)
+            if nearest is not None and nearest[0] < CLEARANCE:
+                shape = None
+        quaternion = Goal.from_rotvec(np.zeros(3), turn).quaternion
+        state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), start)
+        tolerance = Tolerance(1e-6, 1e-6, 1e-6)
+        request = PlanRequest(state, Goal(np.zeros(3), quaternion, shape), tolerance)
+        rows.append(row(robot, request, distances))
+    both = [(each.plain, each.clear) for each in rows if each.plain and each.clear]
+    changed = [pair for pair, each in zip(both, rows, strict=False) if pair[0][2] < 0.01]
+    ratios = [after[0] / before[0] for before, after in changed]
+    cpu = [after[1] / before[1] for before, after in both]
+    smallest = min((after[2] for _, after in both), default=np.inf)
+    print(
+        f"{name}: planned {sum(each.plain is not None for each in rows)} before, {len(both)} now "
+        f"of {len(rows)}; too near before: {len(changed)}, smallest distance now "
+        f"{smallest:.4f} m; the same: {sum(each.same for each in rows)}; of those that were too "
+        f"near, median ratio of durations {median(ratios) if ratios else 1:.3f}; of all, of CPU "
+        f"{median(cpu) if cpu else 1:.2f}",
+        flush=True,
+    )
+    assert smallest >= CLEARANCE - 1e-5
+    for each in rows:
+        if each.plain and each.plain[2] > CLEARANCE + 2e-3:
+            assert each.same

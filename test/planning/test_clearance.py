@@ -1,0 +1,207 @@
+"""Plans keep clear of contacts between links: every method, by distances at dense samples."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from spacerobot_ros.collision import CollisionGeometry
+from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.shared_parameters import robot_of
+from spacerobot_ros.planning import (
+    METHODS,
+    GaitSchedule,
+    Goal,
+    PlanRequest,
+    RobotState,
+    Tolerance,
+    method_options,
+    plan,
+)
+from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.core.method import InitialMotion
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.methods.optimal import OptimalGait
+from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
+from spacerobot_ros.resources import robot_file
+
+TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
+QUICK: dict[str, Any] = {"answers": 1, "intervals": 40, "cache": 0}
+
+
+@pytest.fixture(scope="module")
+def arm() -> SpaceRobot:
+    return SpaceRobot.from_file(robot_file("three_joint_arm"))
+
+
+def bare(name: str) -> SpaceRobot:
+    """Return a robot of the package without its SRDF."""
+    described = SpaceRobot.from_file(robot_file(name)).description
+    return SpaceRobot(replace(described, disabled_collisions=frozenset()))
+
+
+def planned(
+    robot: SpaceRobot,
+    method: str,
+    rotvec: npt.ArrayLike,
+    start: npt.ArrayLike,
+    clearance: Clearance | None,
+    **options: Any,
+) -> GaitSchedule:
+    maker = METHODS[method](robot, 0.05, 0.01, method_options(method, options), clearance)
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array(start, dtype=float))
+    return maker.plan(PlanRequest(state, Goal.from_rotvec(np.zeros(3), rotvec), TOLERANCE))
+
+
+def nearest_of(geometry: CollisionGeometry, positions: Array) -> float:
+    """Return the smallest distance at 400 instants of held commands, m."""
+    ticks = np.linspace(0, len(positions) - 1, 400)
+    at = np.column_stack([np.interp(ticks, np.arange(len(positions)), x) for x in positions.T])
+    poses = geometry.poses(at)
+    return min(float(geometry.distances(p, poses).min()) for p in range(len(geometry.pairs)))
+
+
+@pytest.mark.parametrize("distance", [0.01, 0.03])
+def test_optimal_goes_round_a_contact(arm: SpaceRobot, distance: float) -> None:
+    goal = (0.09, -0.26, -0.21), np.zeros(3)
+    clearance = Clearance(arm.description, distance)
+    plain = planned(arm, "optimal", *goal, None, **QUICK)
+    assert nearest_of(clearance.geometry, plain.positions) < -0.01
+    clear = planned(arm, "optimal", *goal, clearance, **QUICK)
+    assert nearest_of(clearance.geometry, clear.positions) >= distance
+    assert clear.duration < 1.3 * plain.duration
+    error = clear.notes["predicted_attitude_error"]
+    assert isinstance(error, float)
+    assert error < 1e-9
+
+
+def test_a_plan_that_is_clear_stays_the_same(arm: SpaceRobot) -> None:
+    goal = (0.27, 0.17, -0.05), np.zeros(3)
+    plain = planned(arm, "optimal", *goal, None, **QUICK)
+    clear = planned(arm, "optimal", *goal, Clearance(arm.description, 0.01), **QUICK)
+    assert np.array_equal(plain.positions, clear.positions)
+
+
+def test_a_plan_in_motion_keeps_clear(arm: SpaceRobot) -> None:
+    goal = (0.09, -0.26, -0.21), np.zeros(3)
+    clearance = Clearance(arm.description, 0.01)
+    plain = planned(arm, "optimal", *goal, None, **QUICK)
+    tick = 10
+    motion = InitialMotion(plain.velocities[tick - 1], plain.positions[tick:])
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), plain.positions[tick])
+    # In the frame in which the motion has turned the base so far, the goal is another one.
+    request = PlanRequest(state, Goal.from_rotvec(np.zeros(3), goal[0]), TOLERANCE, motion=motion)
+    options = method_options("optimal", QUICK)
+    clear = OptimalGait(arm, 0.05, 0.01, options, clearance).plan(request)
+    assert nearest_of(clearance.geometry, clear.positions) >= 0.01
+    assert np.array_equal(clear.positions[0], plain.positions[tick])
+
+
+def test_a_pair_that_begins_nearer_comes_no_nearer(arm: SpaceRobot) -> None:
+    clearance = Clearance(arm.description, 0.1)
+    far, near = 1.9, 2.175
+    for _ in range(40):
+        middle = (far + near) / 2
+        nearest = clearance.geometry.nearest(np.array([0.0, -0.1, middle]))
+        assert nearest is not None
+        far, near = (middle, near) if nearest[0] > 0.07 else (far, middle)
+    required = clearance.required(np.array([0.0, -0.1, middle]))
+    assert np.sort(required) == pytest.approx([0.07, 0.1, 0.1], abs=1e-5)
+
+
+def test_a_start_that_is_too_near_is_refused(arm: SpaceRobot) -> None:
+    with pytest.raises(PlanningError, match=r"Links '.*' and '.*' are 0\.25 m apart at the start"):
+        plan(arm, rotvec=(0.1, 0.0, 0.0), clearance=0.6)
+
+
+@pytest.mark.parametrize("distance", [-0.01, float("nan"), float("inf")])
+def test_a_clearance_that_is_no_distance_is_refused(arm: SpaceRobot, distance: float) -> None:
+    with pytest.raises(ParameterError, match="clearance is"):
+        plan(arm, rotvec=(0.1, 0.0, 0.0), clearance=distance)
+
+
+def test_a_contact_at_the_start_is_ignored_with_one_warning(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    robot = bare("sliding_masses")
+    clearance = Clearance(robot.description, 0.01)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            schedule = planned(
+                robot, "lie_bracket", (0.02, 0.01, -0.02), (0.0, 0.02, 1.0), clearance
+            )
+    warnings = [each.message for each in caplog.records if "in contact" in each.message]
+    assert [each.split(" are ")[0] for each in warnings] == ["Links 'mass_1' and 'mass_2'"]
+    assert schedule.ticks > 0
+
+
+def test_a_goal_shape_in_collision_is_refused(arm: SpaceRobot) -> None:
+    touching = np.array([-0.01, -0.073, 2.175])
+    with pytest.raises(UnreachableError, match="The shape of the goal is in collision") as refusal:
+        plan(arm, rotvec=(0.05, 0.0, 0.0), joint_positions=touching, clearance=0.01, cache=0)
+    assert refusal.value.proof is Proof.COLLISION
+
+
+def test_loops_of_three_joints_shrink(arm: SpaceRobot) -> None:
+    goal = (0.1, -0.05, 0.08), (0.0, -np.pi / 4, np.pi / 2)
+    clearance = Clearance(arm.description, 0.01)
+    plain = planned(arm, "area_loop", *goal, None)
+    clear = planned(arm, "area_loop", *goal, clearance)
+    assert nearest_of(clearance.geometry, plain.positions) < -0.1
+    assert nearest_of(clearance.geometry, clear.positions) >= 0.01
+
+
+def test_cycles_of_sliders_shrink() -> None:
+    robot = bare("sliding_masses")
+    goal = (0.02, 0.01, -0.02), (0.35, -0.07, 0.28)
+    clearance = Clearance(robot.description, 0.01)
+    plain = planned(robot, "lie_bracket", *goal, None)
+    clear = planned(robot, "lie_bracket", *goal, clearance)
+    assert nearest_of(clearance.geometry, plain.positions) < 0.01
+    cycle = clear.positions[: 40 * 60]
+    assert nearest_of(clearance.geometry, cycle) >= 0.01
+
+
+def test_squares_in_collision_are_refused_with_the_pair() -> None:
+    robot = bare("planar_chain")
+    with pytest.raises(
+        PlanningError,
+        match=r"On square loops .* links 'base_link' and 'segment_2' touch, .* at the shape \[-2",
+    ):
+        planned(robot, "square_path", (0, 0, 0.4), (0.3, -0.4), Clearance(robot.description, 0.01))
+
+
+def test_joints_that_follow_keep_clear_where_others_are_stuck(arm: SpaceRobot) -> None:
+    clearance = Clearance(arm.description, 0.01)
+    method = RemainingJointsGait(
+        arm,
+        0.05,
+        0.01,
+        stuck={arm.joint_names[0]: 0.0},
+        method="optimal",
+        options={"optimal": method_options("optimal", {**QUICK, "base_attitude": 0})},
+        clearance=clearance,
+    )
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.2]))
+    goal = Goal(np.zeros(3), state.quaternion, np.array([0.0, 0.0, -1.2]))
+    schedule = method.plan(PlanRequest(state, goal, TOLERANCE))
+    assert nearest_of(clearance.geometry, schedule.positions) >= 0.01
+
+
+def test_the_srdf_of_the_planner_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "mine.srdf"
+    path.write_text('<robot><disable_collisions link1="base_link" link2="link_2"/></robot>')
+    robot = robot_of(PlannerConfig(robot="three_joint_arm", srdf=str(path), model_error=0.1))
+    assert robot is not None
+    assert robot.description.disabled_collisions == {frozenset({"base_link", "link_2"})}
+    plain = robot_of(PlannerConfig(robot="three_joint_arm"))
+    assert plain is not None
+    assert plain.description.disabled_collisions == frozenset()
