@@ -184,7 +184,7 @@ def _finding_json(found: Controllability) -> dict[str, Any]:
     return {
         "controllable": found.controllable,
         "rank": found.rank,
-        "wanted": found.needed,
+        "wanted": found.required_rank,
         "condition": _finite_or_none(found.condition),
         "singular_values": found.singular_values.tolist(),
         "joints": list(found.joints),

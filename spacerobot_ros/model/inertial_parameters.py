@@ -181,7 +181,7 @@ class InertialParameters:
                 f"moments are {moments} kg m^2."
             )
 
-    def described(self, robot: RobotDescription) -> RobotDescription:
+    def apply_to_description(self, robot: RobotDescription) -> RobotDescription:
         """Return a robot description with these parameters; its ``urdf`` is unchanged.
 
         The first link of each body gets the mass properties of the body, the links that are welded

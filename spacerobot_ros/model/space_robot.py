@@ -84,7 +84,7 @@ class SpaceRobot:
         parameters.require_physical([body.name for body in self.description.bodies])
         if np.array_equal(parameters.vector, self.inertial.vector):
             return self
-        return self.with_masses_of(parameters.described(self.description))
+        return self.with_masses_of(parameters.apply_to_description(self.description))
 
     def with_masses_of(self, description: RobotDescription) -> SpaceRobot:
         """Return the robot with the mass properties of a description of the same structure."""

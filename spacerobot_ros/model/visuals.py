@@ -275,7 +275,7 @@ class MeshFolder:
         self._folder = TemporaryDirectory(prefix="spacerobot_")
         self._files: dict[str, Path | None] = {}
 
-    def described(self, urdf: str) -> str:
+    def urdf_with_mesh_files(self, urdf: str) -> str:
         """Return the URDF text with meshes of the bag as files of this folder.
 
         Other meshes keep their names.

@@ -368,7 +368,7 @@ def _with_mesh_files(send: Callable[[bytes], None], meshes: MeshFolder) -> Calla
         except RuntimeError:  # A description that cannot be read is replayed unchanged.
             send(data)
             return
-        located = meshes.described(text)
+        located = meshes.urdf_with_mesh_files(text)
         send(data if located == text else serialize_message(String(data=located)))
 
     return send_with_files

@@ -48,7 +48,7 @@ def test_numbers_given_as_an_argument_are_those_compiled_in(seed: int) -> None:
     description = parse_robot(random_robot_urdf(rng, joints=5))
     parameters = drawn(description, rng)
     robot = SpaceRobot(description).with_inertial(parameters)
-    other = SpaceRobot(parameters.described(description))
+    other = SpaceRobot(parameters.apply_to_description(description))
     q, qdot, qddot = rng.uniform(-1.0, 1.0, (3, 5))
     quaternion = np.array([0.1, -0.5, 0.3, 0.8]) / np.linalg.norm([0.1, -0.5, 0.3, 0.8])
     v, omega, wrench = rng.normal(size=3), rng.normal(size=3), rng.normal(size=6)
@@ -137,7 +137,7 @@ def test_a_controller_commands_by_what_it_believes_the_bodies_weigh(law: str) ->
     description = load_robot(share_directory() / "urdf" / "planar_manipulator.urdf")
     robot = SpaceRobot(description)
     believed = robot.with_inertial(robot.inertial.scaled([1.3, 0.8, 1.4]))
-    compiled_in = SpaceRobot(believed.inertial.described(description))
+    compiled_in = SpaceRobot(believed.inertial.apply_to_description(description))
     state = ControlState(
         r_WB=rng.normal(size=3),
         quaternion_WB=np.array([0.0, 0.0, 0.6, 0.8]),

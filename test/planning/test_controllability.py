@@ -108,7 +108,7 @@ def test_the_papers_sliding_masses() -> None:
 def test_almost_all_offsets_are_controllable(seed: int) -> None:
     robot = random_sliding_robot(np.random.default_rng(seed), 3)
     found = check_sliding_masses(SpaceRobot.from_urdf(robot.urdf))
-    assert (found.rank, found.needed, found.controllable) == (3, 3, True)
+    assert (found.rank, found.required_rank, found.controllable) == (3, 3, True)
 
 
 def test_sliders_in_a_plane_or_too_few_are_not() -> None:
@@ -124,7 +124,7 @@ def test_sliders_in_a_plane_or_too_few_are_not() -> None:
 
 def test_planar_robots_turn_about_one_axis() -> None:
     chain = check_planar_chain(robot_named("planar_chain"))
-    assert (chain.rank, chain.needed, chain.controllable) == (1, 1, True)
+    assert (chain.rank, chain.required_rank, chain.controllable) == (1, 1, True)
     # At the paper's peak, the entries of its pair in the right order.
     assert chain.singular_values[0] == pytest.approx(0.5376, abs=5e-5)
     np.testing.assert_allclose(np.degrees(np.abs(chain.shape)), [153, 121], atol=0.6)
@@ -171,7 +171,7 @@ def test_which_methods_suit_the_robots_of_the_papers(name: str, suits: set[str])
 @pytest.mark.parametrize("robot", ["planar_chain", "sliding_masses"])
 def test_with_one_joint_none_of_the_three_axes_is_spanned(robot: str) -> None:
     found = best_sampled_brackets(robot_named(robot), among=[1])
-    assert (found.rank, found.needed, found.joints) == (0, 3, ())
+    assert (found.rank, found.required_rank, found.joints) == (0, 3, ())
     assert not found.controllable
     assert found.singular_values.tolist() == [0.0, 0.0, 0.0]
     assert found.condition == np.inf

@@ -26,7 +26,9 @@ START = Rotation.from_rotvec([0.4, -0.2, 0.3])
 def weighing(robot: SpaceRobot, errors: Array) -> SpaceRobot:
     """Return the robot with other masses and inertias, two relative errors a body."""
     masses, inertias = np.split(1 + errors, 2)
-    return SpaceRobot(robot.inertial.scaled(masses, inertias).described(robot.description))
+    return SpaceRobot(
+        robot.inertial.scaled(masses, inertias).apply_to_description(robot.description)
+    )
 
 
 def shapes_of(robot: SpaceRobot, ticks: int) -> Array:

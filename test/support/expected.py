@@ -190,7 +190,7 @@ def plans() -> dict[str, dict[str, Any]]:
             "shape": result.shape.tolist(),
             "objections": dict(result.objections),
             "ranks": [
-                [each.rank, each.needed]
+                [each.rank, each.required_rank]
                 for each in (result.at_shape, result.anywhere, result.planar, result.sliding)
             ],
             "singular_values": result.anywhere.singular_values.tolist(),

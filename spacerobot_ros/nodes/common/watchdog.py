@@ -169,7 +169,7 @@ class Liveness:
         """Number of computations under way that may take long."""
 
     def configure(self, timeout: float) -> None:
-        """Prepare to watch, until the entities created since the construction are destroyed.
+        """Subscribe to heartbeats and create the publisher of diagnostics; a cleanup ends both.
 
         ``timeout``: see :class:`Watchdog`; 0: nothing is watched.
         """

@@ -238,12 +238,12 @@ class Listener:
         expected momenta published before them are of an earlier tick, and those published much
         later than usual are of a later tick.
         """
-        self._take_expected()
+        self._take_expected_momenta()
         momentum = self._momentum.take()
         if momentum is None or len(momentum.data) < 7 or not np.all(np.isfinite(momentum.data)):
             return
         if self._expected_momenta is not None and self._expected.sent_ns < self._momentum.sent_ns:
-            self._take_expected()
+            self._take_expected_momenta()
             late = self._momentum.sent_ns - self._expected.sent_ns
             if late > _LONGEST_EXPECTED_DELAY_NS:
                 self._expected_momenta = None
@@ -257,7 +257,7 @@ class Listener:
         numbers = np.array(momentum.data)
         self._momenta = Momenta(numbers[:6], self._expected_momenta, float(numbers[6]))
 
-    def _take_expected(self) -> None:
+    def _take_expected_momenta(self) -> None:
         expected = self._expected.take()
         if expected is not None and len(expected.data) >= 6:
             self._expected_momenta = np.array(expected.data[:6])

@@ -39,20 +39,20 @@ class Controllability:
 
     Attributes
     ----------
-    rank, needed
+    rank, required_rank
         Number of axes of rotation that the brackets span, and the number to be spanned.
     singular_values
         (3,) of the best three brackets, rad per unit area (rad^2, rad m or m^2), descending.
     joints
         The joints whose brackets they are.
     shape
-        (n,) where.
+        (n,) shape at which the brackets are taken, m or rad.
     message
         The finding for the user; where ``controllable`` is false, the reason.
     """
 
     rank: int
-    needed: int
+    required_rank: int
     singular_values: Array
     joints: tuple[str, ...]
     shape: Array
@@ -61,7 +61,7 @@ class Controllability:
     @property
     def controllable(self) -> bool:
         """Whether the brackets span all needed axes."""
-        return self.rank >= self.needed
+        return self.rank >= self.required_rank
 
     def require(self) -> None:
         """Check that the robot is controllable.
