@@ -164,7 +164,8 @@ class Metric:
 
     Attributes
     ----------
-    ###
+    unit, description
+        SI unit (empty: none) and a short description, as texts for the user.
     evaluate
         Function of the measures and the robot: a number, NaN where a flight has none; or a number
         for each joint.

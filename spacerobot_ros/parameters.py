@@ -37,7 +37,8 @@ class Parameter:
         Full name, with the groups that it is in: ``sensors.joint_noise``.
     default
         Value when none is set.
-    ###
+    unit, description
+        SI unit and a short description, as texts for the user.
     minimum, maximum
         Bounds of a number, or of every entry of an array.
     choices

@@ -88,7 +88,7 @@ def robot_file(name: str, beside: Path | None = None) -> Path:
 
 
 def is_path(name: str) -> bool:
-    """Whether the name of a robot is a file path: it has a suffix or a folder."""
+    """Whether the name of a robot is a file path: it has a known suffix or a folder."""
     return Path(name).suffix in _ROBOT_SUFFIXES or len(Path(name).parts) > 1
 
 

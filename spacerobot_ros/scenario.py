@@ -100,7 +100,7 @@ class Scenario:
     name, path, description
         Name, path and description of the parameter file.
     goal, end_effector_goal
-        ###
+        Goal poses of the base and of the end-effector.
     commanders
         Nodes that command the robot to the goals.
     published, published_method
@@ -297,7 +297,8 @@ class Scenario:
         scenario = self.with_overrides("plant", pace)
         if "planner" in self.commanders:
             scenario = scenario.with_overrides("planner", {"plan_in_background": True})
-        # Viewers need transforms at a rate in wall time, as the plant already publishes its topics.
+        # Viewers follow wall time, which limits the period of recorded transforms; the plant limits
+        # the periods of its own topics.
         shown = {"diagnostics_period": 1.0}
         period = self.config("recorder").tf_period
         if period:

@@ -90,7 +90,7 @@ class _Guard:
 
     def __init__(self, *, announcing: bool) -> None:
         self.number: int | None = None
-        """###"""
+        """Number of the signal that ends the process; None before a signal."""
         self.request: _Request | None = None
         self.tools: set[subprocess.Popen[bytes]] = set()
         self._announcing = announcing

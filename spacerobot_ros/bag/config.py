@@ -40,7 +40,7 @@ class RecorderConfig(WatchdogConfig):
     )
     max_size: float = parameter(
         0.0,
-        "size of a file at which NAME_0, NAME_1, ... are split; 0: never",
+        "file size after which the next file (NAME_0, NAME_1, ...) begins; 0: never",
         unit="MB",
         minimum=0.0,
     )

@@ -301,7 +301,7 @@ class Playback:
         return self._timeline.clock_time(self._next_message.log_time_ns)
 
     def step(self, clock_ns: int) -> ReplayMessage | None:
-        """Return the next message before it is due; None at the end of the replay."""
+        """Return the next message at once, due or not; None at the end of the replay."""
         if self._next_message is None:
             return None
         self._timeline.seek(max(self._next_message.log_time_ns, self._start_ns), clock_ns)

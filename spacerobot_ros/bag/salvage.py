@@ -314,7 +314,8 @@ def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
 
 def _last_state(robot: RecordedRobot) -> LastState:
     odom, joints, momentum = (robot[name] for name in _STATE_TOPICS)
-    # Momenta have no stamp: their log time is the time of their state.
+    # Momenta have no stamp. The plant publishes the momenta of a state first, so that odom k has
+    # momenta k.
     common = np.intersect1d(odom.stamp_ns, joints.stamp_ns)
     if not len(common):
         raise RecordingError(f"The bag {robot.bag.path} holds no state with all its parts.")

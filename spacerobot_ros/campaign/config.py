@@ -57,7 +57,7 @@ class Distribution:
         if self.choices:
             last = len(self.choices) - 1
             return [self.choices[min(int(u * (last + 1)), last)] for u in shares.tolist()]
-        # Infinite values are refused when a flight draws them.
+        # Values that are not finite are refused when a flight draws them.
         with np.errstate(all="ignore"):
             found = np.asarray(
                 _load_scipy_distribution(self.name).ppf(shares, **self.arguments), dtype=float
@@ -255,7 +255,7 @@ def _read_scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
     if "method" in section:
         scenario = scenario.with_method(str(section["method"]))
     for node in ("plant", *scenario.commanders):
-        scenario.config(node)  # The parameters are refused before the first flight.
+        scenario.config(node)  # Invalid parameters are refused before the first flight.
     if not scenario.lockstep:
         raise ParameterError("campaigns are flown in lockstep: leave plant.time_mode out.")
     return scenario

@@ -35,7 +35,7 @@ _ABOUT_FILE, _CAMPAIGN_FILE, _SCENARIO_FILE = "about.json", "campaign.yaml", "sc
 _FLIGHTS_FOLDER = "flights"
 
 _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
-"""Wall time (s) and number of rows after which rows are written; a kill loses only later rows."""
+"""Wall time (s) and number of rows after which rows are written: a kill loses at most as much."""
 
 VERSIONS_JSON = json.dumps(
     {"spacerobot_ros": __version__, "numpy": np.__version__, "python": platform.python_version()}

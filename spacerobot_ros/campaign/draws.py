@@ -21,7 +21,8 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model.description import Array
 
 _MIN_PROBABILITY = 1e-12
-"""Least cumulative probability of a drawn value, because many distributions are infinite at 0."""
+"""Least distance of cumulative probabilities from 0 and 1, at which many distributions are
+infinite."""
 
 _BLOCK_SIZE = 256
 """Number of draws that are computed together."""

@@ -91,7 +91,7 @@ class Fallback:
 
 
 class Engine(Protocol):
-    """Flies draws. ``efficient_flights`` is the number below which fewer flights take as long."""
+    """Flies the draws of a campaign; fewer flights than ``efficient_flights`` take as long."""
 
     name: str
     efficient_flights: int

@@ -76,8 +76,8 @@ class ControllerCommander(Commander):
         if self.active and self.executive is not None and not self._waits_for_first_pose():
             overdue = self.states.overdue()
         if overdue is not None:
-            # A late answer would be refused, so the state without a pose only advances the
-            # estimate.
+            # An answer to a state whose pose was lost would come a tick late, so the state only
+            # advances the estimate.
             self._answer_state(overdue, send=overdue is _WHOLE)
         super().take_joints(stamp_ns, joints)
 

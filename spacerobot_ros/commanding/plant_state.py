@@ -286,7 +286,8 @@ class StateSynchroniser:
     def forget_pose(self) -> None:
         """Forget the latest odom: the plant shows another state of the same time.
 
-        Nor is it the pose of joints that were handed over before.
+        A later odom of this time is then no contradiction, nor the pose of joints that were
+        handed over before.
         """
         self.odom, self._odom_ns, self._odom_fresh = None, _NO_STAMP, False
         if not self._joints_fresh:

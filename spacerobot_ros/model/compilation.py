@@ -162,7 +162,7 @@ def dense_function(
 
 
 def compiled(function: ca.Function) -> ca.Function:
-    """Return the function as compiled C, or unchanged without a compiler.
+    """Return the function as compiled C, or unchanged if it is not or cannot be compiled.
 
     Raises
     ------
@@ -467,8 +467,8 @@ def _make_object(
                 _object_file_name(name, key), key, built.read_bytes()
             )
             for path in (stored, built):
-                # The cache's folder may forbid execution, so the object is loaded from a deleted
-                # temporary file.
+                # The cache's folder may forbid execution; the temporary file is then loaded, and
+                # a loaded object stays when its file is deleted.
                 with suppress(OSError, RuntimeError):
                     if path is not None:
                         return load(str(path))

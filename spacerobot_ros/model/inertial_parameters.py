@@ -111,7 +111,10 @@ class InertialParameters:
         )
 
     def shifted(self, offsets: npt.ArrayLike) -> InertialParameters:
-        """Return the parameters with centres of mass moved by offsets (..., B, 3), m."""
+        """Return the parameters with centres of mass moved by offsets (..., B, 3), m.
+
+        The inertias about the centres of mass stay.
+        """
         centers = self.centers + np.asarray(offsets, dtype=float)
         shape = centers.shape[:-1]
         return InertialParameters(

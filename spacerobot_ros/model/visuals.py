@@ -276,7 +276,7 @@ class MeshFolder:
         self._files: dict[str, Path | None] = {}
 
     def urdf_with_mesh_files(self, urdf: str) -> str:
-        """Return the URDF text with meshes of the bag as files of this folder.
+        """Return the URDF text with meshes that only the bag has as files of this folder.
 
         Other meshes keep their names.
         """

@@ -72,13 +72,13 @@ _QUEUE_DEPTH = 2000
 """Queue depth of subscriptions; above 5000 the events executor stops responding."""
 
 _CHUNK_SIZE = 262_144
-"""Chunk size before compression, bytes: larger chunks cost less each, but slow down seeking."""
+"""Chunk size before compression, bytes: larger chunks have lower fixed costs, but slow seeking."""
 
 _SCAN_PERIOD = 0.1
 """Wall time between two checks for new topics, s."""
 
 _CHECK_PERIOD = 0.4
-"""Wall time between two checks that the bag file still exists, s."""
+"""Wall time between two checks that the bag file exists, s: a failure is seen within a second."""
 
 _LONGEST_DRAIN = 1.2
 """Longest wall time after a signal for recording messages still in transit, s."""

@@ -101,7 +101,7 @@ class Stack(ABC):
         self.names = ("plant", *scenario.commanders, *recorder)
         """Names of the nodes, in the order of their start."""
         for name in self.names:
-            scenario.config(name)  # An invalid goal is refused before any node runs.
+            scenario.config(name)  # Invalid parameters are refused before any node runs.
 
     def _make_client(self, joint_names: Callable[[], Sequence[str]] | None, **options: Any) -> None:
         """Make the client of the mission; ``options`` are those of :class:`MissionClient`."""
@@ -354,7 +354,7 @@ class InProcessStack(Stack):
         return node
 
     def _connect(self) -> None:
-        """###"""
+        """Wait until every subscription in this process is matched with its publisher."""
         deadline = time.monotonic() + _DISCOVERY_TIMEOUT
         while not self._connected():
             if time.monotonic() > deadline:

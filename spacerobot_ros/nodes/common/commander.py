@@ -307,7 +307,7 @@ class CommanderNode(FlightNode):
             self._publish_diagnostics()
 
     def _subscribe_states(self) -> None:
-        """Subscribe to the state; report publishers whose QoS does not match."""
+        """Subscribe to the state; with automatic reliability, notice publishers of another QoS."""
         auto = self.config.state_reliability == "auto" and not self._best_effort
         for kind, topic, callback in (
             (Odometry, "odom", self._on_odom),

@@ -21,8 +21,8 @@ _MAX_LOOKS_FOR_ANSWER = 200
 """Number of checks after which a node without an answer counts as one without services."""
 
 _LOOKS_UNTIL_CONNECTED = 3
-"""Number of checks before a request: before discovery an answer would be lost after 0.1 s.
-"""
+"""Number of checks before a request, in which the node discovers the client. Before that, an answer
+would hold up the node for 0.1 s, and be lost."""
 
 _LOOKS_UNTIL_LOST = 50
 """Number of checks after which an answer counts as lost by the middleware."""

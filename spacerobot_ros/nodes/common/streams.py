@@ -105,7 +105,7 @@ class RawStream:
     Parameters
     ----------
     topic
-        ###
+        Full name of the topic.
     take
         Called with each message.
     """

@@ -216,7 +216,7 @@ class PlantNode(FlightNode):
         )
 
     def on_failure(self, message: str, error: Exception) -> None:
-        """Report the failure, and drop commands until the plant is started again."""
+        """Report the failure, and drop the present commands: none is in force after a restart."""
         self._stop_timers()
         self._active = PlantState.FAILED
         reason = "model" if isinstance(error, SpaceRobotError) else "exception"

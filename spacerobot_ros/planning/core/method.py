@@ -169,7 +169,7 @@ class GaitMethod(ABC):
 
     @abstractmethod
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Return the gait of a request; a gait ends at rest: for equal requests, an equal one.
+        """Return a gait for a request that ends at rest; equal requests have equal gaits.
 
         Raises
         ------

@@ -581,7 +581,7 @@ class Executive:
     def _replan_remaining(self, active: ActiveGoal, state: RobotState) -> None:
         """Plan the remaining motion again from the present state, at most once a period.
 
-        (Shrinking horizon.) It is not where the present motion leads near enough to the goal.
+        (Shrinking horizon.) A motion that ends near enough to the goal is not planned again.
         """
         state = self._tracker.path_check.average_pose(state)
         if self._stamp_ns < self._replan_ns or active.schedule.partial:
@@ -663,7 +663,7 @@ class Executive:
             self._request_plan(job, state)
 
     def _reset_plan_count(self) -> None:
-        """Reset the count of plans and commands for the waiting goal."""
+        """Reset number and time of plans for the waiting goal, which no longer waits."""
         self._new_goal = None
         self._total_plan_time, self._plan_count = 0.0, 0
 
@@ -710,7 +710,7 @@ class Executive:
         self._plan_count += 1
         self._add_notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
         if isinstance(result, Planned):
-            # A plan may aim beside the goal; the report compares its end with the goal itself.
+            # A plan may aim beside the goal; its end is compared with the goal itself.
             schedule = replace(result.schedule, goal=job.identified.goal)
             result = replace(result, schedule=schedule)
             self._add_event(
@@ -938,7 +938,7 @@ class Executive:
     # -- outputs ------------------------------------------------------------------------------
 
     def _change_phase(self, event: Event, target: Phase) -> None:
-        """Change the phase and report the transition; all other methods call this one."""
+        """Change the phase and report the transition; no other method changes the phase."""
         transition = Transition(self.phase, event, target)
         if transition not in TRANSITIONS:
             raise IllegalTransitionError(

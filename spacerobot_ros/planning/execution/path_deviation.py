@@ -50,7 +50,8 @@ _POSE_NOISE = 1e-3
 """Standard deviation of each component of a measured pose, m or rad."""
 
 _MAX_PLAUSIBLE_ERROR = 6 * _PRIOR_DEVIATION
-"""Largest relative error of a mass; larger estimates come from jumps of measurements."""
+"""Largest relative error of masses and inertias that is believed; larger estimates have another
+cause, such as a jump of the measurements."""
 
 _NEAR_SHARES, _AIM_SHARES = (0.6, 0.8), (0.4, 0.6)
 """Two shares of the tolerances each, for early and late in a motion: the remaining motion is
@@ -161,7 +162,7 @@ class PathCheck:
     def shift_goal(
         self, goal: Goal, within: Tolerance, controls: frozenset[Controlled], *, late: bool
     ) -> Goal | None:
-        """Return the goal of a new plan; None if the expected end of the path is near.
+        """Return the goal of a new plan; None if the path is expected to end near its goal.
 
         Plans are made with the masses of the URDF. So the goal is shifted by the error that is
         expected from the estimated masses, as far as it exceeds a share of the tolerance.

@@ -99,7 +99,7 @@ class StuckJointWatch:
             # Joints do not all jam at once: perhaps commands do not arrive for a while.
             stuck[:] = False
         follows = due & (measured >= _FOLLOWS_SHARE * commanded)
-        # Joints between both shares are watched for another window.
+        # Joints between both shares are watched for a window twice as long.
         self._window[due] *= 2
         self._restart_joints(follows | stuck, q)
         return [int(i) for i in np.flatnonzero(stuck)]

@@ -53,7 +53,7 @@ _NEGLIGIBLE_AREA_SHARE = 1e-3
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 LegEnds = list[tuple[Array, float]]
-"""LegEnds (n,) of straight legs, and the durations of these, s."""
+"""Ends (n,) of straight legs, and the durations of the legs, s."""
 
 
 @dataclass(frozen=True)
@@ -287,7 +287,7 @@ class AreaLoopGait(GaitMethod):
             centre = np.maximum(np.minimum(nominal.shape[chosen], upper - half), lower + half)
             corners = np.tile(nominal.shape, (len(loop), 1))
             corners[:, chosen] = np.clip(centre + loop, lower, upper)
-            # The middle of a box is half an edge away from its sides.
+            # From the middle of the box to a corner, joints move half as far as along an edge.
             ends.append((corners[0], self.options.edge_time / 2))
             ends += [(corner, self.options.edge_time) for corner in corners[1:]]
             ends.append((nominal.shape, self.options.edge_time / 2))
@@ -367,7 +367,7 @@ class EdgePath:
 
 
 def edge_path(areas: Array, longest: Array) -> EdgePath:
-    """Return the path that encloses ``areas`` (3,), with edges of at most ``longest`` (3,).
+    """Return the path around ``areas`` (3,), with edges of at most ``longest`` (3,) if possible.
 
     The cube-like path is taken where its edges are short enough, or shorter than those of
     rectangles. Areas that are too large give a path with ``excess`` over 1: edges go as the root

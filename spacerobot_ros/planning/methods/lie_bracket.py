@@ -87,7 +87,7 @@ class LieBracketOptions:
 
 
 class LieBracketGait(GaitMethod):
-    """Controls position and attitude of a base with three or more sliders with any slots."""
+    """Controls position and attitude of a base with three or more sliders; slots may be offset."""
 
     name: ClassVar[str] = "lie_bracket"
     Options: ClassVar[type[LieBracketOptions]] = LieBracketOptions
@@ -283,7 +283,10 @@ class LieBracketGait(GaitMethod):
         return best
 
     def _best_triple(self, z_f: Array) -> tuple[tuple[int, int, int], Array]:
-        """Return the three sliders with the best conditioned brackets at zf, and M."""
+        """Return the three sliders with the best conditioned brackets at zf, and these brackets.
+
+        The columns of the brackets (3, 3) are w12, w23 and w13.
+        """
         triple, M = best_triple(self.robot.curvature(z_f)[3:], self.sliders)
         # M holds the curvature of the pairs 12, 23 and 31; the brackets are its negative.
         brackets = M * np.array([-1.0, -1.0, 1.0])
@@ -299,8 +302,8 @@ class LieBracketGait(GaitMethod):
     def _fit_to_limits(
         self, alpha: Array, triple: tuple[int, int, int], z_f: Array, least: int
     ) -> _TurnStep:
-        """Choose the smallest n >= ``least`` at which a cycle keeps rates and strokes. With
-        ``least`` 0 it follows from ``loop_area``.
+        """Choose n, from ``least`` up, so that a cycle keeps rates and strokes; more cycles are
+        smaller ones. With ``least`` 0 the first n follows from ``loop_area``.
         """
         n = least or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.options.loop_area))
         amplitudes = self._cycle_amplitudes(alpha)

@@ -267,8 +267,7 @@ class CommandHolder:
         return np.where(np.isfinite(limits.velocity), limits.velocity, half), half
 
     def _first_variation(self, positions: Array, quaternions: Array, waves: Array) -> Array:
-        """Return the final turn by waves (N + 1, w, n): (3, w), base
-        components."""
+        """Return the turns (3, w) of the final attitude by waves (N + 1, w, n), base components."""
         # A few hundred points of a smooth integrand are plenty for Newton's direction.
         stride = max(1, len(positions) // 200)
         chosen = np.arange(stride // 2, len(positions), stride)

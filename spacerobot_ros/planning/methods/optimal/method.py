@@ -191,7 +191,7 @@ class OptimalGait(GaitMethod):
         return SolutionLibrary.from_schedules(self._library_key, schedules, np.array(turns))
 
     def store_library(self, library: SolutionLibrary) -> Path | None:
-        """Store a library in the cache of plans; return its path, None on failure."""
+        """Store a library in the cache, where plans find it; return its path, None on failure."""
         cache, name = library_file(self._library_key)
         return cache.store(name, self._library_key, library.to_bytes())
 
