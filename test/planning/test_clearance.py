@@ -32,6 +32,8 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation import InitialState
+from spacerobot_ros.simulation.trials import PlanningProblem
 
 TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
 QUICK: dict[str, Any] = {"answers": 1, "intervals": 40, "cache": 0}
@@ -205,3 +207,12 @@ def test_the_srdf_of_the_planner_is_read(tmp_path: Path) -> None:
     plain = robot_of(PlannerConfig(robot="three_joint_arm"))
     assert plain is not None
     assert plain.description.disabled_collisions == frozenset()
+
+
+def test_the_clearance_of_the_planner_is_kept(arm: SpaceRobot) -> None:
+    # Links are 0.25 m apart at the start.
+    goal = Goal.from_rotvec(np.zeros(3), (0.1, 0.0, 0.0))
+    problem = PlanningProblem("near", arm, InitialState(), goal, PlannerConfig(clearance=0.6))
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+    with pytest.raises(PlanningError, match=r"planner\.clearance = 0\.6 m"):
+        problem.method("optimal").plan(PlanRequest(state, goal, TOLERANCE))
