@@ -348,9 +348,9 @@ def read_summary(path: Path, file: BinaryIO) -> Summary:
     Raises
     ------
     RecordingError
-        There is none.
+        The bag has no summary.
     ValueError
-        It is damaged, or contradicts the file.
+        The summary is damaged, or contradicts the file.
     """
     end = file_size(file) - len(MCAP0_MAGIC) - _FOOTER_SIZE
     footer = parse_record(Footer.read, read_record(file, max(end, 0), Opcode.FOOTER), max(end, 0))

@@ -154,7 +154,7 @@ class Dataset:
         os.replace(new, path)
 
     def _lock(self) -> None:
-        """Lock the folder until this process ends, unless another process has locked it."""
+        """Lock the folder; ParameterError if another process has locked it."""
         descriptor = os.open(self.folder / _FLIGHTS_FOLDER, os.O_RDONLY | os.O_CLOEXEC)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -272,7 +272,7 @@ class Dataset:
 
 
 def _read_row_file(part: Path, columns: Sequence[str] | None = None) -> Any:
-    """Return a file of rows as a pyarrow table, unless it is damaged."""
+    """Return a file of rows as a pyarrow table; ParameterError for a damaged file."""
     arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
     try:
         return parquet.read_table(part, columns=columns)

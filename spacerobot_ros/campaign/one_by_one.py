@@ -55,7 +55,7 @@ class _OneByOneEngine(ABC):
     def fly_draw(
         self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool]
     ) -> Flight:
-        """Fly one draw, or raise a :class:`.SpaceRobotError` about the one that is refused."""
+        """Fly one draw; a refused draw raises a :class:`.SpaceRobotError`."""
 
 
 class FlightsEngine(_OneByOneEngine):

@@ -86,7 +86,7 @@ _MARKS = {
     EventKind.NODE_SILENT: _Mark("node silent", "h", _BAD, 1),
     EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 1, hollow=True),
 }
-"""Kinds that are drawn; the others are about nodes that start and stop."""
+"""Marks of events by kind; other kinds, of nodes that start and stop, are not drawn."""
 
 
 _GLYPHS = {

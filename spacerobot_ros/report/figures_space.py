@@ -166,7 +166,7 @@ def _round_length(longest: float) -> float:
 
 _PLANNED_COLOUR, _TOOL_COLOUR = PALETTE[1], PALETTE[4]
 _FLIGHT_COLOURS = (PALETTE[0], PALETTE[2], PALETTE[5], *PALETTE[6:])
-"""Colors of the flights, this one first."""
+"""Colours of compared flights; the first colour is for the flight of the report."""
 
 
 def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> ReportFigure | str:

@@ -37,14 +37,14 @@ from spacerobot_ros.times import SECOND
 
 @dataclass(frozen=True)
 class Status:
-    """A report of the planner or the controller.
+    """A recorded status of the planner or the controller.
 
     Attributes
     ----------
     time
         Time of the report, s.
     content
-        The report; of another package its message alone.
+        The status; of a status of another package its message alone.
     """
 
     time: float
@@ -52,22 +52,22 @@ class Status:
 
     @property
     def report(self) -> PlannerStatus | ControllerStatus | None:
-        """The report for programs; None where it is no status of this package."""
+        """The typed status; None for a status of another package."""
         return None if isinstance(self.content, str) else self.content
 
     @property
     def sentence(self) -> str:
-        """The report for people."""
+        """Sentence of the status for the user."""
         return self.content if isinstance(self.content, str) else self.content.message
 
     @property
     def state(self) -> str:
-        """State of planner or controller; empty where it is not known."""
+        """State of planner or controller; empty if unknown."""
         return self.report.state.value if self.report is not None else ""
 
     @property
     def executing(self) -> bool:
-        """Whether a schedule begins."""
+        """Whether the status reports the start of a schedule."""
         return self.state == PlannerState.EXECUTING.value
 
     @property
@@ -91,7 +91,7 @@ class Status:
                 return frozenset()
 
     def note(self, name: str) -> list[float]:
-        """Return a result of the planning method as numbers; none if it is not there."""
+        """Return a note of the planning method as numbers; empty without the note."""
         notes = self.report.notes if isinstance(self.report, PlannerStatus) else {}
         value = notes.get(name, "")
         return [] if isinstance(value, str) else np.atleast_1d(value).tolist()
@@ -131,7 +131,7 @@ class FlightReport:
 
     @classmethod
     def of(cls, bag: FlightBag) -> FlightReport:
-        """Read a bag.
+        """Read the flight of a bag.
 
         Raises
         ------
@@ -525,6 +525,6 @@ def read_report(path: Path, namespace: str | None = None) -> FlightReport:
 
 
 def joint_unit(flight: FlightReport, name: str) -> str:
-    """Return m or rad; without a robot description, that it is one of them."""
+    """Return the unit of a joint: m, rad, or ``m or rad`` without a robot description."""
     joint = flight.joint(name)
     return "m or rad" if joint is None else joint.unit

@@ -57,10 +57,10 @@ _PAPER_WIDTHS = (40.0, 400.0)
 """Least and largest width of a figure for a paper, mm."""
 
 _PICTURE_PIXELS = 1000
-"""Pixels."""
+"""Width of a picture in pixels."""
 
 _ROBOT_PANEL_WIDTH = 3.9
-"""Of the robot in the picture, inches."""
+"""Width of the robot in a picture, inches."""
 
 FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
     "robot": configurations_figure,

@@ -91,12 +91,12 @@ class GoalEditor:
 
     @property
     def placed(self) -> bool:
-        """Whether there is a goal."""
+        """Whether the editor has a goal."""
         return _BASE_GIZMO in self._poses
 
     @property
     def has_tool(self) -> bool:
-        """Whether there is a goal of the end-effector."""
+        """Whether the editor has a goal of the end-effector."""
         return _TOOL_GIZMO in self._poses
 
     def add_tool(self, pose: Array | None) -> None:
@@ -380,7 +380,7 @@ class _FinalShape:
             field.value = value if low is None or high is None else min(max(value, low), high)
 
     def show(self, *, visible: bool) -> None:
-        """Show or hide these controls."""
+        """Show or hide the controls of the final joint positions."""
         shown = visible and bool(self._fields)
         if shown != self._enabled.visible:
             self._enabled.visible = shown

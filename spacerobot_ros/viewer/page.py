@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 RequestAction = Callable[[Action], None]
-"""Takes an action of a user."""
+"""Function that takes an action of a user of the page."""
 
 _MAX_NOTICES = 200
 _MAX_SHOWN_NOTICES = 60
@@ -177,7 +177,7 @@ class Faults:
             defer(lambda: act(Inject("clear")))
 
     def offer(self, targets: Targets) -> None:
-        """Offer the faults of a plant with these targets."""
+        """Offer the faults that the targets of a plant can have."""
         if targets == self._targets:
             return
         self._targets, self._names = targets, content.fault_kinds(targets)
@@ -358,7 +358,7 @@ class Log:
         self._changed = False
 
     def add(self, notice: Notice) -> None:
-        """Add a line."""
+        """Add a line to the log."""
         if self._notices and self._notices[0] == notice:
             return  # An immediate repetition is shown once.
         self._notices.appendleft(notice)

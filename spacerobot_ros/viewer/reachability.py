@@ -231,7 +231,7 @@ class GoalChecker:
         self._lock = threading.Lock()
 
     def ask(self, question: Question) -> None:
-        """Cancel the check in progress and start this one."""
+        """Cancel the check in progress, and start the check of a question."""
         process = self._running_process()
         self._number += 1
         if not self._answered and self._cancelled_at is None:
@@ -271,7 +271,7 @@ class GoalChecker:
         return Check(Verdict.PLANNING, f"Planning for {seconds:.0f} s{found}.")
 
     def close(self) -> None:
-        """End the process."""
+        """End the child process that checks goals."""
         process, self._process = self._process, None
         self._cancelled_at = None
         if process is not None:
@@ -300,7 +300,7 @@ class GoalChecker:
         return self._process
 
     def _send_question(self, process: subprocess.Popen[bytes], question: Question | None) -> None:
-        """Send a numbered question; None cancels the one before."""
+        """Send a numbered question; None cancels the earlier question."""
         assert process.stdin is not None
         with suppress(OSError):  # The process has ended; latest_answer notices it.
             pickle.dump((self._number, question), process.stdin)

@@ -28,7 +28,7 @@ _PLANNED: Color = (240, 150, 25)
 _FLOWN: Color = (60, 130, 240)
 _PLUME: Color = (255, 110, 40)
 _LINE_WIDTH = 3.0
-"""Pixels."""
+"""Width of lines in the scene, pixels."""
 
 _MIN_LINE_SEGMENTS = 32
 """Least capacity of a line, in segments."""

@@ -206,6 +206,6 @@ def url_of(server: viser.ViserServer) -> str:
 
 
 def stop_server(server: viser.ViserServer) -> None:
-    """Close the page."""
+    """Stop the server of the page."""
     with redirect_stdout(io.StringIO()):
         server.stop()

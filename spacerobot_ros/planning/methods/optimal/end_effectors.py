@@ -211,7 +211,7 @@ class EndEffectorRows:
         Raises
         ------
         PlanningError
-            It is such a goal.
+            The goal has more independent numbers.
         """
         ranks, rows = [], 0
         for q, turn in zip(*self._samples(), strict=True):
@@ -241,7 +241,7 @@ class EndEffectorRows:
         Raises
         ------
         UnreachableError
-            It is such a goal.
+            The goal needs a motion of a link off these directions.
         """
         R_WB = matrix_from_quaternion(state.quaternion)
         name = self.robot.description.name
@@ -395,7 +395,7 @@ class EndEffectorSpecification:
         UnreachableError
             A part of the goal is out of the robot's reach.
         NotFoundError
-            No shape that puts the end-effectors there was found.
+            No shape with the end-effectors at their goals was found.
         PlanningError
             No such goal is planned.
         """
@@ -441,7 +441,7 @@ class EndEffectorSpecification:
         Raises
         ------
         UnreachableError
-            There is none.
+            No turn of the base puts the end-effectors to their goals.
         """
         tolerance = request.tolerance
         X = turn
@@ -482,7 +482,7 @@ class EndEffectorSpecification:
         Raises
         ------
         NotFoundError
-            There are none.
+            No possible end was found.
         """
         given = turn if self.attitude else None
         rng = np.random.default_rng(0)
@@ -580,7 +580,7 @@ def _require_within_radius(
     Raises
     ------
     UnreachableError
-        It is such a goal.
+        The goal is too far from the centre of mass.
     """
     R_WB = matrix_from_quaternion(state.quaternion)
     r_WC = state.position + R_WB @ robot.center_of_mass(state.q)

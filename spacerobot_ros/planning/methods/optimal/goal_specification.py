@@ -163,7 +163,7 @@ class GoalSpecification:
         UnreachableError
             A part of the goal is out of the robot's reach.
         NotFoundError
-            No shape that puts the base there was found.
+            No shape with the base at its goal was found.
         PlanningError
             No such goal is planned.
         """

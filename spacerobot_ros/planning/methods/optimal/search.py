@@ -427,7 +427,7 @@ class ManoeuvreSearch:
         Raises
         ------
         CandidateError
-            There is none.
+            No such solution was found.
         """
         kept = progress.kept
         assert kept is not None
