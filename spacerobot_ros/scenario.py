@@ -20,6 +20,7 @@ from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.parameters import Value, configured, declared, reconfigured, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
@@ -60,6 +61,7 @@ _SCENARIO_KEYS = (
     "published_method",
     "kills",
     "goal_joint_positions",
+    "end_effector_goals",
     *(f"{goal}_{part}" for goal in _GOAL_KEYS for part in ("position", "orientation", "rotvec")),
 )
 
@@ -215,6 +217,8 @@ class Scenario:
         """
         scenario = {"name": self.name, "description": self.description}
         scenario |= {key: " ".join(map(repr, pose)) for key, pose in self._goal_poses().items()}
+        if self.goal.end_effectors:
+            scenario["end_effector_goals"] = json.dumps(_end_effector_values(self.goal))
         scenario["published"] = json.dumps([asdict(row) for row in self.comparable])
         parameters = {
             f"parameters/{node}": {
@@ -224,10 +228,21 @@ class Scenario:
         }
         return {"scenario": scenario, **parameters}
 
+    @property
+    def end_effectors(self) -> tuple[str, ...]:
+        """Links that have goals; an empty name is the default end-effector."""
+        default = () if self.end_effector_goal is None else ("",)
+        return (*default, *(each.link for each in self.goal.end_effectors))
+
+    @property
+    def goal_links(self) -> tuple[str, ...]:
+        """Names of the links of :attr:`end_effectors`, as their topics have them."""
+        return tuple(link or DEFAULT_END_EFFECTOR for link in self.end_effectors)
+
     def _goal_poses(self) -> dict[str, list[float]]:
         """Return positions (3,) and quaternions (4,) of the goals by their keys in a file."""
         goals = zip(_GOAL_KEYS, (self.goal, self.end_effector_goal), strict=True)
-        poses = {name: goal for name, goal in goals if goal is not None}
+        poses = {name: goal for name, goal in goals if goal is not None and goal.base}
         return {
             f"{name}_{part}": values.tolist()
             for name, goal in poses.items()
@@ -383,7 +398,18 @@ class Scenario:
         made = Goal.of_end_effectors(goals)
         goal = replace(self.goal, joint_positions=None, base=base)
         aimed = replace(goal, end_effectors=made.end_effectors)
-        return replace(self, goal=aimed, published=(), has_goal=True)
+        return replace(self, goal=aimed, published=(), has_goal=True)._with_goal_topics()
+
+    def _with_goal_topics(self) -> Scenario:
+        """Return the scenario with a planner that takes goals of all its end-effectors."""
+        links = [each.link for each in self.goal.end_effectors if each.link]
+        if not links or "planner" not in self.commanders:
+            return self
+        listed = self.planner.end_effectors
+        missing = [link for link in links if link not in (*listed, DEFAULT_END_EFFECTOR)]
+        if not missing:
+            return self
+        return self.with_overrides("planner", {"end_effectors": [*listed, *missing]})
 
     def require_goal(self) -> None:
         """Raise an error if the scenario has no goal, such as one made from a robot file.
@@ -406,6 +432,8 @@ def scenario_text(scenario: Scenario) -> str:
     Published figures and kills of nodes are not in it.
     """
     about: dict[str, Any] = {"description": scenario.description, **scenario._goal_poses()}
+    if scenario.goal.end_effectors:
+        about["end_effector_goals"] = _end_effector_values(scenario.goal)
     if scenario.goal.joint_positions is not None:
         about["goal_joint_positions"] = scenario.goal.joint_positions.tolist()
     content = {"scenario": {"ros__parameters": about}}
@@ -417,6 +445,11 @@ def scenario_text(scenario: Scenario) -> str:
         if values or node != "recorder":
             content[f"/**/{node}"] = {"ros__parameters": values}
     return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+
+
+def _end_effector_values(goal: Goal) -> dict[str, list[float]]:
+    """Return the numbers of the goals of end-effectors by link."""
+    return {each.link: list(each.values) for each in goal.end_effectors}
 
 
 def load_scenario(name: str) -> Scenario:
@@ -457,7 +490,7 @@ def load_scenario(name: str) -> Scenario:
         goal=_parse_goal("goal", values, path),
         end_effector_goal=(
             _parse_goal("end_effector_goal", values, path)
-            if any(key.startswith("end_effector_goal") for key in values)
+            if any(key.startswith("end_effector_goal_") for key in values)
             else None
         ),
         commanders=tuple(name for name in COMMANDERS if name in in_file) or ("planner",),
@@ -465,7 +498,7 @@ def load_scenario(name: str) -> Scenario:
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file={node: _with_robot_beside(path, values) for node, values in in_file.items()},
-    )
+    )._with_goal_topics()
 
 
 def _with_robot_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
@@ -579,8 +612,16 @@ def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
         orientation = values.get(f"{name}_orientation", [0.0, 0.0, 0.0, 1.0])
         if f"{name}_rotvec" in values:
             orientation = Goal.from_rotvec(position, values[f"{name}_rotvec"]).quaternion
-        return Goal.checked(position, orientation, values.get(f"{name}_joint_positions"))
-    except (GoalError, ValueError, TypeError) as error:
+        shape = values.get(f"{name}_joint_positions")
+        goal = Goal.checked(position, orientation, shape)
+        links = values.get("end_effector_goals", {}) if name == "goal" else {}
+        if not links:
+            return goal
+        of_base = any(f"{name}_{part}" in values for part in ("position", "orientation", "rotvec"))
+        goals = [EndEffectorGoal.checked(str(link), pose) for link, pose in links.items()]
+        hands = Goal.of_end_effectors(goals).end_effectors
+        return replace(goal, end_effectors=hands, base=POSE if of_base else frozenset())
+    except (GoalError, ValueError, TypeError, AttributeError) as error:
         raise ParameterError(f"The goal of the scenario file {path} is refused: {error}") from error
 
 

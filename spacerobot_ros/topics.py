@@ -7,8 +7,9 @@ quantity in :mod:`spacerobot_ros.simulation.sensors`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 _POSE_MEMBERS = (*(f"position.{x}" for x in "xyz"), *(f"orientation.{x}" for x in "xyzw"))
 _TWIST_MEMBERS = (*(f"linear.{x}" for x in "xyz"), *(f"angular.{x}" for x in "xyz"))
@@ -290,7 +291,9 @@ _TOPIC_TABLE = (
         "end_effector/goal_pose",
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_USER,
-        "where the end-effector is to be, in the world",
+        "where the end-effector is to be, in the world; likewise `NAME/goal_pose` of links in the "
+        "planner's `end_effectors`. To the planner an orientation of zeros means any "
+        "attitude, and goals with one stamp, of the base too, are one goal",
     ),
     Topic(
         "joint_reference",
@@ -381,6 +384,24 @@ GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
 
 TOPICS_NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/heartbeat")
 """Endings of topics that are recorded only on request."""
+
+
+def goal_topic(end_effector: str) -> str:
+    """Return the topic of the goals of an end-effector: its name, in letters that topics have."""
+    return re.sub(r"\W", "_", end_effector, flags=re.ASCII) + "/goal_pose"
+
+
+def topic_named(name: str) -> Topic:
+    """Return the entry of a topic; goals of any end-effector have that of ``end_effector``.
+
+    Raises
+    ------
+    KeyError
+        There is no such topic.
+    """
+    if name not in TOPICS and name.endswith("/goal_pose"):
+        return replace(TOPICS[goal_topic("end_effector")], name=name)
+    return TOPICS[name]
 
 
 def state_topics() -> list[Topic]:

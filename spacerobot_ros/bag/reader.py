@@ -32,7 +32,7 @@ from spacerobot_ros.errors import RecordingError, RobotDescriptionError, printab
 from spacerobot_ros.messages.definitions import MessageTypes
 from spacerobot_ros.resources import suggestion
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import TOPICS
+from spacerobot_ros.topics import TOPICS, topic_named
 
 if TYPE_CHECKING:
     import pandas
@@ -437,7 +437,9 @@ class RecordedRobot:
     def get(self, name: str) -> TopicSeries | None:
         """Return a topic of the stack; None if it has no message or another type."""
         topic = f"{self.namespace}/{name}"
-        if self.bag.topics.get(topic) != TOPICS[name].type or not self.bag.message_count(topic):
+        if self.bag.topics.get(topic) != topic_named(name).type or not self.bag.message_count(
+            topic
+        ):
             return None
         # The summary of a damaged bag may count messages that are missing.
         return self.bag[topic] if len(self.bag[topic]) else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +14,12 @@ from spacerobot_ros.cli.errors import end_if_requested, fail
 from spacerobot_ros.cli.options import (
     LAWS,
     METHODS,
+    EndEffectorOptions,
     GoalOptions,
     Registered,
     attitude_options,
     bag_option,
+    end_effector_options,
     goal_options,
     json_option,
     note_large_angles,
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
 
 @click.command("run")
 @click.argument("scenario", metavar="SCENARIO|ROBOT")
+@end_effector_options
 @goal_options
 @click.option(
     "--method", type=Registered(METHODS, LAWS), help="Gait method or control law [the scenario's]."
@@ -130,13 +134,15 @@ def _changed_scenario(
 
 def _summary_lines(summary: dict[str, Any]) -> list[str]:
     """Return the result as lines for the user."""
-    degrees = math.degrees(summary["attitude_error_rad"])
+    position, attitude = summary["position_error_m"], summary["attitude_error_rad"]
+    beside = turned = ""
+    if position is not None and attitude is not None:
+        beside = f", {position:.3g} m from the goal"
+        turned = f", {attitude:.3g} rad = {math.degrees(attitude):.3g} deg from the goal"
     return [
         f"{summary['scenario']}, {summary['method']}: {summary['message']}",
-        f"position    ({numbers(summary['final_position_m'])}) m, "
-        f"{summary['position_error_m']:.3g} m from the goal",
-        f"attitude    ({numbers(summary['final_attitude_rotvec_rad'])}) rad, "
-        f"{summary['attitude_error_rad']:.3g} rad = {degrees:.3g} deg from the goal",
+        f"position    ({numbers(summary['final_position_m'])}) m{beside}",
+        f"attitude    ({numbers(summary['final_attitude_rotvec_rad'])}) rad{turned}",
         *_end_effector_line(summary),
         f"shape       ({numbers(summary['final_joint_positions'])})",
         f"manoeuvre   {summary['manoeuvre_time_s']:.6g} s, "
@@ -151,6 +157,12 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
 
 
 def _end_effector_line(summary: dict[str, Any]) -> list[str]:
+    if "end_effectors" in summary:
+        return [
+            f"{link}: {each['position_error_m']:.3g} m and {each['attitude_error_rad']:.3g} rad "
+            "from its goal"
+            for link, each in summary["end_effectors"].items()
+        ]
     if "end_effector_position_error_m" not in summary:
         return []
     position = numbers(summary["end_effector_final_position_m"])
@@ -222,6 +234,7 @@ def up_command(
 @click.command("goal", context_settings={"ignore_unknown_options": True})
 @click.argument("pose", nargs=-1, type=float, metavar="X Y Z [QX QY QZ QW]")
 @attitude_options
+@end_effector_options
 @click.option("--namespace", default="", help="Namespace of the stack.")
 @click.option(
     "--timeout", default=0.0, help="Longest wait for the result, s of wall time; 0: no limit."
@@ -230,26 +243,37 @@ def goal_command(
     pose: tuple[float, ...],
     rotvec: tuple[float, float, float] | None,
     rpy_deg: tuple[float, float, float] | None,
+    links: tuple[str, ...],
+    positions: tuple[tuple[float, ...], ...],
+    poses: tuple[tuple[float, ...], ...],
     namespace: str,
     timeout: float,
 ) -> None:
     """Send a goal pose to a running stack, and wait for the result.
 
-    Exit code 0: the goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C has ended the
-    command, and the stack still pursues the goal.
+    With a goal of an end-effector the base is free, unless its pose is given too. Exit code 0: the
+    goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C has ended the command, and the stack
+    still pursues the goal.
     """
-    if len(pose) not in (3, 7):
+    hands = EndEffectorOptions(poses, positions, links).goals()
+    if len(pose) not in ((0, 3, 7) if hands else (3, 7)):
         raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")
     if rotvec and rpy_deg:
         raise click.UsageError("The attitude is given twice, in radians and in degrees.")
+    if (rotvec or rpy_deg) and not pose:
+        raise click.UsageError("An attitude of the base is sent with its position X Y Z.")
     from spacerobot_ros.planning import Goal
 
-    goal = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
-    if rotvec:
-        note_large_angles(rotvec, "--goal-rpy-deg")
-        goal = Goal.from_rotvec(pose[:3], rotvec)
-    if rpy_deg:
-        goal = Goal.from_rpy(pose[:3], rpy_deg)
+    if not pose:
+        goal = Goal.of_end_effectors(hands)
+    else:
+        goal = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
+        if rotvec:
+            note_large_angles(rotvec, "--goal-rpy-deg")
+            goal = Goal.from_rotvec(pose[:3], rotvec)
+        if rpy_deg:
+            goal = Goal.from_rpy(pose[:3], rpy_deg)
+        goal = replace(goal, end_effectors=tuple(hands))
     from spacerobot_ros.measures import Outcome
     from spacerobot_ros.session.run import send_goal
 

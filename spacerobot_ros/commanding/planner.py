@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import Any
 
 from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
 from spacerobot_ros.commanding.plant_state import Pairing, PlantChange
-from spacerobot_ros.errors import CommandError
+from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -24,6 +25,7 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatistics,
     PlannerStatus,
     ScheduleStart,
+    end_effector_values,
     goal_values,
 )
 from spacerobot_ros.planning.execution.tracker import Setpoint
@@ -85,6 +87,8 @@ class PlannerCommander(Commander):
     ) -> None:
         super().__init__(config, host, (BASE_GOAL_KEY,), pose_required=False, clock=clock)
         self._method, self._long_work = method, long_work
+        self._last_goal: IdentifiedGoal | None = None
+        """The goal that was accepted last."""
 
     def _make_status(self, state: str, message: str, goal_id: str) -> PlannerStatus:
         return PlannerStatus(PlannerState(state), message, goal_id)
@@ -131,13 +135,28 @@ class PlannerCommander(Commander):
         self._accept_goal(BASE_GOAL_KEY, goal)
         self._report_waiting_goal(goal, "Resuming an earlier goal.")
 
+    def _accept_goal(self, key: str, goal: IdentifiedGoal) -> None:
+        """Accept a goal; goals of one stamp, of end-effectors and of the base, are one goal."""
+        last = self._last_goal
+        if last is not None and last.goal_id == goal.goal_id and goal.goal_id:
+            goal = replace(goal, goal=last.goal.joined_with(goal.goal))
+        self._last_goal = goal
+        super()._accept_goal(BASE_GOAL_KEY, goal)
+
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None
-        self.executive.propose_goal(goal)
+        assert self.robot is not None
+        try:
+            named = replace(goal, goal=goal.goal.for_robot(self.robot.description))
+        except PlanningError as refusal:
+            self._refuse_goal(str(refusal), goal.goal_id)
+            return
+        self.executive.propose_goal(named)
 
     def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:
-        values = goal_values(goal.goal)
-        self._publish_status(PlannerStatus(PlannerState.PLANNING, message, goal.goal_id, values))
+        status = PlannerStatus(PlannerState.PLANNING, message, goal.goal_id, goal_values(goal.goal))
+        status = replace(status, end_effector_goals=end_effector_values(goal.goal))
+        self._publish_status(status)
 
     def _abort_goal(self) -> str | None:
         if self.executive is None:

@@ -29,7 +29,12 @@ from spacerobot_ros.measures import (
     peak_wrench,
 )
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.rotations import rotvec_from_quaternion
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotvec_from_quaternion,
+)
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
@@ -286,13 +291,39 @@ class Flight:
 
     @property
     def error(self) -> PoseError | None:
-        """Error of the last true pose to the goal; None without a pose or a goal."""
-        return pose_error(self.signal("pose"), self.goal)
+        """Error of the last true pose to the goal; None without a pose or a goal of the base."""
+        goal = self.goal
+        return None if goal is None or not goal.base else pose_error(self.signal("pose"), goal)
 
     @property
     def end_effector_error(self) -> PoseError | None:
-        """Error of the end-effector's last pose to its goal; None without a pose or a goal."""
+        """Error of the end-effector's last pose to its goal; None without a pose or a goal.
+
+        Of several it is that of the farthest.
+        """
+        if errors := self.end_effector_errors:
+            return max(errors.values(), key=lambda error: error.distance)
         return pose_error(self.signal("end_effector_pose"), self.end_effector_goal)
+
+    @property
+    def end_effector_errors(self) -> dict[str, PoseError]:
+        """Errors of the last true poses of the end-effectors that the planner's goal names."""
+        goal = None if self.goal is None or self.robot is None else self.goal
+        if goal is None or not goal.end_effectors or not len(self.q) or not len(self.pose):
+            return {}
+        assert self.robot is not None
+        shape = dict(zip(self.joint_names, self.q[-1].tolist(), strict=True))
+        frames = self.robot.with_locked(shape).frames
+        R_WB = matrix_from_quaternion(self.pose[-1, 3:])
+        errors = {}
+        for each in goal.for_robot(self.robot).end_effectors:
+            _, pose = frames[each.link]
+            r_WE = self.pose[-1, :3] + R_WB @ pose.r
+            turn = np.zeros(3)
+            if each.quaternion is not None:
+                turn = attitude_error(quaternion_from_matrix(R_WB @ pose.R), each.quaternion)
+            errors[each.link] = PoseError(each.position - r_WE, turn)
+        return errors
 
     @property
     def propellant(self) -> float | None:
@@ -345,19 +376,20 @@ class Flight:
         """
         goal, measures = self.goal, self.measures
         assert goal is not None
-        assert measures.error is not None
+        assert measures.error is not None or not goal.base
+        error = measures.error
         linear, angular = measures.momentum_drift.tolist()
         ticks, wall_time = len(self.time) - 1, self.wall_time
         summary: dict[str, Any] = {
             "scenario": self.scenario.name,
             "method": self.method,
-            "goal": [*goal.position.tolist(), *goal.quaternion.tolist()],
+            "goal": [*goal.position.tolist(), *goal.quaternion.tolist()] if goal.base else None,
             "final_position_m": self.pose[-1, :3].tolist(),
             "final_attitude_rotvec_rad": rotvec_from_quaternion(self.pose[-1, 3:]).tolist(),
             "final_joint_positions": self.q[-1].tolist(),
             "joint_names": list(self.joint_names),
-            "position_error_m": measures.error.distance,
-            "attitude_error_rad": measures.error.angle,
+            "position_error_m": None if error is None else error.distance,
+            "attitude_error_rad": None if error is None else error.angle,
             "sim_time_s": measures.duration,
             "manoeuvre_time_s": measures.manoeuvre_time,
             "plan_time_s": measures.plan_time,
@@ -377,7 +409,12 @@ class Flight:
             "message": self.message,
             "succeeded": self.succeeded,
         }
-        if measures.end_effector_error is not None:
+        if errors := self.end_effector_errors:
+            summary["end_effectors"] = {
+                link: {"position_error_m": each.distance, "attitude_error_rad": each.angle}
+                for link, each in errors.items()
+            }
+        elif measures.end_effector_error is not None:
             end = self.signal("end_effector_pose").values[-1, :3]
             summary["end_effector_final_position_m"] = end.tolist()
             summary["end_effector_position_error_m"] = measures.end_effector_error.distance

@@ -39,6 +39,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text, robot_of
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus, ScheduleStart
@@ -384,10 +385,11 @@ class _LockstepFlight:
         scenario, goal = self._scenario, self._scenario.goal
         # A pose is checked, and its quaternion scaled, where it is received.
         given = Goal.checked(goal.position, goal.quaternion, goal.joint_positions)
+        given = replace(given, end_effectors=goal.end_effectors, base=goal.base)
         if self._planner is not None:
             self._planner.receive_goal(BASE_GOAL_KEY, *_GOAL_STAMP, lambda: given)
         if self._controller is not None:
-            unshaped = replace(given, joint_positions=None)
+            unshaped = replace(given, joint_positions=None, end_effectors=(), base=POSE)
             self._controller.receive_goal(BASE_GOAL_KEY, *_GOAL_STAMP, lambda: unshaped)
             tool = scenario.end_effector_goal
             if tool is not None:

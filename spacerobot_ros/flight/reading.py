@@ -21,6 +21,7 @@ from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
 from spacerobot_ros.control.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.errors import (
+    GoalError,
     PlanningError,
     RecordingError,
     RobotDescriptionError,
@@ -33,10 +34,11 @@ from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.scenario import COMMANDERS, CONFIGS, Published, Scenario
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import TOPICS, StateField
+from spacerobot_ros.topics import TOPICS, StateField, goal_topic
 
 _SAME_CLOCK_TOLERANCE = 1.0
 """Stamps this near to the log times, in s, come from the same clock."""
@@ -242,7 +244,11 @@ class FlightBag:
             goal_id = ids.of(stamp.sec, stamp.nanosec)
             p, o = message.pose.position, message.pose.orientation
             try:
-                goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w])
+                # Zeros ask for the position of an end-effector alone.
+                attitude = [o.x, o.y, o.z, o.w] if any((o.x, o.y, o.z, o.w)) else [0, 0, 0, 1]
+                if topic == "goal_pose":
+                    attitude = [o.x, o.y, o.z, o.w]
+                goal = Goal.checked([p.x, p.y, p.z], attitude)
             except PlanningError:
                 continue
             if not world or message.header.frame_id in ("", world):
@@ -351,7 +357,8 @@ def read_flight(bag: FlightBag) -> Flight:
     goals, tool_goals = bag.goals("goal_pose"), bag.goals("end_effector/goal_pose")
     reports = [status for _, status in statuses[decider]]
     # Bags of version 0.1 have no ids.
-    follower, status = GoalFollower(goals[-1].goal_id if goals else "", unnamed=True), None
+    sent = goals or next((bag.goals(goal_topic(link)) for link in scenario.goal_links), ())
+    follower, status = GoalFollower(sent[-1].goal_id if sent else "", unnamed=True), None
     for status in reports:
         if follower.take(status):
             break
@@ -457,6 +464,13 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
     # Without any joint positions the shape was free.
     if goal is not None and shape is not None and len(shape[1].position):
         goal = replace(goal, joint_positions=np.array(shape[1].position))
+    links = _parse_json(about.get("end_effector_goals", "{}"))
+    with suppress(GoalError, AttributeError):
+        if links:
+            free = goal is None
+            goal = goal or Goal.checked([0, 0, 0], [0, 0, 0, 1])
+            aims = tuple(EndEffectorGoal.checked(str(link), pose) for link, pose in links.items())
+            goal = replace(goal, end_effectors=aims, base=frozenset() if free else POSE)
     return Scenario(
         name=about.get("name", "") or bag.path.stem,
         path=bag.path,
@@ -541,6 +555,6 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
             f"The bag {bag.path} has {len(flight.pose)} poses of the base and {len(flight.q)} "
             "states of the joints: its flight is not whole."
         )
-    if not flight.goals:
+    if not flight.goals and not scenario.goal.end_effectors:
         raise RecordingError(f"The bag {bag.path} holds no goal pose.")
     return with_propellant(flight, scenario.plant.thrusters, bag.names("thrusters"))

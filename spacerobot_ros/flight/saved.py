@@ -21,11 +21,11 @@ from spacerobot_ros.messages.builders import (
 )
 from spacerobot_ros.messages.layout import encode, stamped_copies
 from spacerobot_ros.messages.statuses import StatusRecord
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.model.visuals import meshes_for_bag
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import TOPICS, Topic, state_topics
+from spacerobot_ros.topics import TOPICS, Topic, goal_topic, state_topics, topic_named
 from spacerobot_ros.version import __version__
 
 if TYPE_CHECKING:
@@ -134,9 +134,11 @@ def _other_streams(flight: Flight) -> Iterator[_Stream]:
         message = encode(topic.type, {"name": flight.joint_names, "position": shape})
         yield _Stream(topic, zero, [message])
     goals = {"goal_pose": scenario.goal, "end_effector/goal_pose": scenario.end_effector_goal}
+    for each in scenario.goal.end_effectors:
+        goals[goal_topic(each.link or DEFAULT_END_EFFECTOR)] = each.as_goal()
     for name, goal in goals.items():
-        if goal is not None:
-            yield _Stream(TOPICS[name], zero, [goal_message(goal, world, stamp_ns=1)])
+        if goal is not None and goal.base:
+            yield _Stream(topic_named(name), zero, [goal_message(goal, world, stamp_ns=1)])
     yield from _command_streams(flight)
     yield from _plan_streams(flight, world)
     named = {"planner/status": PlannerStatus, "controller/status": ControllerStatus}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+from copy import deepcopy
 from threading import Thread
 from typing import Any, ClassVar
 
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -18,12 +20,14 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.messages.builders import path_message, trajectory_message
 from spacerobot_ros.messages.readers import MessageDecoder, joint_template
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.nodes.common.commander import CommanderNode
-from spacerobot_ros.nodes.common.messages import goal_markers, shape_of
+from spacerobot_ros.nodes.common.messages import goal_markers, goal_of, shape_of
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatistics,
@@ -32,6 +36,7 @@ from spacerobot_ros.planning.execution.status import (
 )
 from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
 from spacerobot_ros.times import stamp_bytes
+from spacerobot_ros.topics import goal_topic
 
 
 class PlannerNode(CommanderNode):
@@ -76,6 +81,8 @@ class PlannerNode(CommanderNode):
         self._markers_topic = self.create_publisher(MarkerArray, "markers", STREAM)
         self.listen("planner/status")
         self.take_goals("goal_pose")
+        for name in self._end_effectors():
+            self.take_goals(goal_topic(name), name)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.create_service(Trigger, "~/statistics", self._on_statistics)
 
@@ -112,6 +119,35 @@ class PlannerNode(CommanderNode):
             self._message.feed("velocity", setpoint.velocity)
 
     # -- inputs -------------------------------------------------------------------------------
+
+    def _end_effectors(self) -> list[str]:
+        """Return the names of end-effectors that take goals.
+
+        Where a controller moves the robot, goals of its end-effector are for the controller.
+        """
+        default = [DEFAULT_END_EFFECTOR] if self.config.output == "commands" else []
+        return list(dict.fromkeys((*default, *self.config.end_effectors)))
+
+    def read_goal(self, key: str, message: PoseStamped) -> Goal:
+        """Return the goal of a message for the base or an end-effector.
+
+        An orientation of zeros asks for the position of an end-effector alone.
+        """
+        if key == BASE_GOAL_KEY:
+            return super().read_goal(key, message)
+        orientation = message.pose.orientation
+        any_attitude = not any((orientation.x, orientation.y, orientation.z, orientation.w))
+        if any_attitude:
+            message = deepcopy(message)
+            message.pose.orientation.w = 1.0
+        what, frame = f"The goal of the end-effector '{key}'", self.config.world_frame
+        pose = goal_of(message, frame, what, self._goal_shape(), self._pose_of)
+        aim = EndEffectorGoal(
+            "" if key == DEFAULT_END_EFFECTOR else key,
+            pose.position,
+            None if any_attitude else pose.quaternion,
+        )
+        return Goal.of_end_effectors([aim], joint_positions=pose.joint_positions)
 
     def _goal_shape(self) -> Array | None:
         return self._shape

@@ -20,12 +20,14 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.nodes.common.messages import goal_message, shape_message
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.topics import goal_topic
 
 _STATUS_CHECK_PERIOD = 0.2
 """Wall time between two calls of a ``look`` function, s."""
@@ -48,8 +50,8 @@ class MissionClient:
     joint_names
         Returns the robot's joints, where goals may end in joint positions of their own, or where
         those of an earlier goal may be in force; None: no goal of this stack has any.
-    end_effector
-        Whether there will be goals for the end-effector.
+    end_effectors
+        Links that there will be goals for; empty name: the default end-effector.
     on_end
         Called, within the callback, when the goal is decided or no longer followed.
     name, namespace, context
@@ -63,7 +65,7 @@ class MissionClient:
         now: Callable[[], int],
         *,
         joint_names: Callable[[], Sequence[str]] | None = None,
-        end_effector: bool = False,
+        end_effectors: Sequence[str] = (),
         on_end: Callable[[], None] = lambda: None,
         name: str = "mission_client",
         namespace: str = "",
@@ -83,11 +85,13 @@ class MissionClient:
         if joint_names is not None:
             self._shape_topic = self.node.create_publisher(JointState, "goal_joint_states", STREAM)
             self._sends.append(self._shape_topic)
-        if end_effector:
-            self._end_effector_topic = self.node.create_publisher(
-                PoseStamped, "end_effector/goal_pose", STREAM
+        self._end_effector_topics = {
+            link: self.node.create_publisher(
+                PoseStamped, goal_topic(link or DEFAULT_END_EFFECTOR), STREAM
             )
-            self._sends.append(self._end_effector_topic)
+            for link in end_effectors
+        }
+        self._sends += self._end_effector_topics.values()
         self.failures: dict[str, str] = {}
         """Messages of the nodes that have failed, by the last part of their names."""
         self.node.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
@@ -153,9 +157,9 @@ class MissionClient:
         return bool(deciders & readers)
 
     def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
-        """Publish goal poses of the base and, where there is one, of the end-effector.
+        """Publish goal poses of the base and of end-effectors, where there are any.
 
-        Both have the same stamp, which is no other goal's: the status names them by it. A planner
+        All have the same stamp, which is no other goal's: the status names them by it. A planner
         keeps the joint positions that a goal is to end in for the goals after it: so each goal is
         sent with its own, and one without any is sent with none.
         """
@@ -166,9 +170,14 @@ class MissionClient:
         self._follower = GoalFollower(GoalIds().of(stamp.sec, stamp.nanosec))
         if self._shape_topic is not None and self._joint_names is not None:
             self._shape_topic.publish(shape_message(goal, self._joint_names()))
-        self._goal_topic.publish(message)
+        if goal.base:
+            self._goal_topic.publish(message)
+        of_links = {each.link: each.as_goal() for each in goal.end_effectors}
         if end_effector is not None:
-            self._end_effector_topic.publish(goal_message(end_effector, self._frame, time_ns))
+            of_links[""] = end_effector
+        for link, aim in of_links.items():
+            topic = self._end_effector_topics[link]
+            topic.publish(goal_message(aim, self._frame, time_ns))
 
     def await_delivery(self) -> None:
         """Wait until all readers of goals have received the goal that was sent."""

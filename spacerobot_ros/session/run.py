@@ -23,6 +23,7 @@ from spacerobot_ros.flight.reading import (
     with_propellant,
 )
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.nodes.common.process import (
     start_ros,
     use_loopback_discovery,
@@ -35,6 +36,7 @@ from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.stack import InProcessStack, Stack
 from spacerobot_ros.termination import ended_on_request
 from spacerobot_ros.times import SECOND, stamp_to_ns
+from spacerobot_ros.topics import goal_topic
 
 Progress = Callable[[float, float], None]
 """Function called with simulated time and the end time of the present schedule, s."""
@@ -258,6 +260,7 @@ def send_goal(
                 lambda: clocks["own"] or clocks["global"] or time.time_ns(),
                 namespace=namespace,
                 name=f"goal_{decider}",
+                end_effectors=[each.link for each in goal.end_effectors],
                 # An empty message resets the joint positions that an earlier goal required.
                 joint_names=tuple if decider == "planner" else None,
             )
@@ -271,7 +274,7 @@ def send_goal(
             for each in clients:
                 executor.add_node(each.node)
             client = _find_decider(
-                clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY)
+                clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY), goal
             )
             with ended_on_request() as stopped:
                 client.send(goal)
@@ -292,7 +295,7 @@ def send_goal(
 
 
 def _find_decider(
-    clients: list[MissionClient], executor: EventsExecutor, patience: float
+    clients: list[MissionClient], executor: EventsExecutor, patience: float, goal: Goal
 ) -> MissionClient:
     """Return the client that listens to the planner, or to the controller if there is none."""
     deadline = time.monotonic() + patience
@@ -307,7 +310,10 @@ def _find_decider(
                 while not client.is_connected() and time.monotonic() < deadline:
                     executor.spin_once(timeout_sec=0.05)
                 return client
+    links = [goal_topic(each.link or DEFAULT_END_EFFECTOR) for each in goal.end_effectors]
+    topics = " and ".join(f"'{topic}'" for topic in ("goal_pose", *links))
+    listed = "; the planner's parameter end_effectors lists other links" if links else ""
     raise SpaceRobotError(
-        f"No commander takes goals on 'goal_pose' after {patience:g} s: start a planner or a "
-        "controller, `spacerobot up SCENARIO`, in the same ROS domain and namespace."
+        f"No commander takes goals on {topics} after {patience:g} s: start a planner or a "
+        f"controller, `spacerobot up SCENARIO`, in the same ROS domain and namespace{listed}."
     )

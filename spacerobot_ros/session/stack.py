@@ -30,6 +30,7 @@ from spacerobot_ros.nodes import (
 )
 from spacerobot_ros.nodes.common.streams import Connections, unconnected_topics
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.session.mission_client import MissionClient
@@ -93,6 +94,12 @@ class Stack(ABC):
                 f"The scenario '{scenario.name}' kills nodes on the way: fly it with --processes "
                 "and --realtime."
             )
+        goal = scenario.goal
+        if goal.end_effectors and goal.base not in (frozenset(), POSE):
+            raise ParameterError(
+                "Goals of end-effectors are sent with the whole pose of the base or with none: "
+                "give --goal, or leave the attitude of the base out."
+            )
         self.scenario = scenario
         self.when_exists = scenario.parameters("recorder").get("when_exists", "refuse")
         """Reaction to an existing bag of this name; by default it is refused."""
@@ -112,7 +119,7 @@ class Stack(ABC):
             self.scenario.config(decider).world_frame,
             lambda: self.time_ns,
             joint_names=joint_names,
-            end_effector=self.scenario.end_effector_goal is not None,
+            end_effectors=self.scenario.end_effectors,
             namespace=self.namespace,
             **options,
         )

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.planning import Goal, PoseError
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
     GoalFile,
@@ -255,3 +256,47 @@ def test_numbers_and_texts_of_notes_are_read_as_what_they_were() -> None:
     values = status.to_values()
     assert [values[key] for key in notes] == ["0.123456789", "1 -2.5", "clockwise"]
     assert PlannerStatus.from_values(values).notes == {**notes, "one": 0.123456789}
+
+
+def test_goals_and_errors_of_end_effectors_are_read_as_they_were_written() -> None:
+    status = PlannerStatus(
+        PlannerState.REACHED,
+        "There.",
+        "1.5",
+        end_effector_goals={"left": (0.1, -0.2, 0.3), "right": (1.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8)},
+        end_effector_position_error_m=1.25e-7,
+        end_effector_attitude_error_rad=0.0,
+    )
+    values = status.to_values()
+    assert "goal" not in values
+    assert "position_error_m" not in values
+    assert PlannerStatus.from_values(values, "There.") == status
+
+
+def test_a_file_keeps_goals_of_end_effectors(tmp_path: Path) -> None:
+    file = GoalFile(str(tmp_path / "goal.json"))
+    hands = [
+        EndEffectorGoal.checked("left", [0.1, -0.2, 0.3]),
+        EndEffectorGoal.checked("right", [1.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8]),
+    ]
+    for goal in (
+        Goal.of_end_effectors(hands),
+        Goal.of_end_effectors(hands[:1], quaternion=[0.0, 0.0, 0.6, 0.8]),
+        Goal.of_end_effectors(hands[1:], joint_positions=[0.5, -0.75]),
+    ):
+        file.save({BASE_GOAL_KEY: IdentifiedGoal(goal, "1.0")})
+        kept = file.load()[BASE_GOAL_KEY].goal
+        assert kept.equals(goal)
+        assert not kept.equals(GOAL)
+
+
+def test_goals_are_joined_part_by_part() -> None:
+    left, other = (EndEffectorGoal.checked("left", [x, 0.0, 0.0]) for x in (1.0, 2.0))
+    right = EndEffectorGoal.checked("right", [3.0, 0.0, 0.0])
+    first = Goal.of_end_effectors([left])
+    assert first.joined_with(Goal.of_end_effectors([right])).end_effectors == (left, right)
+    assert first.joined_with(Goal.of_end_effectors([other])).end_effectors == (other,)
+    both = first.joined_with(GOAL)
+    assert both.equals(GOAL.joined_with(first))
+    assert both.base == {"position", "attitude"}
+    assert GOAL.joined_with(GOAL) is GOAL

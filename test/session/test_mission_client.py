@@ -43,7 +43,7 @@ class Mission:
             "world",
             lambda: NOW,
             joint_names=lambda: ("a", "b"),
-            end_effector=True,
+            end_effectors=("",),
             on_end=self.on_end,
             context=harness.context,
         )

@@ -200,17 +200,26 @@ class CommanderNode(FlightNode):
         self.commander.answer()
 
     def _on_goal(self, key: str, message: PoseStamped) -> None:
-        commander, part, frame = self.commander, key.replace("_", "-"), self.config.world_frame
-
-        def read() -> Goal:
-            return goal_of(
-                message, frame, f"The goal of the {part}", self._goal_shape(), self._pose_of
-            )
+        commander, part = self.commander, key.replace("_", "-")
 
         stamp = message.header.stamp
-        accepted = commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
+        accepted = commander.receive_goal(
+            key, stamp.sec, stamp.nanosec, lambda: self.read_goal(key, message)
+        )
         if accepted is not None:
             self.log("info", goal_description(part, accepted.goal_id, message, accepted.goal))
+
+    def read_goal(self, key: str, message: PoseStamped) -> Goal:
+        """Return the goal of a message for the base or another part of the robot.
+
+        Raises
+        ------
+        PlanningError
+            It is refused.
+        """
+        what = f"The goal of the {key.replace('_', '-')}"
+        frame = self.config.world_frame
+        return goal_of(message, frame, what, self._goal_shape(), self._pose_of)
 
     def _goal_shape(self) -> Array | None:
         """Return the joint positions (n,) required at the end of goals; None: any."""

@@ -196,11 +196,14 @@ def goal_of(
 
 def goal_description(part: str, goal_id: str, message: PoseStamped, goal: Goal) -> str:
     """Return one log line about a received goal."""
-    position = ", ".join(f"{x:.4g}" for x in goal.position)
-    quaternion = ", ".join(f"{x:.4g}" for x in goal.quaternion)
     frame = printable(message.header.frame_id)
     given = f", given in '{frame}'" if frame else ""
-    return f"Goal {goal_id} of the {part}: ({position}) m, ({quaternion}){given}."
+    aim = goal.end_effectors[0] if goal.end_effectors else goal
+    position = ", ".join(f"{x:.4g}" for x in aim.position)
+    attitude = "any attitude"
+    if aim.quaternion is not None:
+        attitude = f"({', '.join(f'{x:.4g}' for x in aim.quaternion)})"
+    return f"Goal {goal_id} of the {part}: ({position}) m, {attitude}{given}."
 
 
 def compose_poses(outer: Array, inner: Array) -> Array:

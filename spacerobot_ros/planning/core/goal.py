@@ -77,6 +77,10 @@ class EndEffectorGoal:
         given = Goal.checked(values[:3], values[3:] if len(values) == 7 else [0, 0, 0, 1])
         return cls(link, given.position, given.quaternion if len(values) == 7 else None)
 
+    def as_goal(self) -> Goal:
+        """Return it as a pose for a message: the quaternion is zero where any attitude will do."""
+        return Goal(self.position, np.zeros(4) if self.quaternion is None else self.quaternion)
+
     @property
     def values(self) -> tuple[float, ...]:
         """Position (3,), or position and quaternion (7,), as :meth:`checked` takes them."""
@@ -246,7 +250,19 @@ class Goal:
                 )
             goals.append(replace(each, link=link))
         _require_one_goal_each(goals)
-        return replace(self, end_effectors=tuple(goals))
+        return replace(self, end_effectors=tuple(sorted(goals, key=lambda each: each.link)))
+
+    def joined_with(self, other: Goal) -> Goal:
+        """Return the goal with the parts of another one, which count where both have a part.
+
+        A goal of the base alone takes the place of another one.
+        """
+        if not self.end_effectors and not other.end_effectors:
+            return other
+        links = {each.link: each for each in (*self.end_effectors, *other.end_effectors)}
+        of_base = other if other.base else self
+        shape = self.joint_positions if other.joint_positions is None else other.joint_positions
+        return replace(of_base, joint_positions=shape, end_effectors=tuple(links.values()))
 
     def equals(self, other: Goal) -> bool:
         """Whether another goal has exactly the same poses and shape."""

@@ -27,6 +27,12 @@ class PlannerConfig(CommanderConfig):
     integration_step: float = parameter(
         0.01, "longest step of the prediction", unit="s", minimum=1e-06
     )
+    end_effectors: tuple[str, ...] = parameter(
+        (),
+        "links that take goals on NAME/goal_pose, beside end_effector/goal_pose for the link "
+        "end_effector",
+        texts=True,
+    )
     output: str = parameter(
         "commands",
         "joint_commands (velocities) for the plant, or joint_reference for a controller",

@@ -36,6 +36,7 @@ from spacerobot_ros.planning.execution.status import (
     ScheduleStart,
     Severity,
     describe_remaining_error,
+    end_effector_values,
     goal_values,
 )
 from spacerobot_ros.planning.execution.tracker import Setpoint, TakeOver, TrajectoryTracker
@@ -976,13 +977,20 @@ class Executive:
         if active is not None:
             values["corrections"] = active.corrections
             values |= {"manoeuvre_time_s": active.manoeuvre_time, "ends_at_s": active.ends_at}
+        aim = identified.goal
         if remaining is not None:
-            values["position_error_m"] = remaining.distance
-            values["attitude_error_rad"] = remaining.angle
+            if not aim.end_effectors or "position" in aim.base:
+                values["position_error_m"] = remaining.distance
+            if not aim.end_effectors or "attitude" in aim.base:
+                values["attitude_error_rad"] = remaining.angle
+            if aim.end_effectors:
+                values["end_effector_position_error_m"] = remaining.farthest_end_effector
+                values["end_effector_attitude_error_rad"] = remaining.most_turned_end_effector
+        values["end_effector_goals"] = end_effector_values(aim)
         if schedule is not None:
             values |= {"method": schedule.method, "duration_s": schedule.duration}
             values["notes"] = schedule.notes
-        goal = goal_values(identified.goal)
+        goal = goal_values(aim)
         self.outputs.append(PlannerStatus(state, message, identified.goal_id, goal, **values))
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.files import UntrustedFileError, read_private, write_whole
-from spacerobot_ros.planning.core.goal import Goal
+from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal, Goal
 
 BASE_GOAL_KEY = "base"
 """Key of the goal of the base in the file."""
@@ -119,7 +120,7 @@ class GoalFile:
         try:
             return {
                 key: IdentifiedGoal(
-                    Goal.checked(entry["position"], entry["quaternion"], entry["joint_positions"]),
+                    _decode_goal(entry),
                     # Files of earlier versions have no goal ids.
                     str(entry.get("id", "")),
                 )
@@ -131,12 +132,24 @@ class GoalFile:
             ) from error
 
 
-def _encode_goal(identified: IdentifiedGoal) -> dict[str, list[float] | str | None]:
+def _decode_goal(entry: Mapping[str, Any]) -> Goal:
+    goal = Goal.checked(entry["position"], entry["quaternion"], entry["joint_positions"])
+    goals = [EndEffectorGoal.checked(*each) for each in entry.get("end_effectors", {}).items()]
+    if not goals:
+        return goal
+    parts = frozenset(part for part in POSE if part in entry["base"])
+    return replace(goal, end_effectors=Goal.of_end_effectors(goals).end_effectors, base=parts)
+
+
+def _encode_goal(identified: IdentifiedGoal) -> dict[str, Any]:
     goal = identified.goal
     shape = goal.joint_positions
-    entry: dict[str, list[float] | str | None] = {
+    entry: dict[str, Any] = {
         "position": goal.position.tolist(),
         "quaternion": goal.quaternion.tolist(),
         "joint_positions": None if shape is None else shape.tolist(),
     }
+    if goal.end_effectors:
+        entry["end_effectors"] = {each.link: list(each.values) for each in goal.end_effectors}
+        entry["base"] = sorted(goal.base)
     return {**entry, "id": identified.goal_id} if identified.goal_id else entry

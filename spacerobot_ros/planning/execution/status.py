@@ -12,7 +12,13 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 
+_END_EFFECTOR_ERRORS = ("end_effector_position_error_m", "end_effector_attitude_error_rad")
+
+_GOAL_PREFIX = "goal_of_"
+"""Beginning of the keys of goals of end-effectors, before the link."""
+
 _NUMBER_KEYS = (
+    *_END_EFFECTOR_ERRORS,
     *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "ends_at_s", "duration_s"),
 )
 """Keys of status values that are single numbers."""
@@ -58,6 +64,11 @@ class PlannerStatus:
         (7,) its position in m and quaternion (x, y, z, w); empty if it is not reported.
     corrections
         New plans after the first for this goal that count as corrections.
+    end_effector_goals
+        Goals of end-effectors by link: a position (3,), m, or position and quaternion (7,).
+    end_effector_position_error_m, end_effector_attitude_error_rad
+        Largest remaining errors of end-effectors; None if they have no goals, or were not
+        evaluated.
     position_error_m, attitude_error_rad
         Remaining error of the measured base pose; None if it was not evaluated.
     manoeuvre_time_s
@@ -80,6 +91,9 @@ class PlannerStatus:
     corrections: int = 0
     position_error_m: float | None = None
     attitude_error_rad: float | None = None
+    end_effector_goals: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    end_effector_position_error_m: float | None = None
+    end_effector_attitude_error_rad: float | None = None
     manoeuvre_time_s: float = 0.0
     ends_at_s: float = 0.0
     method: str = ""
@@ -97,6 +111,12 @@ class PlannerStatus:
             values["position_error_m"] = _format_note(self.position_error_m)
         if self.attitude_error_rad is not None:
             values["attitude_error_rad"] = _format_note(self.attitude_error_rad)
+        for link, numbers in self.end_effector_goals.items():
+            values[f"{_GOAL_PREFIX}{link}"] = _format_note(list(numbers))
+        for name in _END_EFFECTOR_ERRORS:
+            error = getattr(self, name)
+            if error is not None:
+                values[name] = _format_note(error)
         if self.ends_at_s:
             values["manoeuvre_time_s"] = _format_note(self.manoeuvre_time_s)
             values["ends_at_s"] = _format_note(self.ends_at_s)
@@ -119,11 +139,17 @@ class PlannerStatus:
         try:
             state = PlannerState(given.pop("state"))
             numbers = {name: float(given.pop(name)) for name in _NUMBER_KEYS if name in given}
+            end_effectors = {
+                name.removeprefix(_GOAL_PREFIX): tuple(map(float, given.pop(name).split()))
+                for name in list(given)
+                if name.startswith(_GOAL_PREFIX)
+            }
             return cls(
                 state=state,
                 message=message,
                 goal_id=given.pop("goal_id", ""),
                 goal=tuple(float(word) for word in given.pop("goal", "").split()),
+                end_effector_goals=end_effectors,
                 corrections=int(given.pop("corrections", "0")),
                 method=given.pop("method", ""),
                 **numbers,
@@ -186,8 +212,13 @@ class PlannerStatistics:
 
 
 def goal_values(goal: Goal) -> tuple[float, ...]:
-    """Return position and quaternion (7,) of a goal, as a status reports them."""
-    return (*goal.position.tolist(), *goal.quaternion.tolist())
+    """Return position and quaternion (7,) of a goal for a status; () where the base is free."""
+    return (*goal.position.tolist(), *goal.quaternion.tolist()) if goal.base else ()
+
+
+def end_effector_values(goal: Goal) -> dict[str, tuple[float, ...]]:
+    """Return the goals of end-effectors by link, as a status reports them."""
+    return {each.link: each.values for each in goal.end_effectors}
 
 
 def describe_remaining_error(error: PoseError, controls: frozenset[Controlled]) -> str:
@@ -293,4 +324,5 @@ def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -
 def _have_same_goal(first: PlannerStatus, second: PlannerStatus) -> bool:
     """Whether two statuses report on one goal, or on two goals with the same pose."""
     same_id = bool(first.goal_id) and first.goal_id == second.goal_id
-    return same_id or first.goal == second.goal
+    same_goal = first.goal == second.goal
+    return same_id or (same_goal and first.end_effector_goals == second.end_effector_goals)
