@@ -1,6 +1,6 @@
 """Workers of a campaign: processes of this machine behind pipes, or a cluster of dask.distributed.
 
-:func:`distributed_rows` gives the draws to the workers in tasks of about :data:`TASK_TIME`, and
+:meth:`TaskDistributor.rows` gives the draws to the workers in tasks of about :data:`TASK_TIME`, and
 yields the rows as tasks end.
 """
 
