@@ -122,6 +122,11 @@ GOALS ?= 100
 foreign-robots: $(STAMP)/test ## plan GOALS random goals each for robots that are in no paper; goes on where it was ended; ONLY=WORD: some
 	PYTHONPATH=.:test nice $(BIN)/python3 test/foreign_robots/run.py --goals $(GOALS) --only "$(filter-out many,$(ONLY))"
 
+HAND_GOALS ?= 40
+.PHONY: hand-goals
+hand-goals: $(STAMP)/test ## plan HAND_GOALS random goals of end-effectors for each of five robots; Pinocchio checks where they end; ONLY=WORD: some
+	PYTHONPATH=.:test nice $(BIN)/python3 test/planning/hand_goals.py --goals $(HAND_GOALS) --only "$(ONLY)"
+
 .PHONY: campaigns
 campaigns: $(STAMP)/test ## kill workers and campaigns, fly rows again through ROS: the slow tests of campaigns and flights
 	$(BIN)/python3 -m pytest -m slow test/campaign test/flight
