@@ -223,6 +223,8 @@ class _ScheduledLanes:
         planner, sensors = campaign.scenario.planner, campaign.scenario.plant.sensors
         if planner.averaging > 1 or planner.drift_position or planner.drift_attitude:
             return "the planner averages states, or watches the path"
+        if campaign.scenario.goal.end_effectors:
+            return "the goal is for end-effectors"
         if planner.replanning or planner.output != "commands":
             return "the planner plans again on the way"
         dispersed = [each.name for each in campaign.dispersions]

@@ -314,6 +314,9 @@ def test_errors_are_those_of_the_links() -> None:
     assert Tolerance(0.051, 0.021).admits(error, parts)  # type: ignore[arg-type]
     assert not Tolerance(0.049, 0.021).admits(error, parts)  # type: ignore[arg-type]
     assert not Tolerance(0.051, 0.019).admits(error, parts)  # type: ignore[arg-type]
+    # Without the robot the errors are not known.
+    unknown = PoseError.between(PLACE, ATTITUDE.as_quat(), goal)
+    assert not Tolerance(9.0, 9.0).admits(unknown, parts)  # type: ignore[arg-type]
 
 
 def test_derivatives_of_the_rows_are_their_differences() -> None:

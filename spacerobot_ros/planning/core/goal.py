@@ -435,9 +435,13 @@ class Tolerance:
             and ("shape" not in controls or error.max_joint_error <= self.shape)
             and (
                 "end_effectors" not in controls
-                or all(
-                    each.distance <= self.position and each.angle <= self.attitude
-                    for each in error.end_effectors
+                # Errors that are not known are not small.
+                or (
+                    bool(error.end_effectors)
+                    and all(
+                        each.distance <= self.position and each.angle <= self.attitude
+                        for each in error.end_effectors
+                    )
                 )
             )
         )
