@@ -53,7 +53,7 @@ def test_a_record_may_end_where_the_file_does() -> None:
     ]
     assert read_record(file, 0, Opcode.HEADER) == b"abc"
     assert read_record(file, 12, Opcode.FOOTER) == b""
-    with pytest.raises(ValueError, match="there is no footer at byte 0"):
+    with pytest.raises(ValueError, match="the file has no footer at byte 0"):
         read_record(file, 0, Opcode.FOOTER)
     with pytest.raises(ValueError, match="its index names byte 13, and it has 21 bytes"):
         read_record(file, 13, Opcode.FOOTER)

@@ -104,9 +104,9 @@ def test_a_type_that_is_not_installed_leaves_no_trace(tmp_path: Path) -> None:
     [
         ((99, b"", 1, 1), "has no channel 99"),
         ((70000, b"", 1, 1), "has no channel 70000"),
-        ((1, b"", -1, 1), "whole numbers of nanoseconds"),
-        ((1, b"", 1, 2**64), "whole numbers of nanoseconds"),
-        ((1, b"", 1.5, 1), "whole numbers of nanoseconds"),
+        ((1, b"", -1, 1), "non-negative numbers of nanoseconds"),
+        ((1, b"", 1, 2**64), "non-negative numbers of nanoseconds"),
+        ((1, b"", 1.5, 1), "non-negative numbers of nanoseconds"),
     ],
 )
 def test_what_no_bag_can_hold_is_refused(
