@@ -98,7 +98,8 @@ def test_a_plant_whose_time_no_stamp_carries_says_so(
     harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At a tick in 1000 s that is after two million of them."""
-    monkeypatch.setattr(PlantNode, "_initial_state_and_tick", lambda self, robot: (None, LAST // 1000))
+    start = (None, LAST // 1000)
+    monkeypatch.setattr(PlantNode, "_initial_state_and_tick", lambda self, robot: start)
     plant = harness.make(
         PlantNode,
         {"robot": "sliding_masses", "time_mode": "lockstep", "tick_rate": 0.001},
