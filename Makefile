@@ -162,6 +162,8 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	    --set coordinated_control.attitude_tolerance=0.02
 	$(FLY) servicer --set coordinated_control.time_limit=8
 	$(FLY) servicer_thrusters --set coordinated_control.time_limit=5
+	$(FLY) reach
+	$(FLY) two_hands
 
 # What mkdocs prints of its theme's successor is no warning of the build.
 .PHONY: docs

@@ -244,6 +244,7 @@ def test_another_description_replaces_the_robot_and_ends_its_goal(harness: Harne
     fake.planner.trigger_activate()
     fake.describe()
     fake.describe()  # The same again changes nothing.
+    harness.matched(fake.goals)
     fake.goals.publish(goal_at(NEAR))
     # The state is to come after the goal, however long the functions of the robot are compiled.
     fake.wait_for_log("Goal unstamped-1")

@@ -93,7 +93,11 @@ def test_the_next_solution_is_refined_where_it_may_be_the_better_one(
 
     class ScriptedSearch(ManoeuvreSearch):
         def solver(  # type: ignore[override]
-            self, intervals: int, position: bool, tolerance: float = TOLERANCE
+            self,
+            intervals: int,
+            position: bool,
+            tolerance: float = TOLERANCE,
+            pairs: tuple[int, ...] = (),
         ) -> Scripted:
             return solvers[intervals]
 
