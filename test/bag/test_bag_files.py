@@ -267,6 +267,8 @@ def test_the_fastest_compression_makes_telemetry_little_larger() -> None:
                 unpack_chunk(read_record(file, place, Opcode.CHUNK), place) for place in places
             ]
         records = b"".join(chunks)
+        if len(records) < 500_000:  # The robot's description is most of a short flight's bag.
+            continue
         size = {
             level: sum(
                 len(zstandard.ZstdCompressor(level=level).compress(records[k : k + 262_144]))
@@ -276,5 +278,6 @@ def test_the_fastest_compression_makes_telemetry_little_larger() -> None:
         }
         for level, found in ratios.items():
             found.append(size[-1] / size[level] - 1.0)
+    assert len(ratios[1]) >= 6
     assert 0.005 < min(ratios[1]) <= max(ratios[1]) < 0.045
     assert 0.025 < min(ratios[3]) <= max(ratios[3]) < 0.085
