@@ -22,6 +22,13 @@ BAGS = Path(__file__).resolve().parents[2] / "bags"
 
 NAMES = sorted(path.stem for path in BAGS.glob("*.mcap"))
 
+SOME_QUICK = [
+    name
+    if name in ("servicer_thrusters", "sliding_masses")
+    else pytest.param(name, marks=pytest.mark.slow)
+    for name in NAMES
+]
+
 Messages = Mapping[str, list[Any]]
 
 
@@ -156,7 +163,7 @@ def unit_of(name: str, figure: str, label: str) -> str:
     return UNITS[figure][label]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SOME_QUICK)
 def test_every_trace_has_the_numbers_of_the_bag_in_the_unit_of_its_axis(name: str) -> None:
     for figure, drawn in figures_of(name).items():
         for group in drawn.groups:
@@ -173,7 +180,7 @@ def test_every_trace_has_the_numbers_of_the_bag_in_the_unit_of_its_axis(name: st
                 np.testing.assert_allclose(values, last, rtol=0, atol=1e-9 * scale, err_msg=about)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SOME_QUICK)
 def test_axes_name_their_quantity_and_its_unit(name: str) -> None:
     for figure, drawn in figures_of(name).items():
         axes = drawn.figure.axes
@@ -193,7 +200,7 @@ AXES_BESIDE_TIME = {
 }
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SOME_QUICK)
 def test_axes_of_space_and_of_shapes_have_units(name: str) -> None:
     unit = units_of_joints(name)
     for figure in ("cycles", "path", "loops"):
@@ -207,6 +214,7 @@ def test_axes_of_space_and_of_shapes_have_units(name: str) -> None:
             assert labels <= AXES_BESIDE_TIME[figure], labels
 
 
+@pytest.mark.slow
 def test_every_figure_is_drawn_from_one_of_the_bags_or_named_here() -> None:
     drawn = {figure for name in NAMES for figure in figures_of(name)}
     # Sensors of the reference flights have no errors: test/report/test_report_numbers.py.

@@ -29,7 +29,8 @@ def quick(name: str) -> Scenario:
     return load_scenario(name).with_overrides("planner", QUICK)
 
 
-@pytest.mark.parametrize("name", ["reach", pytest.param("two_hands", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["reach", "two_hands"])
 def test_the_hands_end_at_their_goals(name: str, tmp_path: Path) -> None:
     scenario, bag = quick(name), tmp_path / "run.mcap"
     result = run_scenario(scenario, bag)
