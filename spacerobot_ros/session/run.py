@@ -13,6 +13,7 @@ from typing import Any
 
 import rclpy
 from rclpy.experimental import EventsExecutor
+from rclpy.logging import get_logger_effective_level, set_logger_level
 from rosgraph_msgs.msg import Clock
 
 from spacerobot_ros.errors import SpaceRobotError
@@ -72,12 +73,15 @@ def ros(*, private: bool) -> Iterator[None]:
         ROS does not start: an environment variable is refused.
     """
     (use_private_discovery if private else use_loopback_discovery)()
+    level = get_logger_effective_level("")
     quiet = ["--ros-args", "--log-level", "WARN"]
     start_ros(quiet)
     try:
         yield
     finally:
         rclpy.try_shutdown()
+        # The level is the process's: it would hold for nodes that are made after the run.
+        set_logger_level("", level)
 
 
 def make_stack(

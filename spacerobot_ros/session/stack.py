@@ -332,6 +332,8 @@ class InProcessStack(Stack):
     def close(self) -> None:
         """Destroy the nodes."""
         for node in self._nodes:
+            # A logger outlives its node: the next one of its name in this process is not quiet.
+            node.get_logger().set_level(LoggingSeverity.UNSET)
             if isinstance(node, RecorderNode):
                 node.cleanup()
             node.destroy_node()

@@ -10,7 +10,6 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log
-from rclpy.logging import LoggingSeverity, get_logger
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from support.control_loop import Loop
@@ -97,8 +96,6 @@ def logged(probe: Probe, line: str) -> bool:
 
 
 def test_every_node_says_what_it_does_when_it_starts(harness: Harness) -> None:
-    for name in ("plant", "planner"):  # A flight in this process may have made them quiet.
-        get_logger(name).set_level(LoggingSeverity.INFO)
     flight = Flight(harness)
     flight.probe.watch("/rosout", Log, latched=True)
     flight.start()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from rclpy.logging import LoggingSeverity, get_logger_effective_level
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
@@ -95,6 +96,12 @@ def test_summary_is_what_the_bag_says(result: RunResult, tmp_path: Path) -> None
     assert summary["ticks"] == round(summary["sim_time_s"] * 20)
     assert summary["sim_time_s"] == pytest.approx(summary["manoeuvre_time_s"])
     assert {"plan_time_s", "wall_time_s", "ticks_per_s", "real_time_factor"} <= set(summary)
+
+
+def test_loggers_of_a_run_are_not_quiet_for_the_next_nodes(result: RunResult) -> None:
+    assert result.succeeded
+    for name in ("plant", "planner"):
+        assert get_logger_effective_level(name) is LoggingSeverity.INFO
 
 
 def test_momentum_against_the_momentum_in_motion(result: RunResult) -> None:
