@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from hypothesis import settings
 from support import lost_values
 from support.warm_python import WarmPython
 
@@ -38,6 +39,10 @@ if not _WORKER:
         os.environ.pop(name, None)
 
 lost_values.apply()
+
+# The same examples in every run, on every machine.
+settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=40)
+settings.load_profile("repeatable")
 
 _DOMAINS = 101
 """Higher domains take ports that Linux hands out to others."""

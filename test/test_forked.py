@@ -13,6 +13,9 @@ from typing import Any
 import pytest
 from support.forked import NotExchangedError, can_be_exchanged, exchange, live_functions
 
+pytestmark = pytest.mark.slow
+"""Only `make mutants` needs it."""
+
 TEXT = """\
 from dataclasses import dataclass, field
 from enum import Enum

@@ -36,7 +36,9 @@ def flown(engine: LanesEngine | FlightsEngine, made: Campaign) -> dict[int, Row]
     return {row.draw.number: row for row in rows}
 
 
-@pytest.mark.parametrize(("tolerance", "most"), [(0.05, 3), (0.0012, 3), (0.0012, 0)])
+@pytest.mark.parametrize(
+    ("tolerance", "most"), [(0.05, 3), (0.0012, 3), pytest.param(0.0012, 0, marks=pytest.mark.slow)]
+)
 def test_the_same_draw_is_the_same_flight_in_every_engine(tolerance: float, most: int) -> None:
     """A tight tolerance makes some need a correction, which lanes leave to the planner."""
     settings = {
@@ -136,6 +138,7 @@ def test_every_flight_has_noise_of_its_own(engine: type[LanesEngine | FlightsEng
     assert len({*first, *other}) == 6
 
 
+@pytest.mark.slow
 def test_flights_in_lanes_are_interrupted_or_left_to_the_controller() -> None:
     """The longest time ends them all; joints that seem to race have control given up."""
     lanes, _ = assert_same_flights(controlled(flights=3, longest=0.305))

@@ -84,7 +84,7 @@ def started(*words: str | bytes, **variables: str) -> subprocess.CompletedProces
     ("words", "domain"),
     [
         (("run", "sliding_masses"), "abc"),
-        (("goal", "0", "0", "0"), "999"),
+        pytest.param(("goal", "0", "0", "0"), "999", marks=pytest.mark.slow),
         pytest.param(("run", "sliding_masses"), "-1", marks=pytest.mark.slow),
         pytest.param(("goal", "0", "0", "0"), "1.5", marks=pytest.mark.slow),
     ],

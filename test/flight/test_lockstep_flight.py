@@ -22,7 +22,10 @@ ROOT = Path(__file__).resolve().parents[2]
 
 WHOLE = ("time", "pose", "twist", "q", "qdot", "effort", "momentum")
 
-HEAVY = {"servicer", "servicer_thrusters", "arm_attitude", "coordinated_control"}
+HEAVY = {
+    *("servicer", "servicer_thrusters", "arm_attitude", "coordinated_control"),
+    *("reach", "two_hands"),
+}
 """Reference bags whose robot takes seconds to compile."""
 
 BAGS = [

@@ -146,7 +146,7 @@ def test_a_bag_has_the_frames_of_odom_and_of_pinocchio(
 
 def test_frames_have_the_prefix_that_they_are_given(harness: Harness, tmp_path: Path) -> None:
     bag = record_states(
-        harness, tmp_path / "bag.mcap", "servicer", frame_prefix="one/", world_frame="orbit"
+        harness, tmp_path / "bag.mcap", "planar_chain", frame_prefix="one/", world_frame="orbit"
     )
     _, message = next(iter(bag["/tf"].messages()))
     for transform in message.transforms:

@@ -215,6 +215,7 @@ def slide_to(window: Browser, share: float) -> None:
     window.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
+@pytest.mark.slow
 @with_browser
 def test_the_robot_is_seen_to_move(page: Path, window: Browser) -> None:
     window.open(page, 420, 640)
@@ -259,6 +260,7 @@ def test_play_runs_to_the_end(page: Path, window: Browser) -> None:
     window.wait_for("document.getElementById('play').textContent === 'Play'")
 
 
+@pytest.mark.slow
 @with_browser
 def test_without_webgl_a_sentence_says_so(page: Path, tmp_path: Path) -> None:
     with browser(tmp_path, "--disable-3d-apis") as window:

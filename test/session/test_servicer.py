@@ -39,6 +39,12 @@ GAINS: dict[str, dict[str, Any]] = {
 pytestmark = pytest.mark.usefixtures("own_domain")
 
 
+@pytest.fixture(params=["transposed_jacobian", pytest.param("model_based", marks=pytest.mark.slow)])
+def law(request: pytest.FixtureRequest) -> str:
+    """Return a law; the quick tests of the controller fly the other one without ROS."""
+    return str(request.param)
+
+
 @pytest.fixture
 def unlimited(
     law: str, flown: dict[str, RunResult], tmp_path_factory: pytest.TempPathFactory

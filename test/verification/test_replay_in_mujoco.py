@@ -155,7 +155,7 @@ def effort_limits(urdf: str) -> dict[str, float]:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow) if name == "spatial, model-based" else name
+        pytest.param(name, marks=pytest.mark.slow) if name.startswith("spatial") else name
         for name in FLIGHTS
     ],
 )
