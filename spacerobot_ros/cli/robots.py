@@ -73,6 +73,8 @@ def _parse_shape(text: str) -> list[float]:
 
 def analysis_lines(found: Analysis) -> list[str]:
     """Return the findings as lines that fit a screen."""
+    from spacerobot_ros.planning.methods.registry import METHODS
+
     robot = found.robot
     base = robot.description.bodies[0].inertia.mass
     n, name = robot.n, robot.description.name
@@ -81,8 +83,9 @@ def analysis_lines(found: Analysis) -> list[str]:
     lines += ["", *_rotation_lines(found)]
     lines += [f"{'position':<13}{_position_text(found)}", ""]
     for method, objection in found.objections.items():
-        lines.append(f"{method:<13}{'no: ' + objection if objection else 'yes'}")
-    lines.append(f"{'auto':<13}{found.chosen or 'no method suits this robot'}")
+        suits = "yes" if METHODS[method].plans_for_base else "yes, for end-effectors"
+        lines.append(f"{method:<15}{'no: ' + objection if objection else suits}")
+    lines.append(f"{'auto':<15}{found.chosen or 'no method suits this robot'}")
     return [*lines, "", *_distance_lines(found)]
 
 

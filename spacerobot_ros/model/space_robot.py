@@ -168,6 +168,21 @@ class SpaceRobot:
         self._model.link_index(link)
         return self._call_function(f"jacobian:{link}", q)[0]
 
+    def generalised_jacobian(self, link: str, q: npt.ArrayLike) -> Array:
+        """Return ``J*`` (6, n) of a link's frame origin at zero momentum, base components.
+
+        It maps ``qdot`` to linear over angular velocity in the world, while the base moves as the
+        momenta demand (Umetani and Yoshida's generalised Jacobian).
+
+        Raises
+        ------
+        KeyError
+            There is no such link.
+        """
+        J = self.jacobian(link, q)
+        # The centre of mass rests, and the base turns by -A qdot.
+        return np.asarray(J[:, 6:] - J[:, 3:6] @ self.connection(q)[3:])
+
     def connection(self, q: npt.ArrayLike) -> Array:
         """Return ``A(q)`` (6, n): ``[v_WB_B; omega_WB_B] = -A qdot`` at zero momentum (paper 1)."""
         return self._call_function("connection", q)[0].reshape((6, self.n), order="F")

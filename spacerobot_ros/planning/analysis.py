@@ -73,7 +73,11 @@ class Analysis:
     @property
     def chosen(self) -> str:
         """The method that ``auto`` mostly chooses: ``optimal`` if it suits; "" if none does."""
-        suits = [name for name, objection in self.objections.items() if not objection]
+        suits = [
+            name
+            for name, objection in self.objections.items()
+            if not objection and METHODS[name].plans_for_base
+        ]
         return OptimalGait.name if OptimalGait.name in suits else next(iter(suits), "")
 
 

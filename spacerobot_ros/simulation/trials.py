@@ -196,11 +196,16 @@ def try_method(
 
 
 def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | SpaceRobotError]:
-    """Return the evaluation of every method by its name, or the reason of its refusal."""
+    """Return the evaluation of every method by its name, or the reason of its refusal.
+
+    Methods that plan for end-effectors alone are left out of goals of the base.
+    """
     found: dict[str, PlanEvaluation | SpaceRobotError] = {}
     for name, method in METHODS.items():
         if name == "auto":
             continue  # The method `auto` only chooses among the other methods.
+        if not (method.plans_for_base or problem.goal.end_effectors):
+            continue
         try:
             method.require_suitable(problem.robot)
             found[name] = try_method(problem, name)

@@ -109,6 +109,8 @@ class GaitMethod(ABC):
     controls
         The parts of a goal that the method's schedules control; the others follow from these.
         A method that chooses among others states them in each schedule alone.
+    plans_for_base, plans_for_end_effectors
+        Whether it plans goals of the base, and goals of end-effectors.
     starts_in_motion
         Whether its gaits may begin while the joints move (``PlanRequest.motion``).
     Options
@@ -122,6 +124,8 @@ class GaitMethod(ABC):
 
     name: ClassVar[str]
     controls: frozenset[Controlled] = POSE
+    plans_for_base: ClassVar[bool] = True
+    plans_for_end_effectors: ClassVar[bool] = False
     starts_in_motion: ClassVar[bool] = False
     Options: ClassVar[type[Any]] = EmptyOptions
     options: Any
@@ -198,7 +202,7 @@ class GaitMethod(ABC):
         PlanningError
             Links come too near to each other; ``is_clear``: that has been checked.
         """
-        if self.name != END_EFFECTOR_METHOD:
+        if not self.plans_for_end_effectors:
             self._require_goal_of_base(goal)
         if not is_clear:
             self._require_clear(positions)

@@ -110,22 +110,25 @@ class AutoGait(GaitMethod):
     def _refuse_goal(self, refusals: Mapping[str, SpaceRobotError]) -> PlanningError:
         """Return the error for a goal that no method plans: the proof of one, or all reasons."""
         # Refusals of the robot do not depend on the goal.
-        of_goal = [refusals[name] for name in self._candidates if name not in self._unsuitable]
+        of_goal = [refusals[name] for name in refusals if name not in self._unsuitable]
         for refusal in of_goal:
             if isinstance(refusal, UnreachableError):
                 return refusal
-        reasons = " ".join(f"{name}: {refusals[name]}" for name in self._candidates)
+        reasons = " ".join(
+            f"{name}: {refusals[name]}" for name in self._candidates if name in refusals
+        )
         message = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
         return refusal_of_all(message, of_goal)
 
     def _list_comparable(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
         """Return the methods to compare; add the refusals of the other methods.
 
-        The others do not control a part of the pose that one of the methods controls.
+        The others do not control a part of the pose that one of the methods controls. Methods that
+        plan for end-effectors alone are not compared.
         """
         pose: dict[str, frozenset[Controlled]] = {}
         for name in self._candidates:
-            if name in refusals:
+            if name in refusals or not self._candidates[name].method.plans_for_base:
                 continue
             try:
                 pose[name] = self._get_method(name).controls & POSE

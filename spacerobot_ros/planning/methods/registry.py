@@ -15,6 +15,7 @@ from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
 from spacerobot_ros.planning.methods.auto import AutoGait, CandidateMethod
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.planning.methods.optimal import OptimalGait
+from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateGait
 from spacerobot_ros.planning.methods.square_path import SquarePathGait
 
 METHODS: dict[str, type[GaitMethod]] = {
@@ -23,6 +24,7 @@ METHODS: dict[str, type[GaitMethod]] = {
     SquarePathGait.name: SquarePathGait,
     AreaLoopGait.name: AreaLoopGait,
     OptimalGait.name: OptimalGait,
+    ResolvedRateGait.name: ResolvedRateGait,
     AutoGait.name: AutoGait,
 }
 

@@ -100,7 +100,7 @@ _GIVEN_SHAPE_ERROR = 1e-9
 
 
 @dataclass(frozen=True)
-class _LinkRows:
+class LinkDirections:
     """Directions, in B_0, along which the joints move a link: (k, 3) of its origin, (l, 3) of its
     rotation; no rows of rotation where any attitude will do.
     """
@@ -126,8 +126,13 @@ class EndEffectorRows:
     def __init__(self, robot: SpaceRobot, links: Sequence[tuple[str, bool]], axes: Array) -> None:
         self.robot, self.links, self.axes = robot, tuple(links), axes
         self.parameters = _PARAMETERS_PER_LINK * len(self.links)
-        self.turn = turn_function(robot)
-        self._of_links = [self._directions(link, attitude) for link, attitude in links]
+        self.directions = tuple(self._directions(link, attitude) for link, attitude in links)
+        """Those of each link."""
+
+    @cached_property
+    def turn(self) -> ca.Function:
+        """How a step of the shape turns the base (:func:`.turn_function`)."""
+        return turn_function(self.robot)
 
     @cached_property
     def function(self) -> ca.Function:
@@ -138,7 +143,7 @@ class EndEffectorRows:
         R_all, r_all = self.robot.function("link_poses", compile=False)(q)
         R_X, rows = symbolic_matrix_from_quaternion(X), [ca.SX(0, 1)]
         by_link = ca.vertsplit(parameters, _PARAMETERS_PER_LINK)
-        for each, goal in zip(self._of_links, by_link, strict=True):
+        for each, goal in zip(self.directions, by_link, strict=True):
             index = self.robot.link_names.index(each.link)
             r_CE = R_X @ (r_all[:, index] - center)
             rows.append(ca.DM(each.displacements) @ (r_CE - goal[:3]))
@@ -216,7 +221,7 @@ class EndEffectorRows:
         ranks, rows = [], 0
         for q, turn in zip(*self._samples(), strict=True):
             blocks = []
-            for each in self._of_links:
+            for each in self.directions:
                 by_shape, by_turn = self._rates(each.link, q, turn)
                 use = np.hstack([by_shape] if fixed_attitude else [by_shape, by_turn])
                 blocks += [each.displacements @ use[:3], each.rotations @ use[3:]]
@@ -224,7 +229,7 @@ class EndEffectorRows:
             rows = len(J)
             ranks.append(int(np.linalg.matrix_rank(J, tol=1e-6)))
         if max(ranks) < rows:
-            names = " and ".join(f"'{each.link}'" for each in self._of_links)
+            names = " and ".join(f"'{each.link}'" for each in self.directions)
             raise PlanningError(
                 f"The goal of {names} asks for {rows} independent coordinates, and the joints of "
                 f"robot '{self.robot.description.name}' move no more than {max(ranks)}: ask for "
@@ -245,7 +250,7 @@ class EndEffectorRows:
         """
         R_WB = matrix_from_quaternion(state.quaternion)
         name = self.robot.description.name
-        for each, goal in zip(self._of_links, goals, strict=True):
+        for each, goal in zip(self.directions, goals, strict=True):
             r_WE, now = end_effector_pose(
                 self.robot, each.link, state.position, state.quaternion, state.q
             )
@@ -285,19 +290,19 @@ class EndEffectorRows:
         (6, n) by the joints at zero momentum, as the generalised Jacobian has it, and (6, m) by
         turns of the base about the axes.
         """
-        n, R_X = self.robot.n, matrix_from_quaternion(X)
+        R_X = matrix_from_quaternion(X)
         # [v_cm; omega; qdot] -> [v_E; omega_E]
-        J = self.robot.jacobian(link, q)
-        by_base, by_joints = J[:, 3:6], J[:, 6 : 6 + n]
-        A = self.robot.connection(q)[3:]
-        blocks = by_joints - by_base @ A, by_base @ self.axes.T
+        by_base = self.robot.jacobian(link, q)[:, 3:6]
+        blocks = self.robot.generalised_jacobian(link, q), by_base @ self.axes.T
         first, second = (np.vstack([R_X @ each[:3], R_X @ each[3:]]) for each in blocks)
         return first, second
 
-    def _directions(self, link: str, attitude: bool) -> _LinkRows:
+    def _directions(self, link: str, attitude: bool) -> LinkDirections:
         samples = zip(*self._samples(), strict=True)
         rates = np.hstack([np.hstack(self._rates(link, q, X)) for q, X in samples])
-        return _LinkRows(link, _span(rates[:3]), _span(rates[3:]) if attitude else np.zeros((0, 3)))
+        return LinkDirections(
+            link, _span(rates[:3]), _span(rates[3:]) if attitude else np.zeros((0, 3))
+        )
 
 
 def _span(vectors: Array) -> Array:

@@ -117,6 +117,7 @@ class OptimalGait(GaitMethod):
     """
 
     name: ClassVar[str] = "optimal"
+    plans_for_end_effectors: ClassVar[bool] = True
     starts_in_motion: ClassVar[bool] = True
     Options: ClassVar[type[OptimalOptions]] = OptimalOptions
     options: OptimalOptions

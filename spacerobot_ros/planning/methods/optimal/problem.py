@@ -17,16 +17,9 @@ from spacerobot_ros.parameters import parameter
 
 
 @dataclass(frozen=True)
-class OptimalOptions:
-    """The options of ``optimal``."""
+class MotionOptions:
+    """Options of methods that keep velocities and accelerations of the joints within limits."""
 
-    duration: float = parameter(
-        0.0,
-        "duration of a manoeuvre of least effort; 0: as fast as possible",
-        unit="s",
-        minimum=0.0,
-        maximum=1e9,
-    )
     max_velocity: tuple[float, ...] = parameter(
         (),
         "speed limit of every joint, if below the URDF's; []: the URDF's",
@@ -48,6 +41,19 @@ class OptimalOptions:
         "time from rest to full speed, without max_acceleration",
         unit="s",
         minimum=1e-6,
+        maximum=1e9,
+    )
+
+
+@dataclass(frozen=True)
+class OptimalOptions(MotionOptions):
+    """The options of ``optimal``."""
+
+    duration: float = parameter(
+        0.0,
+        "duration of a manoeuvre of least effort; 0: as fast as possible",
+        unit="s",
+        minimum=0.0,
         maximum=1e9,
     )
     effort_limits: int = parameter(
@@ -219,8 +225,8 @@ class MotionLimits:
     distances: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def of(cls, robot: SpaceRobot, options: OptimalOptions) -> MotionLimits:
-        """Return the robot's own limits, narrowed by the options.
+    def of(cls, robot: SpaceRobot, options: MotionOptions, method: str = "optimal") -> MotionLimits:
+        """Return the robot's own limits, narrowed by the options of a method.
 
         Raises
         ------
@@ -230,18 +236,19 @@ class MotionLimits:
         """
         velocity = robot.velocity_limit.copy()
         if options.max_velocity:
-            fastest = per_joint(robot, "max_velocity", options.max_velocity)
+            fastest = per_joint(robot, "max_velocity", options.max_velocity, method)
             velocity = np.minimum(velocity, fastest)
         if options.max_acceleration:
-            acceleration = per_joint(robot, "max_acceleration", options.max_acceleration)
+            given = options.max_acceleration
+            acceleration = per_joint(robot, "max_acceleration", given, method)
         else:
             acceleration = velocity / options.ramp_time
         for name, v, a in zip(robot.joint_names, velocity, acceleration, strict=True):
             if not (v > 0 and np.isfinite(a) and a > 0):
                 raise ParameterError(
                     f"Joint '{name}' is limited to {v:.4g} a second and {a:.4g} a second squared; "
-                    "optimal needs a speed above zero and a finite acceleration: see "
-                    "optimal.max_acceleration."
+                    f"{method} needs a speed above zero and a finite acceleration: see "
+                    f"{method}.max_acceleration."
                 )
         return cls(robot.lower.copy(), robot.upper.copy(), velocity, acceleration)
 
@@ -499,8 +506,10 @@ def _largest_base_rate(quaternions: Array, period: float) -> float:
     return float(angles.max(initial=0.0)) / period
 
 
-def per_joint(robot: SpaceRobot, option: str, values: Sequence[float]) -> Array:
-    """Return an option's list as (n,) numbers.
+def per_joint(
+    robot: SpaceRobot, option: str, values: Sequence[float], method: str = "optimal"
+) -> Array:
+    """Return the list of a method's option as (n,) numbers.
 
     Raises
     ------
@@ -509,7 +518,7 @@ def per_joint(robot: SpaceRobot, option: str, values: Sequence[float]) -> Array:
     """
     if len(values) != robot.n:
         raise ParameterError(
-            f"optimal.{option} has {len(values)} number(s); robot '{robot.description.name}' has "
+            f"{method}.{option} has {len(values)} number(s); robot '{robot.description.name}' has "
             f"{robot.n} joints ({', '.join(robot.joint_names)})."
         )
     return np.asarray(values, dtype=float)

@@ -1,0 +1,353 @@
+"""End-effectors on straight lines with the base free, held against Pinocchio's momentum."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+from support.hand_motion import end_of_motion
+
+from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, build_method, plan
+from spacerobot_ros.planning.analysis import analyze
+from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.methods.registry import method_options
+from spacerobot_ros.simulation.trials import compare
+
+Array = npt.NDArray[np.float64]
+Pose = tuple[Array, Rotation]
+
+FOLDER = Path(__file__).parents[2] / "urdf"
+PLACE, ATTITUDE = np.array([0.4, -0.3, 0.2]), Rotation.from_rotvec([0.3, -0.5, 0.4])
+ARM = np.array([0.4, -0.9, 1.1])
+SEVEN = np.array([0.3, 0.2, -0.4, -1.7, 0.5, 1.6, 0.8])
+LINK = "left_link_7"
+DUAL = np.array([0.2, -0.3, 0.4, 0.5, 0.1, -0.2, 1.0, 1.2, 0.3, 0.1, 0.6, 0.7, -0.1, 0.2])
+PERIOD = 0.08
+
+
+def robot_of(name: str) -> SpaceRobot:
+    return SpaceRobot.from_file(FOLDER / f"{name}.urdf")
+
+
+def poses(robot: str, positions: Array, *links: str) -> dict[str, Pose]:
+    """Return where links are after shapes (N + 1, n)."""
+    urdf, names = (FOLDER / f"{robot}.urdf").read_text("utf-8"), robot_of(robot).joint_names
+    return end_of_motion(urdf, names, positions, list(links), PLACE, ATTITUDE)
+
+
+def planned(robot: str, q: Array, link: str, goal: npt.ArrayLike, **options: Any) -> GaitSchedule:
+    """Return the motion of a link to a position (3,) or a pose (7,)."""
+    kind = "end_effector_pose" if len(np.ravel(goal)) == 7 else "end_effector_position"
+    return plan(
+        robot,
+        start=RobotState(PLACE, ATTITUDE.as_quat(), q),
+        method="resolved_rate",
+        **{"control_period": PERIOD, kind: {link: goal}, **options},
+    )
+
+
+@pytest.fixture(scope="module")
+def arm() -> tuple[GaitSchedule, Pose, Array]:
+    """Return a motion of the arm of three joints, where it begins, and its goal."""
+    start = poses("three_joint_arm", ARM[np.newaxis], "end_effector")["end_effector"]
+    goal = start[0] + np.array([0.2, -0.25, 0.2])
+    return planned("three_joint_arm", ARM, "end_effector", goal), start, goal
+
+
+def test_the_end_effector_keeps_to_the_line_at_every_tick(
+    arm: tuple[GaitSchedule, Pose, Array],
+) -> None:
+    schedule, (start, _), goal = arm
+    way, shares = goal - start, []
+    for tick in (3, schedule.ticks // 2 + 1, schedule.ticks):
+        r, _ = poses("three_joint_arm", schedule.positions[: tick + 1], "end_effector")[
+            "end_effector"
+        ]
+        shares.append(float((r - start) @ way / (way @ way)))
+        np.testing.assert_allclose(r, start + shares[-1] * way, atol=1e-8)
+    assert 0.0 < shares[0] < shares[1] < 1.0
+    assert shares[2] == pytest.approx(1.0, abs=1e-8)
+    assert schedule.controls == {"end_effectors"}
+    assert schedule.notes["predicted_end_effector_position_error"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_motion_is_as_fast_as_the_limits_of_the_joints_allow(
+    arm: tuple[GaitSchedule, Pose, Array],
+) -> None:
+    schedule, robot = arm[0], robot_of("three_joint_arm")
+    rest = np.zeros((1, robot.n))
+    rates = np.vstack([rest, schedule.velocities, rest])
+    speeds = np.abs(rates) / robot.velocity_limit
+    changes = np.abs(np.diff(rates, axis=0)) / PERIOD / (robot.velocity_limit / 0.5)
+    assert max(speeds.max(), changes.max()) <= 1 + 1e-8
+    # Somewhere a joint is at a limit, but for the ticks in which the limit is another one.
+    at_limit = np.maximum(np.maximum(speeds[:-1], speeds[1:]).max(axis=1), changes.max(axis=1))
+    assert np.mean(at_limit > 0.9) > 0.8
+
+
+@pytest.mark.parametrize(
+    ("options", "factor"),
+    [
+        ({"max_velocity": (0.25, 0.2, 0.3)}, 1.4),
+        ({"max_acceleration": (0.1, 0.2, 0.15)}, 1.4),
+        ({"ramp_time": 3.0}, 1.4),
+    ],
+)
+def test_lower_limits_are_kept(
+    arm: tuple[GaitSchedule, Pose, Array], options: dict[str, Any], factor: float
+) -> None:
+    schedule, _, goal = arm
+    slower = planned("three_joint_arm", ARM, "end_effector", goal, **options)
+    assert slower.duration > factor * schedule.duration
+    rates = np.vstack([np.zeros((1, 3)), slower.velocities, np.zeros((1, 3))])
+    limit = robot_of("three_joint_arm").velocity_limit
+    fastest = np.array(options.get("max_velocity", limit))
+    change = np.array(options.get("max_acceleration", fastest / options.get("ramp_time", 0.5)))
+    assert np.all(np.abs(rates) <= fastest * (1 + 1e-8))
+    assert np.all(np.abs(np.diff(rates, axis=0)) / PERIOD <= change * (1 + 1e-8))
+
+
+def test_a_pose_turns_about_one_axis_in_step_with_the_way() -> None:
+    start = poses("seven_joint_arm", SEVEN[np.newaxis], "link_7")["link_7"]
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.25])
+    goal = start[0] + np.array([0.08, -0.05, -0.1]), turn * start[1]
+    schedule = planned("seven_joint_arm", SEVEN, "link_7", [*goal[0], *goal[1].as_quat()])
+    line = Slerp([0.0, 1.0], Rotation.concatenate([start[1], goal[1]]))
+    for tick in (schedule.ticks // 3, schedule.ticks):
+        r, R = poses("seven_joint_arm", schedule.positions[: tick + 1], "link_7")["link_7"]
+        share = min(1.0, float(np.linalg.norm(r - start[0]) / np.linalg.norm(goal[0] - start[0])))
+        np.testing.assert_allclose(r, start[0] + share * (goal[0] - start[0]), atol=1e-8)
+        assert (line([share])[0].inv() * R).magnitude() < 1e-7
+    assert share == pytest.approx(1.0, abs=1e-8)
+
+
+@pytest.mark.slow
+def test_the_base_keeps_its_attitude_where_that_is_asked_for() -> None:
+    start, _ = poses("dual_arm", DUAL[np.newaxis], LINK)[LINK]
+    goal = start + np.array([0.1, 0.05, -0.08])
+    turned = {}
+    for keep in (0, 1):
+        schedule = planned("dual_arm", DUAL, LINK, goal, keep_attitude=keep)
+        for tick in (schedule.ticks // 2, schedule.ticks):
+            found = poses("dual_arm", schedule.positions[: tick + 1], LINK, "base_link")
+            turned[keep, tick < schedule.ticks] = (
+                ATTITUDE.inv() * found["base_link"][1]
+            ).magnitude()
+        np.testing.assert_allclose(found[LINK][0], goal, atol=1e-8)
+    assert min(turned[0, True], turned[0, False]) > 1e-3
+    assert max(turned[1, True], turned[1, False]) < 1e-8
+
+
+@pytest.mark.slow
+def test_two_end_effectors_arrive_together() -> None:
+    links = ("left_link_7", "right_link_7")
+    starts = poses("dual_arm", DUAL[np.newaxis], *links)
+    ways = {"left_link_7": [0.05, -0.08, 0.1], "right_link_7": [-0.1, 0.04, 0.02]}
+    goals = {link: starts[link][0] + np.array(ways[link]) for link in links}
+    schedule = plan(
+        "dual_arm",
+        start=RobotState(PLACE, ATTITUDE.as_quat(), DUAL),
+        method="resolved_rate",
+        control_period=PERIOD,
+        end_effector_position=goals,
+    )
+    half = poses("dual_arm", schedule.positions[: schedule.ticks // 2 + 1], *links)
+    shares = [
+        np.linalg.norm(half[link][0] - starts[link][0]) / np.linalg.norm(ways[link])
+        for link in links
+    ]
+    assert shares[0] == pytest.approx(shares[1], abs=1e-8)
+    end = poses("dual_arm", schedule.positions, *links)
+    for link in links:
+        np.testing.assert_allclose(end[link][0], goals[link], atol=1e-8)
+
+
+def test_a_small_way_and_none_are_planned_too(arm: tuple[GaitSchedule, Pose, Array]) -> None:
+    start, _ = arm[1]
+    for way in (0.0, 3e-7):
+        goal = start + way * np.array([0.6, 0.0, -0.8])
+        schedule = planned("three_joint_arm", ARM, "end_effector", goal)
+        end = poses("three_joint_arm", schedule.positions, "end_effector")["end_effector"][0]
+        np.testing.assert_allclose(end, goal, atol=1e-10)
+        assert (schedule.ticks == 0) == (way == 0.0)
+
+
+# -- refusals -----------------------------------------------------------------------------------
+
+
+def test_a_joint_at_its_limit_ends_the_line() -> None:
+    start, _ = poses("three_joint_arm", np.zeros((1, 3)), "end_effector")["end_effector"]
+    goal = start + ATTITUDE.apply([-0.6, 0.9, 0.4])
+    with pytest.raises(PlanningError, match=r"is at its limit after 0\.\d+ of 1\.1536 m") as said:
+        planned("three_joint_arm", np.array([0.0, 0.0, 1e-3]), "end_effector", goal)
+    assert not isinstance(said.value, UnreachableError)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"rotvec": (0.1, 0.0, 0.0)}, "the goal is for the base: optimal plans for it"),
+        (
+            {"end_effector_position": (1.5, 0.4, 0.3), "position": (0, 0, 0)},
+            "asks for the pose of the base, too: optimal plans for both",
+        ),
+        (
+            {"end_effector_position": (1.5, 0.4, 0.3), "joint_positions": (0, 0, 0.5)},
+            "asks for joint positions, too",
+        ),
+        (
+            {"end_effector_pose": (1.5, 0.4, 0.3, 0, 0, 0, 1)},
+            "asks for 6 independent coordinates, .* no more than 3: ask for a position instead",
+        ),
+        (
+            {"end_effector_position": (1.5, 0.4, 0.3), "keep_attitude": 1},
+            "with the attitude of the base kept asks for 6 .* leave out resolved_rate.keep_attit",
+        ),
+    ],
+)
+def test_goals_of_another_kind_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(PlanningError, match=message):
+        plan("three_joint_arm", method="resolved_rate", start=ARM, **arguments)
+
+
+def test_a_goal_off_the_plane_of_a_planar_robot_is_unreachable() -> None:
+    with pytest.raises(UnreachableError, match="in one plane") as refusal:
+        planned("planar_chain", np.array([0.4, -0.9]), "segment_2", [0.4, 0.2, 1.9])
+    assert refusal.value.proof is Proof.RANK
+
+
+def test_limits_without_a_speed_are_refused_by_the_name_of_the_method() -> None:
+    with pytest.raises(ParameterError, match=r"resolved_rate\.max_velocity has 2 number"):
+        planned("three_joint_arm", ARM, "end_effector", [1, 1, 1], max_velocity=(1.0, 1.0))
+    with pytest.raises(ParameterError, match=r"see resolved_rate\.max_acceleration"):
+        planned("three_joint_arm", ARM, "end_effector", [1, 1, 1], max_velocity=(1.0, 0.0, 1.0))
+
+
+def test_a_robot_that_drifts_is_refused_and_a_search_is_cancelled() -> None:
+    robot = robot_of("three_joint_arm")
+    method = build_method("resolved_rate", robot, PERIOD, 0.01, {})
+    goal = Goal.of_end_effectors([EndEffectorGoal("end_effector", np.array([1.6, 0.3, 0.5]))])
+    state = RobotState(PLACE, ATTITUDE.as_quat(), ARM, linear_momentum=np.array([0.1, 0, 0]))
+    with pytest.raises(PlanningError, match="drifts"):
+        method.plan(PlanRequest(state, goal, Tolerance(1e-6, 1e-6)))
+    cancelled = Cancellation()
+    cancelled.cancel()
+    state = RobotState(PLACE, ATTITUDE.as_quat(), ARM)
+    with pytest.raises(PlanningCancelled):
+        method.plan(PlanRequest(state, goal, Tolerance(1e-6, 1e-6)), cancelled)
+
+
+# -- among the other methods --------------------------------------------------------------------
+
+
+def test_it_is_compared_for_goals_of_end_effectors_alone() -> None:
+    from spacerobot_ros.scenario import load_scenario
+
+    quick = {"optimal.answers": 1, "optimal.intervals": 20, "optimal.cache": 0}
+    problem = load_scenario("planar_chain").with_overrides("planner", quick).problem()
+    assert "resolved_rate" not in compare(problem)
+    robot = robot_of("planar_chain")
+    found = analyze(robot)
+    assert found.objections["resolved_rate"] is None
+    assert found.chosen == "optimal"
+    options = {"optimal": method_options("optimal", {"cache": 0, "answers": 1, "intervals": 20})}
+    method = build_method("auto", robot, PERIOD, 0.01, options)
+    state = RobotState(PLACE, ATTITUDE.as_quat(), np.array([0.4, -0.9]))
+    goal = Goal.of_end_effectors(
+        [
+            EndEffectorGoal(
+                "segment_2",
+                poses("planar_chain", np.array([[0.6, -1.2]]), "segment_2")["segment_2"][0],
+            )
+        ]
+    )
+    schedule = method.plan(PlanRequest(state, goal, Tolerance(1e-6, 1e-6)))
+    assert "resolved_rate: " in str(schedule.notes["compared"])
+
+
+# -- paper 4 ------------------------------------------------------------------------------------
+
+MANIPULATOR = np.radians([-58.0, 60.3])
+THETA = np.radians(21.0)
+B = np.array([1.5, 1.5, 0.0])
+
+
+@pytest.fixture(scope="module")
+def manipulator() -> tuple[SpaceRobot, RobotState]:
+    """Return paper 4's robot, the centre of mass of the system at the origin."""
+    robot = robot_of("planar_manipulator")
+    attitude = Rotation.from_euler("z", THETA)
+    r_WB = -attitude.apply(robot.center_of_mass(MANIPULATOR))
+    return robot, RobotState(r_WB, attitude.as_quat(), MANIPULATOR)
+
+
+def reach_b(manipulator: tuple[SpaceRobot, RobotState], **options: Any) -> GaitSchedule:
+    robot, state = manipulator
+    return plan(robot, end_effector_position=B, start=state, **options)
+
+
+def test_paper_4_the_straight_line_to_b_meets_a_dynamic_singularity(
+    manipulator: tuple[SpaceRobot, RobotState],
+) -> None:
+    # Computed independently of this program, from the paper's Table I.
+    with pytest.raises(
+        PlanningError,
+        match=r"meets a dynamic singularity after 1\.19498 of 1\.5834\d m of the line of "
+        r"'end_effector': \|det J\*\| falls from 0\.373488 to zero at the shape "
+        r"\(1\.276, 0\.198\).*optimal may reach",
+    ) as refusal:
+        reach_b(manipulator, method="resolved_rate")
+    assert not isinstance(refusal.value, UnreachableError)
+
+
+def test_paper_4_lines_that_end_before_the_singularity_are_followed(
+    manipulator: tuple[SpaceRobot, RobotState],
+) -> None:
+    robot, state = manipulator
+    start = np.array([2.000077, -0.002373, 0.0])
+    way = (B - start) / np.linalg.norm(B - start)
+    goal = start + 1.194 * way
+    schedule = plan(robot, end_effector_position=goal, start=state, method="resolved_rate")
+    urdf = (FOLDER / "planar_manipulator.urdf").read_text("utf-8")
+    found = end_of_motion(
+        *(urdf, robot.joint_names, schedule.positions, ["end_effector", "base_link"]),
+        state.position,
+        Rotation.from_quat(state.quaternion),
+    )
+    np.testing.assert_allclose(found["end_effector"][0], goal, atol=1e-8)
+    # Near theta = -31.9510 deg and q = (73.1295, 11.3449) deg of the singularity.
+    assert np.degrees(schedule.positions[-1]) == pytest.approx([73.13, 11.34], abs=3.5)
+    assert found["base_link"][1].as_euler("xyz", degrees=True)[2] == pytest.approx(-31.95, abs=3.5)
+    assert schedule.notes["at_start"] == pytest.approx(0.373488, abs=1e-6)
+    assert 0.0 < float(str(schedule.notes["least"])) < 0.05
+
+
+def test_paper_4_optimal_reaches_b(manipulator: tuple[SpaceRobot, RobotState]) -> None:
+    schedule = reach_b(manipulator, cache=0, answers=1, max_acceleration=(4.0, 4.0))
+    assert schedule.duration < 3.5
+    assert schedule.notes["predicted_end_effector_position_error"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("clearance", "longest"), [(0.0, 3.00), (0.01, 3.22)])
+def test_paper_4_optimal_reaches_b_as_fast_as_published(
+    manipulator: tuple[SpaceRobot, RobotState], clearance: float, longest: float
+) -> None:
+    schedule = reach_b(
+        manipulator,
+        cache=0,
+        max_acceleration=(4.0, 4.0),
+        clearance=clearance,
+        control_period=0.01,
+    )
+    # A tick or two more, for held commands that end on the goal.
+    assert schedule.notes["solution_time"] <= longest + 0.005  # type: ignore[operator]
+    assert schedule.duration <= longest + 0.02
