@@ -14,11 +14,20 @@ from support.oracles import PinocchioOracle
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import JointLimits
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.resources import resource_names, robot_file
 from spacerobot_ros.scenario import load_scenario
-from spacerobot_ros.session.own_robot import first_shape, first_turn, urdf_remarks
-from spacerobot_ros.simulation.trials import try_method
+from spacerobot_ros.session.own_robot import (
+    first_problem,
+    first_shape,
+    first_turn,
+    scenario_text,
+    urdf_remarks,
+)
+from spacerobot_ros.simulation import InitialState
+from spacerobot_ros.simulation.trials import PlanningProblem, try_method
 
 
 @pytest.fixture
@@ -119,19 +128,123 @@ def test_the_first_turn_is_one_that_the_joints_make_without_loops(name: str) -> 
     assert off < 0.25 * np.linalg.norm(turn)
 
 
+PLAIN = "No link is called 'end_effector'"
+"""The only remark on the planar chain as it is: 120 kg carry 24 kg."""
+
+PIN_1 = ('<joint name="pin_1" type="continuous">', '<joint name="pin_1" type="revolute">')
+RATES = '<limit velocity="2" effort="100"/>'
+BASE = 'ixx="7.2" ixy="0" ixz="0" iyy="10" iyz="0" izz="10"'
+PLATE = """
+  <link name="plate">
+    <inertial><mass value="1"/>
+      <inertia ixx="9" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+  </link>
+  <joint name="weld" type="fixed"><parent link="base_link"/><child link="plate"/></joint>
+</robot>"""
+
+
+def meshes(*names: str) -> tuple[str, str]:
+    """Return the change that gives the base pictures of files that are not there."""
+    drawn = "".join(f'<visual><geometry><mesh filename="{n}"/></geometry></visual>' for n in names)
+    return '<link name="base_link">', f'<link name="base_link">{drawn}'
+
+
+def to_stops(lower: float, upper: float, kind: str = "revolute") -> list[tuple[str, str]]:
+    """Return the changes that give the first pin stops."""
+    limit = f'<limit lower="{lower}" upper="{upper}" velocity="2" effort="100"/>'
+    return [(PIN_1[0], PIN_1[1].replace("revolute", kind)), (RATES, limit)]
+
+
 @pytest.mark.parametrize(
-    ("before", "after", "remark"),
+    ("changes", "remark"),
     [
-        ('velocity="2"', 'velocity="0"', "velocity limit 0"),
-        ('velocity="2"', 'velocity="90"', "check the unit of its velocity limit"),
-        ('effort="', 'effort="0" was="', "effort limit 0"),
-        ("<robot ", "<robot ", "No link is called 'end_effector'"),
+        ([], None),
+        ([('value="120"', 'value="4.7"')], "'base_link' has 4.7 kg and carries 24 kg"),
+        ([('value="120"', 'value="4.9"')], None),
+        ([('value="120"', 'value="12120"')], "has 1.212e+04 kg, 505 times its load"),
+        ([('value="120"', 'value="11880"')], None),
+        ([(BASE, 'ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"')], "'base_link' is a point"),
+        ([(RATES, '<limit velocity="0" effort="1"/>')], "'pin_1' has the velocity limit 0"),
+        ([(RATES, '<limit velocity="0.00098" effort="1"/>')], "'pin_1' moves at up to 0.00098 rad"),
+        ([(RATES, '<limit velocity="0.001" effort="1"/>')], None),
+        ([(RATES, '<limit velocity="50" effort="1"/>')], None),
+        ([(RATES, '<limit velocity="51" effort="1"/>')], "'pin_1' moves at up to 51 rad/s"),
+        ([(RATES, '<limit velocity="2" effort="0"/>')], "'pin_1' has the effort limit 0"),
+        (to_stops(-12.5, 1.0), None),
+        (to_stops(-12.6, 1.0), "'pin_1' turns from -12.6 to 1 rad"),
+        (to_stops(-1.0, 12.6), "'pin_1' turns from -1 to 12.6 rad"),
+        (to_stops(-1.0, 20.0, "prismatic"), None),
+        ([("</robot>", PLATE)], "The inertia of link 'plate' is that of no body"),
+        ([meshes("a.stl")], "The mesh 'a.stl' was not found"),
+        ([meshes("b.stl", "a.stl")], "The mesh 'b.stl' and 1 more was not found"),
+        ([meshes("c.stl", "b.stl", "a.stl")], "The mesh 'c.stl' and 2 more was not found"),
+        ([("<visual>", "<!--"), ("</visual>", "-->")], "No link has a <visual>"),
     ],
 )
-def test_what_to_mind_is_remarked(before: str, after: str, remark: str) -> None:
+def test_unusual_values_are_remarked_and_usual_ones_are_not(
+    changes: list[tuple[str, str]], remark: str | None
+) -> None:
     text = robot_file("planar_chain").read_text("utf-8")
-    assert before in text
-    assert any(remark in each for each in urdf_remarks(parse_robot(text.replace(before, after))))
+    for before, after in changes:
+        assert before in text
+        text = text.replace(before, after, -1 if "visual" in before else 1)
+    remarks = list(urdf_remarks(parse_robot(text)))
+    wanted = [PLAIN] if remark is None else [PLAIN, remark]
+    assert len(remarks) == len(wanted), remarks
+    for part in wanted:
+        assert any(part in each for each in remarks), remarks
+
+
+def test_a_body_alone_carries_no_load_and_may_have_an_end_effector() -> None:
+    link = '<link name="end_effector"><inertial><mass value="7"/>'
+    inertia = '<inertia ixx="1" ixy="0" ixz="0" iyy="1.5" iyz="0" izz="2"/></inertial>'
+    visual = '<visual><geometry><sphere radius="1"/></geometry></visual></link>'
+    body = parse_robot(f'<robot name="ball">{link}{inertia}{visual}</robot>')
+    assert list(urdf_remarks(body)) == []
+
+
+@pytest.mark.parametrize(
+    ("axis", "angle", "line"),
+    [
+        ([0.6, -0.8, 0.0], 2.5, "# 2.5 deg about (0.6, -0.8, 0)"),
+        ([-0.0, 1.0, -0.0], 5.0, "# 5 deg about (0, 1, 0)"),
+        ([1 / 3, 2 / 3, 2 / 3], 0.625, "# 0.625 deg about (0.333, 0.667, 0.667)"),
+    ],
+)
+def test_a_scenario_file_says_its_goal_in_degrees_and_is_read_as_it_was_meant(
+    tmp_path: Path, axis: list[float], angle: float, line: str
+) -> None:
+    robot = SpaceRobot.from_file(robot_file("planar_chain"))
+    turn = np.radians(angle) * np.array(axis)
+    goal = Goal.checked([0.0, 0.0, 0.0], Rotation.from_rotvec(turn).as_quat())
+    config = PlannerConfig(
+        robot="planar_chain", tick_rate=40.0, attitude_tolerance=0.004, position_tolerance=0.03
+    )
+    start = InitialState(joint_positions=np.array([0.25, -0.5]))
+    problem = PlanningProblem("mine", robot, start, goal, config)
+    text = scenario_text(problem, "area_loop", "planar_chain")
+    assert line in text.replace("    #", "#").splitlines()
+    file = tmp_path / "mine.yaml"
+    file.write_text(text, "utf-8")
+    read = load_scenario(str(file))
+    assert Rotation.from_quat(read.goal.quaternion).as_rotvec() == pytest.approx(turn)
+    assert (read.planner.method, read.planner.tick_rate, read.plant.tick_rate) == (
+        *("area_loop", 40.0),
+        40.0,
+    )
+    assert (read.planner.attitude_tolerance, read.planner.position_tolerance) == (0.004, 0.03)
+    assert read.problem().initial.joint_positions == pytest.approx([0.25, -0.5])
+    assert read.goal.joint_positions is None
+
+
+def test_the_tolerance_of_a_small_first_goal_is_a_fiftieth_of_it() -> None:
+    """Light arms turn the base little; the file says the tolerance with one digit."""
+    problem = first_problem("mine", SpaceRobot.from_file(robot_file("free_flyer")), Path("x.urdf"))
+    angle = Rotation.from_quat(problem.goal.quaternion).magnitude()
+    assert np.array_equal(problem.goal.position, np.zeros(3))
+    assert problem.config.attitude_tolerance == pytest.approx(angle / 50, rel=0.3)
+    assert problem.config.attitude_tolerance <= PlannerConfig.attitude_tolerance
+    assert problem.config.robot == "x.urdf"
 
 
 def test_limits_in_degrees_are_remarked() -> None:
