@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from spacerobot_ros.campaign.targets import DrawnFlight, Target, description_of, targets_of
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, printable
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.measures import METRICS, metric_names
 from spacerobot_ros.model.description import Array
@@ -224,7 +224,7 @@ def parse_campaign(
         dispersions=dispersions,
         criteria=_read_criteria(_read_mapping(section, "criteria"), scenario),
         engine=engine,
-        description=str(section.get("description", "")),
+        description=printable(str(section.get("description", ""))),
         section=dict(section),
     )
 

@@ -20,6 +20,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from spacerobot_ros.campaign.config import Campaign, Criterion, meets_criterion
 from spacerobot_ros.campaign.dataset import DRAW_PREFIX, Dataset
 from spacerobot_ros.campaign.draws import Draws, require_module
+from spacerobot_ros.campaign.rows import ERROR
 from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
     Influence,
@@ -30,7 +31,7 @@ from spacerobot_ros.campaign.statistics import (
     sobol_indices,
 )
 from spacerobot_ros.files import write_output
-from spacerobot_ros.measures import METRICS
+from spacerobot_ros.measures import METRICS, Outcome
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.report.figures import FAINT, INK, PALETTE, PictureFormat, drawing, picture_of
 from spacerobot_ros.report.page_parts import facts, figure, html_page, table, tiles
@@ -40,6 +41,8 @@ MADE_BY = f"Made by spacerobot_ros {__version__}."
 """Footer of the pages of campaigns."""
 
 _WORST_FLIGHTS_SHOWN = 10
+_MESSAGES_SHOWN = 4
+"""Messages of flights of one outcome."""
 _MAX_BADNESS = 100.0
 """Distance from a bound at which the order of the worst flights saturates, standard deviations."""
 
@@ -203,9 +206,30 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     lines = [f"success     {results.success}"]
     lines += [f"note        {results.bias}"] if results.bias else []
     lines += [f"required    {c}: {results.requirement_share(c)}" for c in results.campaign.criteria]
+    lines += [
+        f"{outcome:<11} {count} of {len(results)}: {message}"
+        for outcome, count, message in _messages(results)
+        if message and outcome in (ERROR, Outcome.REFUSED, Outcome.ABORTED)
+    ]
     for each in results.influences()[:3]:
         lines.append(f"driver      {each}")
     return lines
+
+
+def _messages(results: Results) -> list[tuple[str, int, str]]:
+    """Return outcomes with the numbers of flights and their most frequent messages.
+
+    Messages that differ in their numbers only are one.
+    """
+    kinds: dict[str, Counter[str]] = {}
+    for outcome, reason in zip(results.columns["outcome"], results.columns["reason"], strict=True):
+        message = re.sub(r"-?\d[\d.e+-]*", "…", reason or "")
+        kinds.setdefault(outcome, Counter())[message] += 1
+    return [
+        (outcome, count, message)
+        for outcome, counts in sorted(kinds.items(), key=lambda kind: -kind[1].total())
+        for message, count in counts.most_common(_MESSAGES_SHOWN)
+    ]
 
 
 def picture_part(drawn: Figure, name: str, caption: str) -> str:
@@ -310,15 +334,7 @@ def _share_cells(met: Share) -> list[str]:
 
 
 def _outcomes_section(results: Results) -> str:
-    kinds: dict[str, list[str]] = {}
-    for outcome, reason in zip(results.columns["outcome"], results.columns["reason"], strict=True):
-        kinds.setdefault(outcome, []).append(reason or "")
-    rows = []
-    for outcome, reasons in sorted(kinds.items(), key=lambda item: -len(item[1])):
-        # Messages that differ in their numbers only are one kind.
-        counts = Counter(re.sub(r"-?\d[\d.e+-]*", "…", reason) for reason in reasons)
-        for sentence, count in counts.most_common(4):
-            rows.append([outcome, f"{count}", sentence])
+    rows = [[outcome, f"{count}", reason] for outcome, count, reason in _messages(results)]
     made = table("outcomes", ["outcome", "flights", "message"], rows)
     fallbacks = Counter(text for text in results.columns.get("fallback", ()) if text)
     for reason, count in fallbacks.most_common(6):

@@ -41,7 +41,7 @@ from spacerobot_ros.termination import tool
 # With fused multiply-adds, results would depend on the processor.
 _COMMON_FLAGS = ("-fPIC", "-shared", "-ffp-contract=off")
 
-_COMPILER_FLAGS = ("-O2", *_COMMON_FLAGS)
+_COMPILER_FLAGS = ("-O1", *_COMMON_FLAGS)
 
 _LONG_FUNCTION_FLAGS = ("-O0", *_COMMON_FLAGS)
 """Flags for functions of ten thousands of operations: a tenth of the time to compile, half

@@ -34,7 +34,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.processes import MultiProcessStack
-from spacerobot_ros.session.stack import InProcessStack, Stack
+from spacerobot_ros.session.stack import InProcessStack, Stack, checked_namespace
 from spacerobot_ros.termination import ended_on_request
 from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.topics import goal_topic
@@ -248,8 +248,9 @@ def send_goal(
     Raises
     ------
     SpaceRobotError
-        No commander takes goals.
+        No commander takes goals, or ROS takes no such namespace.
     """
+    namespace = checked_namespace(namespace)
     with ros(private=False):
         executor = EventsExecutor()
         clocks = {"own": 0, "global": 0}

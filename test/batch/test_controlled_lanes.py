@@ -165,7 +165,8 @@ def thrusters(robot: SpaceRobot, force: float) -> ThrusterTable:
 
 
 @needs_compiler
-@pytest.mark.parametrize("force", [pytest.param(40.0, marks=pytest.mark.slow), 8.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("force", [40.0, 8.0])
 def test_thrusters_in_lanes_are_fired_as_by_the_modulator(force: float) -> None:
     """Until rounding decides about a pulse; the weak ones are at their limit at once."""
     flights = controlled(

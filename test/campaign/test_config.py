@@ -105,6 +105,10 @@ def test_what_is_wrong_is_said_in_one_sentence_without_a_warning() -> None:
     assert any(np.isinf(draw.values["mass"]) for draw in Draws(made))
 
 
+def test_a_description_has_no_control_characters() -> None:
+    assert campaign(description="red \x1b[31m\nblue").description == "red \ufffd[31m blue"
+
+
 def test_numbers_without_a_dot_may_be_chosen() -> None:
     """YAML reads 9e-1 as a text."""
     made = campaign(disperse={"mass": {"choice": ["9e-1", 1]}})

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from support.campaigns import campaign
+from support.slow import some_fast
 
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
@@ -37,7 +38,7 @@ def flown(engine: LanesEngine | FlightsEngine, made: Campaign) -> dict[int, Row]
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "most"), [(0.05, 3), (0.0012, 3), pytest.param(0.0012, 0, marks=pytest.mark.slow)]
+    ("tolerance", "most"), some_fast([(0.05, 3), (0.0012, 3), (0.0012, 0)], (0.0012, 3))
 )
 def test_the_same_draw_is_the_same_flight_in_every_engine(tolerance: float, most: int) -> None:
     """A tight tolerance makes some need a correction, which lanes leave to the planner."""
@@ -122,7 +123,7 @@ def test_coordinated_control_in_lanes_is_that_of_the_plant_and_the_controller() 
     assert len({row.metrics["duration_s"] for row in lanes.values()}) > 3
 
 
-@pytest.mark.parametrize("engine", [LanesEngine, FlightsEngine])
+@pytest.mark.parametrize("engine", some_fast([LanesEngine, FlightsEngine], LanesEngine))
 def test_every_flight_has_noise_of_its_own(engine: type[LanesEngine | FlightsEngine]) -> None:
     """Nothing but the noise differs: the campaign's seed and the number of the flight decide it."""
     same = {"goal.position.x": {"choice": [0.5]}}
@@ -199,6 +200,7 @@ def test_draws_that_are_no_robot_and_no_number_end_no_other_flight() -> None:
     assert {row.engine for row in lanes.values()} == {"lanes"}
 
 
+@pytest.mark.slow
 def test_control_in_lanes_is_flown_in_this_process_too(tmp_path: Path) -> None:
     """Where no workers take the draws apart, lanes do."""
     end = run_campaign(controlled(flights=3, longest=0.2), tmp_path)

@@ -219,6 +219,26 @@ def test_counts_below_the_convergence_are_plain_numbers(
     assert all(re.fullmatch(r"\d*", label) for label in labels), labels
 
 
+def test_messages_are_counted_by_outcome_without_their_numbers(tmp_path: Path) -> None:
+    made = campaign(disperse=MASSES, flights=9)
+    reasons = [
+        *[("reached", "At the goal after 3.5 s."), ("reached", "At the goal after 4.25e-1 s.")],
+        *[("refused", "Too far by 2 m."), ("error", "No robot."), ("refused", "Too far by 3 m.")],
+        *[("refused", "No way."), ("aborted", "Lost."), ("failed", "Off by 1 m."), ("error", "")],
+    ]
+    dataset = Dataset(tmp_path)
+    dataset.begin(made)
+    dataset.add([Row(draw, *each) for draw, each in zip(Draws(made), reasons, strict=True)])
+    dataset.close()
+    lines = write_campaign_report(tmp_path, tmp_path / "report.html")
+    assert [line for line in lines if " of 9: " in line] == [
+        "refused     2 of 9: Too far by … m.",
+        "refused     1 of 9: No way.",
+        "error       1 of 9: No robot.",
+        "aborted     1 of 9: Lost.",
+    ]
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("count", [1, 2, 7])
 def test_flights_that_all_failed_have_a_report(tmp_path: Path, count: int) -> None:
@@ -231,6 +251,7 @@ def test_flights_that_all_failed_have_a_report(tmp_path: Path, count: int) -> No
     dataset.close()
     lines = write_campaign_report(tmp_path, tmp_path / "report.html")
     assert lines[0].startswith(f"success     0 % (0 of {count};")
+    assert lines.count(f"error       {count} of {count}: The mass is negative.") == 1
     text = (tmp_path / "report.html").read_text()
     assert "No flight has any metric." in text
     assert "The mass is negative." in text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from std_srvs.srv import Trigger
 from support.fault_flights import FaultFlight, values_of
 from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
+from support.slow import some_fast
 
 SLIDERS: dict[str, Any] = {"robot": "sliding_masses", "diagnostics_period": 1.0}
 # Slides of 2 s in one swing, cycles of 1 s.
@@ -38,12 +38,6 @@ AREA_LOOP: dict[str, Any] = {
     "area_loop.nominal": [0.0, -1.2, 2.0, 0.0, 0.8, 0.0],
 }
 A_LITTLE = ([0.0, 0.0, 0.0], [0.004, 0.003, -0.004])
-
-
-def some_fast(cases: Mapping[str, Any], *fast: str) -> list[Any]:
-    """Return parameters of which all but a few are left to the slow tests."""
-    marks = {name: () if name in fast else (pytest.mark.slow,) for name in cases}
-    return [pytest.param(case, id=name, marks=marks[name]) for name, case in cases.items()]
 
 
 def sliders(harness: Harness, *faults: str, **planner: Any) -> FaultFlight:
@@ -141,7 +135,7 @@ SURVIVED = {
 }
 
 
-@pytest.mark.parametrize("faults", some_fast(SURVIVED, "a slow joint", "no pose in flight"))
+@pytest.mark.parametrize("faults", some_fast(SURVIVED, "no pose in flight"))
 def test_the_goal_is_met_in_spite_of(harness: Harness, faults: tuple[str, ...]) -> None:
     flight = sliders(harness, *faults, averaging=15, max_corrections=6)
     assert_met(flight, flight.fly(*TURNED))

@@ -20,7 +20,10 @@ MODES = pytest.mark.parametrize("real_time", [False, True], ids=["lockstep", "re
 
 @pytest.mark.parametrize(
     ("setup", "real_time", "count"),
-    [("planar_manipulator", False, 20), ("sliding_masses", True, 20)],
+    [
+        ("planar_manipulator", False, 20),
+        pytest.param("sliding_masses", True, 20, marks=pytest.mark.slow),
+    ],
     ids=["lockstep", "real_time"],
 )
 def test_some_random_actions_leave_every_state_as_specified(

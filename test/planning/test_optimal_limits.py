@@ -135,6 +135,7 @@ def test_a_search_cut_short_gives_the_best_so_far(arm: SpaceRobot) -> None:
     assert_within(hasty, arm.velocity_limit, arm.velocity_limit / 0.5)
 
 
+@pytest.mark.slow
 def test_a_plan_is_the_same_on_a_busy_machine(
     arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -28,7 +28,7 @@ EXPECTED: dict[str, tuple[bool, float | None, float | None]] = {
     "late_poses": (True, 2e-3, 2e-3),
     "biased_pose": (True, 0.11, 2e-3),
 }
-FAST = ("noisy_sensors", "wrong_masses", "late_poses")
+FAST = ("noisy_sensors", "late_poses")
 KILLED = "killed_nodes"
 
 

@@ -16,7 +16,9 @@ from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.scenario import load_scenario
+from spacerobot_ros.session.run import send_goal
 from spacerobot_ros.session.stack import InProcessStack, checked_namespace
 
 ROOT = Path(__file__).parents[2]
@@ -106,6 +108,8 @@ def test_two_stacks_of_the_command_fly_side_by_side(ros_domain: int, tmp_path: P
 def test_what_ros_does_not_take_as_a_namespace_is_refused(name: str) -> None:
     with pytest.raises(ParameterError, match="namespace"):
         checked_namespace(name)
+    with pytest.raises(ParameterError, match="namespace"):
+        send_goal(Goal.from_rotvec([1, 2, 3], [0.1, 0.2, 0]), print, namespace=name, timeout=1)
 
 
 @pytest.mark.parametrize("name", ["a/b", "/a/b", "a/b/", "/a/b/"])

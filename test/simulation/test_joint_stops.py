@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support.oracles import Array
 from support.random_robots import random_robot_urdf
+from support.slow import some_fast
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
@@ -126,7 +127,7 @@ def test_spin_keeps_the_slider_out_until_effort_draws_it_in() -> None:
 # -- many joints ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
+@pytest.mark.parametrize("seed", some_fast(range(4), 0))
 def test_stops_change_no_momentum_and_only_take_energy(seed: int) -> None:
     robot, rng = random_robot(seed), np.random.default_rng(200 + seed)
     side = rng.choice([-1.0, 1.0], robot.n)

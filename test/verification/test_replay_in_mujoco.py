@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
+from support.slow import some_fast
 
 from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.scenario import load_scenario
@@ -154,10 +155,7 @@ def effort_limits(urdf: str) -> dict[str, float]:
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow) if name.startswith("spatial") else name
-        for name in FLIGHTS
-    ],
+    some_fast(list(FLIGHTS), "planar, saturated"),
 )
 def test_the_commands_lead_to_the_same_motion(
     name: str, ros_domain: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
