@@ -95,6 +95,10 @@ mutants: $(STAMP)/mutants ## put random errors into the whole package; see out/m
 hostile-bags: $(STAMP)/test ## read bags that were made to harm their reader, each in a process of its own
 	$(BIN)/python3 -m pytest -m 'slow or not slow' -rP test/bag/test_hostile_bags.py
 
+.PHONY: attacks
+attacks: $(STAMP)/test ## try files and words that were made to harm or mislead, each in a process of its own; see out/attacks.md
+	$(BIN)/python3 -m pytest -q -m "slow or not slow" test/attacks
+
 .PHONY: reports
 reports: $(STAMP)/test ## fly every scenario, make its report, open it in Chromium at desktop and phone width
 	$(BIN)/python3 -m pytest -m slow -rP test/report/test_every_report.py

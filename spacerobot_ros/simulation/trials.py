@@ -240,7 +240,17 @@ def random_goals(problem: PlanningProblem, count: int, distance: float, angle: f
     """Return goals within ``distance`` (m) and ``angle`` (rad) of the start, with a fixed seed.
 
     Axes of rotation are uniform; those of planar robots are their axis.
+
+    Raises
+    ------
+    ParameterError
+        A bound is negative or not finite.
     """
+    if not (0.0 <= distance < math.inf and 0.0 <= angle < math.inf):
+        raise ParameterError(
+            f"Random goals lie within {distance:g} m and {math.degrees(angle):g} deg of the start; "
+            "both must be finite numbers from 0."
+        )
     rng = np.random.default_rng(0)
     start = problem.plant().pose
     axes = Turning.of(problem.robot).axes

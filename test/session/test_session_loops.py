@@ -303,7 +303,7 @@ def test_a_goal_is_followed_no_longer_than_its_timeout(
     assert len(shown) == 4
     assert shown[-1] == "The end."
     for decider, each in clients.items():
-        assert each.options["namespace"] == "left"
+        assert each.options["namespace"] == "/left"
         assert each.options["end_effectors"] == ["hand"]
         names = each.options["joint_names"]
         assert (names and names()) == (() if decider == "planner" else None)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.planner_loop import QUICK, TICK, StubMethod, goal_at, robot_of
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -88,6 +88,9 @@ def test_random_goals_are_spread_evenly_over_a_ball_and_over_angles(robot: str, 
     assert np.abs(turns.as_rotvec().mean(axis=0)).max() < 0.04
     again = random_goals(at, 3, 0.4, 0.7)
     assert all(np.array_equal(a.position, b.position) for a, b in zip(goals, again, strict=False))
+    for bounds in ((np.nan, 0.7), (0.4, np.inf), (-0.1, 0.7), (0.4, -0.7)):
+        with pytest.raises(ParameterError, match="Random goals lie within"):
+            random_goals(at, 3, *bounds)
 
 
 def test_goals_are_counted_by_what_became_of_them(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,9 +11,16 @@ import pytest
 def some_fast(cases: Iterable[Any], *fast: Any) -> list[Any]:
     """Return parameters of which all but a few are left to the slow tests.
 
-    ``fast`` are cases, or names of a mapping of cases, which become their ids.
+    ``fast`` are cases, or names of a mapping of cases, which become their ids. A tuple is a case of
+    several parameters.
     """
     if isinstance(cases, Mapping):
         marks = {name: () if name in fast else (pytest.mark.slow,) for name in cases}
         return [pytest.param(case, id=name, marks=marks[name]) for name, case in cases.items()]
-    return [case if case in fast else pytest.param(case, marks=pytest.mark.slow) for case in cases]
+    return [
+        pytest.param(
+            *(case if isinstance(case, tuple) else (case,)),
+            marks=() if case in fast else (pytest.mark.slow,),
+        )
+        for case in cases
+    ]
