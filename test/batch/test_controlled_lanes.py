@@ -188,6 +188,7 @@ def test_thrusters_in_lanes_are_fired_as_by_the_modulator(force: float) -> None:
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_the_noise_of_a_flight_is_that_of_its_seed() -> None:
     """Of flights that are equal but for their seeds, those of one seed alone are equal."""
     flights = controlled(

@@ -36,10 +36,10 @@ GAINS: dict[str, dict[str, Any]] = {
         for name, value in (("kp", 1.0), ("kd", 2.0))
     },
 }
-pytestmark = pytest.mark.usefixtures("own_domain")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_domain")]
 
 
-@pytest.fixture(params=["transposed_jacobian", pytest.param("model_based", marks=pytest.mark.slow)])
+@pytest.fixture(params=["transposed_jacobian", "model_based"])
 def law(request: pytest.FixtureRequest) -> str:
     """Return a law; the quick tests of the controller fly the other one without ROS."""
     return str(request.param)
@@ -163,7 +163,6 @@ def test_lost_thrust_is_reported(law: str, tmp_path: Path) -> None:
     assert "not reached in time" in result.message
 
 
-@pytest.mark.slow
 def test_both_poses_are_reached_with_a_tenth_of_the_thrust(
     unlimited: RunResult, law: str, tmp_path: Path
 ) -> None:
@@ -186,8 +185,7 @@ def either_way() -> Callable[[], float]:
     return lambda: float(rng.uniform(0.9, 1.1))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("error", [heavier, pytest.param(either_way, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("error", [heavier, either_way])
 def test_both_poses_are_reached_with_wrong_masses(
     law: str, error: Callable[[], Callable[[], float]], tmp_path: Path
 ) -> None:
