@@ -260,6 +260,14 @@ _TOPIC_TABLE = (
         "was recorded and lost",
     ),
     Topic(
+        "clearance",
+        _STATUS_TYPE,
+        _PUBLISHED_BY_PLANT,
+        "smallest distance between two links, every `clearance_period`: `time` (s), `distance` "
+        "(m; negative: the depth of a contact), and the links `first` and `second`",
+        when="links of the robot could touch",
+    ),
+    Topic(
         "fault_injection",
         _STRING_TYPE,
         _PUBLISHED_BY_USER,
