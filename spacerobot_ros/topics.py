@@ -195,7 +195,8 @@ _TOPIC_TABLE = (
         "joint_states",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_PLANT,
-        "measured positions and velocities of the joints, and the efforts of their actuators",
+        "measured positions and velocities of the joints, and the efforts of their actuators in "
+        "the last tick: of servos, those that their motion took",
         state=_joint_states("measured"),
         frame="base",
     ),

@@ -312,7 +312,7 @@ class _ScheduledLanes:
                 flights.robot, ready.flight, result.q[row, end], pose
             ),
             peak_rate=result.peak_rate[row],
-            peak_effort=np.zeros(flights.robot.n),
+            peak_effort=result.peak_effort[row],
             peak_wrench=np.zeros(2),
             # The joints follow the schedule exactly at every tick.
             lowest=schedule.positions.min(axis=0),
