@@ -45,6 +45,9 @@ _SAME_CLOCK_TOLERANCE = 1.0
 
 _COMMAND_TOPICS = ("joint_commands", "base_wrench", "joint_reference")
 
+_NO_GOAL = Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+"""Goal of the base where a bag has none, or leaves it free."""
+
 WRENCH_COLUMNS = TOPICS["base_wrench_realised"].state[0].columns
 """Paths of force and torque in a message of a wrench."""
 
@@ -243,11 +246,11 @@ class FlightBag:
             stamp = message.header.stamp
             goal_id = ids.of(stamp.sec, stamp.nanosec)
             p, o = message.pose.position, message.pose.orientation
-            try:
+            attitude = [o.x, o.y, o.z, o.w]
+            if topic != "goal_pose" and not any(attitude):
                 # Zeros ask for the position of an end-effector alone.
-                attitude = [o.x, o.y, o.z, o.w] if any((o.x, o.y, o.z, o.w)) else [0, 0, 0, 1]
-                if topic == "goal_pose":
-                    attitude = [o.x, o.y, o.z, o.w]
+                attitude = _NO_GOAL.quaternion.tolist()
+            try:
                 goal = Goal.checked([p.x, p.y, p.z], attitude)
             except PlanningError:
                 continue
@@ -379,7 +382,6 @@ def read_flight(bag: FlightBag) -> Flight:
         end_effector_goals=tool_goals,
         status=status,
         gait=follower.gait,
-        measures_clearance=bool(bag.series_of("clearance")),
     )
     # A table of thrusters that is a file of its own is not looked for: a bag may name any file.
     in_urdf = scenario.in_file.get("plant", {}).get("thrusters") == IN_URDF
@@ -469,14 +471,14 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
     with suppress(GoalError, AttributeError):
         if links:
             free = goal is None
-            goal = goal or Goal.checked([0, 0, 0], [0, 0, 0, 1])
+            goal = goal or _NO_GOAL
             aims = tuple(EndEffectorGoal.checked(str(link), pose) for link, pose in links.items())
             goal = replace(goal, end_effectors=aims, base=frozenset() if free else POSE)
     return Scenario(
         name=about.get("name", "") or bag.path.stem,
         path=bag.path,
         description=about.get("description", ""),
-        goal=goal or Goal.checked([0, 0, 0], [0, 0, 0, 1]),
+        goal=goal or _NO_GOAL,
         end_effector_goal=end_effector_goal,
         commanders=tuple(name for name in COMMANDERS if name in nodes) or COMMANDERS[:1],
         published=published,

@@ -25,7 +25,6 @@ from spacerobot_ros.report.figures_over_time import (
     NO_STATES,
     attitude_figure,
     attitude_group,
-    clearance_figure,
     draw_whole,
     efforts_figure,
     errors_figure,
@@ -77,7 +76,6 @@ FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
     "efforts": efforts_figure,
     "thrusters": thrusters_figure,
     "twist": twist_figure,
-    "clearance": clearance_figure,
     "momentum": momentum_figure,
     "path": path_figure,
 }
@@ -96,7 +94,6 @@ _REPORT_FIGURES = (
     efforts_figure,
     thrusters_figure,
     twist_figure,
-    clearance_figure,
     momentum_figure,
 )
 

@@ -114,13 +114,18 @@ class Reach:
         for file in folder.glob("tests-*.json"):
             measured |= json.loads(file.read_text())
         found = cls({name: (cpu, wall) for name, (cpu, wall, passed) in measured.items() if passed})
+        users: dict[str, list[str]] = defaultdict(list)
+        for file in folder.glob("users-*.json"):
+            for fixture, names in json.loads(file.read_text()).items():
+                users[fixture] += names
         for file in folder.glob("lines-*"):
             data = CoverageData(str(file))
             data.read()
             for path in data.measured_files():
                 here = found.lines["spacerobot_ros/" + path.rpartition("/spacerobot_ros/")[2]]
                 for line, names in data.contexts_by_lineno(path).items():
-                    here[line] = [*here.get(line, []), *names]
+                    tests = [test for name in names for test in users.get(name, [name])]
+                    here[line] = list(dict.fromkeys([*here.get(line, []), *tests]))
         return found
 
     def moved_to(self, old: Path, new: Path) -> Reach:

@@ -16,14 +16,7 @@ PAGES = [
     *(ROOT / "docs" / name for name in ("choosing.md", "planner_state_machine.md")),
     *(
         ROOT / "docs" / "theory" / f"{name}.md"
-        for name in (
-            "area_loop",
-            "controllability",
-            "lie_bracket",
-            "optimal",
-            "singularities",
-            "square_path",
-        )
+        for name in ("area_loop", "controllability", "lie_bracket", "optimal", "square_path")
     ),
 ]
 
