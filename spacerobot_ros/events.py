@@ -31,6 +31,9 @@ class EventKind(str, Enum):
     """A fault begins to act."""
     FAULT_ENDED = "fault_ended"
     FAULTS_CLEARED = "faults_cleared"
+    CONTACT = "contact"
+    """Two links of the robot touch; the simulation goes on through the contact."""
+    CONTACT_ENDED = "contact_ended"
 
     GOAL_ACCEPTED = "goal_accepted"
     GOAL_REFUSED = "goal_refused"
@@ -53,6 +56,10 @@ class EventKind(str, Enum):
 
     NODE_SILENT = "node_silent"
     NODE_BACK = "node_back"
+
+
+CONTACTS = frozenset({EventKind.CONTACT, EventKind.CONTACT_ENDED})
+"""Kinds of events of contacts between links."""
 
 
 @dataclass(frozen=True)

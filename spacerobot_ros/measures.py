@@ -61,6 +61,9 @@ class Measures:
         Propellant used by the thrusters, kg; NaN without thrusters.
     plan_time, wall_time
         Wall time of planning and of the whole flight, s; NaN where it is not known.
+    clearance
+        Smallest distance between two links, m, negative where they touch: the depth. Infinite of a
+        robot without pairs that could touch, NaN where it was not measured.
     """
 
     outcome: Outcome
@@ -79,6 +82,7 @@ class Measures:
     propellant: float = math.nan
     plan_time: float = math.nan
     wall_time: float = math.nan
+    clearance: float = math.nan
 
 
 def momentum_change(momenta: Array, reference: Array) -> Array:
@@ -202,6 +206,9 @@ def _margin_metric(quantity: str, limit: str, peak_of: Callable[[Measures], Arra
     )
 
 
+CLEARANCE = "clearance_m"
+"""Name of the metric that campaigns measure only where a criterion names it."""
+
 METRICS: dict[str, Metric] = {
     "position_error_m": _error_metric(
         "error", "distance", "m", "distance of the last true position of the base from the goal"
@@ -247,6 +254,13 @@ METRICS: dict[str, Metric] = {
         "kg m/s, kg m^2/s",
         "largest change of a momentum that thrust does not explain",
         lambda m, _: float(m.momentum_drift.max()),
+    ),
+    CLEARANCE: Metric(
+        "m",
+        "smallest distance between two links, measured where a criterion names it; negative: the "
+        "depth of a contact",
+        lambda m, _: m.clearance,
+        smallest_is_worst=True,
     ),
 }
 """Every metric by its name."""

@@ -195,7 +195,8 @@ _TOPIC_TABLE = (
         "joint_states",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_PLANT,
-        "measured positions and velocities of the joints, and the efforts of their actuators",
+        "measured positions and velocities of the joints, and the efforts of their actuators in "
+        "the last tick: of servos, those that their motion took",
         state=_joint_states("measured"),
         frame="base",
     ),
@@ -258,6 +259,14 @@ _TOPIC_TABLE = (
         ("plant", "planner", "coordinated_control", "recorder"),
         "refused commands, limits, momentum, faults, deadlines; ignored states; silent nodes; what "
         "was recorded and lost",
+    ),
+    Topic(
+        "clearance",
+        _STATUS_TYPE,
+        _PUBLISHED_BY_PLANT,
+        "smallest distance between two links, every `clearance_period`: `time` (s), `distance` "
+        "(m; negative: the depth of a contact), and the links `first` and `second`",
+        when="links of the robot could touch",
     ),
     Topic(
         "fault_injection",

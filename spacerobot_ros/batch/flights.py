@@ -404,7 +404,7 @@ class BatchResult:
     peak_rate
         (N, n) largest joint rate at the end of a tick, m/s or rad/s.
     peak_effort
-        (N, n) largest effort of a joint in a tick, N or N m; zero under velocity actuation.
+        (N, n) largest effort of a joint in a tick, N or N m.
     peak_wrench
         (N, 2) largest force (N) and torque (N m) commanded on the base.
     impulse

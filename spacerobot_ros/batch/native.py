@@ -277,9 +277,8 @@ class CompiledTick:
             copies |= {"next_remaining": "remaining", "next_open": "open"}
         state, limited = rows.first("next_state"), rows.first("limited", 1)
         rates = state + n + 4 if effort else rows.first("qdot")
-        peaks = [(rates, rows.first("peak_rate"), n)]
-        if effort:
-            peaks.append((rows.first("realised"), rows.first("peak_effort"), n))
+        efforts = rows.first("realised" if effort else "effort")
+        peaks = [(rates, rows.first("peak_rate"), n), (efforts, rows.first("peak_effort"), n)]
         report, width = [(state, 0, n), (rates, n, n)], 2 * n
         for name in ("pose", "twist", "momentum"):
             report.append((rows.first(name), width, rows.size(name)))
@@ -321,20 +320,21 @@ class _TickNames:
 
 _TICKS = {
     "velocity": _TickNames(
-        ("state", "command", "momenta", "r_cm", "h"),
+        ("state", "command", "before", "momenta", "r_cm", "h"),
         (
             "next_state",
             "pose",
             "twist",
             "qdot",
+            "effort",
             "momentum",
             "link_R",
             "link_r",
             "limited",
             "next_r_cm",
         ),
-        ("next_state", "qdot", "limited", "next_r_cm"),
-        {"next_state": "state", "next_r_cm": "r_cm"},
+        ("next_state", "qdot", "effort", "limited", "next_r_cm"),
+        {"next_state": "state", "qdot": "before", "next_r_cm": "r_cm"},
     ),
     "effort": _TickNames(
         ("state", "command", "h"),

@@ -14,7 +14,7 @@ import yaml
 from spacerobot_ros.campaign.targets import DrawnFlight, Target, description_of, targets_of
 from spacerobot_ros.errors import ParameterError, printable
 from spacerobot_ros.files import load_yaml
-from spacerobot_ros.measures import METRICS, metric_names
+from spacerobot_ros.measures import CLEARANCE, METRICS, metric_names
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario, number_in, scenario_or_robot
@@ -141,6 +141,11 @@ class Campaign:
     def names(self) -> tuple[str, ...]:
         """Names of the drawn quantities, in the order of the columns."""
         return tuple(dispersion.name for dispersion in self.dispersions)
+
+    @property
+    def measures_clearance(self) -> bool:
+        """Whether a criterion names the smallest distance between links."""
+        return any(criterion.metric == CLEARANCE for criterion in self.criteria)
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):

@@ -140,6 +140,8 @@ class LanesEngine:
         plant = scenario.plant
         if plant.faults or any(each.name.startswith("faults") for each in campaign.dispersions):
             return "it has faults"
+        if campaign.measures_clearance:
+            return "a criterion names clearance_m, and lanes measure no distances between links"
         match scenario.commanders, plant.actuation:
             case ("planner",), "velocity":
                 return self._scheduled.refusal(campaign)
@@ -310,7 +312,7 @@ class _ScheduledLanes:
                 flights.robot, ready.flight, result.q[row, end], pose
             ),
             peak_rate=result.peak_rate[row],
-            peak_effort=np.zeros(flights.robot.n),
+            peak_effort=result.peak_effort[row],
             peak_wrench=np.zeros(2),
             # The joints follow the schedule exactly at every tick.
             lowest=schedule.positions.min(axis=0),
@@ -485,7 +487,7 @@ def _has_noise(flight: DrawnFlight) -> bool:
 def _first_plan(flight: DrawnFlight) -> _Plan | None:
     """Let the executive plan for the first state; None if it makes no whole schedule."""
     period = flight.scenario.plant.control_period
-    first = fly_scenario(flight.scenario, robots=robots_of(flight), longest=period)
+    first = fly_scenario(flight.scenario, robots=robots_of(flight), longest=period, contacts=False)
     if len(first.schedules) != 1 or first.gait is None:
         return None
     ((begins_ns, schedule),) = first.schedules

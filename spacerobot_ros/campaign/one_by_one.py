@@ -47,7 +47,8 @@ class _OneByOneEngine(ABC):
                 flown = self.fly_draw(campaign, drawn_flight(campaign, draw, common), stopped)
                 if stopped() and flown.outcome is Outcome.INTERRUPTED:
                     return
-                yield Row.of(campaign, draw, flown.measures, self.name)
+                measures = flown.measured(clearance=campaign.measures_clearance)
+                yield Row.of(campaign, draw, measures, self.name)
             except Exception as error:  # The error becomes a row with its message as the reason.
                 yield Row.of_error(draw, error, self.name)
 
@@ -80,6 +81,7 @@ class FlightsEngine(_OneByOneEngine):
             robots=robots_of(flight),
             progress=lambda now, end: stopped(),
             longest=campaign.longest,
+            contacts=False,
         )
 
 

@@ -205,7 +205,8 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     draw = draws[number]
     scenario = drawn_flight(campaign, draw).with_masses_in_urdf().scenario
     run_scenario(scenario, bag, longest=campaign.longest)
-    row = Row.of(campaign, draw, read_run(bag).measures, "ros")
+    measures = read_run(bag).measured(clearance=campaign.measures_clearance)
+    row = Row.of(campaign, draw, measures, "ros")
     known = stored_flight(dataset, number)
     if known is None:
         return Rerun(row, None, "", "", bag)

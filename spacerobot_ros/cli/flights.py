@@ -152,6 +152,7 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         f"momentum    changed by at most {summary['linear_momentum_drift']:.1e} kg m/s and "
         f"{summary['angular_momentum_drift']:.1e} kg m^2/s",
         *_propellant_line(summary),
+        *_clearance_line(summary),
         f"bag         {summary['bag']} ({summary['messages_recorded']} messages)",
     ]
 
@@ -173,6 +174,15 @@ def _end_effector_line(summary: dict[str, Any]) -> list[str]:
 def _propellant_line(summary: dict[str, Any]) -> list[str]:
     used = summary.get("propellant_kg")
     return [] if used is None else [f"propellant  {1e3 * used:.1f} g"]
+
+
+def _clearance_line(summary: dict[str, Any]) -> list[str]:
+    if "clearance_m" not in summary:
+        return []
+    first, second = summary["clearance_links"]
+    distance, time = summary["clearance_m"], summary["clearance_time_s"]
+    fact = f"come within {distance:.3g} m" if distance > 0 else f"touch, {-distance:.3g} m deep,"
+    return [f"clearance   links '{first}' and '{second}' {fact} at {time:.6g} s"]
 
 
 def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -29,16 +30,33 @@ _MAX_LISTED_JOINTS = 12
 _MOST_DISTANCES = 3
 """Pairs of links whose distances are listed, nearest first."""
 
+_MOST_INTERVALS = 4
+"""Intervals of distances that are listed; of more, the number and the length are."""
+
 
 @click.command("analyze")
 @click.argument("robot")
 @click.option("--shape", metavar="'Q1 Q2 ...'", help="Shape to analyse, m or rad [the best].")
-@picture_option("Picture of the curvature (.png, .svg, .pdf) [out/ROBOT_curvature.png].")
+@click.option(
+    "--end-effector",
+    default="",
+    metavar="LINK",
+    help="Link whose workspaces are computed [end_effector].",
+)
+@picture_option(
+    "Picture of the curvature (.png, .svg, .pdf) [out/ROBOT_curvature.png]. That of the "
+    "workspaces is beside it, its name ends in _workspaces."
+)
 @json_option("Write the findings as JSON.")
 def analyze_command(
-    robot: str, shape: str | None, picture: Path | None, json_file: Path | None
+    robot: str,
+    shape: str | None,
+    end_effector: str,
+    picture: Path | None,
+    json_file: Path | None,
 ) -> None:
-    """Analyse what loops of the joints of ROBOT do to its base.
+    """Analyse what loops of the joints of ROBOT do to its base, and where its end-effector comes
+    to dynamic singularities.
 
     ROBOT is a name or a URDF file. The methods that suit it are listed.
     """
@@ -47,21 +65,28 @@ def analyze_command(
     from spacerobot_ros.resources import robot_file
 
     model = SpaceRobot.from_file(robot_file(robot))
-    found = analyze(model, None if shape is None else _parse_shape(shape))
-    for line in analysis_lines(found):
+    found = analyze(model, None if shape is None else _parse_shape(shape), end_effector)
+    for line in (*analysis_lines(found), "", *workspace_lines(found)):
         click.echo(line)
     if json_file is not None:
         write_json(json_file, analysis_json(found))
     from spacerobot_ros.report.figures import PictureFormat
-    from spacerobot_ros.report.planning_figures import draw_analysis
+    from spacerobot_ros.report.planning_figures import draw_analysis, draw_workspaces
 
-    target = picture or Path("out") / f"{model.description.name}_curvature.png"
+    name = model.description.name
+    target = picture or Path("out") / f"{name}_curvature.png"
     drawn = draw_analysis(found, PictureFormat.of(target))
     if drawn is None:
         click.echo(f"{'picture':<13}none: no loops of the joints turn the base")
-        return
-    write_output(target, drawn)
-    click.echo(f"{'picture':<13}{target}")
+    else:
+        write_output(target, drawn)
+        click.echo(f"{'picture':<13}{target}")
+    if found.workspaces:
+        of_workspaces = target.with_name(
+            f"{name if picture is None else target.stem}_workspaces{target.suffix}"
+        )
+        write_output(of_workspaces, draw_workspaces(found, PictureFormat.of(of_workspaces)))
+        click.echo(f"{'':<13}{of_workspaces}")
 
 
 def _parse_shape(text: str) -> list[float]:
@@ -87,6 +112,43 @@ def analysis_lines(found: Analysis) -> list[str]:
         lines.append(f"{method:<15}{'no: ' + objection if objection else suits}")
     lines.append(f"{'auto':<15}{found.chosen or 'no method suits this robot'}")
     return [*lines, "", *_distance_lines(found)]
+
+
+def workspace_lines(found: Analysis) -> list[str]:
+    """Return the workspaces of the end-effector as lines that fit a screen."""
+    if not found.workspaces:
+        why = "the robot has no joints"
+        if not found.end_effector:
+            why = "no link is called 'end_effector': name one with --end-effector"
+        return [f"{'workspaces':<13}none: {why}"]
+    lines = []
+    for each in found.workspaces:
+        limits = "within joint limits" if each.within_limits else "joints turn freely"
+        place = " in a plane" if each.dimensions == 2 else ""
+        reach = _interval_text(each.reach)
+        count = f", from {each.singular_shapes} singular shapes" if each.singular_shapes else ""
+        lines += [
+            f"'{each.link}', {limits}: {reach} m from the centre of mass{place}",
+            f"  path-dependent    {_intervals_text(each.path_dependent)}{count}",
+            f"  path-independent  {_intervals_text(each.path_independent)}",
+        ]
+    return [f"{'workspaces' if not i else '':<13}{line}" for i, line in enumerate(lines)]
+
+
+def _interval_text(ends: tuple[float, float]) -> str:
+    # Millimetres are not enough to compare with papers.
+    low, high = (f"{end:.5f}".rstrip("0").rstrip(".") for end in ends)
+    return low if low == high else f"{low} to {high}"
+
+
+def _intervals_text(intervals: Sequence[tuple[float, float]]) -> str:
+    if not intervals:
+        return "none found"
+    if len(intervals) > _MOST_INTERVALS:
+        total = sum(high - low for low, high in intervals)
+        span = _interval_text((intervals[0][0], intervals[-1][1]))
+        return f"{len(intervals)} intervals from {span} m, together {total:.3g} m"
+    return " and ".join(map(_interval_text, intervals)) + " m"
 
 
 def analysis_json(found: Analysis) -> dict[str, Any]:
@@ -123,6 +185,18 @@ def analysis_json(found: Analysis) -> dict[str, Any]:
         "distances": [
             {"links": list(pair), "distance_m": distance}
             for pair, distance in found.geometry.distances_of_links(found.shape).items()
+        ],
+        "workspaces": [
+            {
+                "link": each.link,
+                "within_limits": each.within_limits,
+                "dimensions": each.dimensions,
+                "reach_m": list(each.reach),
+                "path_dependent_m": [list(ends) for ends in each.path_dependent],
+                "path_independent_m": [list(ends) for ends in each.path_independent],
+                "singular_shapes": each.singular_shapes,
+            }
+            for each in found.workspaces
         ],
         "methods": found.objections,
         "auto": found.chosen or None,

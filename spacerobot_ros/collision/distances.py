@@ -109,6 +109,57 @@ class ExactDistances:
             found[k] = compute(here, there, request, result)
         return found
 
+    def placed(self) -> PlacedSolids:
+        """Return the same solids for one state after another."""
+        return PlacedSolids(self._geometries, self._coal)
+
+
+class PlacedSolids:
+    """Solids at poses that change, and exact distances between them; see :class:`ExactDistances`.
+
+    Parameters
+    ----------
+    geometries
+        The shapes, and their attitudes and positions in the frames of their links.
+    coal
+        The module.
+    """
+
+    def __init__(self, geometries: Sequence[tuple[Any, Array, Array]], coal: Any) -> None:
+        self._coal = coal
+        self._shapes = [shape for shape, _, _ in geometries]
+        self._R = np.array([R for _, R, _ in geometries])
+        self._r = np.array([r for _, _, r in geometries])[:, :, np.newaxis]
+        self._poses = [coal.Transform3s.Identity() for _ in geometries]
+        self._computers: dict[tuple[int, int], Any] = {}
+        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+        self._present: tuple[Array, Array] = self._R, self._r[:, :, 0]
+        self._placed: set[int] = set()
+
+    def move(self, R: Array, r: Array) -> None:
+        """Place every solid's link at attitudes (S, 3, 3) and positions (S, 3), m, in one frame."""
+        self._present = R @ self._R, r + (R @ self._r)[:, :, 0]
+        self._placed.clear()
+
+    def distance(self, first: int, second: int) -> float:
+        """Return the distance of two solids, m; negative: the depth of their contact."""
+        compute = self._computers.get((first, second))
+        if compute is None:
+            compute = self._coal.ComputeDistance(self._shapes[first], self._shapes[second])
+            self._computers[first, second] = compute
+        self._result.clear()
+        poses = self._pose(first), self._pose(second)
+        return float(compute(*poses, self._request, self._result))
+
+    def _pose(self, solid: int) -> Any:
+        pose = self._poses[solid]
+        if solid not in self._placed:
+            R, r = self._present
+            pose.setRotation(R[solid])
+            pose.setTranslation(r[solid])
+            self._placed.add(solid)
+        return pose
+
 
 class EnclosureDistances:
     """Lower bounds of distances: those of the rounded boxes around the solids."""

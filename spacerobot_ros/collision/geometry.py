@@ -10,6 +10,7 @@ is drawn.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -22,7 +23,7 @@ from spacerobot_ros.collision.rounded_box import RoundedBox
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.model.description import Array, JointKind, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
-from spacerobot_ros.model.meshes import shape_mesh
+from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
 
 _SHAPES, _SEED = 1000, 0
 """Random shapes at which a pair is in contact that always is, and the seed of their draw."""
@@ -77,6 +78,9 @@ class CollisionGeometry:
     ----------
     robot
         The robot.
+    mesh_of
+        Returns the triangles of a visual of the kind ``mesh`` in the frame of its link; a mesh for
+        which it raises a :class:`.MeshError` is left out.
 
     Attributes
     ----------
@@ -91,10 +95,12 @@ class CollisionGeometry:
         Sentences on links whose shape is not what the user may expect.
     """
 
-    def __init__(self, robot: RobotDescription) -> None:
+    def __init__(
+        self, robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
+    ) -> None:
         self.robot = robot
         self._kinematics = ForwardKinematics(robot)
-        self.solids, self.notes = _solids_of(robot)
+        self.solids, self.notes = _solids_of(robot, mesh_of)
         self.ignored: dict[LinkPair, str] = {}
         links = self._kinematics.links
         self._link_of = np.array([links.index(each.link) for each in self.solids], dtype=int)
@@ -104,14 +110,20 @@ class CollisionGeometry:
         self._leave_out(self._always_in_contact())
 
     @cached_property
-    def _distance(self) -> DistanceFunction:
+    def distance_function(self) -> DistanceFunction:
+        """The distances of two solids, exact where the package coal is installed."""
         # Where bounding balls never come near, the library of distances need not be imported.
         return distance_function(self.solids)
 
     @property
     def exact(self) -> bool:
         """Whether distances are those of the shapes themselves rather than of their enclosures."""
-        return self._distance.exact
+        return self.distance_function.exact
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links, in the order of :meth:`poses`."""
+        return self._kinematics.links
 
     def links_of(self, pair: int) -> LinkPair:
         """Return the links of a pair."""
@@ -119,7 +131,7 @@ class CollisionGeometry:
         return LinkPair(first, second)
 
     def poses(self, shapes: Array) -> Poses:
-        """Return the poses of all links at shapes (N, n), m or rad."""
+        """Return the poses of all links at shapes (..., n), m or rad."""
         return self._kinematics.link_poses(shapes)
 
     def lower_bounds(self, poses: Poses) -> Array:
@@ -137,22 +149,34 @@ class CollisionGeometry:
         R, r = poses
         i, j = self.pairs[pair]
         a, b = self._link_of[i], self._link_of[j]
-        return self._distance(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
+        return self.distance_function(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
 
     def nearest(self, shape: Array) -> tuple[float, int] | None:
         """Return the smallest distance at a shape (n,), m, and its pair; None without pairs."""
         if not len(self.pairs):
             return None
-        poses = self.poses(shape[np.newaxis])
-        bounds = self.lower_bounds(poses)[0]
-        best, nearest = np.inf, 0
-        for pair in np.argsort(bounds, kind="stable"):
-            if bounds[pair] >= best:
-                break
-            distance = float(self.distances(int(pair), poses)[0])
-            if distance < best:
-                best, nearest = distance, int(pair)
-        return best, nearest
+        distances, pairs = self.nearest_at(shape[np.newaxis])
+        return float(distances[0]), int(pairs[0])
+
+    def nearest_at(self, shapes: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+        """Return the smallest distances (N,) at shapes (N, n), m, and their pairs (N,).
+
+        Without pairs the distances are infinite.
+        """
+        distances = np.full(len(shapes), np.inf)
+        pairs = np.zeros(len(shapes), dtype=np.int64)
+        if not len(self.pairs) or not len(shapes):
+            return distances, pairs
+        R, r = self.poses(shapes)
+        bounds = self.lower_bounds((R, r))
+        # Pairs that may be the nearest come first, so that most others need not be looked at.
+        for pair in np.argsort(bounds.min(axis=0), kind="stable").tolist():
+            at = np.flatnonzero(bounds[:, pair] < distances)
+            if len(at):
+                found = self.distances(pair, (R[at], r[at]))
+                nearer = found < distances[at]
+                distances[at[nearer]], pairs[at[nearer]] = found[nearer], pair
+        return distances, pairs
 
     def distances_of_links(self, shape: Array) -> dict[LinkPair, float]:
         """Return the distances of links at a shape (n,), m, the smallest first."""
@@ -249,7 +273,9 @@ def _random_shapes(robot: RobotDescription) -> Array:
 # -- solids -------------------------------------------------------------------------------------
 
 
-def _solids_of(robot: RobotDescription) -> tuple[tuple[Solid, ...], tuple[str, ...]]:
+def _solids_of(
+    robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh]
+) -> tuple[tuple[Solid, ...], tuple[str, ...]]:
     solids: list[Solid] = []
     notes: list[str] = []
     drawn = [link.name for link in robot.links if link.shapes and not link.collisions]
@@ -263,7 +289,7 @@ def _solids_of(robot: RobotDescription) -> tuple[tuple[Solid, ...], tuple[str, .
         for shape in link.collisions or link.shapes:
             if shape.kind == "mesh":
                 try:
-                    vertices = _hull(shape_mesh(shape).vertices)
+                    vertices = _hull(mesh_of(shape).vertices)
                 except MeshError as error:
                     notes.append(f"Contacts of link '{link.name}' are not all noticed: {error}")
                     continue

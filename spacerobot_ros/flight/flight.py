@@ -20,6 +20,7 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import PlanningError, RecordingError
 from spacerobot_ros.events import Event
+from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.measures import (
     Measures,
     Outcome,
@@ -152,6 +153,9 @@ class Flight:
         Wall time of planning, and of the whole flight, s; NaN where it is not known.
     refusals
         Commands that were refused: time (s), topic, reason.
+    measures_clearance
+        Whether the distances between links are measured: false where ``plant.clearance_period`` is
+        0, and of bags without the topic ``clearance``.
     """
 
     scenario: Scenario
@@ -173,6 +177,7 @@ class Flight:
     plan_time: float = math.nan
     wall_time: float = math.nan
     refusals: tuple[tuple[float, str, Refusal], ...] = ()
+    measures_clearance: bool = False
 
     # -- arrays -------------------------------------------------------------------------------
 
@@ -338,8 +343,24 @@ class Flight:
         return momentum_drift(self.momentum, None if expected is None else expected.values)
 
     @cached_property
+    def clearance(self) -> FlightClearance | None:
+        """The smallest distance between links over time; None where it is not measured, without
+        joint states, or of a robot without links that could touch.
+        """
+        if self.robot is None or not self.measures_clearance:
+            return None
+        return FlightClearance.of(self.robot, self.joint_names, self.signal("q").time, self.q)
+
+    @cached_property
     def measures(self) -> Measures:
         """The measures of the flight, which has states."""
+        return self.measured()
+
+    def measured(self, *, clearance: bool = True) -> Measures:
+        """Return the measures of the flight, which has states.
+
+        ``clearance``: whether the smallest distance between links is measured, which takes a while.
+        """
         wrench = self.commands.get("base_wrench")
         return Measures(
             outcome=self.outcome,
@@ -358,7 +379,14 @@ class Flight:
             propellant=math.nan if self.propellant is None else self.propellant,
             plan_time=self.plan_time,
             wall_time=self.wall_time,
+            clearance=self._smallest_distance if clearance else math.nan,
         )
+
+    @property
+    def _smallest_distance(self) -> float:
+        if self.clearance is not None:
+            return self.clearance.nearest.distance
+        return math.inf if self.measures_clearance else math.nan
 
     def __repr__(self) -> str:
         error = self.error
@@ -422,6 +450,10 @@ class Flight:
                 summary["end_effector_attitude_error_rad"] = measures.end_effector_error.angle
         if self.propellant is not None:
             summary["propellant_kg"] = self.propellant
+        if self.clearance is not None:
+            summary["clearance_m"] = measures.clearance
+            summary["clearance_links"] = list(self.clearance.nearest.links)
+            summary["clearance_time_s"] = self.clearance.nearest_time
         return summary
 
     # -- views and files ----------------------------------------------------------------------
@@ -625,6 +657,7 @@ class FlightLog:
             plan_time=plan_time,
             wall_time=wall_time,
             refusals=tuple(self.refusals),
+            measures_clearance=scenario.plant.clearance_period > 0,
         )
 
 

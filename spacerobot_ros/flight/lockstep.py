@@ -32,7 +32,7 @@ from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.executive import END_EFFECTOR
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.events import Event
+from spacerobot_ros.events import CONTACTS, Event, EventKind
 from spacerobot_ros.flight.flight import Flight, FlightLog
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
@@ -141,6 +141,7 @@ def fly_scenario(
     robots: Robots | None = None,
     progress: Progress = lambda now, end: False,
     longest: float = math.inf,
+    contacts: bool = True,
 ) -> Flight:
     """Fly a scenario from its initial state to its goal, without ROS: as `spacerobot run` does.
 
@@ -154,6 +155,8 @@ def fly_scenario(
         Called with the progress of the flight; it may end it.
     longest
         Simulated time after which the flight is interrupted, s.
+    contacts
+        Whether contacts between links are among the events.
 
     Raises
     ------
@@ -163,7 +166,26 @@ def fly_scenario(
         The shape of the goal is of another robot.
     """
     require_flyable(scenario)
-    return _LockstepFlight(scenario, robots or Robots.of(scenario)).fly(progress, longest)
+    flight = _LockstepFlight(scenario, robots or Robots.of(scenario)).fly(progress, longest)
+    return _with_contacts(flight) if contacts else flight
+
+
+def _with_contacts(flight: Flight) -> Flight:
+    """Return a flight with the contacts among its events, where the plant's node reports them."""
+    if flight.clearance is None:
+        return flight
+    events = list(flight.events)
+    for contact in flight.clearance.contacts(flight.scenario.plant.clearance_ticks):
+        assert contact.time_s is not None
+        # After the beginning of the flight, and before the answers to that state.
+        earlier = [
+            each.kind is EventKind.RUNNING
+            or (each.time_s or 0.0) < contact.time_s
+            or each.kind in CONTACTS
+            for each in events
+        ]
+        events.insert(earlier.index(False) if False in earlier else len(events), contact)
+    return replace(flight, events=tuple(events))
 
 
 class _DecisionMoment(Enum):

@@ -382,6 +382,7 @@ def read_flight(bag: FlightBag) -> Flight:
         end_effector_goals=tool_goals,
         status=status,
         gait=follower.gait,
+        measures_clearance=bool(bag.series_of("clearance")),
     )
     # A table of thrusters that is a file of its own is not looked for: a bag may name any file.
     in_urdf = scenario.in_file.get("plant", {}).get("thrusters") == IN_URDF

@@ -51,7 +51,7 @@ def save_flight(flight: Flight, path: str | os.PathLike[str], *, overwrite: bool
         installed.
     """
     scenario, robot = flight.scenario, flight.required_robot()
-    streams = [*_state_streams(flight), *_other_streams(flight)]
+    streams = [*_state_streams(flight), *_clearance_streams(flight), *_other_streams(flight)]
     with BagWriter(path, overwrite=overwrite) as writer:
         writer.add_metadata("spacerobot", {"version": __version__})
         nodes = ["plant", *scenario.commanders]
@@ -108,6 +108,19 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
         yield _Stream(
             topic, stamps[rows], stamped_copies(message, topic.type, stamps[rows], chosen)
         )
+
+
+def _clearance_streams(flight: Flight) -> Iterator[_Stream]:
+    """Yield the clearances, where distances are exact, as those of the plant's node are."""
+    if flight.clearance is None or not flight.clearance.geometry.exact:
+        return
+    statuses = flight.clearance.statuses(max(1, flight.scenario.plant.clearance_ticks))
+    times = np.array([round(each.time_s * SECOND) for each in statuses], dtype=np.int64)
+    messages = [
+        StatusRecord("/plant", each.level, each.message, each.to_values()).encoded()
+        for each in statuses
+    ]
+    yield _Stream(TOPICS["clearance"], times, messages)
 
 
 def _topic_quantities(flight: Flight) -> dict[str, Array]:

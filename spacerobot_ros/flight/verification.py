@@ -130,7 +130,11 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
             f" to {last * flight.config.period_ns} ns, and there are {states} of them: a flight "
             "has a state in every tick."
         )
-    resimulation = _resimulate(flight, _initial_state(first, published, flight), first, last)
+    initial = _initial_state(first, published, flight)
+    resimulation = _resimulate(flight, initial, _rates_at(first, published, flight), first, last)
+    if flight.config.actuation == "velocity" and not _has_efforts(published):
+        # An earlier version, which did not compute the efforts of servos, published zeros.
+        resimulation.states["effort"][:] = 0.0
     published = [p for p in published if p.follows_from(resimulation.states)]
     missing = _missing_states(flight, published, resimulation)
     if first > 0:
@@ -387,6 +391,21 @@ def _initial_state(
     )
 
 
+def _rates_at(first: int, published: list[_PublishedTopic], flight: _RecordedPlant) -> Floats:
+    """Return the joint velocities (n,) in the first state in the bag; zero in the very first."""
+    n = flight.robot.n
+    if first == 0:
+        return np.zeros(n)
+    joints = next(p for p in published if p.topic.name == "joint_states")
+    return joints.values[joints.ticks == first][0, n : 2 * n]
+
+
+def _has_efforts(published: list[_PublishedTopic]) -> bool:
+    """Whether any published effort of a joint is not zero."""
+    with_efforts = (p for p in published if p.topic.state[-1].quantity == "effort")
+    return any(p.values[:, -p.values.shape[1] // 3 :].any() for p in with_efforts)
+
+
 # -- re-simulation ----------------------------------------------------------------------------
 
 
@@ -410,10 +429,11 @@ class _Resimulation:
 
 
 def _resimulate(
-    flight: _RecordedPlant, initial: InitialState | None, first: int, last: int
+    flight: _RecordedPlant, initial: InitialState | None, rates: Floats, first: int, last: int
 ) -> _Resimulation:
     """Step the plant of a flight from tick ``first`` to tick ``last``, or as far as it goes.
 
+    ``rates`` (n,) are the joint velocities in the first state.
     RecordingError where sensors err, whose noise is only known from the very first state on.
     """
     plant = build_plant(flight.robot, flight.config, initial)
@@ -425,6 +445,9 @@ def _resimulate(
             "not known."
         )
     plant.tick = first
+    if flight.config.actuation == "velocity":
+        # The efforts of servos follow from the change of the velocities.
+        plant.qdot[:] = rates
     recorded = [flight.commands(source) for source in commands.sources]
     states: dict[str, Floats] = {}
     done = _Resimulation(first, last, states, frozenset(recorded[0]))

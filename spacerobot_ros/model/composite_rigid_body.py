@@ -298,18 +298,23 @@ def shape_forces(
     return ca.vertcat(*Q), -excess[:3]
 
 
-def joint_efforts(kin: TreeKinematics, qdot: ca.SX, qddot: ca.SX) -> ca.SX:
-    """Return the efforts (n,), N or N m, of a free robot at zero momentum whose shape moves at the
-    rates ``qdot`` (n,) and changes them by ``qddot`` (n,): inverse dynamics.
+def joint_efforts(
+    kin: TreeKinematics, qdot: ca.SX, qddot: ca.SX, L_B: ca.SX | None = None
+) -> ca.SX:
+    """Return the efforts (n,), N or N m, of a free robot whose shape moves at the rates ``qdot``
+    (n,) and changes them by ``qddot`` (n,): inverse dynamics.
 
-    The base turns and accelerates such that both momenta stay zero: by ``-diag(D, M 1)^-1 f_0``,
-    where ``f_0`` is the force that the motion of the joints alone would demand from outside. So
-    ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no inertia matrix of the shape is needed.
-    They are of second degree in time: the same path in half the time takes four times the efforts.
+    ``L_B`` (3,) is the angular momentum about the system's centre of mass, kg m^2/s in base
+    components; None: zero. The base turns and accelerates such that both momenta stay as they are:
+    by ``-diag(D, M 1)^-1 f_0``, where ``f_0`` is the force that the motion of the joints alone
+    would demand from outside. So ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no inertia
+    matrix of the shape is needed. At zero momentum they are of second degree in time: the same path
+    in half the time takes four times the efforts.
     """
     parts = composites(kin)
     D = SymmetricFactor(parts.rotational)
-    f = motion_forces(parts, -D.solve(parts.D_q @ qdot), qdot, qddot)
+    relative = -(parts.D_q @ qdot) if L_B is None else L_B - parts.D_q @ qdot
+    f = motion_forces(parts, D.solve(relative), qdot, qddot)
     base = ca.vertcat(D.solve(f[0][:3]), f[0][3:] * kin.per_mass)
     along = (
         ca.dot(S, force) - ca.dot(P, base)

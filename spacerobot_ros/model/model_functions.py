@@ -151,6 +151,7 @@ class ModelFunctions:
             "flight_step": self._flight_step,
             "holding_step": lambda: self._flight_step(holding=True),
             "joint_efforts": self._joint_efforts,
+            "servo_efforts": self._servo_efforts,
             "jacobian": self._jacobian,
             "connection": lambda: self._shape_function("connection", self._connection),
             "curvature": self._curvature,
@@ -231,6 +232,19 @@ class ModelFunctions:
         efforts = joint_efforts(self._kin, *rates.values())
         return self._dense_model_function(
             "joint_efforts", {"q": self._kin.q, **rates}, {"tau": efforts}
+        )
+
+    def _servo_efforts(self) -> ca.Function:
+        """Return the efforts of servos that change the rates of the joints within ``h``."""
+        n, quaternion = self.n, ca.SX.sym("quaternion", 4)
+        before, after = ca.SX.sym("before", n), ca.SX.sym("after", n)
+        L_W, h = ca.SX.sym("L_W", 3), ca.SX.sym("h")
+        mean, change = (before + after) / 2, (after - before) / h
+        L_B = matrix_from_quaternion(quaternion).T @ L_W
+        inputs = {"quaternion_WB": quaternion, "q": self._kin.q, "before": before, "after": after}
+        efforts = joint_efforts(self._kin, mean, change, L_B)
+        return self._dense_model_function(
+            "servo_efforts", {**inputs, "L_W": L_W, "h": h}, {"tau": efforts}
         )
 
     def _jacobian(self, link: str) -> ca.Function:

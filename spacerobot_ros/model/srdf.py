@@ -1,19 +1,28 @@
-"""SRDF files: pairs of links whose contact does not count, as MoveIt writes them."""
+"""SRDF files: pairs of links whose contact does not count, as MoveIt writes them.
+
+The URDF text of a robot carries its pairs as the elements ``<disable_collisions>`` of SRDF, which
+other readers of URDF leave out: nodes and bags that get the text alone know them, too.
+"""
 
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, fromstring
+from xml.sax.saxutils import quoteattr
 
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.resources import suggestion
 
+_CARRIED = re.compile(r"[ \t]*<disable_collisions\b[^<>]*/>\n?")
+_END = re.compile(r"</robot\s*>")
+
 
 def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
-    """Return a robot with the disabled pairs of an SRDF file.
+    """Return a robot with the disabled pairs of an SRDF file in place of its own.
 
     Read are ``<disable_collisions link1="..." link2="..."/>``, ``<disable_default_collisions
     link="..."/>`` and ``<enable_collisions link1="..." link2="..."/>``; the last one wins.
@@ -34,27 +43,66 @@ def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
             f"The file {path} is no SRDF: its root element is <{root.tag}>, and that of an SRDF "
             "is <robot>."
         )
-    links = [link.name for link in robot.links]
+    disabled = disabled_pairs(root, [link.name for link in robot.links], f"The SRDF {path}")
+    text = _with_pairs(robot.urdf, disabled)
+    return replace(robot, disabled_collisions=disabled, urdf=text)
+
+
+def disabled_pairs(root: Element, links: list[str], source: str) -> frozenset[frozenset[str]]:
+    """Return the pairs of links whose contact does not count, by the elements of SRDF.
+
+    Parameters
+    ----------
+    root
+        The root of an SRDF, or of a URDF that carries them.
+    links
+        Names of the links of the robot.
+    source
+        Subject of the message about a link that the robot does not have.
+
+    Raises
+    ------
+    RobotDescriptionError
+        An element names such a link.
+    """
     quiet = {
-        _link(each, "link", links, path) for each in root.findall("disable_default_collisions")
+        _link(each, "link", links, source) for each in root.findall("disable_default_collisions")
     }
     disabled = {
         frozenset(pair) for pair in itertools.combinations(links, 2) if not quiet.isdisjoint(pair)
     }
-    disabled |= {_pair(each, links, path) for each in root.findall("disable_collisions")}
-    disabled -= {_pair(each, links, path) for each in root.findall("enable_collisions")}
-    return replace(robot, disabled_collisions=frozenset(disabled))
+    disabled |= {_pair(each, links, source) for each in root.findall("disable_collisions")}
+    disabled -= {_pair(each, links, source) for each in root.findall("enable_collisions")}
+    return frozenset(disabled)
 
 
-def _pair(element: Element, links: list[str], path: str | Path) -> frozenset[str]:
-    return frozenset(_link(element, name, links, path) for name in ("link1", "link2"))
+def _with_pairs(urdf: str, pairs: frozenset[frozenset[str]]) -> str:
+    """Return a URDF text that carries these pairs alone."""
+    urdf = _CARRIED.sub("", urdf)
+    ends = list(_END.finditer(urdf))
+    if not pairs or not ends:
+        return urdf
+    place = ends[-1].start()
+    return urdf[:place] + "".join(_elements(pairs)) + urdf[place:]
 
 
-def _link(element: Element, attribute: str, links: list[str], path: str | Path) -> str:
+def _elements(pairs: frozenset[frozenset[str]]) -> list[str]:
+    named = sorted((min(pair), max(pair)) for pair in pairs)
+    return [
+        f"  <disable_collisions link1={quoteattr(first)} link2={quoteattr(second)}/>\n"
+        for first, second in named
+    ]
+
+
+def _pair(element: Element, links: list[str], source: str) -> frozenset[str]:
+    return frozenset(_link(element, name, links, source) for name in ("link1", "link2"))
+
+
+def _link(element: Element, attribute: str, links: list[str], source: str) -> str:
     name = element.get(attribute)
     if name not in links:
         raise RobotDescriptionError(
-            f"The SRDF {path} has a <{element.tag}> whose {attribute} is '{name or ''}', but the "
+            f"{source} has a <{element.tag}> whose {attribute} is '{name or ''}', but the "
             f"robot has no such link.{suggestion(name or '', links)}"
         )
     return name

@@ -40,7 +40,7 @@ from spacerobot_ros.model.description import (
 from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
 from spacerobot_ros.model.meshes import mesh_beside, with_mesh_files
 from spacerobot_ros.model.rotations import matrix_from_rpy
-from spacerobot_ros.model.srdf import with_srdf
+from spacerobot_ros.model.srdf import disabled_pairs, with_srdf
 from spacerobot_ros.resources import suggestion
 
 _MAX_NUMBER = 1e12
@@ -172,6 +172,7 @@ def parse_robot(text: str) -> RobotDescription:
         bodies=tuple(bodies),
         frames=frames,
         urdf=text,
+        disabled_collisions=disabled_pairs(root, list(links), "The robot description"),
     )
     _require_mass(description)
     _require_common_range(description)
@@ -459,7 +460,7 @@ _OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": 
 """Descriptions of other file formats by their root elements."""
 
 _ELEMENTS_READ = {
-    "robot": ("link", "joint", "material"),
+    "robot": ("link", "joint", "material", "disable_collisions"),
     "link": ("inertial", "visual", "collision"),
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
     "material": ("color",),

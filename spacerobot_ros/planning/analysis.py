@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from spacerobot_ros.planning.core.controllability import (
     sample_shapes,
 )
 from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.workspaces import Workspaces, workspaces
 from spacerobot_ros.planning.methods.auto import AutoGait
 from spacerobot_ros.planning.methods.geometric_phase import check_planar_chain
 from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nominal, given_nominal
@@ -57,6 +59,8 @@ class Analysis:
         Reason why a method does not suit the robot, by name of the method; None if it does.
     geometry
         The solids of the robot, and the pairs of them whose distance counts.
+    end_effector
+        The link whose workspaces are computed; "" if none is named, and none is called so.
     """
 
     robot: SpaceRobot
@@ -69,6 +73,16 @@ class Analysis:
     sliding: Controllability
     objections: dict[str, str | None]
     geometry: CollisionGeometry
+    end_effector: str = ""
+
+    @cached_property
+    def workspaces(self) -> tuple[Workspaces, ...]:
+        """Those of the end-effector, without and within the limits of the joints; () without an
+        end-effector or joints.
+        """
+        if not self.end_effector or self.robot.n == 0:
+            return ()
+        return workspaces(self.robot, self.end_effector)
 
     @property
     def chosen(self) -> str:
@@ -81,14 +95,21 @@ class Analysis:
         return OptimalGait.name if OptimalGait.name in suits else next(iter(suits), "")
 
 
-def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis:
+def analyze(
+    robot: SpaceRobot, shape: Sequence[float] | None = None, end_effector: str = ""
+) -> Analysis:
     """Return the analysis of a robot at a shape (n,), or at the best shape for loops.
+
+    ``end_effector`` is the link whose workspaces are asked for, if not ``end_effector``.
 
     Raises
     ------
     ParameterError
-        The shape is none of this robot.
+        The shape is none of this robot, or the link.
     """
+    link = robot.description.end_effector(end_effector)
+    if link:
+        _check_link(robot, link)
     given = None if shape is None else _check_shape(robot, shape)
     anywhere = best_sampled_brackets(robot)
     nominal = None
@@ -118,6 +139,7 @@ def analyze(robot: SpaceRobot, shape: Sequence[float] | None = None) -> Analysis
             if method is not AutoGait
         },
         CollisionGeometry(robot.description),
+        link,
     )
 
 
@@ -128,6 +150,15 @@ def _find_objection(method: type[GaitMethod], robot: SpaceRobot) -> str | None:
     except PlanningError as refusal:
         return str(refusal)
     return None
+
+
+def _check_link(robot: SpaceRobot, link: str) -> None:
+    names = [each.name for each in robot.description.links if each.name != robot.base_link]
+    if link not in names:
+        raise ParameterError(
+            f"Robot '{robot.description.name}' has no link '{link}' besides its base; its links "
+            f"are {', '.join(names)}."
+        )
 
 
 def _check_shape(robot: SpaceRobot, shape: Sequence[float]) -> Array:

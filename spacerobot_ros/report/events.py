@@ -43,7 +43,7 @@ class FlightEvent:
         return f"{label}: {', '.join(details)}" if details else label
 
 
-_DETAIL_KEYS = ("fault", "joints", "reason", "method", "node")
+_DETAIL_KEYS = ("fault", "joints", "reason", "method", "node", "first", "second")
 """Keys that distinguish an event from others of its kind."""
 
 
@@ -72,6 +72,8 @@ _MARKS = {
     EventKind.FAULT_INJECTED: _Mark("fault on", "^", _WARN, 1),
     EventKind.FAULT_ENDED: _Mark("fault off", "^", _WARN, 1, hollow=True),
     EventKind.FAULTS_CLEARED: _Mark("faults off", "^", _WARN, 1, hollow=True),
+    EventKind.CONTACT: _Mark("contact", "P", _BAD, 1),
+    EventKind.CONTACT_ENDED: _Mark("contact over", "P", _BAD, 1, hollow=True),
     EventKind.LATCHED: _Mark("latched", "s", _BAD, 1),
     EventKind.REARMED: _Mark("rearmed", "s", _GOOD, 1, hollow=True),
     EventKind.STUCK_JOINT: _Mark("stuck joint", "D", _BAD, 1),
@@ -108,7 +110,12 @@ _GLYPHS = {
 _FAULT_KINDS = frozenset(
     (EventKind.FAULT_INJECTED, EventKind.FAULT_ENDED, EventKind.FAULTS_CLEARED)
 )
-_PROMINENT_KINDS = _FAULT_KINDS | {EventKind.STUCK_JOINT, EventKind.LATCHED, EventKind.GOAL_ABORTED}
+_PROMINENT_KINDS = _FAULT_KINDS | {
+    EventKind.STUCK_JOINT,
+    EventKind.LATCHED,
+    EventKind.GOAL_ABORTED,
+    EventKind.CONTACT,
+}
 """Kinds that are marked over the whole height of a chart."""
 
 

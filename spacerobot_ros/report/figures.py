@@ -485,6 +485,10 @@ def scaled(unit: str, largest: float) -> tuple[float, str]:
     return (1e3, f"m{unit}") if largest >= 5e-5 else (1e6, f"µ{unit}")
 
 
+LIMIT = "limit (URDF)"
+"""Name of a limit of a joint in keys."""
+
+
 @dataclass(frozen=True)
 class TraceGroup:
     """Traces of one unit that share a panel.
@@ -499,6 +503,8 @@ class TraceGroup:
         (start, end, trace, value) of each goal.
     limits
         (trace, value) of each limit.
+    limit_name
+        Name of the limits in the key of the picture.
     window
         Lower and upper end of the axis, if high peaks are left out; None: all values are shown.
     decades
@@ -514,6 +520,7 @@ class TraceGroup:
     colours: Sequence[str]
     goals: Sequence[tuple[float, float, int, float]] = ()
     limits: Sequence[tuple[int, float]] = ()
+    limit_name: str = LIMIT
     window: tuple[float, float] | None = None
     decades: int = 0
     rows: bool = False

@@ -26,6 +26,7 @@ from spacerobot_ros.report.figures import (
     FAINT,
     INK,
     LARGEST_VALUE_SLICES,
+    LIMIT,
     MUTED,
     PALETTE,
     ReportFigure,
@@ -84,7 +85,7 @@ def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
         tint = MUTED if len(owners) == len(group.names) else colours[owners[0]]
         axes.axhline(bound, color=tint, lw=1.0, ls=(0, DOTS), zorder=1.8)
     if shown:
-        keys.append(legend_entry(MUTED, "limit (URDF)", DOTS))
+        keys.append(legend_entry(MUTED, group.limit_name, DOTS))
     dense = draw_traces(axes, group.signal, colours, share)
     for start, end, index, value in group.goals:
         axes.hlines(value, start, end, color=colours[index], ls=(0, DASHES), lw=1.2, zorder=3)
@@ -139,7 +140,7 @@ def time_figure(
             draw_events(axes, flight.events)
     if any(group.goals for group in groups):
         caption += "; dashed, the goal"
-    if any(group.limits for group in groups):
+    if any(group.limits and group.limit_name == LIMIT for group in groups):
         caption += "; dotted, the limits of the URDF, where they are in range"
     caption += "."
     aside = ""
@@ -558,6 +559,37 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
         TraceGroup(Signal(time, energy), ["energy"], "kinetic energy", "J", [colour(2)]),
     ]
     return ReportFigure("momentum", "Momentum balance", caption, figure, groups, aside)
+
+
+_CLEARANCE_STATES = 2000
+"""States of a flight whose smallest distances are drawn."""
+
+
+def clearance_figure(flight: FlightReport) -> ReportFigure | None:
+    """Smallest distance between two links; None where no links of the robot could touch."""
+    clearance = flight.clearance
+    if clearance is None:
+        return None
+    time, distances = clearance.over_time(_CLEARANCE_STATES)
+    signal = Signal(time, distances[:, np.newaxis])
+    touching = bool(distances.min() <= 0)
+    group = TraceGroup(
+        signal,
+        ["distance"],
+        "smallest distance",
+        "m",
+        [PALETTE[0]],
+        limits=[(0, 0.0)] if touching else [],
+        limit_name="contact",
+    )
+    nearest = clearance.nearest
+    sentence = f"{str(nearest)[0].upper()}{str(nearest)[1:]} at {clearance.nearest_time:.6g} s"
+    caption = f"Smallest distance between two links that no joint connects. {sentence}"
+    if touching:
+        caption += "; below the dotted line links touch, by the shapes in the URDF"
+    if not clearance.geometry.exact:
+        caption += "; distances are lower bounds, since the package coal is not installed"
+    return time_figure(flight, "clearance", "Clearance", caption, [group])
 
 
 def power_of_ten(value: float) -> str:

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.control.status import CommandReport, ControllerStatus
+from spacerobot_ros.errors import MeshError
+from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.flight.flight import Flight, SentGoal, Signal, pose_error, reported_goal
 from spacerobot_ros.flight.reading import (
     WRENCH_COLUMNS,
@@ -22,7 +24,7 @@ from spacerobot_ros.flight.reading import (
 )
 from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model import RobotDescription
-from spacerobot_ros.model.description import Array, Joint, Pose
+from spacerobot_ros.model.description import Array, Joint, Pose, Shape
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
 from spacerobot_ros.model.visuals import meshes_from_attachments
@@ -244,6 +246,24 @@ class FlightReport:
     def joint_names(self) -> list[str]:
         """The joints, in the order of columns."""
         return self.bag.names("joint_states")
+
+    @cached_property
+    def clearance(self) -> FlightClearance | None:
+        """The smallest distance between links, by the meshes that the bag carries; None where the
+        plant did not measure it, or there are no states.
+        """
+        if self.robot is None or not self.flight.measures_clearance:
+            return None
+
+        def carried(shape: Shape) -> TriangleMesh:
+            if shape.resource not in self.meshes:
+                raise MeshError(f"The bag does not carry the mesh '{shape.resource}'.")
+            return self.meshes[shape.resource].moved(shape.pose, shape.size)
+
+        shape = self.shape
+        return FlightClearance.of(
+            self.robot, self.joint_names, shape.time, shape.values, mesh_of=carried
+        )
 
     # -- names --------------------------------------------------------------------
 

@@ -1,4 +1,5 @@
-"""Pictures of the commands ``analyze`` and ``plan``: curvature maps of a robot, and one plan.
+"""Pictures of the commands ``analyze`` and ``plan``: curvature maps and workspaces of a robot, and
+one plan.
 
 Curvature maps over the shape space are those of paper 3, figures 2 and 3, and paper 2, figures 6
 to 8.
@@ -14,11 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Wedge
 
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_quaternions
 from spacerobot_ros.planning.analysis import Analysis
 from spacerobot_ros.planning.core.controllability import curvature_matrices, curvatures, shape_box
+from spacerobot_ros.planning.core.workspaces import Workspaces
 from spacerobot_ros.planning.methods.geometric_phase import PhasePlane, PlanarPhase, curvature_peaks
 from spacerobot_ros.planning.methods.nominal_shape import JOINT_PLANES
 from spacerobot_ros.report.figures import (
@@ -55,6 +58,17 @@ _SQUARE_COUNT = 60
 _COLOUR_BAR_X = WIDTH - 0.86
 """Where a bar of colours stands, inches."""
 
+_RING_STYLES: dict[str, dict[str, Any]] = {
+    "path-independent": {"facecolor": (PALETTE[0], 0.25), "edgecolor": PALETTE[0], "lw": 0.6},
+    "path-dependent": {
+        "facecolor": (PALETTE[1], 0.25),
+        "edgecolor": PALETTE[1],
+        "hatch": "///",
+        "lw": 0.6,
+    },
+}
+"""How the two kinds of workspaces are drawn."""
+
 _AXIS_NAMES = ("x", "y", "z")
 
 
@@ -68,6 +82,42 @@ def draw_analysis(found: Analysis, format: PictureFormat = PictureFormat.PNG) ->
         else:
             return None
         return picture_of(figure, format)
+
+
+# -- workspaces ---------------------------------------------------------------------------------
+
+
+def draw_workspaces(found: Analysis, format: PictureFormat = PictureFormat.PNG) -> bytes:
+    """Return the workspaces of the end-effector as a picture, round the centre of mass."""
+    with drawing():
+        high, gap = 3.3, 0.75
+        figure = new_figure(high + 1.35)
+        for column, each in enumerate(found.workspaces):
+            axes = panel(figure, 0.75 + column * (high + gap), 0.95, high, high)
+            draw_rings(axes, each)
+            axes.set_title("within joint limits" if each.within_limits else "joints turn freely")
+            axes.set_xlabel(
+                f"'{each.link}' from the centre of mass (m)"
+                + ("" if each.dimensions == 2 else ", any section")
+            )
+        kinds = [Patch(label=kind, **style) for kind, style in _RING_STYLES.items()]
+        figure.axes[0].legend(handles=kinds, loc="upper left", bbox_to_anchor=(0.0, -0.16), ncols=2)
+        return picture_of(figure, format)
+
+
+def draw_rings(axes: Axes, workspaces: Workspaces) -> None:
+    """Draw path-dependent and path-independent distances as rings round the centre of mass."""
+    for kind, intervals in (
+        ("path-independent", workspaces.path_independent),
+        ("path-dependent", workspaces.path_dependent),
+    ):
+        for low, high in intervals:
+            # A single distance is a thin ring.
+            width = max(high - low, 1e-3 * workspaces.reach[1])
+            axes.add_patch(Wedge((0.0, 0.0), high, 0.0, 360.0, width=width, **_RING_STYLES[kind]))
+    far = 1.05 * workspaces.reach[1]
+    axes.plot(0.0, 0.0, marker="+", color=INK, ms=8, mew=1.3, linestyle="none")
+    axes.set(xlim=(-far, far), ylim=(-far, far), aspect="equal")
 
 
 # -- planar robots ------------------------------------------------------------------------------

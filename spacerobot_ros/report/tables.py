@@ -104,6 +104,10 @@ def result_table(flight: FlightReport) -> Table:
         linear, angular = flight.drift
         drifts = f"linear {linear:.3g} kg m/s, angular {angular:.3g} kg m²/s"
         rows.append(("Momentum drift", drifts))
+    if (clearance := flight.clearance) is not None:
+        nearest = clearance.nearest
+        at = f"links {nearest.links} at {clearance.nearest_time:.6g} s"
+        rows.append(("Clearance", f"{nearest.distance:.4g} m, {at}"))
     return Table(("Quantity", "Value"), rows)
 
 

@@ -25,6 +25,7 @@ from spacerobot_ros.report.figures_over_time import (
     NO_STATES,
     attitude_figure,
     attitude_group,
+    clearance_figure,
     draw_whole,
     efforts_figure,
     errors_figure,
@@ -76,6 +77,7 @@ FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
     "efforts": efforts_figure,
     "thrusters": thrusters_figure,
     "twist": twist_figure,
+    "clearance": clearance_figure,
     "momentum": momentum_figure,
     "path": path_figure,
 }
@@ -94,6 +96,7 @@ _REPORT_FIGURES = (
     efforts_figure,
     thrusters_figure,
     twist_figure,
+    clearance_figure,
     momentum_figure,
 )
 

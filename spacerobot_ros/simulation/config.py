@@ -160,6 +160,14 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         minimum=0.0,
         maximum=_MAX_INITIAL_VALUE,
     )
+    clearance_period: float = parameter(
+        1.0,
+        "simulated time between clearances, the smallest distances between links; 0: none. "
+        "Realtime: at most 0.5 s of wall time",
+        unit="s",
+        minimum=0.0,
+        maximum=_MAX_INITIAL_VALUE,
+    )
     resume_bag: str = parameter(
         "", "bag from whose last state and time to go on; '': the initial state"
     )
@@ -223,6 +231,13 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     def period_ns(self) -> int:
         """Duration of a tick, ns."""
         return period_ns(self.tick_rate)
+
+    @property
+    def clearance_ticks(self) -> int:
+        """Ticks from one clearance to the next in lockstep; 0: none."""
+        if not self.clearance_period:
+            return 0
+        return max(1, round(self.clearance_period * SECOND / self.period_ns))
 
     @property
     def control_period(self) -> float:

@@ -22,7 +22,9 @@ class VelocityPlant:
     """A free-floating robot whose servos realise held joint velocities.
 
     After :meth:`step`, the attributes are those of :class:`Plant`, where ``qdot`` are the
-    velocities of the last tick. ``effort`` is zero: the efforts of servos are not modelled.
+    velocities of the last tick, and ``effort`` the efforts that the servos' motion took in it: the
+    inverse dynamics of the mean of the velocities before and in the tick, and of the acceleration
+    that leads from one to the other in a tick. Limits of efforts do not hold the servos back.
 
     Parameters
     ----------
@@ -57,11 +59,11 @@ class VelocityPlant:
             f"velocity_tick_{substeps}", lambda model: tick_function(robot, model, substeps)
         )
         inputs, outputs = self._advance.inputs, self._advance.outputs
-        self._state, self._command, self._momenta, self._r_cm, self._h = inputs
+        self._state, self._command, self._before, self._momenta, self._r_cm, self._h = inputs
         self._next_state, self.pose, self.twist, self.qdot = outputs[:4]
-        self.momentum, self.link_R, self.link_r, self._limited, self._next_r_cm = outputs[4:]
+        self.effort, self.momentum, self.link_R, self.link_r = outputs[4:8]
+        self._limited, self._next_r_cm = outputs[8:]
         self.q = self._next_state[: robot.n]
-        self.effort = np.zeros(robot.n)
         self.velocity_limited = np.zeros(robot.n, dtype=np.int64)
         self.stroke_limited = np.zeros(robot.n, dtype=np.int64)
         self._held: Flags | None = None
@@ -90,7 +92,7 @@ class VelocityPlant:
         self._momenta[:] = start.momenta()
         self._r_cm[:] = start.system_position(robot)
         # A step of zero duration computes all outputs of the present state.
-        self._command[:] = 0.0
+        self._command[:] = self._before[:] = 0.0
         self._h[:] = 0.0
         self._advance.evaluate()
         self._h[:] = self.control_period
@@ -107,6 +109,7 @@ class VelocityPlant:
         the ticks by joint.
         """
         self._state[:] = self._next_state
+        self._before[:] = self.qdot
         self._command[:] = command
         if self._held is not None:
             self._command[self._held] = 0.0
@@ -123,6 +126,7 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     """Compose the tick from the model's functions; see :class:`VelocityPlant` for its results."""
     n = robot.n
     state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)
+    before = ca.MX.sym("before", n)
     momenta, r_cm, h = ca.MX.sym("momenta", 6), ca.MX.sym("r_cm", 3), ca.MX.sym("h")
     p_W, L_W = momenta[:3], momenta[3:]
 
@@ -135,6 +139,7 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     by_rate, by_stroke = command != rate, rate != qdot
     limited = ca.vertcat(ca.sum1(by_rate) + ca.sum1(by_stroke), by_rate, by_stroke)
 
+    effort = model("servo_efforts", state[n:], q, before, qdot, L_W, duration)
     next_state = model(f"velocity_step:{substeps}", state, qdot, L_W, h)
     q_next, quaternion = next_state[:n], next_state[n:]
     v, omega = model("base_twist", quaternion, q_next, qdot, p_W, L_W)
@@ -145,12 +150,13 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     link_R, link_r = model("link_poses", q_next)
     return model.function(
         f"velocity_tick_{substeps}",
-        [state, command, momenta, r_cm, h],
+        [state, command, before, momenta, r_cm, h],
         [
             next_state,
             ca.vertcat(r_WB, quaternion),
             ca.vertcat(v, omega),
             qdot,
+            effort,
             ca.vertcat(*momentum),
             link_R,
             link_r,

@@ -105,6 +105,11 @@ def status_html(state: StackState, *, described: bool = True) -> str:
         text = _node_html("Plant", plant.state.value, plant.message, plant.level)
         lines.append(_grey_out(text, offline="plant" in state.absent))
         lines.extend(_line_html(f"Fault: {each}", 1) for each in state.plant.faults)
+    if state.clearance is not None:
+        level = state.clearance.level or None
+        lines.append(
+            _grey_out(_line_html(state.clearance.message, level), offline="plant" in state.absent)
+        )
     if state.planner is not None:
         status = state.planner
         text = _node_html("Planner", status.state.value, status.message, status.state.level)

@@ -12,6 +12,7 @@ from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.simulation.clearance import ClearanceStatus
 from spacerobot_ros.simulation.status import PlantStatus
 
 
@@ -78,7 +79,7 @@ class StackState:
         The last state, and the wall time since it came, s; infinite before the first.
     tool
         (7,) pose of the end-effector in the world.
-    momenta, firing
+    momenta, firing, clearance
         As the plant reports them.
     plant, planner, controller, replay
         The last status of each node; None if there is no such node.
@@ -102,6 +103,7 @@ class StackState:
     age_s: float = float("inf")
     momenta: Momenta | None = None
     firing: Firing | None = None
+    clearance: ClearanceStatus | None = None
     plant: PlantStatus | None = None
     planner: PlannerStatus | None = None
     controller: ControllerStatus | None = None

@@ -216,6 +216,10 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     assert select_engine(stuck, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has faults"):
         select_engine(stuck, "lanes")
+    near = campaign(criteria={"clearance_m": {"min": 0.0}})
+    assert select_engine(near, "auto").name == "flights"
+    with pytest.raises(SpaceRobotError, match="lanes measure no distances between links"):
+        select_engine(near, "lanes")
     # What would be another kind of flight is not flown as the nominal one.
     for name, values in (("plant.actuation", ["velocity", "effort"]), ("plant.tick_rate", [20])):
         other = campaign(disperse={name: {"choice": values}})

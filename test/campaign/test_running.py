@@ -30,6 +30,7 @@ from spacerobot_ros.campaign.running import (
 )
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.version import __version__
 
 MASSES: dict[str, Any] = {
@@ -357,3 +358,16 @@ def test_the_servicer_is_the_same_in_lanes_one_by_one_and_in_the_stack(
             assert (here.outcome, here.reason) == (there.outcome, there.reason)
             deviation, at = largest_deviation(there.metrics, here.metrics)
             assert deviation < RERUN_TOLERANCE, (there.engine, at)
+
+
+def test_the_clearance_is_measured_where_a_criterion_names_it() -> None:
+    """The masses of this robot, without its SRDF, touch each other in the end."""
+    touching = {"plant.robot_description": robot_file("sliding_masses").read_text("utf-8")}
+    given = {"set": {**touching, "plant.robot": ""}, "flights": 1}
+    for criteria, passes in (({}, True), ({"clearance_m": {"min": 0.0}}, False)):
+        (row,) = fly_all(
+            FlightsEngine(), made := campaign(**given, criteria=criteria), Draws(made), bool
+        )
+        assert row.passed is passes
+        found = row.metrics["clearance_m"]
+        assert np.isnan(found) if passes else found == pytest.approx(-0.24, abs=1e-4)

@@ -51,7 +51,7 @@ def test_the_robots_of_the_papers(
     tmp_path: Path, robot: str, suits: set[str], rank: int, first: str
 ) -> None:
     found, lines, picture = analyzed(tmp_path, robot)
-    assert len(lines) <= 25
+    assert len(lines) <= 35
     methods = found["methods"]
     assert {*methods, "auto"} == set(METHODS)
     paper_methods = {"lie_bracket", "square_path", "area_loop"}
@@ -103,7 +103,40 @@ def test_a_urdf_of_ones_own(tmp_path: Path) -> None:
     assert found["anywhere"]["rank"] == 3
     assert found["auto"] == "optimal"
     assert picture.is_file()
-    assert len(lines) <= 25
+    assert len(lines) <= 27
+
+
+def test_the_workspaces_of_paper_4(tmp_path: Path) -> None:
+    found, lines, picture = analyzed(tmp_path, "planar_manipulator")
+    free, limited = found["workspaces"]
+    assert (free["within_limits"], limited["within_limits"]) == (False, True)
+    # Computed independently of this program, from the paper's Table I.
+    for kind, ends in (
+        ("path_dependent_m", [[0.35106, 0.55368], [1.43617, 2.28723]]),
+        ("path_independent_m", [[0.0, 0.35106], [0.55368, 1.43617]]),
+    ):
+        np.testing.assert_allclose(free[kind], ends, rtol=0, atol=6e-6)
+    text = "\n".join(lines)
+    assert "path-dependent    0.35106 to 0.55368 and 1.43617 to 2.28723 m" in text
+    assert "path-independent  0 to 0.35106 and 0.55368 to 1.43617 m" in text
+    drawn = picture.with_name("a_workspaces.png")
+    assert lines[-1].split() == [str(drawn)]
+    assert len(drawn.read_bytes()) > 20_000
+
+
+def test_workspaces_need_a_link(tmp_path: Path) -> None:
+    found, lines, picture = analyzed(tmp_path, "planar_chain")
+    assert found["workspaces"] == []
+    assert "workspaces   none: no link is called 'end_effector': name one with" in "\n".join(lines)
+    assert not picture.with_name("a_workspaces.png").exists()
+
+
+@pytest.mark.slow
+def test_the_workspaces_of_a_named_link(tmp_path: Path) -> None:
+    named, lines, _ = analyzed(tmp_path, "planar_chain", "--end-effector", "segment_2")
+    (only,) = named["workspaces"]  # Its joints have no limits.
+    assert only["link"] == "segment_2"
+    assert "'segment_2', joints turn freely: " in "\n".join(lines)
 
 
 def test_a_robot_whose_loops_turn_nothing_has_no_picture(tmp_path: Path) -> None:
@@ -114,6 +147,7 @@ def test_a_robot_whose_loops_turn_nothing_has_no_picture(tmp_path: Path) -> None
     assert found["curvature_matrix"] is None
     assert not picture.exists()
     assert lines[-1].startswith("picture      none")
+    assert any(line.startswith("workspaces   none: ") for line in lines)
 
 
 @pytest.mark.parametrize(
@@ -124,6 +158,8 @@ def test_a_robot_whose_loops_turn_nothing_has_no_picture(tmp_path: Path) -> None
         (["three_joint_arm", "--shape", "0 1"], "The shape has 2 number(s)"),
         (["three_joint_arm", "--shape", "0 1 nan"], "The shape has 3 number(s)"),
         (["three_joint_arm", "--shape", "0 1 two"], "it must be numbers"),
+        (["planar_chain", "--end-effector", "hand"], "has no link 'hand' besides its base; its "),
+        (["planar_chain", "--end-effector", "base_link"], "has no link 'base_link' besides"),
     ],
 )
 def test_what_is_refused_with_a_sentence(arguments: list[str], sentence: str) -> None:
@@ -138,4 +174,4 @@ def test_what_is_refused_with_a_sentence(arguments: list[str], sentence: str) ->
 def test_every_robot_of_the_package_is_drawn(tmp_path: Path, robot: str) -> None:
     _, lines, picture = analyzed(tmp_path, robot)
     assert picture.is_file()
-    assert len(lines) <= 30
+    assert len(lines) <= 40

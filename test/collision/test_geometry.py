@@ -108,6 +108,20 @@ def test_an_srdf_beside_the_urdf_is_read(tmp_path: Path) -> None:
     assert robot.with_locked({"j1": 0.3}).disabled_collisions == robot.disabled_collisions
 
 
+def test_the_urdf_text_carries_the_pairs_of_an_srdf(tmp_path: Path) -> None:
+    robot = parse_robot(chain((BALL,), (BALL,), (BALL,), (BALL,)).replace('"c"', '"c &amp; c"'))
+    pairs = '<disable_collisions link1="a" link2="c &amp; c"/><disable_collisions link1="d" '
+    with_both = with_srdf(robot, srdf(tmp_path, f'{pairs} link2="a"/>'))
+    again = parse_robot(with_both.urdf)
+    assert again.disabled_collisions == {frozenset({"a", "c & c"}), frozenset({"a", "d"})}
+    # Those of another file take their place.
+    other = with_srdf(again, srdf(tmp_path, '<disable_collisions link1="b" link2="d"/>'))
+    assert parse_robot(other.urdf).disabled_collisions == {frozenset({"b", "d"})}
+    assert with_srdf(other, srdf(tmp_path)).urdf == robot.urdf
+    with pytest.raises(RobotDescriptionError, match="The robot description has a <disable_coll"):
+        parse_robot(robot.urdf.replace("</robot>", '<disable_collisions link1="x"/></robot>'))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

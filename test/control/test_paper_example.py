@@ -93,7 +93,7 @@ def test_end_effector_path_is_a_straight_line(name: str) -> None:
         OFF_THE_LINE[name] * 1e-3, abs=5e-4
     )
     own = largest_distance(path, path[0])
-    assert own <= (1e-4 if name == "model_based" else 16e-3)
+    assert own == pytest.approx(15.3e-3 if name == "transposed_jacobian" else 0.0, abs=1e-4)
 
 
 def largest_distance(path: Array, start: Array) -> float:

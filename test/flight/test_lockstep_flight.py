@@ -39,6 +39,8 @@ def assert_same(flight: Flight, other: Flight, tolerance: float = 0.0) -> None:
     for name in WHOLE:
         mine, its = getattr(flight, name), getattr(other, name)
         assert mine.shape == its.shape, name
+        if name == "effort" and not its.any():
+            continue  # The bag is of a plant that did not compute the efforts of servos.
         np.testing.assert_allclose(mine, its, rtol=tolerance, atol=tolerance, err_msg=name)
     assert {"pose_lost", *other.quantities} == {"pose_lost", *flight.quantities}
     for name, values in other.quantities.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,7 @@ from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from support import crossing
 from support.odometry import pose_of, twist_of
 from support.oracles import PinocchioOracle
 from support.plant_rig import SLIDERS, STATE, TICK, TICK_NS, Rig
@@ -95,8 +97,16 @@ def test_the_description_is_there_for_a_late_reader(harness: Harness) -> None:
     Rig(harness)
     late = harness.probe({"robot_description": String}, latched=("robot_description",), name="late")
     harness.spin_until(lambda: late.count("robot_description"), "the robot description")
-    expected = (URDF / "sliding_masses.urdf").read_text("utf-8")
-    assert late.last("robot_description").data == expected
+    # With the pairs of the SRDF beside it before the end.
+    start, end = (URDF / "sliding_masses.urdf").read_text("utf-8").split("</robot>")
+    received = late.last("robot_description").data
+    assert received.startswith(start)
+    assert received.endswith(f"</robot>{end}")
+    carried = received.removeprefix(start).removesuffix(f"</robot>{end}").splitlines()
+    assert carried == [
+        f'  <disable_collisions link1="mass_{i}" link2="mass_{j}"/>'
+        for i, j in ((1, 2), (1, 3), (2, 3))
+    ]
 
 
 def test_states_agree_with_pinocchio_while_everything_moves(harness: Harness) -> None:
@@ -268,3 +278,44 @@ def test_a_status_is_published_before_the_states_that_it_is_true_of(harness: Har
     rig.wait("odom", 4)
     states = [t for t in rig.probe.order[before:] if t in ("plant/status", "odom")]
     assert states == ["plant/status", "plant/status", "odom", "plant/status", "odom"]
+
+
+def test_clearances_are_published_with_events_of_contacts(harness: Harness) -> None:
+    topics = {"clearance": DiagnosticStatus, "events": DiagnosticStatus}
+    parameters = {
+        "robot": "",
+        "robot_description": crossing.URDF,
+        "initial_joint_positions": [-0.06, -0.12],
+        "clearance_period": 2 * TICK,
+    }
+    rig = Rig(harness, parameters, topics=topics)
+    shapes = [[-0.06, -0.12]]
+    for _ in range(7):
+        state = rig.step([0.02 / TICK, 0.04 / TICK], ["y", "x"])
+        shapes.append([state.position[state.name.index(name)] for name in ("y", "x")])
+    truth = crossing.distance(np.array(shapes))
+    assert (truth[::2] <= 0).tolist() == [False, True, True, False]
+    rig.wait("clearance", 4)
+    found = [{pair.key: pair.value for pair in m.values} for m in rig.probe.messages["clearance"]]
+    assert [float(each["time"]) for each in found] == pytest.approx(
+        [0, 2 * TICK, 4 * TICK, 6 * TICK]
+    )
+    np.testing.assert_allclose([float(each["distance"]) for each in found], truth[::2], atol=1e-6)
+    assert {(each["first"], each["second"]) for each in found} == {("left", "right")}
+    levels = [m.level for m in rig.probe.messages["clearance"]]
+    assert levels == [b"\0", b"\2", b"\2", b"\0"]
+    events = [{p.key: p.value for p in m.values} for m in rig.probe.messages["events"]]
+    contacts = {e["event"]: float(e["time"]) for e in events if e["event"].startswith("contact")}
+    assert contacts == pytest.approx({"contact": 2 * TICK, "contact_ended": 6 * TICK})
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [{"robot_description": crossing.URDF, "clearance_period": 0.0}, {"robot": "sliding_masses"}],
+)
+def test_clearances_are_not_published_where_there_are_none(
+    harness: Harness, parameters: dict[str, Any]
+) -> None:
+    """By a period of 0, and for a robot none of whose links may touch."""
+    rig = Rig(harness, parameters, topics={"clearance": DiagnosticStatus})
+    assert rig.probe.count_publishers("clearance") == 0

@@ -18,6 +18,7 @@ from support.recorded_stack import LATCHED_TOPICS, PLANT, STREAMS, BagContent, S
 from support.ros_harness import LATCHED, Harness, nanoseconds
 
 from spacerobot_ros import __version__
+from spacerobot_ros.model import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 
 URDF = Path(__file__).parents[2] / "urdf" / "sliding_masses.urdf"
@@ -51,7 +52,7 @@ def test_recorded_is_published_on_every_topic(stack: Stack) -> None:
         assert recorded == kept, topic
     assert len(bag["/odom"]) > 40
     assert stack.recorder.messages_recorded == bag.count
-    assert bag["/robot_description"][0].data == URDF.read_text("utf-8")
+    assert bag["/robot_description"][0].data == load_robot(URDF).urdf
 
 
 def test_messages_carry_simulated_time(stack: Stack) -> None:
@@ -90,7 +91,7 @@ def test_description_parameters_and_version_are_in_the_bag(stack: Stack) -> None
     assert bag.metadata["spacerobot"]["version"] == __version__
     media_type, data = bag.attachments["robot_description.urdf"]
     assert media_type == "application/xml"
-    assert data == URDF.read_bytes()
+    assert data == load_robot(URDF).urdf.encode()
     for name, given in (("plant", PLANT), ("planner", PLANNER)):
         written = {k: json.loads(v) for k, v in bag.metadata[f"parameters/{name}"].items()}
         node = getattr(stack, name)

@@ -217,5 +217,6 @@ def test_axes_of_space_and_of_shapes_have_units(name: str) -> None:
 @pytest.mark.slow
 def test_every_figure_is_drawn_from_one_of_the_bags_or_named_here() -> None:
     drawn = {figure for name in NAMES for figure in figures_of(name)}
-    # Sensors of the reference flights have no errors: test/report/test_report_numbers.py.
-    assert drawn | {"sensors"} == set(FIGURES)
+    # Sensors of the reference flights have no errors (test/report/test_report_numbers.py), and
+    # their plants measured no clearance (test/flight/test_clearance.py).
+    assert drawn | {"sensors", "clearance"} == set(FIGURES)

@@ -16,7 +16,14 @@ PAGES = [
     *(ROOT / "docs" / name for name in ("choosing.md", "planner_state_machine.md")),
     *(
         ROOT / "docs" / "theory" / f"{name}.md"
-        for name in ("area_loop", "controllability", "lie_bracket", "optimal", "square_path")
+        for name in (
+            "area_loop",
+            "controllability",
+            "lie_bracket",
+            "optimal",
+            "singularities",
+            "square_path",
+        )
     ),
 ]
 

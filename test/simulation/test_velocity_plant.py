@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from support.oracles.oracle import Motion
 from support.velocity_flights import RATE, STROKE, TICK, URDF, Case, sliding_masses
 
 from spacerobot_ros.model import SpaceRobot
@@ -73,6 +74,29 @@ def test_energy_twist_and_link_poses_are_those_of_pinocchio(seed: int) -> None:
             R_BL, r_BL = plant.link_R[:, 3 * index : 3 * index + 3], plant.link_r[:, index]
             np.testing.assert_allclose(R_WB @ R_BL, R_WL, atol=1e-13)
             np.testing.assert_allclose(plant.pose[:3] + R_WB @ r_BL, r_WL, atol=1e-13)
+
+
+@pytest.mark.parametrize("momentum", [False, True], ids=["at rest", "drifting"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_pinocchios_robot_accelerates_under_the_efforts_as_the_servos_did(
+    seed: int, momentum: bool
+) -> None:
+    """They are those of the middle of the change of rates, at the state before the tick."""
+    case = Case(seed, momentum=momentum)
+    plant, oracle, start = case.plant(), case.oracle, case.initial
+    momenta = np.concatenate([start.linear_momentum, start.angular_momentum])
+    for _ in range(4):
+        q, quaternion, before = plant.q.copy(), plant.pose[3:].copy(), plant.qdot.copy()
+        plant.step(case.command())
+        mean = (before + plant.qdot) / 2
+        twist = oracle.base_twist(q, mean, quaternion, momenta)
+        motion = Motion(q, mean, quaternion, np.zeros(3), np.ones(3), twist[3:])
+        reached = oracle.forward_dynamics(motion, np.zeros(6), plant.effort)[6:]
+        np.testing.assert_allclose(reached, (plant.qdot - before) / TICK, rtol=1e-9, atol=1e-8)
+    plant.step(plant.qdot.copy())
+    plant.reset()
+    # On a spinning robot it takes efforts to stay in shape.
+    assert np.any(np.abs(plant.effort) > 1e-3) == momentum
 
 
 # -- another integration ----------------------------------------------------------------------

@@ -7,6 +7,7 @@ plant that is stepped here, without what re-simulates a bag.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,8 @@ class Made:
 
     ``moved`` are the rates of the sliders in each tick, ``commands`` what was commanded (by default
     the same): of a tick, or of a time in ticks. ``injected`` are faults by time in ticks.
+    ``efforts`` are errors of the efforts that the plant publishes, by tick; None: it publishes
+    zeros.
     """
 
     def __init__(
@@ -59,12 +62,14 @@ class Made:
         without_pose: Sequence[int] = (),
         first: int = 0,
         error: float = 0.0,
+        efforts: Mapping[int, float] | None = None,
     ) -> None:
         self.config = config or config_of()
         self.prefix, self.first, self.error = prefix, first, error
         self.moved = [np.array(rates, dtype=float) for rates in moved]
         self.commands = dict(enumerate(self.moved)) if commands is None else dict(commands)
         self.injected, self.without_pose = injected, without_pose
+        self.efforts = efforts
 
     def write(self, path: Path) -> Path:
         with made_bag(path) as (bag, say):
@@ -101,6 +106,8 @@ class Made:
         say(f"{self.prefix}/momentum", array(*plant.momentum), time)
         joints = JointState(name=NAMES, position=(shape + self.error).tolist(), effort=[0.0] * 3)
         joints.velocity = plant.qdot.tolist()
+        if self.efforts is not None:
+            joints.effort = (plant.effort + self.efforts.get(tick, 0.0)).tolist()
         say(f"{self.prefix}/joint_states", stamped(joints, time, "base_link"), time)
 
 
@@ -120,6 +127,23 @@ def test_a_flight_without_faults(tmp_path: Path) -> None:
     result = verified(tmp_path, [RATES] * 10)
     assert result.difference is None, str(result.difference)
     assert (result.ticks, result.duration, result.messages) == (10, 1.0, 33)
+
+
+@pytest.mark.parametrize("first", [0, 4])
+def test_efforts_are_compared_where_the_plant_of_the_bag_published_them(
+    tmp_path: Path, first: int
+) -> None:
+    moved = [RATES * math.sin(0.7 * k) for k in range(10)]
+    exact: dict[int, float] = {}
+    for efforts in (exact, None):
+        right = verified(tmp_path, moved, first=first, efforts=efforts)
+        assert right.difference is None, str(right.difference)
+    wrong = Made(moved, first=first, efforts={6: 1e-6}).write(tmp_path / "wrong.mcap")
+    difference = verify_bag(wrong).difference
+    assert difference is not None
+    assert difference.time == pytest.approx(6 * TICK)
+    assert difference.field == "effort of slider_1"
+    assert difference.recorded - difference.expected == pytest.approx(1e-6)
 
 
 @pytest.mark.parametrize("time", [3.0, 3.4, 3.99])

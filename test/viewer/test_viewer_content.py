@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag.playback import ReplayStatus
+from spacerobot_ros.collision import LinkPair
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model import load_robot
@@ -23,6 +24,7 @@ from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.clearance import ClearanceStatus
 from spacerobot_ros.simulation.faults import Targets
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer import content
@@ -262,3 +264,15 @@ def test_long_names_of_joints_have_room() -> None:
     urdf = robot.urdf.replace(f'"{robot.joint_names[0]}"', f'"{long[0]}"')
     table = content.joints_html(parse_robot(urdf), *np.zeros((3, 3)))
     assert f'title="{long[0]}">{short[0]}<' in table
+
+
+def test_the_clearance_and_its_links_are_shown() -> None:
+    links = LinkPair("left <arm>", "right")
+    apart = content.status_html(replace(STATE, clearance=ClearanceStatus(0.0123, links, 4.0)))
+    assert escape("Links 'left <arm>' and 'right' are 0.0123 m apart.") in apart
+    assert "#d23c3c" not in apart
+    deep = content.status_html(replace(STATE, clearance=ClearanceStatus(-0.2, links, 4.0)))
+    assert f'#d23c3c;font-weight:600;margin:2px 0">{escape("Links")}' in deep
+    assert escape("and 'right' touch, 0.2 m deep.") in deep
+    gone = replace(STATE, clearance=ClearanceStatus(0.1, links, 4.0), absent=frozenset({"plant"}))
+    assert 'opacity:.45"><div style="margin:2px 0">Links' in content.status_html(gone)

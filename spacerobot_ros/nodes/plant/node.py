@@ -28,6 +28,7 @@ from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.streams import RawInput
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.nodes.plant.publisher import (
+    ClearancePublisher,
     LinkMarkers,
     PlantReport,
     StatePublisher,
@@ -59,8 +60,8 @@ _LONGEST_REST = 0.8
 _REPORT_PERIOD_NS = 950_000_000
 """Wall time after the last diagnostics at which new ones are due, ns: about one a second."""
 
-_LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD = 0.5, 0.1
-"""Longest wall time between two publications in real time, s: of markers, and of /tf."""
+_LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD, _LONGEST_CLEARANCE_PERIOD = 0.5, 0.1, 0.5
+"""Longest wall time between two publications in real time, s: of markers, of /tf, of clearances."""
 
 # Module names are faster than enum members, which are looked up for every command.
 _RUNNING, _PAUSED, _RESTING = PlantState.RUNNING, PlantState.PAUSED, PlantState.RESTING
@@ -154,6 +155,12 @@ class PlantNode(FlightNode):
         if self._transforms.publishes:
             self._tf_ticks = self._viewed_ticks(config.tf_period, _LONGEST_FRAME_PERIOD)
         self._report_ticks = self._ticks(config.diagnostics_period)
+        self._clearance_ticks = self._viewed_ticks(
+            config.clearance_period, _LONGEST_CLEARANCE_PERIOD
+        )
+        self._clearance = None
+        if self._clearance_ticks:
+            self._clearance = ClearancePublisher.of(self, self.plant)
         for source in self._commands.sources:
             reader = CommandReader(source, robot, config.frame_prefix)
             self.take_raw(
@@ -319,6 +326,8 @@ class PlantNode(FlightNode):
         self._publisher.publish(now, all_topics=self._tick % self._pose_ticks == 0)
         if self._marker_ticks and self._tick % self._marker_ticks == 0:
             self._markers.publish(now)
+        if self._clearance is not None and self._tick % self._clearance_ticks == 0:
+            self._clearance.publish(now)
         if self._tf_ticks and self._tick % self._tf_ticks == 0:
             self._transforms.publish(now)
         if self._report_ticks and self._tick % self._report_ticks == 0:

@@ -20,6 +20,7 @@ from spacerobot_ros.messages.builders import (
     state_message,
 )
 from spacerobot_ros.messages.readers import MessageTemplate
+from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
@@ -33,12 +34,13 @@ from spacerobot_ros.nodes.common.messages import (
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.streams import RawOutput
 from spacerobot_ros.simulation.actuators import FaultyPlant, ThrusterPlant, thrusters_in
+from spacerobot_ros.simulation.clearance import ClearanceMonitor
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.time_modes import RealTime
-from spacerobot_ros.times import set_stamp, stamp_bytes
+from spacerobot_ros.times import SECOND, set_stamp, stamp_bytes
 from spacerobot_ros.topics import TOPICS, Topic
 
 PROPELLANT_KEY = "propellant_kg"
@@ -419,6 +421,42 @@ class TransformPublisher:
             self._stream.take(
                 self._frames.message(time_ns, quantities["measured_pose"], quantities["measured_q"])
             )
+
+
+class ClearancePublisher:
+    """Publishes the smallest distance between links, and reports their contacts.
+
+    Parameters
+    ----------
+    node
+        The plant's node.
+    plant
+        The plant.
+    """
+
+    def __init__(self, node: FlightNode, plant: Plant, monitor: ClearanceMonitor) -> None:
+        self._node, self._plant, self._monitor = node, plant, monitor
+        self._name = node.get_fully_qualified_name()
+        self._stream = node.send_raw(DiagnosticStatus, "clearance")
+
+    @classmethod
+    def of(cls, node: FlightNode, plant: Plant) -> ClearancePublisher | None:
+        """Return the publisher of a plant; None where none of its links could touch."""
+        monitor = ClearanceMonitor.of(plant.robot.description, tuple(plant.robot.link_names))
+        return None if monitor is None else cls(node, plant, monitor)
+
+    def publish(self, time_ns: int) -> None:
+        """Publish the present clearance, and events of contacts that have begun or ended."""
+        plant = self._plant
+        status, events = self._monitor.measure(plant.link_R, plant.link_r, time_ns / SECOND)
+        record = StatusRecord(self._name, status.level, status.message, status.to_values())
+        self._stream.take(record.encoded())
+        for event in events:
+            self._node.report_event(event)
+            if event.level:
+                self._node.get_logger().error(event.message)
+            else:
+                self._node.get_logger().info(event.message)
 
 
 class LinkMarkers:

@@ -35,6 +35,7 @@ from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.watchdog import Pulse, Role
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.simulation.clearance import ClearanceStatus
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.viewer.state import Firing, Measured, Momenta, Part, StackState
@@ -120,6 +121,7 @@ class Listener:
         self._momentum = Latest(streams, Float64MultiArray, "momentum")
         self._expected = Latest(streams, Float64MultiArray, "momentum_expected")
         self._thrusters = Latest(streams, JointState, "thrusters")
+        self._clearances = Latest(streams, DiagnosticStatus, "clearance")
         self._names: Sequence[str] = ()
         self._beats: dict[str, _Heartbeat] = {}
         self._statuses: dict[str, Any] = {}
@@ -159,6 +161,7 @@ class Listener:
         self._expected_momenta: Array | None = None
         self._least_apart_ns = _LONGEST_EXPECTED_DELAY_NS
         self._firing: Firing | None = None
+        self._clearance: ClearanceStatus | None = None
 
     def use(self, robot: RobotDescription) -> None:
         """Start reading the joints of a robot."""
@@ -188,6 +191,7 @@ class Listener:
             age_s=now - self._came_at,
             momenta=self._momenta,
             firing=self._firing,
+            clearance=self._clearance,
             plant=statuses.get("plant"),
             planner=statuses.get("planner"),
             controller=statuses.get("controller"),
@@ -230,6 +234,10 @@ class Listener:
         thrusters = self._thrusters.take()
         if thrusters is not None and len(thrusters.name) == len(thrusters.velocity):
             self._firing = Firing(tuple(thrusters.name), np.array(thrusters.velocity))
+        clearance = self._clearances.take()
+        if clearance is not None:
+            with suppress(SpaceRobotError):  # The message is of another package.
+                self._clearance = ClearanceStatus.from_values(read_status(clearance).values)
 
     def _take_momenta(self) -> None:
         """Take the momenta and the expected momenta, if both are of one tick.

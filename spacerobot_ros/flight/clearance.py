@@ -1,0 +1,118 @@
+"""The clearance of a flight: the smallest distance between links in its true states.
+
+A flight without ROS reports clearances and contacts as the plant's node does:
+:meth:`FlightClearance.statuses` and :meth:`FlightClearance.contacts`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from spacerobot_ros.collision import Approach, CollisionGeometry, PathCheck
+from spacerobot_ros.events import Event
+from spacerobot_ros.model.description import Array, RobotDescription, Shape
+from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
+from spacerobot_ros.simulation.clearance import ClearanceMonitor, ClearanceStatus
+
+
+@dataclass(frozen=True, eq=False)
+class FlightClearance:
+    """The smallest distance between links of a robot over the time of a flight.
+
+    Attributes
+    ----------
+    geometry
+        The solids of the robot, with at least one pair.
+    time
+        (N,) times of the states, s; at least one.
+    shapes
+        (N, n) true positions of the robot's joints, m or rad.
+    """
+
+    geometry: CollisionGeometry
+    time: Array
+    shapes: Array
+
+    @classmethod
+    def of(
+        cls,
+        robot: RobotDescription,
+        joint_names: Sequence[str],
+        time: Array,
+        q: Array,
+        mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh,
+    ) -> FlightClearance | None:
+        """Return the clearance of a flight; None without states, or where no pair of links counts.
+
+        Parameters
+        ----------
+        robot
+            The robot.
+        joint_names, time, q
+            The names of columns, the times (N,), s, and the joint positions (N, n), m or rad.
+        mesh_of
+            As for :class:`~spacerobot_ros.collision.geometry.CollisionGeometry`.
+        """
+        names = list(joint_names)
+        if not len(time) or not set(robot.joint_names) <= set(names):
+            return None
+        geometry = CollisionGeometry(robot, mesh_of)
+        if not len(geometry.pairs):
+            return None
+        return cls(geometry, time, q[:, [names.index(name) for name in robot.joint_names]])
+
+    @cached_property
+    def nearest(self) -> Approach:
+        """The nearest approach of two links, between the states too."""
+        found = PathCheck(self.geometry).nearest(self.shapes)
+        assert found is not None
+        return found
+
+    def statuses(self, every: int) -> list[ClearanceStatus]:
+        """Return the clearances of one state in ``every``, as the plant publishes them."""
+        distances, pairs = self.geometry.nearest_at(self.shapes[::every])
+        return [
+            ClearanceStatus(distance, self.geometry.links_of(pair), time)
+            for distance, pair, time in zip(
+                distances.tolist(), pairs.tolist(), self.time[::every].tolist(), strict=True
+            )
+        ]
+
+    def contacts(self, every: int) -> list[Event]:
+        """Return the events of contacts in one state in ``every``, as the plant reports them."""
+        if not self.geometry.exact:
+            return []
+        shapes, time = self.shapes[::every], self.time[::every]
+        distances, _ = self.geometry.nearest_at(shapes)
+        touching = distances <= 0
+        touching[1:] |= touching[:-1]  # Contacts end in the state after.
+        monitor = ClearanceMonitor(self.geometry, self.geometry.links)
+        events: list[Event] = []
+        for row in np.flatnonzero(touching).tolist():
+            R, r = self.geometry.poses(shapes[row])
+            link_R = np.ascontiguousarray(R.transpose(1, 0, 2).reshape(3, -1))
+            events += monitor.measure(link_R, r.T, float(time[row]))[1]
+        return events
+
+    @property
+    def nearest_time(self) -> float:
+        """Time of the nearest approach, s."""
+        return float(np.interp(self.nearest.tick, np.arange(len(self.time)), self.time))
+
+    def over_time(self, most: int) -> tuple[Array, Array]:
+        """Return times (K,), s, and the smallest distances (K,) of all pairs then, m.
+
+        These are ``most`` states at about equal intervals, and the nearest approach.
+        """
+        rows = np.unique(np.linspace(0, len(self.time) - 1, most).round().astype(int))
+        distances, _ = self.geometry.nearest_at(self.shapes[rows])
+        time = self.time[rows]
+        place = int(np.searchsorted(time, self.nearest_time))
+        return (
+            np.insert(time, place, self.nearest_time),
+            np.insert(distances, place, self.nearest.distance),
+        )

@@ -1,0 +1,137 @@
+"""The clearance of a plant in flight: the smallest distance between its links, and their contacts.
+
+A plant integrates the motion of bodies that do not push each other: it goes on through a contact,
+and reports that it does.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.model.description import Array, RobotDescription
+
+_LOG = logging.getLogger(__name__)
+
+_OK, _ERROR = 0, 2
+
+
+@dataclass(frozen=True)
+class ClearanceStatus:
+    """The smallest distance between two links at one time, as on the topic ``clearance``.
+
+    Attributes
+    ----------
+    distance
+        m; negative where the links touch: the depth of the contact.
+    links
+        The two links.
+    time_s
+        Simulated time, s.
+    """
+
+    distance: float
+    links: LinkPair
+    time_s: float
+
+    @property
+    def level(self) -> int:
+        """Level of diagnostic_msgs/DiagnosticStatus: ERROR while links touch."""
+        return _OK if self.distance > 0 else _ERROR
+
+    @property
+    def message(self) -> str:
+        """The status as a sentence."""
+        if self.distance > 0:
+            return f"Links {self.links} are {self.distance:.3g} m apart."
+        return f"Links {self.links} touch, {-self.distance:.3g} m deep."
+
+    def to_values(self) -> dict[str, str]:
+        """Return the status as key-value pairs of a DiagnosticStatus."""
+        return {
+            "time": f"{self.time_s:.9f}",
+            "distance": f"{self.distance:.9g}",
+            "first": self.links.first,
+            "second": self.links.second,
+        }
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, str]) -> ClearanceStatus:
+        """Return the status from the key-value pairs of :meth:`to_values`.
+
+        Raises
+        ------
+        SpaceRobotError
+            They are not those of a clearance.
+        """
+        try:
+            links = LinkPair(values["first"], values["second"])
+            return cls(float(values["distance"]), links, float(values["time"]))
+        except (KeyError, ValueError) as error:
+            raise SpaceRobotError(f"The values are not a clearance: {error}.") from error
+
+
+class ClearanceMonitor:
+    """Measures the clearance of a robot state by state, and derives events from its contacts.
+
+    Parameters
+    ----------
+    geometry
+        The solids of the robot, with at least one pair, and exact distances.
+    links
+        The links in the order of the poses.
+    """
+
+    def __init__(self, geometry: CollisionGeometry, links: tuple[str, ...]) -> None:
+        self._nearest = NearestPair(geometry, links)
+        self._touching: frozenset[LinkPair] = frozenset()
+
+    @classmethod
+    def of(cls, robot: RobotDescription, links: tuple[str, ...]) -> ClearanceMonitor | None:
+        """Return the monitor of a robot; None: none of its links could touch.
+
+        It is None, too, where the package coal is not installed, which the log says.
+        """
+        geometry = CollisionGeometry(robot)
+        if not len(geometry.pairs):
+            return None
+        if not geometry.exact:
+            _LOG.warning("The plant measures no clearance without the package coal.")
+            return None
+        return cls(geometry, links)
+
+    def measure(
+        self, link_R: Array, link_r: Array, time_s: float
+    ) -> tuple[ClearanceStatus, list[Event]]:
+        """Return the clearance, and an event for each contact that has begun or ended.
+
+        Parameters
+        ----------
+        link_R, link_r
+            Attitudes (3, 3 L) and positions (3, L), m, of the links in B.
+        time_s
+            Simulated time, s.
+        """
+        distance, pair = self._nearest.nearest(link_R, link_r)
+        status = ClearanceStatus(distance, self._nearest.geometry.links_of(pair), time_s)
+        before = self._touching
+        if distance > 0 and not before:
+            return status, []
+        self._touching = self._nearest.touching(link_R, link_r)
+        return status, [
+            *(_contact_event(each, time_s) for each in sorted(self._touching - before)),
+            *(_contact_event(each, time_s, over=True) for each in sorted(before - self._touching)),
+        ]
+
+
+def _contact_event(links: LinkPair, time_s: float, *, over: bool = False) -> Event:
+    about = {"first": links.first, "second": links.second}
+    if over:
+        message = f"Links {links} no longer touch."
+        return Event(EventKind.CONTACT_ENDED, message, _OK, time_s, about=about)
+    message = f"Links {links} touch; the simulation goes on through the contact."
+    return Event(EventKind.CONTACT, message, _ERROR, time_s, about=about)

@@ -1,0 +1,112 @@
+"""Statements of the documents that were once wrong are there, and have a check that exists."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from spacerobot_ros.batch import native
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.resources import resource_names, robot_file
+
+ROOT = Path(__file__).resolve().parents[2]
+
+HELD_BY_TESTS = [
+    (
+        "docs/records.md",
+        "3 to 8 % larger than at level 3",
+        "bag/test_bag_files.py::test_the_fastest_compression_makes_telemetry_little_larger",
+    ),
+    (
+        "docs/records.md",
+        "two runs in lockstep record messages of equal values in the same order",
+        "session/test_run.py::test_two_runs_are_the_same_to_the_last_message",
+    ),
+    (
+        "docs/records.md",
+        "each of the eight scenarios without faults",
+        "verification/test_reference_bags.py::test_every_scenario_has_a_bag_and_they_are_small",
+    ),
+    (
+        "docs/campaigns.md",
+        "`rerun` repeats through ROS within 1e-9",
+        "campaign/test_running.py::test_rows_flown_again_through_ros_are_the_same",
+    ),
+    (
+        "docs/campaigns.md",
+        "two to eight flights at once in [SIMD lanes](theory/lanes.md) (eight with AVX-512)",
+        "batch/test_lanes.py::test_narrower_registers_give_the_same_flights",
+    ),
+    (
+        "docs/theory/coordinated_control.md",
+        "15.3 mm; 3e-10 m from the line through the true start",
+        "control/test_paper_example.py::test_end_effector_path_is_a_straight_line",
+    ),
+    (
+        "docs/theory/coordinated_control.md",
+        "As printed, (27) does fail there",
+        "control/test_singularity.py::test_eq_27_as_printed_fails_at_a_singularity",
+    ),
+    (
+        "docs/theory/square_path.md",
+        "The paper's laws also start from joint rates that are not zero (its property 3); "
+        "`square_path` begins at rest.",
+        "planning/test_executive_decisions.py::test_a_goal_is_planned_from_rest_or_blended_into",
+    ),
+    (
+        "docs/theory/coordinated_control.md",
+        "The paper prints $\\theta_1$ there.",
+        "control/test_equations.py::test_eq_12_has_the_third_angle_in_its_second_column",
+    ),
+]
+"""Page, statement, and the test that holds it."""
+
+HELD_BY_COMMANDS = [
+    ("docs/records.md", "takes 28 to 37 % of the processor time of a tick", "bench ticks"),
+    ("docs/architecture.md", "about as many as a bare ping-pong of as many topics", "bench"),
+]
+"""Page, statement, and the command of ``spacerobot`` that measures it."""
+
+
+def text_of(page: str) -> str:
+    return " ".join((ROOT / page).read_text("utf-8").split())
+
+
+@pytest.mark.parametrize(("page", "statement", "test"), HELD_BY_TESTS)
+def test_a_statement_is_there_and_has_its_test(page: str, statement: str, test: str) -> None:
+    assert statement in text_of(page)
+    file, _, name = test.partition("::")
+    assert re.search(rf"^def {name}\(", (ROOT / "test" / file).read_text("utf-8"), re.MULTILINE)
+
+
+@pytest.mark.parametrize(("page", "statement", "command"), HELD_BY_COMMANDS)
+def test_a_figure_is_there_with_the_command_that_measures_it(
+    page: str, statement: str, command: str
+) -> None:
+    assert statement in text_of(page)
+    assert f"spacerobot {command}" in text_of(page)
+
+
+def test_composite_bodies_take_a_part_of_the_operations() -> None:
+    shares = []
+    for name in ("dual_arm", "sliding_masses"):
+        robot = SpaceRobot.from_file(robot_file(name))
+        composite, paper = (
+            robot.function(each, compile=False).n_instructions()
+            for each in ("shape_equations", "forward_dynamics")
+        )
+        shares.append(f"{100 * composite / paper:.0f} % (`{name}`)")
+    assert f"it takes {' to '.join(shares)} of the operations" in text_of("docs/theory/model.md")
+
+
+def test_the_scenarios_with_reference_bags_are_eight() -> None:
+    assert len(resource_names("bags", ".mcap")) == 8
+
+
+def test_lanes_are_as_many_as_the_page_says() -> None:
+    lanes = {"avx512f": 8, "avx2": 4, "sse2": 2}
+    assert {flag: unit.lanes for flag, unit in native.UNITS.items()} == lanes
+    statement = "There are eight lanes with AVX-512, four with AVX2, two otherwise."
+    assert statement in text_of("docs/theory/lanes.md")

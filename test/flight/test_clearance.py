@@ -1,0 +1,168 @@
+"""The clearance of a flight: its nearest approach, its contacts, its bag and its report."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.crossing import LINKS, URDF, distance
+
+from spacerobot_ros import fly, load_scenario, read_bag
+from spacerobot_ros.events import EventKind
+from spacerobot_ros.flight.clearance import FlightClearance
+from spacerobot_ros.flight.flight import Flight
+from spacerobot_ros.flight.reading import read_run
+from spacerobot_ros.measures import metrics_of
+from spacerobot_ros.model import SpaceRobot, parse_robot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.report.figures_over_time import clearance_figure
+from spacerobot_ros.report.flight import read_report
+from spacerobot_ros.report.tables import result_table
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.session.run import run_scenario
+
+RADIUS = 0.12
+"""Of the balls of the sliding masses, m: without their SRDF they may touch."""
+
+PAIRS = [(0, 1), (0, 2), (1, 2)]
+
+PARAMETERS = {
+    "plant.initial_joint_positions": [0.3, -0.25, 0.2],
+    "plant.clearance_period": 0.1,
+    "planner.clearance": 0.0,
+    "planner.lie_bracket.t1": 2.0,
+    "planner.lie_bracket.cycle_period": 1.0,
+}
+
+
+def distances_of_masses(q: Array) -> Array:
+    """Return the distances (N, 3) of the pairs of masses on three axes, m."""
+    return np.array([np.hypot(q[:, i], q[:, j]) - 2 * RADIUS for i, j in PAIRS]).T
+
+
+@pytest.fixture(scope="module")
+def through() -> Flight:
+    """A flight whose masses slide into each other."""
+    sliders = SpaceRobot(parse_robot(robot_file("sliding_masses").read_text()))
+    goal = (0.04, -0.05, 0.01)
+    turn = (0.01, 0.004, 0.0)
+    return fly(sliders, goal, rotvec=turn, method="lie_bracket", parameters=PARAMETERS)
+
+
+def test_the_nearest_approach_of_a_flight_may_be_between_two_states() -> None:
+    # The balls pass the middle at 1.3 s, between two states that are 1 s apart.
+    shapes = np.array([[-0.65, -1.3], [-0.15, -0.3], [0.35, 0.7], [0.4, 0.7]])
+    time = np.array([0.0, 1.0, 2.0, 5.0])
+    robot = parse_robot(URDF)
+    assert FlightClearance.of(robot, ("y", "z"), time, shapes) is None
+    # A bag may have its joints in another order than the robot.
+    found = FlightClearance.of(robot, ("x", "y"), time, shapes[:, ::-1])
+    assert found is not None
+    assert list(found.nearest.links) == LINKS
+    assert found.nearest.distance == pytest.approx(0.1 - 0.12, abs=1e-4)
+    assert found.nearest_time == pytest.approx(1.3, abs=0.01)
+    at, distances = found.over_time(3)
+    np.testing.assert_allclose(at, [0.0, found.nearest_time, 2.0, 5.0])
+    np.testing.assert_allclose(distances[[0, 2, 3]], distance(shapes)[[0, 2, 3]], atol=1e-6)
+
+
+def test_contacts_of_states_begin_and_end() -> None:
+    way = np.linspace(-1.0, 1.0, 21)[:, np.newaxis] * [0.15, 0.3]
+    found = FlightClearance.of(parse_robot(URDF), ("y", "x"), np.arange(21) / 4, way)
+    assert found is not None
+    for every in (1, 2):
+        touching = np.flatnonzero(distance(way)[::every] <= 0) * every / 4
+        assert [(each.kind, each.time_s) for each in found.contacts(every)] == [
+            (EventKind.CONTACT, touching[0]),
+            (EventKind.CONTACT_ENDED, touching[-1] + every / 4),
+        ]
+    np.testing.assert_allclose(
+        [each.distance for each in found.statuses(3)], distance(way)[::3], atol=1e-6
+    )
+
+
+def test_a_flight_through_contacts_has_events_and_a_clearance(through: Flight) -> None:
+    assert through.succeeded
+    truth = distances_of_masses(through.q)
+    assert through.measures.clearance == pytest.approx(truth.min(), abs=1e-4)
+    summary = through.summary()
+    assert summary["clearance_m"] == through.measures.clearance
+    deepest = PAIRS[int(truth.min(axis=0).argmin())]
+    assert summary["clearance_links"] == [f"mass_{i + 1}" for i in deepest]
+    at = through.time[truth.min(axis=1).argmin()]
+    assert summary["clearance_time_s"] == pytest.approx(at, abs=0.05)
+    robot = through.required_robot()
+    assert metrics_of(through.measures, robot)["clearance_m"] == summary["clearance_m"]
+    assert math.isnan(through.measured(clearance=False).clearance)
+    looked_at = truth[::2]  # Every 0.1 s, at 20 Hz.
+    begins = {
+        (f"mass_{i + 1}", f"mass_{j + 1}"): 0.1 * np.flatnonzero(looked_at[:, k] <= 0)[0]
+        for k, (i, j) in enumerate(PAIRS)
+    }
+    assert min(begins.values()) > 0
+    events = [each for each in through.events if each.kind is EventKind.CONTACT]
+    found = {(e.about["first"], e.about["second"]): e.time_s for e in events}
+    assert found == {links: pytest.approx(time) for links, time in begins.items()}
+    times = [event.time_s for event in through.events]
+    assert times == sorted(times)  # type: ignore[type-var]
+
+
+def test_its_bag_and_its_report_show_the_contacts(through: Flight, tmp_path: Path) -> None:
+    through.save(tmp_path / "through.mcap")
+    series = read_bag(tmp_path / "through.mcap")["/clearance"]
+    read = [{pair.key: pair.value for pair in m.values} for _, m in series.messages()]
+    truth = distances_of_masses(through.q)
+    np.testing.assert_allclose(
+        [float(each["distance"]) for each in read], truth.min(axis=1)[::2], atol=1e-4
+    )
+    again = read_run(tmp_path / "through.mcap")
+    assert again.measures.clearance == pytest.approx(through.measures.clearance, abs=1e-9)
+    report = read_report(tmp_path / "through.mcap")
+    shown = [each.text for each in report.events if each.event.kind is EventKind.CONTACT]
+    assert shown == [
+        f"contact: {pair}" for pair in ("mass_2, mass_3", "mass_1, mass_2", "mass_1, mass_3")
+    ]
+    figure = clearance_figure(report)
+    assert figure is not None
+    assert "Links 'mass_1' and 'mass_2' touch, 0.186 m deep at " in figure.caption
+    (group,) = figure.groups
+    assert group.limits == [(0, 0.0)]
+    assert group.signal.values.min() == pytest.approx(truth.min(), abs=1e-4)
+    ((_, text),) = [row for row in result_table(report).rows if row[0] == "Clearance"]
+    assert text.startswith("-0.186 m, links 'mass_1' and 'mass_2' at ")
+
+
+def test_a_flight_that_does_not_measure_it_has_no_clearance(
+    through: Flight, tmp_path: Path
+) -> None:
+    goal, method = through.scenario.goal, "lie_bracket"
+    parameters = {**PARAMETERS, "plant.clearance_period": 0.0}
+    flight = fly(SpaceRobot(through.required_robot()), goal, method=method, parameters=parameters)
+    assert flight.clearance is None
+    assert math.isnan(flight.measures.clearance)
+    assert "clearance_m" not in flight.summary()
+    assert not [event for event in flight.events if event.kind is EventKind.CONTACT]
+    flight.save(tmp_path / "silent.mcap")
+    assert "/clearance" not in read_bag(tmp_path / "silent.mcap").topics
+    assert clearance_figure(read_report(tmp_path / "silent.mcap")) is None
+    # The SRDF beside the robot disables all pairs: the distance is infinite.
+    sliders = fly("sliding_masses", goal, method=method, parameters=PARAMETERS)
+    assert sliders.measures.clearance == math.inf
+    assert "clearance_m" not in sliders.summary()
+
+
+@pytest.mark.slow
+def test_the_nodes_publish_the_clearances_that_a_flight_without_ros_has(tmp_path: Path) -> None:
+    scenario = load_scenario("reach").with_overrides("plant", {"clearance_period": 0.25})
+    summary = run_scenario(scenario, tmp_path / "ros.mcap").summary
+    flight = fly(scenario)
+    assert summary["clearance_m"] == pytest.approx(flight.measures.clearance, abs=1e-9)
+    flight.save(tmp_path / "alone.mcap")
+    named = []
+    for name in ("ros", "alone"):
+        series = read_bag(tmp_path / f"{name}.mcap")["/clearance"]
+        named.append([(m.name, m.message) for _, m in series.messages()])
+    assert named[0] == named[1]
+    assert len(named[0]) == 7

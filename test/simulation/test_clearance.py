@@ -1,0 +1,99 @@
+"""The clearance of a plant: distances of balls on sliders, and events of their contacts."""
+
+from __future__ import annotations
+
+import logging
+import sys
+
+import numpy as np
+import pytest
+from support.crossing import URDF, distance
+
+from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair
+from spacerobot_ros.collision import distances as distances_module
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.actuators import build_plant
+from spacerobot_ros.simulation.clearance import ClearanceMonitor, ClearanceStatus
+from spacerobot_ros.simulation.config import PlantConfig
+
+
+def test_a_plant_goes_on_through_a_contact_and_says_so() -> None:
+    start = (-0.15, -0.3)
+    config = PlantConfig(initial_joint_positions=start, tick_rate=20.0)
+    plant = build_plant(SpaceRobot(parse_robot(URDF)), config)
+    monitor = ClearanceMonitor.of(plant.robot.description, plant.robot.link_names)
+    assert monitor is not None
+    found: list[ClearanceStatus] = []
+    events: list[Event] = []
+    shapes = []
+    for tick in range(13):
+        status, news = monitor.measure(plant.link_R, plant.link_r, tick / 20)
+        found.append(status)
+        events += news
+        shapes.append(plant.q.copy())
+        plant.step(np.array([0.5, 1.0]))
+    truth = distance(np.array(shapes))
+    np.testing.assert_allclose([each.distance for each in found], truth, atol=1e-6)
+    touching = np.flatnonzero(truth <= 0)
+    assert 1 < len(touching) < 6
+    assert [(each.kind, each.time_s, each.level) for each in events] == [
+        (EventKind.CONTACT, touching[0] / 20, 2),
+        (EventKind.CONTACT_ENDED, (touching[-1] + 1) / 20, 0),
+    ]
+    assert events[0].about == {"first": "left", "second": "right"}
+    assert events[0].message == (
+        "Links 'left' and 'right' touch; the simulation goes on through the contact."
+    )
+    assert [each.level for each in found] == [2 if d <= 0 else 0 for d in truth]
+    assert found[0].message == f"Links 'left' and 'right' are {truth[0]:.3g} m apart."
+    deepest = found[int(truth.argmin())]
+    assert deepest.message == f"Links 'left' and 'right' touch, {-truth.min():.3g} m deep."
+
+
+def test_a_clearance_is_read_again_from_its_message() -> None:
+    status = ClearanceStatus(-0.0125, LinkPair("a", "b"), 12.75)
+    assert ClearanceStatus.from_values(status.to_values()) == status
+    for flaw in ({"distance": "near"}, {"first": None}):
+        values = {k: v for k, v in (status.to_values() | flaw).items() if v is not None}
+        with pytest.raises(SpaceRobotError, match="are not a clearance"):
+            ClearanceStatus.from_values(values)
+
+
+@pytest.mark.parametrize("name", ["servicer", "seven_joint_arm"])
+def test_the_nearest_pair_is_that_of_all_distances(name: str) -> None:
+    robot = load_robot(robot_file(name))
+    geometry = CollisionGeometry(robot)
+    low, high = robot.limits("lower"), robot.limits("upper")
+    shapes = np.random.default_rng(5).uniform(low, high, (40, len(low)))
+    R, r = geometry.poses(shapes)
+    each = np.array([geometry.distances(p, (R, r)) for p in range(len(geometry.pairs))])
+    together, pairs = geometry.nearest_at(shapes)
+    np.testing.assert_allclose(together, each.min(axis=0), atol=1e-9)
+    np.testing.assert_array_equal(pairs, each.argmin(axis=0))
+    nearest = NearestPair(geometry, geometry.links)
+    for k in range(len(shapes)):
+        poses = R[k].transpose(1, 0, 2).reshape(3, -1), r[k].T
+        found, _ = nearest.nearest(*poses)
+        assert found == pytest.approx(together[k], abs=1e-9)
+        touching = {geometry.links_of(p) for p in np.flatnonzero(each[:, k] <= 0).tolist()}
+        assert nearest.touching(*poses) == touching
+    assert (each.min(axis=0) < 0).any()
+
+
+def test_without_coal_or_pairs_a_plant_measures_no_clearance(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    sliders = load_robot(robot_file("sliding_masses"))
+    assert ClearanceMonitor.of(sliders, ()) is None
+    monkeypatch.setitem(sys.modules, "coal", None)
+    distances_module._coal.cache_clear()
+    try:
+        with caplog.at_level(logging.WARNING):
+            assert ClearanceMonitor.of(parse_robot(URDF), ("base", "left", "right")) is None
+    finally:
+        monkeypatch.undo()
+        distances_module._coal.cache_clear()
+    assert "The plant measures no clearance without the package coal." in caplog.messages
