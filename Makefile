@@ -178,6 +178,7 @@ docs: $(STAMP)/docs ## build the documentation site; see out/docs/index.html
 .PHONY: figures
 figures: $(STAMP)/docs ## compute the numbers of the documents again: docs/figures.json
 	$(BIN)/python3 -m docs_build.figures
+	$(BIN)/python3 -m docs_build.singularities
 
 .PHONY: structure
 structure: ## count lines, modules and unclear words of the package; AGAINST=PATH: of another checkout too

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from docs_build.singularities import singularity_figures
 from spacerobot_ros.control import ControlState, PoseReference
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.model import SpaceRobot
@@ -32,7 +33,13 @@ _CYCLES = 30
 
 def figures() -> dict[str, str]:
     """Return every number of the documents by key, with the digits that are shown."""
-    return {**_lie_bracket(), **_square_path(), **_area_loop(), **_coordinated_control()}
+    return {
+        **_lie_bracket(),
+        **_square_path(),
+        **_area_loop(),
+        **_coordinated_control(),
+        **singularity_figures(),
+    }
 
 
 def _lie_bracket() -> dict[str, str]:

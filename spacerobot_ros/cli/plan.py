@@ -112,7 +112,8 @@ def plan_command(
         write_output(picture, draw_plan(problem, trial, PictureFormat.of(picture)))
         click.echo(f"picture     {picture}")
     if not trial.reached:
-        fail(f"The goal is not reached within the planner's tolerance: {left}.")
+        stopped = trial.pieces[-1].notes.get("stopped", "")
+        fail(f"The goal is not reached within the planner's tolerance: {left}. {stopped}".rstrip())
 
 
 def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:

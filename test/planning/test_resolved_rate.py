@@ -19,6 +19,7 @@ from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCanc
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.methods.registry import method_options
+from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateGait
 from spacerobot_ros.simulation.trials import compare
 
 Array = npt.NDArray[np.float64]
@@ -302,10 +303,69 @@ def test_paper_4_the_straight_line_to_b_meets_a_dynamic_singularity(
         PlanningError,
         match=r"meets a dynamic singularity after 1\.19498 of 1\.5834\d m of the line of "
         r"'end_effector': \|det J\*\| falls from 0\.373488 to zero at the shape "
-        r"\(1\.276, 0\.198\).*optimal may reach",
+        r"\(1\.27635, 0\.198006\).*optimal may reach",
     ) as refusal:
         reach_b(manipulator, method="resolved_rate")
     assert not isinstance(refusal.value, UnreachableError)
+
+
+def request_b(state: RobotState) -> PlanRequest:
+    goal = Goal.of_end_effectors([EndEffectorGoal("end_effector", B)])
+    return PlanRequest(state, goal, Tolerance(1e-6, 1e-6))
+
+
+def test_paper_4_the_path_ends_at_the_singularity(
+    manipulator: tuple[SpaceRobot, RobotState],
+) -> None:
+    robot, state = manipulator
+    method = build_method("resolved_rate", robot, 0.01, 0.01, {})
+    assert isinstance(method, ResolvedRateGait)
+    path = method.path(request_b(state))
+    assert not path.is_complete
+    # Computed independently of this program, from the paper's Table I.
+    assert 1.583415 * path.shares[-1] == pytest.approx(1.194983, abs=2e-6)
+    assert np.degrees(path.shapes[-1]) == pytest.approx([73.1295, 11.3449], abs=1e-4)
+    turned = Rotation.from_quat(path.turns[-1]).as_rotvec(degrees=True)
+    assert 21.0 + turned[2] == pytest.approx(-31.9510, abs=1e-4)
+    attitude = Rotation.from_euler("z", np.radians(21.0) + np.radians(turned[2]))
+    q = path.shapes[-1]
+    hand = attitude.apply(robot.link_pose("end_effector", q)[1] - robot.center_of_mass(q))
+    assert hand[:2] == pytest.approx([1.622675, 1.131448], abs=2e-6)
+
+
+@pytest.mark.parametrize("first_step", [0.02, 0.9])
+def test_a_singularity_is_not_stepped_over(
+    manipulator: tuple[SpaceRobot, RobotState], monkeypatch: pytest.MonkeyPatch, first_step: float
+) -> None:
+    robot, state = manipulator
+    module = "spacerobot_ros.planning.methods.resolved_rate."
+    monkeypatch.setattr(module + "_STEP", first_step)
+    monkeypatch.setattr(module + "_FEWEST_STEPS", 2)
+    monkeypatch.setattr(module + "_APPROACH", 1.0)
+    method = build_method("resolved_rate", robot, 0.01, 0.01, {})
+    assert isinstance(method, ResolvedRateGait)
+    path = method.path(request_b(state))
+    assert 1.583415 * path.shares[-1] == pytest.approx(1.194983, abs=0.01)
+
+
+def test_paper_4_the_line_is_followed_until_shortly_before_the_singularity(
+    manipulator: tuple[SpaceRobot, RobotState],
+) -> None:
+    schedule = reach_b(manipulator, method="resolved_rate", as_far_as_possible=1)
+    assert "meets a dynamic singularity after 1.19498 of" in str(schedule.notes["stopped"])
+    hand = np.array(schedule.notes["final_pose_of_end_effector"][:3])  # type: ignore[index]
+    start = np.array([2.000077, -0.002373, 0.0])
+    way = (B - start) / np.linalg.norm(B - start)
+    np.testing.assert_allclose(hand, start + (hand - start) @ way * way, atol=2e-6)
+    assert 1.18 < (hand - start) @ way < 1.194983
+    # It goes slowly in the end: from rest to rest, with rates that are possible.
+    rates = np.vstack([schedule.velocities, np.zeros((1, 2))])
+    assert np.abs(np.diff(rates, axis=0)).max() <= schedule.control_period * 4.0 * (1 + 1e-8)
+    path = schedule.path
+    state = RobotState(path.position[-1], path.quaternion[-1], schedule.positions[-1])
+    # From there no rates lead on, and the line is refused.
+    with pytest.raises(PlanningError, match=r"meets a dynamic singularity after 0\.00"):
+        reach_b((manipulator[0], state), method="resolved_rate", as_far_as_possible=1)
 
 
 def test_paper_4_lines_that_end_before_the_singularity_are_followed(

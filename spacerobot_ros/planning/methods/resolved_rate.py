@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
 import numpy as np
@@ -65,7 +65,7 @@ _LEAST_PROGRESS = 0.01
 """Progress on the line below which a singularity is near: the line in reaches of the end-effector,
 for a motion of the joints by one radian of the fastest one."""
 
-_ZERO_PROGRESS = 1e-6
+_ZERO_PROGRESS = 1e-8
 """Progress below which the path has come to the singularity itself."""
 
 _APPROACH = 0.25
@@ -98,6 +98,13 @@ class ResolvedRateOptions(MotionOptions):
         0,
         "1: the attitude of the base stays as it is (reaction null space), 0: the base turns as it "
         "must",
+        minimum=0,
+        maximum=1,
+    )
+    as_far_as_possible: int = parameter(
+        0,
+        "1: a line that meets a singularity or a joint limit is followed until shortly before, "
+        "0: it is refused",
         minimum=0,
         maximum=1,
     )
@@ -202,16 +209,15 @@ class _Lines:
         progress that is never negative.
         """
         M = np.column_stack([self.scaled_jacobian(q, X), -self._way / self.length])
-        rows, _ = np.linalg.qr(M.T)
-        free = -rows @ rows[-1]
-        free[-1] += 1.0
-        size = float(np.linalg.norm(free))
-        if size < 1e-9:  # The joints cannot move without leaving the line.
+        # Of the null space, the unit vector of most progress: the projection of the last axis.
+        basis = np.linalg.qr(M.T, mode="complete")[0][:, len(M) :]
+        progress = float(np.linalg.norm(basis[-1]))
+        if progress < _ZERO_PROGRESS / 100:  # The joints cannot move without leaving the line.
             return np.zeros(len(q)), np.zeros(4), 0.0
-        u = self.weights * free[:-1] / size
+        u = self.weights * (basis @ basis[-1])[:-1] / progress
         omega = -self._robot.connection(q)[3:] @ u
         X_rate = quaternion_multiply(X, np.append(omega, 0.0)) / 2
-        return u, X_rate, float(free[-1]) / size
+        return u, X_rate, progress
 
     def measure(self, q: Array, X: Array) -> tuple[str, float]:
         """Return the number that becomes zero at a singularity, with its name."""
@@ -260,6 +266,11 @@ class JointPath:
         """Whether it gets to the ends of the lines."""
         return bool(self.shares[-1] == 1.0)
 
+    def until(self, last: int) -> JointPath:
+        """Return the path up to and with one of its places."""
+        parts = {each.name: getattr(self, each.name)[: last + 1] for each in fields(self)}
+        return JointPath(**parts)
+
 
 def _trace(lines: _Lines, q: Array, cancellation: Cancellation) -> JointPath:
     """Follow lines from a shape (n,) to their ends, or to a singularity (Runge-Kutta 4)."""
@@ -280,15 +291,22 @@ def _trace(lines: _Lines, q: Array, cancellation: Cancellation) -> JointPath:
         left = total - y[-1]
         step = min(longest, left / progress[-1])
         if len(progress) > 1 and (falls := progress[-2] - progress[-1]) > 0:
-            # A singularity is a turning point of the path, which no step may go beyond.
             slope = falls / (lengths[-1] - lengths[-2])
             step = min(step, _APPROACH * progress[-1] / slope)
         k2 = rate(y + step / 2 * k)
         k3 = rate(y + step / 2 * k2)
         k4 = rate(y + step * k3)
-        y = y + step / 6 * (k + 2 * k2 + 2 * k3 + k4)
-        y[n : n + 4] /= np.linalg.norm(y[n : n + 4])
-        k = rate(y)
+        there = y + step / 6 * (k + 2 * k2 + 2 * k3 + k4)
+        there[n : n + 4] /= np.linalg.norm(there[n : n + 4])
+        at_end = rate(there)
+        # A singularity is a turning point of the path, which no step may go beyond: there the
+        # tangent is the other way round, as progress is never negative.
+        if min(float(x[:n] @ (k[:n] / lines.weights**2)) for x in (k2, k3, k4, at_end)) < 0:
+            longest = step / 4
+            if longest < _ZERO_PROGRESS**2:
+                progress[-1] = 0.0
+            continue
+        y, k = there, at_end
         lengths.append(lengths[-1] + step)
         states.append(y)
         progress.append(float(k[-1]))
@@ -392,7 +410,8 @@ class ResolvedRateGait(GaitMethod):
 
     From rest to rest, as fast as the limits of the joints allow. Positions, or poses with a turn
     about one axis, of one end-effector or of several at once. Lines that meet a dynamic
-    singularity or a limit of a joint are refused; ``optimal`` reaches most of their ends.
+    singularity or a limit of a joint are refused, or followed until shortly before; ``optimal``
+    reaches most of their ends.
     """
 
     name: ClassVar[str] = "resolved_rate"
@@ -426,14 +445,36 @@ class ResolvedRateGait(GaitMethod):
             return self._schedule(state, goal, q[np.newaxis], {})
         lines = self._lines(state, goal, request.tolerance)
         path = _trace(lines, q, cancellation)
-        self._require_free_way(lines, path)
+        notes: Notes = {}
+        obstacle = self._find_obstacle(lines, path)
+        if obstacle is not None:
+            last, reason = obstacle
+            if not (self.options.as_far_as_possible and last > 0):
+                raise PlanningError(reason)
+            path, notes = path.until(last), {"stopped": reason}
         positions = self._held_commands(lines, state, _TimedPath.of(path, self._limits))
         name, first = lines.measure(q, path.turns[0])
         least = min(
             lines.measure(shape, X)[1] for shape, X in zip(path.shapes, path.turns, strict=True)
         )
-        measures: Notes = {"singularity_measure": name, "at_start": first, "least": least}
-        return self._schedule(state, goal, positions, measures)
+        notes |= {"singularity_measure": name, "at_start": first, "least": least}
+        return self._schedule(state, goal, positions, notes)
+
+    def path(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> JointPath:
+        """Return the path along the lines of a goal, to their ends or to a singularity.
+
+        It is the same whatever the limits of the joints are, which may end it before.
+
+        Raises
+        ------
+        PlanningError
+            The goal is of another kind, or asks for too much; see :meth:`plan`.
+        """
+        goal = request.goal.for_robot(self.robot.description)
+        self._require_goal_of_end_effectors(goal)
+        return _trace(
+            self._lines(request.state, goal, request.tolerance), request.state.q, cancellation
+        )
 
     def _require_goal_of_end_effectors(self, goal: Goal) -> None:
         if not goal.end_effectors:
@@ -505,8 +546,10 @@ class ResolvedRateGait(GaitMethod):
                 f"for a position instead of a pose{less}."
             )
 
-    def _require_free_way(self, lines: _Lines, path: JointPath) -> None:
-        """Refuse a path that leaves the limits of the joints, or comes near to a singularity."""
+    def _find_obstacle(self, lines: _Lines, path: JointPath) -> tuple[int, str] | None:
+        """Return the last place of a path before the limits of the joints are left, or before a
+        singularity is near, with the reason; None where the way is free.
+        """
         robot = self.robot
         beyond = np.maximum(robot.lower - path.shapes, path.shapes - robot.upper)
         outside = np.flatnonzero(beyond.max(axis=1) > _LIMIT_ROUNDING)
@@ -514,21 +557,21 @@ class ResolvedRateGait(GaitMethod):
         if len(outside) and (not len(slow) or outside[0] < slow[0]):
             k = int(outside[0])
             joint = robot.description.movable_joints[int(np.argmax(beyond[k]))]
-            raise PlanningError(
+            return k - 1, (
                 f"Joint '{joint.name}' is at its limit {lines.place(path.shares[k])}: optimal may "
                 "reach the goal off the line, as may a line from another shape."
             )
         if not len(slow):
-            return
+            return None
         nearest = int(np.argmin(path.progress))
         name, value = lines.measure(path.shapes[nearest], path.turns[nearest])
         first = lines.measure(path.shapes[0], path.turns[0])[1]
-        shape = ", ".join(f"{x:.4g}" for x in path.shapes[nearest])
+        shape = ", ".join(f"{x:.6g}" for x in path.shapes[nearest])
         meets, least, there = "meets", "zero", "no rates of the joints lead on"
         if path.is_complete:
             meets, least = "comes near to", f"{value:.3g}"
             there = "the joints would have to move fast for little progress"
-        raise PlanningError(
+        return int(slow[0]) - 1, (
             f"The straight line {meets} a dynamic singularity "
             f"{lines.place(path.shares[nearest])}: {name} falls from {first:.6g} to {least} at the "
             f"shape ({shape}), where {there}. optimal may reach the goal off the line, as may a "
