@@ -1,0 +1,353 @@
+"""Options of `bench`, `figures`, `export`, `verify` and `campaign` reach the functions behind."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import click
+import pytest
+from support.command_line import CliRunner, Result
+
+import spacerobot_ros.bag
+import spacerobot_ros.bag.tables as tables
+import spacerobot_ros.benchmarks.checkouts as checkouts
+import spacerobot_ros.benchmarks.engines as engines
+import spacerobot_ros.benchmarks.planning as planning
+import spacerobot_ros.benchmarks.real_time as real_time
+import spacerobot_ros.benchmarks.soak as soak
+import spacerobot_ros.benchmarks.ticks as ticks
+import spacerobot_ros.flight.verification as verification
+import spacerobot_ros.report
+import spacerobot_ros.session.viewing as viewing
+from spacerobot_ros.bag.tables import ExportFormat
+from spacerobot_ros.cli import campaign
+from spacerobot_ros.cli.errors import sentences
+from spacerobot_ros.cli.main import main
+from spacerobot_ros.cli.options import beside, numbers, viewing_if
+from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
+from spacerobot_ros.report.figures import PictureFormat
+
+
+def call(*words: object) -> Result:
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """Return the calls of benchmarks; each prints its name and gives its arguments as figures."""
+    asked: list[tuple[Any, ...]] = []
+
+    def stand_in(module: Any, name: str) -> None:
+        def measure(*words: Any, **options: Any) -> dict[str, Any]:
+            kept = tuple(word for word in words if not callable(word))
+            asked.append((name, *kept, *options.values()))
+            (show,) = (word for word in words if word is click.echo)
+            show(name)
+            return {"flat": len(asked) < 2, "asked": name}
+
+        monkeypatch.setattr(module, name, measure)
+
+    for module, *names in (
+        (ticks, "ticks_benchmark"),
+        (real_time, "real_time_benchmark", "viewer_benchmark"),
+        (soak, "soak_benchmark"),
+        (planning, "planning_benchmark", "first_plan_benchmark"),
+        (engines, "lanes_benchmark"),
+    ):
+        for name in names:
+            stand_in(module, name)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("words", "call_"),
+    [
+        ("", ("ticks_benchmark", 20_000)),
+        ("100", ("ticks_benchmark", 100)),
+        ("--ticks 150", ("ticks_benchmark", 150)),
+        ("--ticks=150", ("ticks_benchmark", 150)),
+        ("real-time", ("real_time_benchmark", 60.0, (100.0,))),
+        ("real-time 5 --rate 1 --rate 1e4", ("real_time_benchmark", 5.0, (1.0, 1e4))),
+        ("soak", ("soak_benchmark", 1800.0, None)),
+        ("soak 10", ("soak_benchmark", 10.0, None)),
+        ("viewer", ("viewer_benchmark", 60.0, True)),
+        ("viewer 5 --no-priorities", ("viewer_benchmark", 5.0, False)),
+        ("planning", ("planning_benchmark", 20, None, None, None)),
+        (
+            "planning 1 --long-search 1 --library 1 --against x",
+            ("planning_benchmark", 1, Path("x"), 1, 1),
+        ),
+        ("first-plans", ("first_plan_benchmark", None)),
+        ("first-plans --against x", ("first_plan_benchmark", Path("x"))),
+        ("campaign", ("lanes_benchmark",)),
+    ],
+)
+def test_benchmarks_are_given_their_numbers(
+    asked: list[Any], tmp_path: Path, words: str, call_: tuple[Any, ...]
+) -> None:
+    assert call("bench", *words.split()).exit_code == 0
+    assert asked == [call_]
+    file = tmp_path / "new" / "figures.json"
+    if words and not words.startswith("--"):
+        done = call("bench", *words.split(), "--json", file)
+        assert json.loads(file.read_text("utf-8")) == {"flat": False, "asked": call_[0]}
+        soaks = words.startswith("soak")
+        assert done.exit_code == (1 if soaks else 0), "memory that grows fails"
+        assert file.read_text("utf-8").count("\n") == (1 if soaks else 4)
+        assert asked[1] == ((*call_[:-1], file.with_suffix(".png")) if soaks else call_)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *("ticks 99", "real-time 4.9", "real-time --rate 0.9", "real-time --rate 10001"),
+        *("soak 9.9", "viewer 4.9", "planning 0", "planning --long-search 0"),
+        *("planning --library 0", "ticks --rounds 0"),
+    ],
+)
+def test_benchmarks_of_nothing_are_refused(asked: list[Any], words: str) -> None:
+    assert call("bench", *words.split()).exit_code == 2
+    assert asked == []
+
+
+def test_checkouts_are_measured_in_turns(asked: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    compared: list[tuple[Any, ...]] = []
+
+    def compare(other: Path, measure: Any, show: Any, rounds: int) -> dict[str, Any]:
+        there = SimpleNamespace(measure=lambda *w, **o: (*w, o), run=lambda words: words)
+        compared.append((other, measure(there), rounds))
+        return {}
+
+    monkeypatch.setattr(checkouts, "compare", compare)
+    assert call("bench", "ticks", 200, "--against", "x").exit_code == 0
+    assert call("bench", "real-time", 7, "--against", "y", "--rounds", 1).exit_code == 0
+    words = ["-m", "spacerobot_ros", "bench", "real-time", "7.0", "--rate=100.0", "--json"]
+    assert compared == [(Path("x"), ("tick_times", {"ticks": 200}), 5), (Path("y"), words, 1)]
+    assert asked == []
+
+
+@pytest.mark.parametrize(
+    ("text", "width"),
+    [
+        ("88mm", 88.0),
+        ("90", 90.0),
+        (" 8.8 CM ", 88.0),
+        (".5in", 12.7),
+        ("72 pt", 25.4),
+        ("-3mm", None),
+        ("3km", None),
+        ("3.mm", None),
+    ],
+)
+def test_widths_of_figures_are_taken_in_any_unit(
+    monkeypatch: pytest.MonkeyPatch, text: str, width: float | None
+) -> None:
+    drawn: list[Any] = []
+
+    def draw(bag: Path, folder: Path, names: list[str], **options: Any) -> dict[str, Any]:
+        drawn.append((bag, folder, names, options))
+        return {"pose": Path("pose.pdf"), "joints": "The bag has none."}
+
+    monkeypatch.setattr(spacerobot_ros.report, "write_figures", draw)
+    done = call("figures", "a.mcap", "--width", text)
+    if width is None:
+        assert done.exit_code == 2
+        assert f"'{text}' is no length such as 88mm, 18cm, 3.5in or 246pt." in done.stderr
+        return
+    assert done.exit_code == 0
+    assert done.stdout == "pose        pose.pdf\n"
+    ((bag, folder, names, options),) = drawn
+    assert (bag, folder, names) == (Path("a.mcap"), Path("a_figures"), [])
+    assert options.pop("width") == pytest.approx(width)
+    assert options == {
+        **{"format": PictureFormat.PDF, "style": None, "events": False, "namespace": None}
+    }
+
+
+@pytest.mark.parametrize(
+    ("only", "results", "out", "err", "code"),
+    [
+        ("", {"pose": "It has none."}, "", "pose        none: It has none.\n", 1),
+        ("pose", {"pose": Path("p")}, "pose        p\n", "", 0),
+        (
+            " Pose, x",
+            {"pose": Path("p"), "x": "No."},
+            "pose        p\n",
+            "x           none: No.\n",
+            1,
+        ),
+    ],
+)
+def test_figures_that_were_asked_for_and_not_drawn_fail(
+    monkeypatch: pytest.MonkeyPatch,
+    only: str,
+    results: dict[str, Any],
+    out: str,
+    err: str,
+    code: int,
+) -> None:
+    monkeypatch.setattr(spacerobot_ros.report, "write_figures", lambda *words, **options: results)
+    done = call("figures", "a.mcap", "--only", only, "--format", "SVG")
+    assert (done.stdout, done.stderr, done.exit_code) == (out, err, code)
+
+
+@pytest.mark.parametrize(
+    ("words", "out", "topics"),
+    [
+        ("", "bags/a_csv", ["/x", "/y"]),
+        ("--format MAT", "bags/a.mat", ["/x", "/y"]),
+        ("--format parquet --topic y --topic /y", "bags/a_parquet", ["/y"]),
+        ("--out there --topic x", "there", ["/x"]),
+    ],
+)
+def test_tables_are_exported_beside_their_bag(
+    monkeypatch: pytest.MonkeyPatch, words: str, out: str, topics: list[str]
+) -> None:
+    class Opened(dict[str, Any]):
+        path = Path("bags/a.mcap")
+
+        def __missing__(self, topic: str) -> Any:
+            return SimpleNamespace(topic=f"/{topic.lstrip('/')}")
+
+        def table(self, topic: str) -> str:
+            return topic
+
+    def export(tables: Iterator[str], out: Path, format: ExportFormat) -> Any:
+        exported.append((list(tables), out, format))
+        return SimpleNamespace(rows={"/x": 3}, path="written")
+
+    exported: list[Any] = []
+    kept = {topic: SimpleNamespace(topic=topic) for topic in ("/x", "/y")}
+    monkeypatch.setattr(spacerobot_ros.bag, "read_bag", lambda path: Opened(kept))
+    monkeypatch.setattr(tables, "export", export)
+    done = call("export", "bags/a.mcap", *words.split())
+    form = "csv" if "--format" not in words else words.split()[1].lower()
+    assert exported == [(topics, Path(out), ExportFormat(form))]
+    rows = {"/x": "3 rows", "/y": "no messages, left out"}
+    lines = [f"{topic:<27} {rows[topic]}" for topic in topics]
+    assert done.stdout.splitlines() == [*lines, f"{'tables':<27} written"]
+
+
+def test_a_verified_bag_and_one_that_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    result = SimpleNamespace(
+        **{"ticks": 40, "duration": 2.0, "messages": 120, "topics": ["odom", "momentum"]},
+        **{"largest": 1.25e-10, "difference": None, "missing": None},
+        largest_at=SimpleNamespace(field="pose", topic="odom", time=0.35),
+    )
+
+    def verify(bag: Path, tolerance: float) -> Any:
+        asked.append((bag, tolerance))
+        return result
+
+    monkeypatch.setattr(verification, "verify_bag", verify)
+    done = call("verify", "a.mcap")
+    lines = [
+        "flown again 40 ticks, 2 s",
+        "compared    120 messages on odom, momentum",
+        "largest     1.25e-10, pose of odom at 0.35 s",
+    ]
+    last = "verified    every published state follows from the commands"
+    assert (done.exit_code, done.stdout.splitlines()) == (0, [*lines, last])
+    for name, text in (("missing", "It lacks one."), ("difference", "It is not so.")):
+        setattr(result, name, text)
+        done = call("verify", "a.mcap", "--tolerance", "0")
+        assert (done.exit_code, done.stdout.splitlines()) == (1, lines)
+        assert done.stderr.endswith(f"{text}\n")
+    assert asked == [(Path("a.mcap"), 1e-9), *[(Path("a.mcap"), 0.0)] * 2]
+    assert call("verify", "a.mcap", "--tolerance", "-1e-9").exit_code == 2
+    result.difference = result.missing = result.largest_at = None
+    assert call("verify", "a.mcap").stdout.splitlines()[2] == "largest     1.25e-10"
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (PlanningError("No way."), 1),
+        (GoalError("No goal."), 2),
+        (ParameterError("No number."), 2),
+        (ImportError("No module named 'rclpy'", name="rclpy.node"), 2),
+        (ImportError("No module named 'other'", name="other"), None),
+        (ImportError("It is broken."), None),
+        (KeyError("x"), None),
+    ],
+)
+def test_exceptions_are_exit_codes_and_errors_of_programs_are_not(
+    capsys: pytest.CaptureFixture[str], error: Exception, code: int | None
+) -> None:
+    with pytest.raises(type(error) if code is None else SystemExit) as raised, sentences():
+        raise error
+    if isinstance(raised.value, SystemExit):
+        assert raised.value.code == code
+        text = capsys.readouterr().err
+        assert text == f"{error}\n" or text.startswith(f"ROS 2 was not found ({error}); source its")
+
+
+def test_the_progress_of_a_campaign_is_shown_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[tuple[int, str]] = []
+
+    @contextmanager
+    def bar(**options: Any) -> Iterator[Any]:
+        assert (options["length"], options["label"]) == (1000, "flights")
+        made = SimpleNamespace(pos=0)
+
+        def update(step: int, text: str) -> None:
+            made.pos += step
+            shown.append((made.pos, text))
+
+        made.update = update
+        yield made
+
+    monkeypatch.setattr(click, "progressbar", bar)
+
+    def report(terminal: bool) -> None:
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
+        with campaign._progress_bar("flights") as show:
+            for done, left in ((1, math.inf), (2, 3725.4), (2, 59.6), (1, 1.0), (4, 0.0)):
+                show(SimpleNamespace(done=done, total=4, rate=0.12345, seconds_left=left))  # type: ignore[arg-type]
+
+    report(terminal=False)
+    assert shown == []
+    report(terminal=True)
+    assert shown == [
+        (250, "1/4, 0.123/s, ? left"),
+        (500, "2/4, 0.123/s, 1:02:05 left"),
+        (500, "2/4, 0.123/s, 0:01:00 left"),
+        (500, "1/4, 0.123/s, 0:00:01 left"),
+        (1000, "4/4, 0.123/s, 0:00:00 left"),
+    ]
+
+
+def test_a_viewer_runs_beside_a_command_that_asks_for_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[Any] = []
+
+    @contextmanager
+    def view(parameters: Any, show: Any, namespace: str) -> Iterator[None]:
+        asked.append((parameters, namespace))
+        show("at this address")
+        yield
+
+    monkeypatch.setattr(viewing, "viewing", view)
+    for wanted in (False, True):
+        with viewing_if(wanted, {"port": 0}, "left"):
+            assert len(asked) == wanted
+    assert asked == [({"port": 0}, "left")]
+    assert capsys.readouterr().err == "at this address\n"
+
+
+def test_files_beside_a_bag_have_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "flight.1").mkdir()
+    assert beside(tmp_path / "a.b.mcap", ".html") == tmp_path / "a.b.html"
+    assert beside(tmp_path / "flight.1", ".html") == tmp_path / "flight.1.html"
+    monkeypatch.chdir(tmp_path / "flight.1")
+    assert beside(Path("."), "_figures") == tmp_path / "flight.1_figures"
+    assert numbers([1.0, -0.123456]) == "1.00000, -0.12346"
