@@ -77,6 +77,7 @@ def plan_command(
     The gait is simulated. Exit code 0: it ends within tolerance; 1: it does not, or the goal cannot
     be reached; 2: bad input.
     """
+    from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
     from spacerobot_ros.simulation.trials import PlanEvaluation, compare, fastest, try_method
 
     problem = problem_of_scenario(scenario, goal, settings)
@@ -99,6 +100,9 @@ def plan_command(
         click.echo(f"planned in {trial.plan_time:.3f} s")
         if problem.config.clearance:
             click.echo(_clearance_line(problem, trial))
+        beyond = [str(piece.notes.get(BEYOND_EFFORT_LIMITS, "")) for piece in trial.pieces]
+        for clause in filter(None, dict.fromkeys(beyond)):
+            click.echo(f"warning     Efforts are beyond limits: {clause}.")
     if json_file is not None:
         content = plan_json(problem, trial)
         if comparing:
