@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 from support.hand_motion import end_of_motion
 
@@ -116,6 +118,7 @@ def test_lower_limits_are_kept(
     assert np.all(np.abs(np.diff(rates, axis=0)) / PERIOD <= change * (1 + 1e-8))
 
 
+@pytest.mark.slow
 def test_a_pose_turns_about_one_axis_in_step_with_the_way() -> None:
     start = poses("seven_joint_arm", SEVEN[np.newaxis], "link_7")["link_7"]
     turn = Rotation.from_rotvec([0.3, -0.2, 0.25])
@@ -179,6 +182,85 @@ def test_a_small_way_and_none_are_planned_too(arm: tuple[GaitSchedule, Pose, Arr
         end = poses("three_joint_arm", schedule.positions, "end_effector")["end_effector"][0]
         np.testing.assert_allclose(end, goal, atol=1e-10)
         assert (schedule.ticks == 0) == (way == 0.0)
+
+
+# -- through waypoints --------------------------------------------------------------------------
+
+WAYPOINTS = np.array([[0.15, -0.1, 0.05], [0.2, -0.3, 0.2]])
+"""From the start of the arm, m."""
+
+
+def smooth_path(start: Array, goal: Array) -> Array:
+    """Return 4001 places (N, 3) of the natural cubic spline by chords through the waypoints."""
+    points = np.vstack([start, start + WAYPOINTS, goal])
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    path = CubicSpline(along, points, bc_type="natural")
+    return np.asarray(path(np.linspace(0.0, along[-1], 4001)))
+
+
+def test_the_end_effector_goes_through_waypoints_on_a_smooth_path(
+    arm: tuple[GaitSchedule, Pose, Array],
+) -> None:
+    (start, _), goal = arm[1], arm[1][0] + np.array([0.05, -0.4, 0.1])
+    # A waypoint that comes twice is no obstacle.
+    given = np.vstack([start, start + WAYPOINTS, start + WAYPOINTS[1]])
+    options = {"waypoints": tuple(given.ravel().tolist())}
+    schedule = planned("three_joint_arm", ARM, "end_effector", goal, **options)
+    path, places = smooth_path(start, goal), []
+    for tick in (schedule.ticks // 4, schedule.ticks // 2, schedule.ticks):
+        r, _ = poses("three_joint_arm", schedule.positions[: tick + 1], "end_effector")[
+            "end_effector"
+        ]
+        near = np.linalg.norm(path - r, axis=1)
+        assert near.min() < 2e-4  # Half of the spacing of the path's places.
+        places.append(int(near.argmin()))
+    assert 0 < places[0] < places[1] < places[2] == 4000
+    np.testing.assert_allclose(r, goal, atol=1e-8)
+    rates = np.vstack([np.zeros((1, 3)), schedule.velocities, np.zeros((1, 3))])
+    limit = robot_of("three_joint_arm").velocity_limit
+    assert np.all(np.abs(rates) <= limit * (1 + 1e-8))
+    assert np.all(np.abs(np.diff(rates, axis=0)) / PERIOD <= limit / 0.5 * (1 + 1e-8))
+
+
+def test_a_path_may_end_where_it_began_and_a_correction_goes_straight(
+    arm: tuple[GaitSchedule, Pose, Array],
+) -> None:
+    start, _ = arm[1]
+    robot = robot_of("three_joint_arm")
+    waypoints = tuple((start + WAYPOINTS).ravel().tolist())
+    options = {"resolved_rate": method_options("resolved_rate", {"waypoints": waypoints})}
+    method = build_method("resolved_rate", robot, PERIOD, 0.01, options)
+    state = RobotState(PLACE, ATTITUDE.as_quat(), ARM)
+    goal = Goal.of_end_effectors([EndEffectorGoal("end_effector", start)])
+    request = PlanRequest(state, goal, Tolerance(1e-6, 1e-6))
+    schedule = method.plan(request)
+    end, _ = poses("three_joint_arm", schedule.positions, "end_effector")["end_effector"]
+    np.testing.assert_allclose(end, start, atol=1e-8)
+    assert schedule.duration > 1.0
+    assert method.plan(replace(request, correction=True)).ticks == 0
+
+
+def test_waypoints_that_lead_nowhere_are_refused(arm: tuple[GaitSchedule, Pose, Array]) -> None:
+    start, _ = arm[1]
+    with pytest.raises(ParameterError, match=r"resolved_rate\.waypoints has 4 number\(s\); a way"):
+        planned("three_joint_arm", ARM, "end_effector", start, waypoints=(1.0, 2.0, 3.0, 4.0))
+    with pytest.raises(
+        PlanningError, match=r"^The path through the waypoints meets a dynamic|at its limit"
+    ):
+        planned("three_joint_arm", ARM, "end_effector", start, waypoints=(90.0, 2.0, 3.0))
+    tip = poses("planar_chain", np.array([[0.4, -0.9]]), "segment_2")["segment_2"][0]
+    above = tuple((tip + ATTITUDE.apply([0.1, 0.0, 0.2])).tolist())
+    with pytest.raises(UnreachableError, match="in one plane"):
+        planned("planar_chain", np.array([0.4, -0.9]), "segment_2", tip, waypoints=above)
+    both = {"left_link_7": [1.0, 1.0, 1.0], "right_link_7": [1.0, -1.0, 1.0]}
+    with pytest.raises(PlanningError, match="lead one end-effector, and the goal is for 2"):
+        plan(
+            "dual_arm",
+            start=RobotState(PLACE, ATTITUDE.as_quat(), DUAL),
+            method="resolved_rate",
+            end_effector_position=both,
+            waypoints=(1.0, 1.0, 1.0),
+        )
 
 
 # -- refusals -----------------------------------------------------------------------------------
@@ -249,6 +331,7 @@ def test_a_robot_that_drifts_is_refused_and_a_search_is_cancelled() -> None:
 # -- among the other methods --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_it_is_compared_for_goals_of_end_effectors_alone() -> None:
     from spacerobot_ros.scenario import load_scenario
 

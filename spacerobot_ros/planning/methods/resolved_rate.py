@@ -1,11 +1,10 @@
-"""End-effectors along straight lines while the base floats: resolved-rate motion.
+"""End-effectors along given lines while the base floats: resolved-rate motion.
 
 At zero momentum the generalised Jacobian ``J*(q)`` maps the rates of the joints to the velocity of
-an end-effector in the world (Umetani and Yoshida). The rates that take it along a straight line,
-the attitude about one axis, are ``qdot = J*^+ xdot``. Where ``J*`` loses rank no rates do: a
-dynamic singularity. Whether the line meets one depends on the shape alone, which depends on the
-path that led there (paper 4, section V, calls the two kinds of workspaces path-dependent and
-path-independent).
+an end-effector in the world (Umetani and Yoshida). The rates that take it along a line, straight
+or through waypoints, the attitude about one axis, are ``qdot = J*^+ xdot``. Where ``J*`` loses
+rank no rates do: a dynamic singularity. Whether the line meets one depends on the shape alone,
+which depends on the path that led there (paper 4, section V; path-dependent workspaces).
 
 The path is followed in its own length, not in time: its tangent is a vector of the null space of
 ``[J*, -x']``, which is finite up to the singularity, where the progress on the line becomes zero.
@@ -23,7 +22,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
@@ -77,6 +76,9 @@ _ZERO_DISTANCE = 1e-10
 _SAMPLED_SHAPES = 8
 """Shapes in general position at which the freedom of the joints is examined."""
 
+_LENGTH_SAMPLES = 200
+"""Places of a curved way from which its scaled length is estimated."""
+
 _INTERVALS = 160
 """Intervals of the linear program."""
 
@@ -101,6 +103,14 @@ class ResolvedRateOptions(MotionOptions):
         minimum=0,
         maximum=1,
     )
+    waypoints: tuple[float, ...] = parameter(
+        (),
+        "positions x, y, z in the world, one after the other, through which a smooth path leads "
+        "the end-effector to its goal; []: the straight line",
+        unit="m",
+        minimum=-1e9,
+        maximum=1e9,
+    )
     as_far_as_possible: int = parameter(
         0,
         "1: a line that meets a singularity or a joint limit is followed until shortly before, "
@@ -110,9 +120,42 @@ class ResolvedRateOptions(MotionOptions):
     )
 
 
+class _Way:
+    """A smooth way through points (K, 3), m, from the origin: a natural cubic spline by the lengths
+    of its chords, which through two points is the straight line.
+
+    Attributes
+    ----------
+    length
+        Of the chords together, m.
+    """
+
+    def __init__(self, points: Array) -> None:
+        from scipy.interpolate import CubicSpline
+
+        # A point that comes twice is no way.
+        chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        kept = np.flatnonzero(np.append(np.inf, chords) > _ZERO_DISTANCE)
+        along = np.append(0.0, np.cumsum(chords))[kept]
+        self.is_straight = len(kept) <= 2
+        self.length = float(along[-1])
+        if len(kept) == 1:
+            along, kept = np.array([0.0, 1.0]), np.array([0, 0])
+        self._place = CubicSpline(along / along[-1], points[kept], bc_type="natural")
+        self._rate = self._place.derivative()
+
+    def place(self, share: float) -> Array:
+        """Return the displacement (3,) after a share of the way."""
+        return np.asarray(self._place(share))
+
+    def rate(self, share: float) -> Array:
+        """Return the derivative (3,) of the displacement by the share."""
+        return np.asarray(self._rate(share))
+
+
 @dataclass(frozen=True)
 class _LinkLine:
-    """The straight line of a link E, in the base B_0 at the start, seen from the centre of mass.
+    """The line of a link E, in the base B_0 at the start, seen from the centre of mass.
 
     Attributes
     ----------
@@ -122,8 +165,10 @@ class _LinkLine:
         (k, 3) and (l, 3) directions in which the joints move and turn it, and in which it follows.
     r_CE, quaternion
         (3,) and (4,) of its pose at the start.
-    way, turn
-        (3,) from the start to the goal, m, and the rotation vector (3,) likewise, rad.
+    way
+        The way from the start to the goal.
+    turn
+        (3,) the rotation vector from the start to the goal, rad.
     """
 
     link: str
@@ -131,7 +176,7 @@ class _LinkLine:
     rotations: Array
     r_CE: Array
     quaternion: Array
-    way: Array
+    way: _Way
     turn: Array
 
     def miss(self, R: Array, r: Array, progress: float) -> Array:
@@ -142,7 +187,7 @@ class _LinkLine:
         rotation = rotvec_from_quaternion(quaternion_multiply(target, found))
         return np.concatenate(
             [
-                self.displacements @ (self.r_CE + progress * self.way - r),
+                self.displacements @ (self.r_CE + self.way.place(progress) - r),
                 self.rotations @ rotation,
             ]
         )
@@ -174,9 +219,17 @@ class _Lines:
                 reach = reach_of_end_effector(robot, limits.lower, limits.upper, line.link)
             scales += [1 / reach] * len(line.displacements) + [1.0] * len(line.rotations)
         self._scales = np.array(scales)
-        way = [np.append(x.displacements @ x.way, x.rotations @ x.turn) for x in lines]
-        self._way = np.concatenate(way) * self._scales
-        self.length = float(np.linalg.norm(self._way))
+        self.is_straight = all(line.way.is_straight for line in lines)
+        shares = np.linspace(0.0, 1.0, 2 if self.is_straight else _LENGTH_SAMPLES)
+        self.length = float(np.mean([np.linalg.norm(self._rate(share)) for share in shares]))
+
+    def _rate(self, share: float) -> Array:
+        """Return the scaled derivative (m,) of the rows by the share of the lines."""
+        rates = [
+            np.append(x.displacements @ x.way.rate(share), x.rotations @ x.turn)
+            for x in self._lines
+        ]
+        return np.asarray(np.concatenate(rates) * self._scales)
 
     def jacobian(self, q: Array, X: Array) -> Array:
         """Return the rows (m, n) of J* in B_0, for a shape and a turn (4,) of the base."""
@@ -202,13 +255,13 @@ class _Lines:
         least = np.linalg.lstsq(self.scaled_jacobian(q, X), miss, rcond=None)[0]
         return self.weights * least, float(np.linalg.norm(miss))
 
-    def tangent(self, q: Array, X: Array) -> tuple[Array, Array, float]:
+    def tangent(self, q: Array, X: Array, share: float) -> tuple[Array, Array, float]:
         """Return the path's tangent: (n,) of the shape, (4,) of the turn, and the progress.
 
         It is of unit length with the joints scaled, the shortest way of the joints, and makes a
         progress that is never negative.
         """
-        M = np.column_stack([self.scaled_jacobian(q, X), -self._way / self.length])
+        M = np.column_stack([self.scaled_jacobian(q, X), -self._rate(share) / self.length])
         # Of the null space, the unit vector of most progress: the projection of the last axis.
         basis = np.linalg.qr(M.T, mode="complete")[0][:, len(M) :]
         progress = float(np.linalg.norm(basis[-1]))
@@ -230,9 +283,9 @@ class _Lines:
     def place(self, share: float) -> str:
         """Return a share of the lines in words."""
         line = self._lines[0]
-        way = float(np.linalg.norm(line.way))
+        way, kind = line.way.length, "line" if line.way.is_straight else "path"
         if way > _ZERO_DISTANCE:
-            return f"after {share * way:.6g} of {way:.6g} m of the line of '{line.link}'"
+            return f"after {share * way:.6g} of {way:.6g} m of the {kind} of '{line.link}'"
         turn = float(np.linalg.norm(line.turn))
         return f"after {share * turn:.6g} of {turn:.6g} rad of the turn of '{line.link}'"
 
@@ -279,7 +332,7 @@ def _trace(lines: _Lines, q: Array, cancellation: Cancellation) -> JointPath:
 
     def rate(y: Array) -> Array:
         X = y[n : n + 4] / np.linalg.norm(y[n : n + 4])
-        u, X_rate, progress = lines.tangent(y[:n], X)
+        u, X_rate, progress = lines.tangent(y[:n], X, min(float(y[-1]) / total, 1.0))
         return np.concatenate([u, X_rate, [progress]])
 
     k = rate(y)
@@ -406,7 +459,7 @@ class _TimedPath:
 
 
 class ResolvedRateGait(GaitMethod):
-    """End-effectors on straight lines to their goals, with the base free.
+    """End-effectors on straight lines, or through waypoints, to their goals, with the base free.
 
     From rest to rest, as fast as the limits of the joints allow. Positions, or poses with a turn
     about one axis, of one end-effector or of several at once. Lines that meet a dynamic
@@ -424,6 +477,11 @@ class ResolvedRateGait(GaitMethod):
 
     def _setup(self) -> None:
         self._limits = MotionLimits.of(self.robot, self.options, self.name)
+        if len(self.options.waypoints) % 3:
+            raise ParameterError(
+                f"{self.name}.waypoints has {len(self.options.waypoints)} number(s); a waypoint "
+                "has three."
+            )
 
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:
@@ -441,9 +499,13 @@ class ResolvedRateGait(GaitMethod):
         goal = request.goal.for_robot(self.robot.description)
         self._require_goal_of_end_effectors(goal)
         error = PoseError.between(state.position, state.quaternion, goal, q, self.robot)
-        if Tolerance(_ZERO_DISTANCE, _ZERO_DISTANCE).admits(error, self.controls):
+        waypoints = self._waypoints(request, goal)
+        at_goal = Tolerance(_ZERO_DISTANCE, _ZERO_DISTANCE).admits(error, self.controls)
+        if at_goal and not len(waypoints):
             return self._schedule(state, goal, q[np.newaxis], {})
-        lines = self._lines(state, goal, request.tolerance)
+        lines = self._lines(state, goal, request.tolerance, waypoints)
+        if lines.length < _ZERO_DISTANCE:
+            return self._schedule(state, goal, q[np.newaxis], {})
         path = _trace(lines, q, cancellation)
         notes: Notes = {}
         obstacle = self._find_obstacle(lines, path)
@@ -472,9 +534,20 @@ class ResolvedRateGait(GaitMethod):
         """
         goal = request.goal.for_robot(self.robot.description)
         self._require_goal_of_end_effectors(goal)
-        return _trace(
-            self._lines(request.state, goal, request.tolerance), request.state.q, cancellation
-        )
+        waypoints = self._waypoints(request, goal)
+        lines = self._lines(request.state, goal, request.tolerance, waypoints)
+        return _trace(lines, request.state.q, cancellation)
+
+    def _waypoints(self, request: PlanRequest, goal: Goal) -> Array:
+        """Return the waypoints (K, 3) of a request, in the world: none of a correction."""
+        if request.correction or not self.options.waypoints:
+            return np.zeros((0, 3))
+        if len(goal.end_effectors) > 1:
+            raise PlanningError(
+                f"{self.name}.waypoints lead one end-effector, and the goal is for "
+                f"{len(goal.end_effectors)}: give a goal of one, or leave them out."
+            )
+        return np.reshape(self.options.waypoints, (-1, 3))
 
     def _require_goal_of_end_effectors(self, goal: Goal) -> None:
         if not goal.end_effectors:
@@ -489,7 +562,9 @@ class ResolvedRateGait(GaitMethod):
                 f"asks for {part}, too: optimal plans for both."
             )
 
-    def _lines(self, state: RobotState, goal: Goal, tolerance: Tolerance) -> _Lines:
+    def _lines(
+        self, state: RobotState, goal: Goal, tolerance: Tolerance, waypoints: Array
+    ) -> _Lines:
         """Return the lines of a goal, along directions in which the joints move the links.
 
         Raises
@@ -504,7 +579,12 @@ class ResolvedRateGait(GaitMethod):
         if self.options.keep_attitude:
             goals.append(EndEffectorGoal(robot.base_link, state.position, state.quaternion))
         rows = EndEffectorRows(robot, [(x.link, x.quaternion is not None) for x in goals], axes)
-        rows.require_directions(state, goals, (tolerance.position, tolerance.attitude))
+        tolerances = tolerance.position, tolerance.attitude
+        rows.require_directions(state, goals, tolerances)
+        for point in waypoints:
+            rows.require_directions(
+                state, [replace(goals[0], position=point), *goals[1:]], tolerances
+            )
         from_start, r_BC = quaternion_inverse(state.quaternion), robot.center_of_mass(state.q)
         R_BW = matrix_from_quaternion(state.quaternion).T
         lines = []
@@ -515,13 +595,16 @@ class ResolvedRateGait(GaitMethod):
                 wanted = quaternion_multiply(from_start, each.quaternion)
                 between = quaternion_multiply(wanted, quaternion_inverse(quaternion))
                 turn = rotvec_from_quaternion(between)
+            points = each.position[np.newaxis]
+            if each is goals[0]:
+                points = np.vstack([waypoints, points])
             line = _LinkLine(
                 each.link,
                 directions.displacements,
                 directions.rotations,
                 r_BE - r_BC,
                 quaternion,
-                R_BW @ (each.position - state.position) - r_BE,
+                _Way(np.vstack([np.zeros(3), (points - state.position) @ R_BW.T - r_BE])),
                 turn,
             )
             if each.link == robot.base_link:  # Its attitude alone is kept.
@@ -571,8 +654,9 @@ class ResolvedRateGait(GaitMethod):
         if path.is_complete:
             meets, least = "comes near to", f"{value:.3g}"
             there = "the joints would have to move fast for little progress"
+        line = "straight line" if lines.is_straight else "path through the waypoints"
         return int(slow[0]) - 1, (
-            f"The straight line {meets} a dynamic singularity "
+            f"The {line} {meets} a dynamic singularity "
             f"{lines.place(path.shares[nearest])}: {name} falls from {first:.6g} to {least} at the "
             f"shape ({shape}), where {there}. optimal may reach the goal off the line, as may a "
             "line from another shape."
