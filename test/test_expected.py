@@ -10,6 +10,7 @@ import pytest
 from support.expected import (
     ANALYSED,
     BAGS,
+    CAMPAIGN_PAGES,
     PARAMETERS,
     PLANS,
     REPORTS,
@@ -17,7 +18,8 @@ from support.expected import (
     parameters,
     plans,
 )
-from support.figure_prints import analysis_prints, report_prints
+from support.figure_prints import PARTS, analysis_prints, report_part
+from support.page_prints import CAMPAIGNS
 
 WRITE = "If this is wanted, `make expected` writes the file anew."
 
@@ -56,10 +58,18 @@ def test_plans_stay_as_they_are() -> None:
     assert not problems, "\n".join([*problems[:40], WRITE])
 
 
+@pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("name", _some_quick(BAGS, "servicer_thrusters", "sliding_masses"))
-def test_reports_stay_as_they_are(name: str) -> None:
-    kept = json.loads(REPORTS.read_text("utf-8"))[name]
-    problems = differences(report_prints(name), kept)
+def test_reports_stay_as_they_are(name: str, part: str) -> None:
+    kept = json.loads(REPORTS.read_text("utf-8"))[name].get(part)
+    problems = differences(report_part(name, part), kept)
+    assert not problems, "\n".join([*problems[:40], WRITE])
+
+
+@pytest.mark.parametrize("name", CAMPAIGNS)
+def test_pages_of_campaigns_stay_as_they_are(name: str) -> None:
+    kept = json.loads(CAMPAIGN_PAGES.read_text("utf-8"))
+    problems = differences(CAMPAIGNS[name](), kept[name])
     assert not problems, "\n".join([*problems[:40], WRITE])
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from support.figure_prints import analysis_prints, report_prints
+from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
 
 from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
@@ -38,7 +39,7 @@ from spacerobot_ros.viewer.server import ViewerConfig
 
 FOLDER = Path(__file__).parents[1] / "expected"
 PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"
-REPORTS = FOLDER / "reports.json"
+REPORTS, CAMPAIGN_PAGES = FOLDER / "reports.json", FOLDER / "campaigns.json"
 BAGS = ("arm_attitude", "planar_chain", "servicer_thrusters", "sliding_masses")
 ANALYSED = ("planar_chain", "three_joint_arm")
 
@@ -266,7 +267,13 @@ def main() -> None:
     """Write the files."""
     reports = {name: report_prints(name) for name in BAGS}
     reports |= {f"analysis of {name}": analysis_prints(name) for name in ANALYSED}
-    for path, content in ((PARAMETERS, parameters()), (PLANS, plans()), (REPORTS, reports)):
+    pages = {name: print_of() for name, print_of in CAMPAIGNS.items()}
+    for path, content in (
+        (PARAMETERS, parameters()),
+        (PLANS, plans()),
+        (REPORTS, reports),
+        (CAMPAIGN_PAGES, pages),
+    ):
         path.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
         print(path)
 

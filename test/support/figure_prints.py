@@ -9,11 +9,15 @@ count to five digits, so that other versions of numpy and matplotlib draw the sa
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
-from collections.abc import Iterable
+import re
+from collections.abc import Callable, Iterable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -28,7 +32,14 @@ from matplotlib.text import Text
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.report.figures import WIDTH, ReportFigure, drawing
-from spacerobot_ros.report.flight import read_report
+from spacerobot_ros.report.figures_over_time import (
+    momentum_figure,
+    shape_figure,
+    thrusters_figure,
+)
+from spacerobot_ros.report.flight import FlightReport, read_report
+from spacerobot_ros.report.page import charts_of, page
+from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.planning_figures import _planar_figure, _spatial_figure
 from spacerobot_ros.report.scene import scene_of
 from spacerobot_ros.report.tables import (
@@ -38,7 +49,7 @@ from spacerobot_ros.report.tables import (
     result_table,
     runs_table,
 )
-from spacerobot_ros.report.writing import FIGURES
+from spacerobot_ros.report.writing import FIGURES, _overview_figure
 from spacerobot_ros.resources import robot_file
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,25 +57,80 @@ NARROW = 88.0 / 25.4
 """Width of a figure in a column of a paper, inches."""
 
 
+@cache
+def _flight(name: str) -> FlightReport:
+    return read_report(ROOT / "bags" / f"{name}.mcap", None)
+
+
+def _figure(flight: FlightReport, figure: str, style: str) -> dict[str, str] | None:
+    with drawing(WIDTH if style == "report" else NARROW, style):
+        drawn = FIGURES[figure](flight)
+        if not isinstance(drawn, ReportFigure):
+            return None
+        return {"caption": drawn.caption, **prints_of(drawn.figure)}
+
+
+def _page(flight: FlightReport) -> list[str]:
+    """Return the page with a picture that stands in for its figures, which are parts themselves."""
+    missing, still = "It has no <errors>.", "in the picture"
+    stand_in = ReportFigure("pose", "Pose", f"Shown {still}, too.", Figure(), of_picture=still)
+    player = PagePart("<p>3D view</p>")
+    with patch.object(ReportFigure, "svg", b"<svg/>"):
+        return words_of(page(flight, player, [stand_in, missing, None, missing], [flight]))
+
+
+def _charts(flight: FlightReport) -> dict[str, Any]:
+    """Return the charts of two figures; the numbers of their samples as fingerprints."""
+    with drawing():
+        figures = [draw(flight) for draw in (momentum_figure, thrusters_figure, shape_figure)]
+    content = charts_of(flight, figures).data["charts"]
+    for chart in content["charts"]:
+        for name, kind in (("time", "<f8"), ("values", "<f4")):
+            texts = chart[name] if isinstance(chart[name], list) else [chart[name]]
+            numbers = [np.frombuffer(base64.b64decode(text), kind) for text in texts]
+            chart[name] = [f"{len(each)}:{_digest([_numbers(each)])}" for each in numbers]
+    return {"end": content["end"], "charts": content["charts"], "events": content["events"]}
+
+
+PARTS: dict[str, Callable[[FlightReport], Any]] = {
+    "numbers on top": lambda flight: [list(row) for row in headline(flight)],
+    "results": lambda flight: result_table(flight).rows,
+    "joints": lambda flight: getattr(joint_table(flight), "rows", None),
+    "published": lambda flight: getattr(published_table(flight), "rows", None),
+    "runs": lambda flight: runs_table([flight, flight]).rows,
+    "page": _page,
+    "charts": _charts,
+    "3D view": lambda flight: _digest(
+        map(_command, getattr(scene_of(flight), "commands", ["none"]))
+    ),
+    "overview": lambda flight: prints_of(_overview_figure(flight)),
+    **{
+        f"figure {figure}, {style}": partial(_figure, figure=figure, style=style)
+        for style in ("report", "paper")
+        for figure in FIGURES
+    },
+}
+"""The parts of a report by name; None where a bag has nothing for one."""
+
+
+def report_part(name: str, part: str) -> Any:
+    """Return a part of the report of a reference flight: a table, a figure or the 3D view."""
+    return json.loads(json.dumps(PARTS[part](_flight(name))))
+
+
 def report_prints(name: str) -> dict[str, Any]:
-    """Return figures, tables and 3D view of the report of a reference flight."""
-    flight = read_report(ROOT / "bags" / f"{name}.mcap", None)
-    found: dict[str, Any] = {
-        "numbers on top": [list(row) for row in headline(flight)],
-        "results": result_table(flight).rows,
-        "joints": getattr(joint_table(flight), "rows", None),
-        "published": getattr(published_table(flight), "rows", None),
-        "runs": runs_table([flight, flight]).rows,
-        "3D view": _digest(map(_command, getattr(scene_of(flight), "commands", ["none"]))),
-    }
-    for width, style in ((WIDTH, "report"), (NARROW, "paper")):
-        with drawing(width, style):
-            for figure, draw in FIGURES.items():
-                drawn = draw(flight)
-                if isinstance(drawn, ReportFigure):
-                    key = f"figure {figure}, {style}"
-                    found[key] = {"caption": drawn.caption, **prints_of(drawn.figure)}
-    return dict(json.loads(json.dumps(found)))
+    """Return the parts that the report of a reference flight has."""
+    found = {part: report_part(name, part) for part in PARTS}
+    return {part: content for part, content in found.items() if content is not None}
+
+
+def words_of(text: str) -> list[str]:
+    """Return the lines of a page's body, without pictures, licences and footer."""
+    body = text.partition("<main>\n")[2].partition("<footer>")[0]
+    body = re.sub(r"<img [^>]*>", "<img>", body)
+    return re.sub(
+        r'<details id="licences">.*?</details>\n?', "", body, flags=re.DOTALL
+    ).splitlines()
 
 
 def analysis_prints(name: str) -> dict[str, str]:
