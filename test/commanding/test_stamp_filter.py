@@ -173,3 +173,87 @@ def test_a_state_of_another_robot_tells_nothing_about_the_time() -> None:
     listener.times.withdraw()
     listener.states(10)
     assert listener.times.ignored == 0
+
+
+class Exact:
+    """A filter after 16 states at a pace; all times are binary fractions of a second."""
+
+    PERIOD = 0.0625
+
+    def __init__(self, pace: float = 1.0) -> None:
+        self.wall = 64.0
+        self.times = StampFilter(self.PERIOD, clock=lambda: self.wall)
+        for tick in range(1, 17):
+            self.wall += self.PERIOD / pace
+            assert self.times.admits(round(tick * self.PERIOD * SECOND), "joints")
+
+    @property
+    def now(self) -> int:
+        return self.times.now_ns
+
+
+@pytest.mark.parametrize(("pace", "wall"), [(1.0, 0.0), (1.0, 0.5), (4.0, 0.5), (0.5, 0.5)])
+def test_stamps_are_plausible_up_to_the_bounds_of_a_step_and_of_losses(
+    pace: float, wall: float
+) -> None:
+    """One step and a half, and twice the time that passes at this pace; odom may be behind, too."""
+    exact = Exact(pace)
+    exact.wall += wall
+    step = 1.5 * Exact.PERIOD
+    longest = round((step + 2.0 * pace * wall) * SECOND)
+    odom_from = -round(step * SECOND)
+    for ahead, plausible, of_odom in (
+        (0, True, True),
+        (longest, True, True),
+        (longest + 1, False, False),
+        (-1, False, True),
+        (odom_from, False, True),
+        (odom_from - 1, False, False),
+    ):
+        assert exact.times.would_admit(exact.now + ahead) is plausible
+        assert exact.times.admits_odom(exact.now + ahead, "odom") is of_odom
+
+
+@pytest.mark.parametrize(("pace", "doubt"), [(1.0, 0.25), (0.5, 0.5), (4.0, 0.2), (100.0, 0.2)])
+def test_a_jump_is_believed_after_four_states_and_a_fifth_of_a_second(
+    pace: float, doubt: float
+) -> None:
+    exact = Exact(pace)
+    stamp = exact.now + 8 * SECOND
+    assert exact.times.accepted_jump() is None
+    assert not exact.times.admits_odom(stamp, "odom")
+    assert not exact.times.admits(stamp, "joints")
+    begin = exact.wall
+    for share in (0.25, 0.5, 0.75, 0.9375):
+        exact.wall = begin + share * doubt
+        assert exact.times.accepted_jump() is None
+    exact.wall = begin + doubt + 1e-9
+    assert exact.times.accepted_jump() == (Stamped(stamp, "odom"), Stamped(stamp, "joints"))
+    assert (exact.now, exact.times.ignored) == (stamp, 0)
+    assert exact.times.accepted_jump() is None
+
+
+def test_a_jump_is_not_believed_at_the_first_look_after_a_standstill() -> None:
+    exact = Exact()
+    exact.times.admits(exact.now + 8 * SECOND, "joints")
+    exact.wall += 60.0
+    looks = [exact.times.accepted_jump() is not None for _ in range(3)]
+    assert looks == [False, True, False]
+
+
+def test_ignored_messages_are_named_with_their_distance_in_time() -> None:
+    exact = Exact()
+    for part, ahead, words in (
+        ("joint_states", 8.125, "8.125 s ahead of"),
+        ("joint_states", -0.5, "0.5 s behind"),
+        ("odom", 1234.5678, "1235 s ahead of"),
+    ):
+        stamp = exact.now + round(ahead * SECOND)
+        put = exact.times.admits if part == "joint_states" else exact.times.admits_odom
+        assert not put(stamp, "message")
+        before = exact.times.ignored
+        assert exact.times.admits(exact.now, "joints")
+        assert exact.times.ignored == before + 1
+        assert exact.times.last_ignored == (
+            f"A message on '{part}' is ignored: its stamp is {words} the time of the states."
+        )
