@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -76,6 +77,7 @@ def plan_command(
     The gait is simulated. Exit code 0: it ends within tolerance; 1: it does not, or the goal cannot
     be reached; 2: bad input.
     """
+    from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
     from spacerobot_ros.simulation.trials import PlanEvaluation, compare, fastest, try_method
 
     problem = problem_of_scenario(scenario, goal, settings)
@@ -96,6 +98,11 @@ def plan_command(
     if not comparing:
         click.echo(f"{scenario}, {method}: {trial.duration:.6g} s, ends {left}")
         click.echo(f"planned in {trial.plan_time:.3f} s")
+        if problem.config.clearance:
+            click.echo(_clearance_line(problem, trial))
+        beyond = [str(piece.notes.get(BEYOND_EFFORT_LIMITS, "")) for piece in trial.pieces]
+        for clause in filter(None, dict.fromkeys(beyond)):
+            click.echo(f"warning     Efforts are beyond limits: {clause}.")
     if json_file is not None:
         content = plan_json(problem, trial)
         if comparing:
@@ -123,6 +130,19 @@ def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:
     from spacerobot_ros.planning.execution.status import describe_remaining_error
 
     return describe_remaining_error(trial.error, trial.controls - {"shape"})
+
+
+def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:
+    """Return a line with the nearest approach of two links in a plan."""
+    from spacerobot_ros.collision import CollisionGeometry, PathCheck
+
+    geometry = CollisionGeometry(problem.robot.description)
+    nearest = PathCheck(geometry).nearest(trial.positions)
+    if nearest is not None:
+        return f"clearance   {nearest}"
+    reasons = Counter(geometry.ignored.values())
+    listed = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+    return f"clearance   no pair of links is looked at{listed and f' ({listed})'}"
 
 
 def problem_of_scenario(

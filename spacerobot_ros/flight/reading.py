@@ -48,6 +48,9 @@ _COMMAND_TOPICS = ("joint_commands", "base_wrench", "joint_reference")
 _NO_GOAL = Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
 """Goal of the base where a bag has none, or leaves it free."""
 
+_ABSENT_MEANS_ZERO = (("planner", "clearance"), ("plant", "clearance_period"))
+"""Parameters by node that bags of earlier versions lack: their flights were without them."""
+
 WRENCH_COLUMNS = TOPICS["base_wrench_realised"].state[0].columns
 """Paths of force and torque in a message of a wrench."""
 
@@ -451,6 +454,9 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
         for node in CONFIGS
         if f"parameters/{node}" in bag.metadata
     }
+    for node, parameter in _ABSENT_MEANS_ZERO:
+        if node in nodes:
+            nodes[node].setdefault(parameter, 0.0)
     urdf, own = bag.parts[0].urdf, nodes.get("plant", {}).get("robot", "")
     for values in nodes.values():
         if urdf is not None and values.get("robot") in ("", own):

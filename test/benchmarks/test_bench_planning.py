@@ -36,6 +36,7 @@ def test_goals_are_the_same_ones_every_time(name: str) -> None:
         assert np.all((one.state.q >= robot.lower) & (one.state.q <= robot.upper))
 
 
+@pytest.mark.slow
 def test_plans_are_measured() -> None:
     found = plans(str(robot_file("planar_chain")), "planar_chain", 1, 7, {"answers": 1})
     assert found["cpu_s"][0] > 0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +20,12 @@ from support.command_line import CliRunner, Result
 from spacerobot_ros.bag.salvage import Salvaged
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.options import numbers
+from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.flight.verification import Difference, Verification
+from spacerobot_ros.model import load_robot
 from spacerobot_ros.planning import METHODS, BasePath, GaitSchedule, Goal, PoseError
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.run import RunResult
 from spacerobot_ros.simulation.trials import MethodRecord, PlanEvaluation, PlanningProblem
 
@@ -265,7 +269,23 @@ def test_the_lines_of_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.stdout == (
         "planar_chain, square_path: 0.06 s, ends 0.0456 rad and 0.0123 m from the goal\n"
         "planned in 0.679 s\n"
+        "clearance   no pair of links is looked at (1 disabled by the SRDF)\n"
     )
+    silent = plan(monkeypatch, True, *PLANAR, "--set", "planner.clearance=0").stdout
+    assert silent == "".join(result.stdout.splitlines(keepends=True)[:2])
+
+
+def test_the_clearance_of_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ("three_joint_arm", "--method", "area_loop")
+    found = plan(monkeypatch, True, *words).stdout.splitlines()[-1]
+    geometry = CollisionGeometry(load_robot(robot_file("three_joint_arm")))
+    # All joints move together from one shape to the next.
+    way = np.linspace(0, 1, 2001)[:, np.newaxis] * np.ones(3)
+    nearest = geometry.nearest_at(np.concatenate([way + k for k in range(3)]))[0].min()
+    assert nearest < 0
+    said = re.fullmatch(r"clearance   links '\w+' and '\w+' touch, ([\d.]+) m deep", found)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(-nearest, rel=6e-3)
 
 
 def test_a_plan_that_misses_its_goal_is_exit_1_and_a_sentence(

@@ -17,6 +17,7 @@ from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import metrics_of
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.report.figures_over_time import clearance_figure
 from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.tables import result_table
@@ -166,3 +167,12 @@ def test_the_nodes_publish_the_clearances_that_a_flight_without_ros_has(tmp_path
         named.append([(m.name, m.message) for _, m in series.messages()])
     assert named[0] == named[1]
     assert len(named[0]) == 7
+
+
+def test_flights_recorded_before_there_was_a_clearance_are_without() -> None:
+    flight = read_run(Path(__file__).parents[2] / "bags" / "sliding_masses.mcap")
+    assert flight.scenario.planner.clearance == 0.0
+    assert flight.scenario.plant.clearance_period == 0.0
+    # Its masses overlap, and its robot knows no SRDF.
+    assert flight.clearance is None
+    assert PlannerConfig().clearance == 0.01

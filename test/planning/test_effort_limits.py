@@ -18,9 +18,11 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, plan
+from spacerobot_ros.planning.core.joint_efforts import JointEfforts
+from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
+from spacerobot_ros.simulation import InitialState, VelocityPlant
 
 Array = npt.NDArray[np.float64]
 
@@ -81,7 +83,7 @@ def test_a_chain_keeps_a_tenth_of_its_efforts() -> None:
     shares = JointEfforts(free, np.ones(2), PERIOD).shares(fast.positions)
     np.testing.assert_allclose(np.abs(shares).max(axis=0), peak, rtol=0.1)
     # Limits that are not reached change nothing, and neither do those that are not to be kept.
-    for unlimited in ({"effort_limits": 1}, {"max_effort": [1.0, 1.0]}):
+    for unlimited in ({"effort_limits": 1}, {"max_effort": [1.0, 1.0], "effort_limits": 2}):
         same = plan(free, **asked, **unlimited)
         assert same.positions.tobytes() == fast.positions.tobytes()
     robot = tenth(CHAIN, peak)
@@ -90,6 +92,56 @@ def test_a_chain_keeps_a_tenth_of_its_efforts() -> None:
     assert "effort of pin_" in str(slow.notes["limited_by"])
     # The same path would take the root of 10 times as long, and of 1 / 0.85 for the reserve.
     assert fast.duration * 1.5 < slow.duration < fast.duration * 3.5
+
+
+def test_servos_keep_a_tenth_of_the_efforts_by_default() -> None:
+    """Effort limits that nobody asked for, in the plant under joint velocities."""
+    asked: dict[str, Any] = {"rotvec": [0, 0, 0.1], "start": CHAIN_START, **QUICK, "starts": 1}
+    asked["control_period"] = 0.05
+    free = SpaceRobot.from_urdf(CHAIN)
+    fast = plan(free, **asked)
+    taken = np.abs(efforts_of_servos(free, fast)).max(axis=0)
+    robot = tenth(CHAIN, taken)
+    slow = plan(robot, **asked)
+    share = np.abs(efforts_of_servos(robot, slow)) / robot.effort_limit
+    assert 0.9 < share.max() <= 1 + 1e-6
+    assert BEYOND_EFFORT_LIMITS not in slow.notes
+    careless = plan(robot, **asked, effort_limits=2)
+    assert careless.positions.tobytes() == fast.positions.tobytes()
+    peak = f"pin_1 takes {taken[0]:.4g} N m, 10 times its limit of {taken[0] / 10:.4g} N m, "
+    assert str(careless.notes[BEYOND_EFFORT_LIMITS]).startswith(peak + "pin_2 takes")
+
+
+@pytest.mark.parametrize("effort", [0.0, 1e9])
+def test_unknown_and_strong_motors_change_nothing(effort: float) -> None:
+    asked: dict[str, Any] = {"rotvec": CHAIN_TURN, "start": CHAIN_START, **QUICK, "starts": 1}
+    limits = {"pin_1": effort, "pin_2": effort}
+    robot = SpaceRobot.from_urdf(with_effort_limits(CHAIN, limits))
+    same, free = plan(robot, **asked), plan(SpaceRobot.from_urdf(CHAIN), **asked, effort_limits=2)
+    assert same.positions.tobytes() == free.positions.tobytes()
+    assert BEYOND_EFFORT_LIMITS not in same.notes
+
+
+def test_a_gait_beyond_effort_limits_says_so() -> None:
+    limits = {"pin_1": 0.4, "pin_2": 50.0}
+    robot = SpaceRobot.from_urdf(with_effort_limits(CHAIN, limits))
+    schedule = plan(robot, method="square_path", rotvec=CHAIN_TURN, start=CHAIN_START)
+    taken = np.abs(efforts_of_servos(robot, schedule)).max(axis=0)
+    assert schedule.notes[BEYOND_EFFORT_LIMITS] == (
+        f"pin_1 takes {taken[0]:.4g} N m, {taken[0] / 0.4:.3g} times its limit of 0.4 N m"
+    )
+
+
+def efforts_of_servos(robot: SpaceRobot, schedule: GaitSchedule) -> Array:
+    """Return the efforts (ticks + 1, n) that the plant publishes when a schedule is flown."""
+    h = schedule.control_period
+    start = InitialState(joint_positions=schedule.positions[0])
+    plant, efforts = VelocityPlant(robot, h, start), []
+    for rates in [*(np.diff(schedule.positions, axis=0) / h), np.zeros(robot.n)]:
+        plant.step(rates)
+        efforts.append(plant.effort.copy())
+    np.testing.assert_allclose(plant.q, schedule.positions[-1], atol=1e-9)
+    return np.array(efforts)
 
 
 @pytest.mark.slow
@@ -115,7 +167,7 @@ def test_a_tenth_of_the_efforts(name: str, start: list[float], turn: list[float]
     assert slow.duration < fast.duration * 3.5
 
 
-def test_efforts_are_limited_where_a_controller_is_given_a_reference(chain: SpaceRobot) -> None:
+def test_efforts_have_a_reserve_where_a_controller_is_given_a_reference(chain: SpaceRobot) -> None:
     def limits(settings: dict[str, Any]) -> int:
         config: PlannerConfig = configured(PlannerConfig, settings)
         return int(config.method_options["optimal"].effort_limits)
@@ -148,6 +200,10 @@ def test_a_given_duration_is_long_enough_or_refused(chain: SpaceRobot) -> None:
     assert np.abs(shares).max() <= 0.85 * (1 + 1e-8)
     with pytest.raises(PlanningError, match="the solver found no path within the limits"):
         plan(chain, **asked, **limited, duration=1.5)
+    # The limits of the robot are kept where they can be: nobody asked for them.
+    weak = SpaceRobot.from_urdf(with_effort_limits(CHAIN, {"pin_1": 3.4, "pin_2": 1.6}))
+    hurried = plan(weak, **asked, duration=1.5)
+    assert "times its limit of 3.4 N m" in str(hurried.notes[BEYOND_EFFORT_LIMITS])
 
 
 def test_a_motor_without_effort_is_refused(chain: SpaceRobot) -> None:

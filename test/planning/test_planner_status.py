@@ -238,6 +238,13 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
         ({"attitude", "shape"}, "0.2 rad and 0.75 at the joints from the goal"),
     ):
         assert describe_remaining_error(error, frozenset(controls)) == words  # type: ignore[arg-type]
+    hand = PoseError(np.array([0.0, 0.3, -0.4]), np.zeros(3))
+    for hands, words in (
+        ((hand,), "0.5 m at the end-effectors from the goal"),
+        ((hand, error), "0.5 m and 0.2 rad at the end-effectors from the goal"),
+    ):
+        of_hands = PoseError(error.position, error.rotvec, end_effectors=hands)
+        assert describe_remaining_error(of_hands, frozenset({"end_effectors"})) == words
     unshaped = PoseError(error.position, error.rotvec)
     assert (
         describe_remaining_error(unshaped, frozenset({"attitude", "shape"}))

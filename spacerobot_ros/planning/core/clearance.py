@@ -14,7 +14,7 @@ from spacerobot_ros.model.description import Array, RobotDescription
 
 _LOG = logging.getLogger(__name__)
 
-DEFAULT_CLEARANCE = 0.0
+DEFAULT_CLEARANCE = 0.01
 """Smallest distance between two links of a plan, m; 0: contacts are not looked at."""
 
 _EXACT = 1e-6

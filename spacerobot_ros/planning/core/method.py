@@ -16,6 +16,7 @@ from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
+from spacerobot_ros.planning.core.joint_efforts import JointEfforts, given_effort_limits
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
@@ -81,6 +82,10 @@ class PlanRequest:
 @dataclass(frozen=True)
 class EmptyOptions:
     """The options class of a method without options."""
+
+
+BEYOND_EFFORT_LIMITS = "beyond_effort_limits"
+"""Name of the note about joints that take more than their effort limits."""
 
 
 class GaitMethod(ABC):
@@ -161,6 +166,12 @@ class GaitMethod(ABC):
         """The prediction of the base motion under held commands, as the plant integrates it."""
         return BasePrediction(self.robot, self.control_period, self.integration_step)
 
+    @cached_property
+    def _joint_efforts(self) -> JointEfforts | None:
+        """The efforts of held commands; None where the URDF does not limit efforts."""
+        limit = given_effort_limits(self.robot)
+        return None if limit is None else JointEfforts(self.robot, limit, self.control_period)
+
     @classmethod  # noqa: B027 - any robot is suitable by default
     def require_suitable(cls, robot: SpaceRobot) -> None:
         """Refuse a robot for which the method plans no goal with any options.
@@ -194,8 +205,11 @@ class GaitMethod(ABC):
         remaining: float = 0.0,
         progress: object = None,
         is_clear: bool = False,
+        velocity: Array | float = 0.0,
     ) -> GaitSchedule:
         """Return shapes (N + 1, n) at the ticks as a schedule of this method.
+
+        ``velocity`` (n,) is held before. Of efforts beyond the limits of the URDF there is a note.
 
         Raises
         ------
@@ -206,6 +220,9 @@ class GaitMethod(ABC):
             self._require_goal_of_base(goal)
         if not is_clear:
             self._require_clear(positions)
+        if self._joint_efforts is not None:
+            beyond = self._joint_efforts.beyond_limits(positions, velocity)
+            notes = {**notes, BEYOND_EFFORT_LIMITS: beyond} if beyond else notes
         return GaitSchedule(
             method=self.name,
             joint_names=self.robot.joint_names,

@@ -128,7 +128,7 @@ class PlannerConfig(CommanderConfig):
     def method_options(self) -> Mapping[str, Any]:
         """The options of the methods by name; the output decides on those that are left open.
 
-        A controller that is given a reference drives the joints by efforts, which are limited.
+        A controller that is given a reference has a reserve of efforts for its feedback.
         """
         optimal = self.options.get(OptimalGait.name, OptimalGait.Options())
         if self.output == "commands" or optimal.effort_limits != 0:

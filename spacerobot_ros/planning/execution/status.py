@@ -231,7 +231,9 @@ def describe_remaining_error(error: PoseError, controls: frozenset[Controlled]) 
         parts["shape"] = f"{error.max_joint_error:.3g} at the joints"
     if error.end_effectors:
         distance, angle = error.farthest_end_effector, error.most_turned_end_effector
-        parts["end_effectors"] = f"{distance:.3g} m and {angle:.3g} rad at the end-effectors"
+        # Goals of positions alone leave no angle.
+        turn = f" and {angle:.3g} rad" if angle > 0 else ""
+        parts["end_effectors"] = f"{distance:.3g} m{turn} at the end-effectors"
     remaining = " and ".join(text for part, text in parts.items() if part in controls)
     return f"{remaining} from the goal"
 

@@ -29,7 +29,7 @@ from spacerobot_ros.model.rotations import attitude_error, matrix_from_quaternio
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
-from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
+from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -95,7 +95,7 @@ class ManoeuvreModel:
     control_period: float
     axes: Array
     constraints: PathConstraints
-    efforts: JointEfforts | None = None
+    efforts: LimitedEfforts | None = None
     end_effectors: EndEffectorRows | None = None
     distances: DistanceLibrary | None = None
 

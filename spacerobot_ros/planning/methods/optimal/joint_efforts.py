@@ -1,10 +1,9 @@
 """Joint efforts of a motion at zero momentum, and their limits.
 
-Where the plant is driven by efforts, a controller tracks the held commands. Between two of them the
-reference has the mean of their velocities and the acceleration that leads from one to the other in
-a control period; the efforts of that motion, by inverse dynamics (:func:`.joint_efforts` of the
-model), are the controller's command beside its feedback. Efforts are quadratic in the speed: so a
-motion whose efforts are f^2 times their limits keeps these in f times its time.
+The efforts of held commands (:class:`.JointEfforts`) are those of servos that follow them; where
+the plant is driven by efforts, they are a controller's command beside its feedback. Efforts are
+quadratic in the speed: so a motion whose efforts are f^2 times their limits keeps these in f times
+its time.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ import numpy as np
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.joint_efforts import JointEfforts, given_effort_limits
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     TOLERANCE,
     DurationBounds,
@@ -40,17 +40,10 @@ _AT_LIMITS_FROM, _AT_LIMITS_BEYOND = 0.9, 0.1
 """Shares of the limits at which guesses count as made for them, below and beyond one."""
 
 
-class JointEfforts:
-    """The efforts of one robot, within limits.
+class LimitedEfforts(JointEfforts):
+    """The efforts of one robot, within limits that manoeuvres keep.
 
-    Parameters
-    ----------
-    robot
-        The model.
-    limit
-        (n,) largest effort of every joint in a motion, N or N m; infinite: any.
-    control_period
-        Duration of a command, s.
+    Parameters are those of :class:`JointEfforts`.
 
     Raises
     ------
@@ -65,41 +58,24 @@ class JointEfforts:
                     f"Joint '{name}' is limited to an effort of {value:g}, which moves nothing; "
                     "with optimal.effort_limits 2 efforts are not limited."
                 )
-        self._period = control_period
-        self.limit = limit
-        self._names = robot.joint_names
-        self._function = robot.function("joint_efforts", compile=False)
+        super().__init__(robot, limit, control_period)
 
     @classmethod
     def of(
         cls, robot: SpaceRobot, options: OptimalOptions, control_period: float
-    ) -> JointEfforts | None:
+    ) -> LimitedEfforts | None:
         """Return the efforts that the options limit; None: none."""
-        if options.effort_limits != 1:
+        if options.effort_limits == 2:
             return None
         limit = robot.effort_limit.copy()
+        if options.effort_limits == 0:
+            given = given_effort_limits(robot)
+            limit = np.full(robot.n, np.inf) if given is None else given
         if options.max_effort:
             limit = np.minimum(limit, per_joint(robot, "max_effort", options.max_effort))
-        limit *= 1 - options.effort_reserve
+        if options.effort_limits == 1:
+            limit *= 1 - options.effort_reserve
         return cls(robot, limit, control_period) if np.any(np.isfinite(limit)) else None
-
-    def shares(self, positions: Array, velocity: Array | float = 0.0) -> Array:
-        """Return the efforts of held commands over their limits (N + 1, n), at the ticks.
-
-        ``positions`` (N + 1, n) are the shapes at the ticks, at rest after; ``velocity`` (n,) is
-        held before.
-        """
-        rates = np.diff(positions, axis=0) / self._period
-        before = np.vstack([np.broadcast_to(velocity, (1, rates.shape[1])), rates])
-        after = np.vstack([rates, np.zeros((1, rates.shape[1]))])
-        return self._effort_shares(positions, (before + after) / 2, (after - before) / self._period)
-
-    def excess(self, positions: Array, velocity: Array | float = 0.0) -> float:
-        """Return the factor by which held commands must be slower; at most 1: they need not be.
-
-        Arguments are those of :meth:`shares`.
-        """
-        return math.sqrt(float(np.abs(self.shares(positions, velocity)).max(initial=0.0)))
 
     def peak(self, trajectory: Trajectory) -> float:
         """Return the largest ratio of efforts on a trajectory to those that solutions may use."""
@@ -118,17 +94,13 @@ class JointEfforts:
     @property
     def inequality(self) -> PathInequality:
         """The limits as a path constraint at both ends of every interval."""
-        n = len(self._names)
+        n = len(self.limit)
         q, qdot, qddot = (ca.SX.sym(name, n) for name in ("q", "qdot", "qddot"))
         limited = np.flatnonzero(np.isfinite(self.limit))
         tau = self._function(q, qdot, qddot)[limited.tolist()]
         share = tau / (_PLANNED_EFFORT_SHARE * self.limit[limited])
         function = ca.Function("efforts", [q, qdot, qddot], [ca.vertcat(1 - share, 1 + share)])
         return PathInequality(function)
-
-    def _effort_shares(self, q: Array, qdot: Array, qddot: Array) -> Array:
-        tau = self._function(q.T, qdot.T, qddot.T).full().T
-        return np.asarray(tau / self.limit)
 
 
 class EffortLimitedShooting(MultipleShooting):
@@ -153,7 +125,7 @@ class EffortLimitedShooting(MultipleShooting):
         self,
         stages: Callable[[Sequence[PathInequality]], Stages],
         intervals: int,
-        efforts: JointEfforts,
+        efforts: LimitedEfforts,
         tolerance: float = TOLERANCE,
     ) -> None:
         super().__init__(stages(()), intervals, tolerance)

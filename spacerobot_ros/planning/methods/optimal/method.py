@@ -10,16 +10,17 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
@@ -46,7 +47,6 @@ from spacerobot_ros.planning.methods.optimal.archives import (
     unpack_arrays,
 )
 from spacerobot_ros.planning.methods.optimal.end_effectors import (
-    EndEffectorRows,
     EndEffectorSpecification,
 )
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
@@ -57,7 +57,7 @@ from spacerobot_ros.planning.methods.optimal.initial_guesses import (
     library_key,
     load_library,
 )
-from spacerobot_ros.planning.methods.optimal.joint_efforts import JointEfforts
+from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -68,6 +68,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     per_joint,
 )
 from spacerobot_ros.planning.methods.optimal.search import (
+    Manoeuvre,
     ManoeuvreSearch,
     MotionSearch,
 )
@@ -95,15 +96,36 @@ _LIMIT_ROUNDING = 1e-8
 
 
 @dataclass(frozen=True)
+class _Searches:
+    """The searches for manoeuvres that begin at rest, and for those that begin in motion."""
+
+    from_rest: ManoeuvreSearch
+    in_motion: MotionSearch
+
+    @classmethod
+    def of(cls, model: ManoeuvreModel, *, compiling: bool) -> _Searches:
+        """Make both for one model."""
+        search = ManoeuvreSearch(model, compiling=compiling)
+        return cls(search, MotionSearch(model, search.solver))
+
+
+@dataclass(frozen=True)
 class _GoalKind:
-    """Goals with the same parts: the searches for their manoeuvres, with the rows of
-    end-effectors, if there are any.
-    """
+    """Goals with the same parts: what they ask for, and the searches for their manoeuvres."""
 
     specification: GoalSpecification | EndEffectorSpecification
-    search: ManoeuvreSearch
-    motion_search: MotionSearch
-    rows: EndEffectorRows | None = None
+    model: ManoeuvreModel
+    compiling: bool
+
+    @cached_property
+    def of_any_effort(self) -> _Searches:
+        """The searches without effort limits."""
+        return _Searches.of(replace(self.model, efforts=None), compiling=self.compiling)
+
+    @cached_property
+    def within_efforts(self) -> _Searches:
+        """The searches with effort limits: most manoeuvres of most robots do not need them."""
+        return _Searches.of(self.model, compiling=self.compiling)
 
 
 class OptimalGait(GaitMethod):
@@ -131,7 +153,7 @@ class OptimalGait(GaitMethod):
         if chosen.joint_margin:
             self._margin = per_joint(robot, "joint_margin", chosen.joint_margin)
         self._constraints = PathConstraints.of(robot, chosen)
-        self._efforts = JointEfforts.of(robot, chosen, self.control_period)
+        self._efforts = LimitedEfforts.of(robot, chosen, self.control_period)
         self._model = ManoeuvreModel(
             robot,
             self._prediction,
@@ -154,9 +176,7 @@ class OptimalGait(GaitMethod):
         specification: GoalSpecification | EndEffectorSpecification,
         model: ManoeuvreModel,
     ) -> _GoalKind:
-        search = ManoeuvreSearch(model, compiling=self.options.answers > 1)
-        motion_search = MotionSearch(model, search.solver)
-        return _GoalKind(specification, search, motion_search, model.end_effectors)
+        return _GoalKind(specification, model, self.options.answers > 1)
 
     def _kind_of(self, goal: Goal) -> _GoalKind:
         """Return the kind of a goal; that of a goal of end-effectors is made when it is needed.
@@ -243,15 +263,19 @@ class OptimalGait(GaitMethod):
                 return kept
         # Libraries have manoeuvres to attitudes of the base.
         library = None if correction or goal.end_effectors else self._library
-        found = kind.search.search(
-            boundary,
-            limits,
-            state.quaternion,
-            self._count_intervals(correction),
-            replace(self.options, duration=0.0, answers=1) if correction else self.options,
-            cancellation,
-            library=library,
-            gentle=correction,
+        chosen = replace(self.options, duration=0.0, answers=1) if correction else self.options
+        found = self._within_efforts(
+            kind,
+            lambda searches: searches.from_rest.search(
+                boundary,
+                limits,
+                state.quaternion,
+                self._count_intervals(correction),
+                chosen,
+                cancellation,
+                library=library,
+                gentle=correction,
+            ),
         )
         notes: Notes = {
             "starts": float(found.starts),
@@ -265,7 +289,12 @@ class OptimalGait(GaitMethod):
             )
         schedule = self._build_schedule(state, goal, found.held.positions, notes)
         # A result of a busy machine is not cached, as an idle machine finds a better one.
-        if self._cache is not None and key is not None and not found.cut_short:
+        if (
+            self._cache is not None
+            and key is not None
+            and not found.cut_short
+            and self._keeps_efforts(found)
+        ):
             kept_plan = _CachedPlan(schedule.positions, notes)
             self._cache.store(archive_name(key), key, kept_plan.to_bytes())
         return schedule
@@ -294,19 +323,49 @@ class OptimalGait(GaitMethod):
             starts=1 if again else min(chosen.starts, _MAX_STARTS_IN_MOTION),
             answers=1 if again else chosen.answers,
         )
-        found = self._kind_of(request.goal).motion_search.search(
-            boundary,
-            limits,
-            request.state.quaternion,
-            self._count_intervals(False),
-            budget,
-            motion,
-            cancellation,
+        found = self._within_efforts(
+            self._kind_of(request.goal),
+            lambda searches: searches.in_motion.search(
+                boundary,
+                limits,
+                request.state.quaternion,
+                self._count_intervals(False),
+                budget,
+                motion,
+                cancellation,
+            ),
+            motion.velocity,
         )
         notes: Notes = {"starts": float(found.starts), "durations": list(found.solutions)}
         return self._build_schedule(
             request.state, request.goal, found.held.positions, notes, motion.velocity
         )
+
+    def _within_efforts(
+        self,
+        kind: _GoalKind,
+        search: Callable[[_Searches], Manoeuvre],
+        velocity: Array | float = 0.0,
+    ) -> Manoeuvre:
+        """Return the manoeuvre of a search without effort limits if it keeps them, and otherwise
+        that of a search with them; ``velocity`` (n,) is held before.
+
+        Limits that are the robot's own, and that no manoeuvre is found to keep, are not kept.
+        """
+        found = search(kind.of_any_effort)
+        if self._keeps_efforts(found, velocity):
+            return found
+        try:
+            return search(kind.within_efforts)
+        except NotFoundError:
+            if self.options.effort_limits == 0 and not self.options.max_effort:
+                return found
+            raise
+
+    def _keeps_efforts(self, found: Manoeuvre, velocity: Array | float = 0.0) -> bool:
+        if self._efforts is None:
+            return True
+        return self._efforts.excess(found.held.positions, velocity) <= 1 + _LIMIT_ROUNDING
 
     def _count_intervals(self, correction: bool) -> int:
         intervals = self.options.intervals
@@ -345,7 +404,7 @@ class OptimalGait(GaitMethod):
             notes["predicted_end_effector_position_error"] = left.farthest_end_effector
             notes["predicted_end_effector_attitude_error"] = left.most_turned_end_effector
         notes["limited_by"] = self._list_active_limits(positions, velocity)
-        schedule = self._schedule_of(goal, positions, path, notes, is_clear=True)
+        schedule = self._schedule_of(goal, positions, path, notes, is_clear=True, velocity=velocity)
         return replace(schedule, controls=controls)
 
     def _list_active_limits(self, positions: Array, velocity: Array | float) -> str:
@@ -458,9 +517,9 @@ class OptimalGait(GaitMethod):
         error = attitude_error(attitudes[-1], aim)
         if np.linalg.norm(kind.specification.axes @ error) > _MAX_CACHED_END_ERROR:
             raise CandidateError("it ends in another attitude")
-        if kind.rows is not None:
+        if (rows_at_end := kind.model.end_effectors) is not None:
             turn = quaternion_multiply(quaternion_inverse(state.quaternion), attitudes[-1])
-            rows = kind.rows.evaluate(turn[np.newaxis], last[np.newaxis], boundary.end_effectors)
+            rows = rows_at_end.evaluate(turn[np.newaxis], last[np.newaxis], boundary.end_effectors)
             if np.abs(rows[0]).max() > _MAX_CACHED_END_ERROR:
                 raise CandidateError("it ends with end-effectors elsewhere")
         self._constraints.check(positions, attitudes, period)

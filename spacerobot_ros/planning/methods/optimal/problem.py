@@ -58,8 +58,9 @@ class OptimalOptions(MotionOptions):
     )
     effort_limits: int = parameter(
         0,
-        "efforts of the joints within their limits: 0: where the planner's output is a reference "
-        "for a controller, 1: always, 2: never",
+        "efforts of the joints within their limits: 0: kept where a manoeuvre is found that keeps "
+        "them, with effort_reserve where a controller tracks it, 1: kept, with effort_reserve, "
+        "2: not",
         minimum=0,
         maximum=2,
     )

@@ -1,0 +1,103 @@
+"""Joint efforts of held commands at zero momentum, beside their limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+
+_BEYOND = 1e-6
+"""Part of a limit by which it may be exceeded: rounding."""
+
+_ALL_TICKS = 4000
+"""Number of ticks up to which the efforts of all of them are compared with limits."""
+
+
+class JointEfforts:
+    """The efforts of one robot whose joints follow held commands, and their limits.
+
+    Between two commands the joints have the mean of their velocities and the acceleration that
+    leads from one to the other in a control period; the efforts of that motion follow by inverse
+    dynamics (:func:`.joint_efforts` of the model), as the plant under velocity actuation publishes
+    them.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    limit
+        (n,) largest effort of every joint in a motion, N or N m; infinite: any.
+    control_period
+        Duration of a command, s.
+    """
+
+    def __init__(self, robot: SpaceRobot, limit: Array, control_period: float) -> None:
+        self._period = control_period
+        self._joints = robot.description.movable_joints
+        self.limit = limit
+        self._function = robot.function("joint_efforts", compile=False)
+
+    def shares(self, positions: Array, velocity: Array | float = 0.0) -> Array:
+        """Return the efforts of held commands over their limits (N + 1, n), at the ticks.
+
+        ``positions`` (N + 1, n) are the shapes at the ticks, at rest after; ``velocity`` (n,) is
+        held before.
+        """
+        return self._effort_shares(positions, *self._rates(positions, velocity))
+
+    def excess(self, positions: Array, velocity: Array | float = 0.0) -> float:
+        """Return the factor by which held commands must be slower; at most 1: they need not be.
+
+        Arguments are those of :meth:`shares`.
+        """
+        return math.sqrt(float(np.abs(self.shares(positions, velocity)).max(initial=0.0)))
+
+    def beyond_limits(self, positions: Array, velocity: Array | float = 0.0) -> str:
+        """Return the clause that says which joints take more than their limits; empty: none.
+
+        Arguments are those of :meth:`shares`. Of many ticks, those are compared at which the joints
+        accelerate most, and some in between.
+        """
+        rates, changes = self._rates(positions, velocity)
+        if len(positions) > _ALL_TICKS:
+            scale = np.maximum(np.abs(changes).max(axis=0), np.finfo(float).tiny)
+            most = np.argsort(-np.abs(changes / scale).max(axis=1))[: _ALL_TICKS // 2]
+            between = np.linspace(0, len(positions) - 1, _ALL_TICKS // 2).astype(int)
+            chosen = np.union1d(most, between)
+            positions, rates, changes = positions[chosen], rates[chosen], changes[chosen]
+        peaks = np.abs(self._effort_shares(positions, rates, changes)).max(axis=0)
+        clauses = []
+        for joint, share, limit in zip(self._joints, peaks, self.limit, strict=True):
+            if share > 1 + _BEYOND:
+                unit = "N" if joint.unit == "m" else "N m"
+                taken, allowed = f"{share * limit:.4g} {unit}", f"{limit:.4g} {unit}"
+                clauses.append(
+                    f"{joint.name} takes {taken}, {share:.3g} times its limit of {allowed}"
+                )
+        return ", ".join(clauses)
+
+    def _rates(self, positions: Array, velocity: Array | float) -> tuple[Array, Array]:
+        """Return the joint rates and their changes a second (N + 1, n) at the ticks."""
+        rates = np.diff(positions, axis=0) / self._period
+        before = np.vstack([np.broadcast_to(velocity, (1, positions.shape[1])), rates])
+        after = np.vstack([rates, np.zeros((1, positions.shape[1]))])
+        return (before + after) / 2, (after - before) / self._period
+
+    def _effort_shares(
+        self, q: npt.NDArray[np.float64], qdot: Array, qddot: Array
+    ) -> npt.NDArray[np.float64]:
+        tau = self._function(q.T, qdot.T, qddot.T).full().T
+        return np.asarray(tau / self.limit)
+
+
+def given_effort_limits(robot: SpaceRobot) -> Array | None:
+    """Return the effort limits (n,) of the URDF; None where it gives none.
+
+    A limit of zero stands for one that is not known: nothing moves under it.
+    """
+    limit = np.where(robot.effort_limit > 0, robot.effort_limit, np.inf)
+    return limit if np.isfinite(limit).any() else None

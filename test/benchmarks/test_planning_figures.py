@@ -1,0 +1,345 @@
+"""Benchmarks of planning by stand-ins for the checkouts and the clock: figures and lines."""
+
+from __future__ import annotations
+
+import json
+import math
+import runpy
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.clocks import Clock, named
+
+from spacerobot_ros.benchmarks import measurements, planning
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
+from spacerobot_ros.planning.methods.optimal import method as optimal
+from spacerobot_ros.resources import robot_file
+
+CASES = ("planar_chain", "sliding_masses", "three_joint_arm", "servicer")
+
+
+class Checkout:
+    """Plans in a time that its name and the arguments decide, and writes down what is asked."""
+
+    def __init__(self, factor: float, longer: float = 0.0) -> None:
+        self.factor, self.longer = factor, longer
+        self.asked: list[tuple[str, dict[str, Any]]] = []
+
+    def measure(self, name: str, **arguments: Any) -> Any:
+        self.asked.append((name, arguments))
+        if name == "first_plan":
+            first = len(self.asked) % 4 == 1
+            return {
+                "joints": 5 + len(self.asked) // 4,
+                "cpu_s": self.factor * (12.34 if first else 1.0 + 0.25 * (len(self.asked) % 4)),
+                "plan_cpu_s": self.factor * 0.5,
+            }
+        each = self.factor * (0.5 if arguments.get("library") else 1.0)
+        longer = self.longer - (0.025 if arguments["options"] else 0.0)
+        return {
+            "cpu_s": [each * x for x in (0.1, 0.25, 7.0)],
+            "duration_s": [d * (1 + longer) for d in (4.0, 5.0, 6.0)],
+        }
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, ours: Checkout, theirs: Checkout | None) -> None:
+    given: list[Path | None] = []
+
+    def pair(other: Path | None) -> tuple[Checkout, Checkout | None]:
+        given.append(other)
+        return ours, None if other is None else theirs
+
+    monkeypatch.setattr(planning, "Checkout", named(pair=pair))
+
+
+def test_goals_are_counted_and_compared_with_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = Checkout(1.0), Checkout(3.0, longer=-0.015)
+    stand_in(monkeypatch, ours, theirs)
+    lines: list[str] = []
+    figures = planning.planning_benchmark(3, Path("there"), 17, 9, lines.append)
+    percent = "0 % at most 1 %, 100 % at most 2 %, 100 % at most 3 % longer; at most 1.015"
+    assert lines[:6] == [
+        "planar_chain: 0.250 s of CPU time in the median of 3 goals",
+        "... there 0.750 s: 3.00 times faster here",
+        f"... durations beside those there: {percent}",
+        "... with a library 0.125 s: 6.00 times faster",
+        "... durations beside those without it: 100 % at most 1 %, 100 % at most 2 %, "
+        "100 % at most 3 % longer; at most 1.000",
+        "... durations beside those by a search from 17 guesses: 0 % at most 1 %, 0 % at most 2 %, "
+        "100 % at most 3 % longer; at most 1.026",
+    ]
+    assert len(lines) == 24
+    assert tuple(figures) == CASES
+    for name, robot in figures.items():
+        assert robot["median_cpu_s"] == 0.25
+        assert robot["times_faster"] == pytest.approx(3.0)
+        assert robot["library_times_faster"] == pytest.approx(6.0)
+        assert robot["durations_to_there"]["worst"] == pytest.approx(1 / 0.985)
+        assert robot["durations_to_long_search"]["best"] == pytest.approx(1 / 0.975)
+        about = {"urdf": str(robot_file(name)), "case": name, "count": 3, "seed": 7}
+        search = {"starts": 17, "answers": 17, "agreeing": 0}
+        asked = [arguments for _, arguments in ours.asked if arguments["case"] == name]
+        plain = about | {"options": {}}
+        assert asked == [plain, plain | {"library": 9}, about | {"options": search}]
+        assert ("plans", plain) in theirs.asked
+
+
+def test_goals_alone_are_one_line_a_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(monkeypatch, Checkout(2.0), None)
+    lines: list[str] = []
+    figures = planning.planning_benchmark(3, None, None, None, lines.append)
+    assert lines == [f"{name}: 0.500 s of CPU time in the median of 3 goals" for name in CASES]
+    assert all(each.keys() == {"median_cpu_s", "cpu_s", "duration_s"} for each in figures.values())
+
+
+def test_a_library_is_compared_with_plans_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(monkeypatch, Checkout(2.0), None)
+    lines: list[str] = []
+    planning.planning_benchmark(3, None, None, 4, lines.append)
+    assert lines[1] == "... with a library 0.250 s: 2.00 times faster"
+
+
+def test_first_plans_here_and_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = Checkout(1.0), Checkout(2.0)
+    stand_in(monkeypatch, ours, theirs)
+    lines: list[str] = []
+    figures = planning.first_plan_benchmark(Path("there"), lines.append)
+    assert list(figures) == ["seven_joint_arm", "quadruped", "dual_arm"]
+    assert lines[:2] == [
+        "seven_joint_arm, 5 joints: 12.3 s of CPU time from an empty cache to the first plan, "
+        "1.50 s in the next process, 1.00 s more than the plan itself",
+        "... there 24.7 s of CPU time from an empty cache to the first plan, "
+        "3.00 s in the next process, 2.00 s more than the plan itself",
+    ]
+    # Of the processes after the first one the median counts; the first one has an empty cache.
+    assert figures["quadruped"] == {
+        "joints": 6,
+        "first_cpu_s": 12.34,
+        "next_cpu_s": 1.5,
+        "more_cpu_s": 1.0,
+        "there": {"joints": 6, "first_cpu_s": 24.68, "next_cpu_s": 3.0, "more_cpu_s": 2.0},
+    }
+    caches = [arguments["cache"] for _, arguments in ours.asked]
+    assert [caches.index(each) for each in caches] == [0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8]
+    assert not any(Path(each).exists() for each in caches)
+    lines.clear()
+    assert "there" not in planning.first_plan_benchmark(None, lines.append)["quadruped"]
+    assert len(lines) == 3
+
+
+def test_goals_and_starts_are_within_their_bounds() -> None:
+    for name, case in measurements.CASES.items():
+        robot = SpaceRobot.from_file(robot_file(name))
+        requests = list(measurements.requests(robot, case, 40, 11))
+        turns = 2 * np.arccos([abs(each.goal.quaternion[3]) for each in requests])
+        assert 0.05 <= turns.min() < turns.max() <= case.angle
+        assert np.ptp(turns) > 0.7 * case.angle, "of all angles"
+        axes = np.array([each.goal.quaternion[:3] for each in requests])
+        assert np.all((np.abs(axes[:, :2]).max(axis=0) < 1e-12) == (name == "planar_chain"))
+        starts = np.array([each.state.q for each in requests])
+        inside = np.clip(np.array(case.start), robot.lower, robot.upper)
+        assert 0.25 < np.abs(starts - inside).max() <= 0.3
+        positions = np.array([each.goal.position for each in requests])
+        if not case.sliding:
+            np.testing.assert_array_equal(positions, 0.0)
+        for each in requests:
+            tolerance = each.tolerance
+            assert (tolerance.attitude, tolerance.position) == (2e-3, 2e-3)
+            np.testing.assert_array_equal(each.state.quaternion, [0, 0, 0, 1])
+            np.testing.assert_array_equal(each.state.position, 0.0)
+    assert measurements.CASES["servicer"].start == (0.0, -1.2, 2.0, 0.0, 0.8, 0.0)
+    assert measurements.CASES["three_joint_arm"].start == (0.0, -math.pi / 4, math.pi / 2)
+    assert [case.angle for case in measurements.CASES.values()] == [3.0, 1.0, 1.0, 1.0]
+
+
+def test_positions_of_sliding_goals_can_be_reached() -> None:
+    """The centre of mass stays: masses within their ranges put the base there."""
+    robot = SpaceRobot.from_file(robot_file("sliding_masses"))
+    for each in measurements.requests(robot, measurements.CASES["sliding_masses"], 20, 3):
+        goal = each.goal
+        turn = matrix_from_quaternion(goal.quaternion)
+        wanted = turn.T @ (robot.center_of_mass(each.state.q) - goal.position)
+        # A mass moves the common centre along its axis, as far as its share of all.
+        ranges = np.sort([robot.center_of_mass(q) for q in (robot.lower, robot.upper)], axis=0)
+        assert np.all((ranges[0] - 1e-12 <= wanted) & (wanted <= ranges[1] + 1e-12))
+        assert np.linalg.norm(goal.position) > 1e-3
+
+
+class Gait:
+    """A method that takes 0.2 s of its clock for the first plan, 0.1 s more for each next one."""
+
+    clock: Clock
+    made: list[Gait]
+
+    def __init__(self, robot: SpaceRobot, period: float, *, options: Any) -> None:
+        self.robot, self.period, self.options = robot, period, options
+        self.requests: list[Any] = []
+        type(self).made.append(self)
+
+    def plan(self, request: Any) -> Any:
+        self.requests.append(request)
+        self.clock.advance(0.1 + 0.1 * len(self.requests))
+        if len(self.requests) == 3:
+            raise PlanningError("too far")
+        return named(duration=10.0 * len(self.requests))
+
+    def build_library(self, requests: Iterator[Any]) -> Any:
+        count = len(list(requests))
+        return named(to_bytes=lambda: b"manoeuvres" * count)
+
+
+@pytest.fixture
+def gait(monkeypatch: pytest.MonkeyPatch) -> type[Gait]:
+    Gait.clock, Gait.made = Clock(), []
+    monkeypatch.setattr(measurements, "time", Gait.clock)
+    monkeypatch.setattr(optimal, "OptimalGait", Gait)
+    return Gait
+
+
+@pytest.mark.parametrize("library", [0, 2])
+def test_plans_are_timed_after_the_first_goal(gait: type[Gait], library: int) -> None:
+    urdf = str(robot_file("sliding_masses"))
+    found = measurements.plans(urdf, "sliding_masses", 3, 7, {"starts": 4}, library)
+    assert found["cpu_s"] == pytest.approx([0.3, 0.4, 0.5])
+    assert found["duration_s"] == pytest.approx([20.0, math.nan, 40.0], nan_ok=True)
+    *_, last = gait.made
+    assert last.period == 0.05
+    assert (last.options.starts, last.options.cache) == (4, 0)
+    assert tuple(last.options.max_velocity) == (0.0647, 0.1871, 0.6550)
+    assert tuple(last.options.max_acceleration) == (0.228, 0.643, 3.564)
+    assert len(gait.made) == 1 + bool(library)
+    assert bool(last.options.library) == bool(library)
+    case, robot = measurements.CASES["sliding_masses"], SpaceRobot.from_file(urdf)
+    first, *_ = measurements.requests(robot, case, 1, 7)
+    np.testing.assert_array_equal(first.goal.quaternion, last.requests[0].goal.quaternion)
+
+
+def test_a_first_plan_and_the_same_again(gait: type[Gait], monkeypatch: pytest.MonkeyPatch) -> None:
+    used = iter([named(ru_utime=1.0, ru_stime=0.25), named(ru_utime=8.0, ru_stime=0.5)])
+    monkeypatch.setattr(
+        measurements,
+        "resource",
+        named(RUSAGE_SELF=0, RUSAGE_CHILDREN=-1, getrusage=lambda who: next(used)),
+    )
+    found = measurements.first_plan(str(robot_file("three_joint_arm")))
+    assert found == {"joints": 3, "cpu_s": 9.75, "plan_cpu_s": pytest.approx(0.3)}
+    (method,) = gait.made
+    first, again = method.requests
+    assert first is again
+    assert (method.period, method.options.cache) == (0.05, 0)
+    assert np.all((first.state.q >= method.robot.lower) & (first.state.q <= method.robot.upper))
+    turn = quaternion_from_rotvec(np.array([0.1, -0.15, 0.2]))
+    np.testing.assert_allclose(first.goal.quaternion, turn)
+    np.testing.assert_array_equal(first.goal.position, 0.0)
+    np.testing.assert_array_equal(first.state.quaternion, [0, 0, 0, 1])
+    assert (first.tolerance.attitude, first.tolerance.position) == (2e-3, 2e-3)
+
+
+def test_the_script_writes_the_result_of_a_measurement(
+    gait: type[Gait], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "result.json"
+    words = [
+        "plans",
+        json.dumps(
+            {
+                "urdf": str(robot_file("planar_chain")),
+                "count": 1,
+                "seed": 3,
+                "case": "planar_chain",
+                "options": {},
+            }
+        ),
+        str(file),
+    ]
+    monkeypatch.setattr(sys, "argv", ["measurements.py", *words])
+    runpy.run_path(str(measurements.__file__), run_name="__main__")
+    assert json.loads(file.read_text())["duration_s"] == [20.0]
+
+
+# -- ticks ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("duration", "cycles"), [(0.0, 170), (607.0, 170), (607.1, 171), (610.0, 171), (3100.0, 1001)]
+)
+def test_a_gait_lasts_as_long_as_the_flight(duration: float, cycles: int) -> None:
+    """It takes 100 s before its cycles of 3 s, of which there are at least 170."""
+    assert measurements.gait_cycles(duration) == cycles
+
+
+def test_ticks_are_the_difference_of_two_flights(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, flown, calls = Clock(), [], []
+
+    def by_command(words: list[str], longest: float) -> tuple[float, int]:
+        flown.append((words, longest))
+        controlled = words[0] == "coordinated_control"
+        ticks = 500 if math.isinf(longest) else round(longest / 0.05)
+        # 3 s to start, and more the first time; 250 us a tick, twice that under control.
+        return 3.0 + 9.0 * (len(flown) % 3 == 1) + 250e-6 * (1 + controlled) * ticks, ticks
+
+    def fly(scenario: str, **arguments: Any) -> Any:
+        calls.append(("fly", scenario, arguments))
+        clock.advance(0.040 + 2.0 * (len(calls) % 7 == 0) if arguments else 0.030)
+        return named(time=list(range(201)))
+
+    def plan(scenario: str, **arguments: Any) -> None:
+        calls.append(("plan", scenario, arguments))
+        clock.advance(0.008)
+
+    monkeypatch.setattr(measurements, "time", clock)
+    monkeypatch.setattr(measurements, "_fly_by_command", by_command)
+    monkeypatch.setattr(measurements, "_imported_package", lambda: named(fly=fly, plan=plan))
+    found = measurements.tick_times(20_000)
+    assert found == {
+        "stack_us": pytest.approx(250.0),
+        "controlled_stack_us": pytest.approx(500.0),
+        "loop_us": pytest.approx(1e6 * (0.040 - 0.008) / 200),
+        "controlled_loop_us": pytest.approx(1e6 * 0.030 / 200),
+        **{
+            f"plan_{name}_ms": pytest.approx(8.0)
+            for name in ("lie_bracket", "area_loop", "square_path", "optimal")
+        },
+    }
+    sliding = ["sliding_masses", "--method", "lie_bracket", "--set=planner.lie_bracket.cycles=301"]
+    assert flown[:3] == [(sliding, 5.0), (sliding, 5.0), (sliding, 1000.0)]
+    assert flown[3:] == [(["coordinated_control"], t) for t in (5.0, 5.0, math.inf)]
+    plans = [call for call in calls if call[0] == "plan"]
+    gait = ("plan", "sliding_masses", {"method": "lie_bracket", "cycles": 301})
+    assert plans[:16] == [gait] * 16, "15 after the first one"
+    assert plans[-16:] == [("plan", "planar_chain", {"method": "optimal", "cache": 0})] * 16
+    flights = [call for call in calls if call[0] == "fly"]
+    assert len(flights) == 2 * (1 + 1 + 3), "once for the ticks, three times after the first one"
+    assert flights[0][2] == {
+        "method": "lie_bracket",
+        "parameters": {"planner.lie_bracket.cycles": 301},
+    }
+
+
+@pytest.mark.parametrize("longest", [7.5, math.inf])
+def test_a_flight_by_command_is_timed(longest: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    ran: list[list[str]] = []
+
+    def run_module(name: str, run_name: str) -> None:
+        assert (name, run_name) == ("spacerobot_ros", "__main__")
+        ran.append(sys.argv)
+        print("nobody sees this")
+        clock.advance(1.75)
+        Path(sys.argv[sys.argv.index("--json") + 1]).write_text(json.dumps({"ticks": 321}))
+        raise SystemExit(0)
+
+    monkeypatch.setattr(measurements, "time", clock)
+    monkeypatch.setattr(measurements, "runpy", named(run_module=run_module))
+    monkeypatch.setattr(sys, "argv", ["pytest"])
+    assert measurements._fly_by_command(["servicer", "--x"], longest) == (1.75, 321)
+    ((program, command, *words),) = ran
+    assert (program, command, words[:2]) == ("spacerobot", "run", ["servicer", "--x"])
+    assert words[2:-4] == ([] if math.isinf(longest) else ["--longest", "7.5"])
+    assert Path(words[-3]).suffix == ".mcap"
