@@ -12,6 +12,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 from support.hand_motion import end_of_motion
+from support.planner_loop import Loop
 
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
@@ -20,8 +21,10 @@ from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateGait
+from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.trials import compare
 
 Array = npt.NDArray[np.float64]
@@ -449,6 +452,29 @@ def test_paper_4_the_line_is_followed_until_shortly_before_the_singularity(
     # From there no rates lead on, and the line is refused.
     with pytest.raises(PlanningError, match=r"meets a dynamic singularity after 0\.00"):
         reach_b((manipulator[0], state), method="resolved_rate", as_far_as_possible=1)
+
+
+@pytest.mark.slow
+def test_paper_4_a_flight_stops_before_the_singularity_and_says_why(
+    manipulator: tuple[SpaceRobot, RobotState],
+) -> None:
+    state = manipulator[1]
+    loop = Loop(
+        {"method": "resolved_rate", "resolved_rate.as_far_as_possible": 1},
+        robot="planar_manipulator",
+        initial=InitialState(state.position, state.quaternion, state.q),
+    )
+    status = loop.decide(Goal.of_end_effectors([EndEffectorGoal("end_effector", B)]))
+    assert status.state is PlannerState.FAILED
+    assert "The straight line meets a dynamic singularity after 0.00" in status.message
+    loop.tick(5)
+    assert not loop.commands[-1].any()
+    pose, q = loop.poses[-1], loop.shapes[-1]
+    hand = pose[:3] + Rotation.from_quat(pose[3:]).apply(
+        loop.plant.robot.link_pose("end_effector", q)[1]
+    )
+    start = np.array([2.000077, -0.002373, 0.0])
+    assert 1.18 < np.linalg.norm(hand - start) < 1.194983
 
 
 def test_paper_4_lines_that_end_before_the_singularity_are_followed(
