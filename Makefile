@@ -108,6 +108,11 @@ CLEAR_GOALS ?= 50
 clear-plans: $(STAMP)/test ## plan CLEAR_GOALS random goals each of six robots with and without clearance, and list distances
 	SPACEROBOT_CLEAR_GOALS=$(CLEAR_GOALS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_clear_plans.py
 
+CLEAR_FLIGHTS ?= 100
+.PHONY: clear-flights
+clear-flights: $(STAMP)/test ## fly CLEAR_FLIGHTS draws each of four robots with noise, wrong masses and corrections, and list the smallest distances
+	SPACEROBOT_CLEAR_FLIGHTS=$(CLEAR_FLIGHTS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_clear_flights.py
+
 COUNT ?= 2000
 SEED ?= 1
 ONLY ?= many

@@ -66,6 +66,10 @@ class Distances:
         ticks = np.arange(schedule.ticks + 1)
         at = np.linspace(0, schedule.ticks, 400)
         shapes = np.column_stack([np.interp(at, ticks, x) for x in schedule.positions.T])
+        return self.nearest_of(shapes)
+
+    def nearest_of(self, shapes: Array) -> float:
+        """Return the smallest distance at shapes (N, n), m."""
         best = np.inf
         for q in shapes:
             pinocchio.computeDistances(
