@@ -100,7 +100,7 @@ class CollisionGeometry:
     ) -> None:
         self.robot = robot
         self._kinematics = ForwardKinematics(robot)
-        self.solids, self.notes = _solids_of(robot, mesh_of)
+        self.solids, self.notes = solids_of(robot, mesh_of)
         self.ignored: dict[LinkPair, str] = {}
         links = self._kinematics.links
         self._link_of = np.array([links.index(each.link) for each in self.solids], dtype=int)
@@ -273,9 +273,13 @@ def _random_shapes(robot: RobotDescription) -> Array:
 # -- solids -------------------------------------------------------------------------------------
 
 
-def _solids_of(
-    robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh]
+def solids_of(
+    robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
 ) -> tuple[tuple[Solid, ...], tuple[str, ...]]:
+    """Return the solids of a robot, and sentences on links that may not be as expected.
+
+    ``mesh_of`` is that of :class:`CollisionGeometry`.
+    """
     solids: list[Solid] = []
     notes: list[str] = []
     drawn = [link.name for link in robot.links if link.shapes and not link.collisions]

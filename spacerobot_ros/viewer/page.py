@@ -441,6 +441,16 @@ class Page:
             if event.client is not None:
                 defer(lambda: self._aim_camera(event.client.camera))
 
+        self._collision_shapes: Any = gui.add_checkbox(
+            "Collision shapes",
+            initial_value=False,
+            hint="Show the shapes by which distances between links are measured.",
+        )
+
+        @self._collision_shapes.on_update
+        async def _(event: Any) -> None:
+            defer(self._show_collision_shapes)
+
         self._style = gui.add_button("Dark or light", color="gray")
         themes: dict[int, bool] = {}
 
@@ -477,6 +487,11 @@ class Page:
             self._server.scene, _ROBOT_PATH, robot, on_note=lambda text: self.note(Notice(text, 1))
         )
         self._drawing.base.visible = False  # Until its first state comes.
+        self._show_collision_shapes()
+
+    def _show_collision_shapes(self) -> None:
+        if self._drawing is not None:
+            self._drawing.show_collision_shapes(visible=bool(self._collision_shapes.value))
 
     def show_thrusters(self, table: ThrusterTable | None) -> None:
         """Set the thrusters, which are known later than the robot."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spacerobot_ros.collision.drawn import collision_visuals
 from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
@@ -27,6 +28,7 @@ GHOST_OPACITY = 0.35
 _PLANNED: Color = (240, 150, 25)
 _FLOWN: Color = (60, 130, 240)
 _PLUME: Color = (255, 110, 40)
+_COLLISION: Color = (200, 60, 200)
 _LINE_WIDTH = 3.0
 """Width of lines in the scene, pixels."""
 
@@ -95,6 +97,8 @@ class RobotDrawing:
             self._add_visual(f"{paths[visual.link]}/{number}", visual)
             for number, visual in enumerate(visuals_of(robot, meshes, _MAX_MESH_TRIANGLES))
         ]
+        self._robot, self._paths = robot, paths
+        self._collision_shapes: list[Any] | None = None
 
     def _node_paths(self, robot: RobotDescription) -> dict[str, str]:
         """Return the path of the scene node of every link."""
@@ -115,6 +119,28 @@ class RobotDrawing:
         mesh = visual.mesh
         faces = mesh.faces.astype(np.uint32)
         return self._scene.add_mesh_simple(path, mesh.vertices, faces, flat_shading=True, **look)
+
+    def show_collision_shapes(self, *, visible: bool) -> None:
+        """Show or hide the shapes by which distances between links are measured."""
+        if self._collision_shapes is None:
+            if not visible:
+                return
+            self._collision_shapes = [
+                self._scene.add_mesh_simple(
+                    f"{self._paths[visual.link]}/collision{number}",
+                    visual.mesh.vertices,
+                    visual.mesh.faces.astype(np.uint32),
+                    color=_COLLISION,
+                    opacity=GHOST_OPACITY,
+                    flat_shading=True,
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+                for number, visual in enumerate(collision_visuals(self._robot))
+                if len(visual.mesh.faces)
+            ]
+        for each in self._collision_shapes:
+            each.visible = visible
 
     def paint(self, color: Color) -> None:
         """Set the color of all parts."""

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.spatial import ConvexHull
 
+from spacerobot_ros.collision.drawn import collision_visuals
 from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
@@ -182,3 +184,34 @@ def test_plumes_point_against_the_thrust() -> None:
     np.testing.assert_allclose(first[1] - first[0], -table.direction_B[2])
     assert np.linalg.norm(second[1] - second[0]) < 1.0
     assert scene.plumes(table, ("unknown",), np.ones(1), 1.0).shape == (0, 2, 3)
+
+
+def test_collision_shapes_are_shown_on_request(server: Any) -> None:
+    server.scene.reset()
+    robot = load_robot(robot_file("surveyor"))
+    page = Page(server, ViewerConfig())
+    page.show_robot(robot)
+    assert page._drawing is not None
+    assert page._drawing._collision_shapes is None
+    page._collision_shapes.value = True
+    page._show_collision_shapes()
+    shapes = page._drawing._collision_shapes
+    assert shapes is not None
+    assert len(shapes) == sum(len(link.collisions or link.shapes) for link in robot.links)
+    assert all(each.visible for each in shapes)
+    # A mesh is drawn as its convex hull, whose faces point outward: its volume is that of the hull.
+    for visual, drawn in zip(collision_visuals(robot), shapes, strict=True):
+        a, b, c = (drawn.vertices[drawn.faces[:, k]].astype(float) for k in range(3))
+        volume = float(np.einsum("ka,ka->", np.cross(a, b), c)) / 6
+        whole = ConvexHull(visual.mesh.vertices).volume
+        assert volume == pytest.approx(whole, rel=1e-5), visual.shape.kind
+    assert {visual.shape.kind for visual in collision_visuals(robot)} >= {"mesh"}
+    page._collision_shapes.value = False
+    page._show_collision_shapes()
+    assert not any(each.visible for each in shapes)
+    # Another robot is drawn with its own.
+    page._collision_shapes.value = True
+    page.show_robot(load_robot(robot_file("three_joint_arm")))
+    again = page._drawing._collision_shapes
+    assert again is not None
+    assert len(again) == len(collision_visuals(load_robot(robot_file("three_joint_arm"))))
