@@ -18,7 +18,7 @@ from support.expected import (
     parameters,
     plans,
 )
-from support.figure_prints import PARTS, analysis_prints, report_part
+from support.figure_prints import PARTS, PICTURES, analysis_prints, report_part
 from support.page_prints import CAMPAIGNS
 
 WRITE = "If this is wanted, `make expected` writes the file anew."
@@ -64,6 +64,13 @@ def test_reports_stay_as_they_are(name: str, part: str) -> None:
     kept = json.loads(REPORTS.read_text("utf-8"))[name].get(part)
     problems = differences(report_part(name, part), kept)
     assert not problems, "\n".join([*problems[:40], WRITE])
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_pictures_of_commands_stay_as_they_are(name: str) -> None:
+    kept = json.loads(REPORTS.read_text("utf-8"))[f"picture: {name}"]
+    problems = differences(PICTURES[name](), kept)
+    assert not problems, "\n".join([*problems, WRITE])
 
 
 @pytest.mark.parametrize("name", CAMPAIGNS)

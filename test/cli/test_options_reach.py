@@ -80,6 +80,58 @@ def test_the_attitude_of_a_scenario_is_given_in_degrees(
     assert (attitude.inv() * attitude_of_rpy()).magnitude() < 1e-12
 
 
+HANDS = (
+    *("--end-effector", "left", "--end-effector", "right"),
+    *("--end-effector-goal", 0.5, -0.25, 1.0, 0.0, 0.6, 0.0, 0.8),
+    *("--end-effector-position", 0.125, 2.0, -1.0),
+)
+"""Goals of two end-effectors: a pose, and a position in any attitude."""
+
+
+def assert_hands(end_effectors: Any) -> None:
+    left, right = end_effectors
+    assert (left.link, right.link) == ("left", "right")
+    np.testing.assert_array_equal(left.position, [0.5, -0.25, 1.0])
+    np.testing.assert_allclose(left.quaternion, [0.0, 0.6, 0.0, 0.8])
+    np.testing.assert_array_equal(right.position, [0.125, 2.0, -1.0])
+    assert right.quaternion is None
+
+
+@pytest.mark.parametrize("command", ["plan", "run"])
+def test_goals_of_end_effectors_reach_the_scenario(
+    command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found: list[Any] = []
+
+    def noted(self: Any, hands: Any, *_: Any) -> Any:
+        found.append(hands)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(type(load_scenario("arm_attitude")), "with_end_effectors", noted)
+    call(command, "arm_attitude", *HANDS)
+    (hands,) = found
+    assert_hands(hands)
+
+
+@pytest.mark.parametrize("pose", [(), (0.25, -0.5, 0.75)])
+def test_goals_of_end_effectors_are_sent_with_and_without_one_of_the_base(
+    pose: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[Any] = []
+
+    def send_goal(goal: Any, show: Callable[[str], None], **named: Any) -> Outcome:
+        sent.append(goal)
+        return Outcome.REACHED
+
+    monkeypatch.setattr(session, "send_goal", send_goal)
+    assert call("goal", *pose, *HANDS).exit_code == 0
+    (goal,) = sent
+    assert_hands(goal.end_effectors)
+    if pose:
+        np.testing.assert_array_equal(goal.position, pose)
+
+
 # -- libraries of manoeuvres --------------------------------------------------------------------
 
 

@@ -335,6 +335,21 @@ def test_a_commander_that_is_to_stop_with_the_decision_answers_no_later_state(
     assert rig.commander.active
 
 
+def test_a_controller_that_is_to_stop_with_the_decision_does(arm: SpaceRobot) -> None:
+    settings = config(ControllerConfig, stop_when_decided=True, settle_time=0.1)
+    rig = Rig(ControllerCommander, settings, arm.n)
+    rig.use(arm)
+    rig.commander.activate()
+    rig.state(1)
+    assert rig.commander.active
+    rig.goal(goal=Goal.checked(np.zeros(3), [0.0, 0.0, 0.0, 1.0]))
+    for tick in range(2, 12):
+        rig.state(tick)
+    assert rig.host.states[-1] == "reached"
+    assert rig.commander.activity is Activity.DECIDED
+    assert rig.host.commands[-1] < 11
+
+
 def test_an_abort_gives_up_goals_with_and_without_a_robot(robot: SpaceRobot) -> None:
     rig = Rig(PlannerCommander, config(PlannerConfig, **METHOD), robot.n)
     rig.commander.activate()

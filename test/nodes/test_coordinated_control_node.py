@@ -211,6 +211,15 @@ def test_a_goal_for_what_is_not_controlled_is_refused(
     np.testing.assert_allclose([*wrench, *effort], 0.0, atol=1e-12)
 
 
+def test_goals_are_taken_in_the_frame_that_the_world_is_called(harness: Harness) -> None:
+    loop = Loop(harness, world_frame="orbit")
+    loop.answer()
+    loop.aim(base=pose([1.0, 0.0, 0.0], frame="orbit"))
+    wrench, _ = loop.answer()
+    assert wrench[0] > 0.5 * KP
+    assert "'orbit'" in loop.node.start_message()
+
+
 def test_a_goal_without_a_frame_is_taken(harness: Harness) -> None:
     loop = Loop(harness)
     loop.aim(base=pose([1.0, 0.0, 0.0], frame=""))

@@ -57,6 +57,27 @@ def test_a_recording_is_split_by_size(harness: Harness, tmp_path: Path) -> None:
     assert read_bag(files[-1]).metadata["recorder"] == {"messages": "300", "messages_lost": "0"}
 
 
+def test_a_recording_is_split_by_time_and_flushed_as_often_as_it_is_to(
+    harness: Harness, tmp_path: Path
+) -> None:
+    publisher = harness.probe({}).create_publisher(String, "/talk", 10)
+    parameters = {"topics": "/talk", "clock_wait": 0.0, "flush_period": 0.375}
+    bag = str(tmp_path / "flight.mcap")
+    # The third message comes more than a nanosecond after the first.
+    recorder = harness.make(RecorderNode, {**parameters, "bag": bag, "max_duration": 1e-9})
+    assert 375_000_000 in {timer.timer_period_ns for timer in recorder.timers}
+    harness.matched(publisher)
+    for n in range(3):
+        publisher.publish(String(data=f"{n}"))
+        harness.spin_until(lambda n=n: recorder.messages_recorded > n, "it is recorded")  # type: ignore[misc]
+        recorder.flush()
+    recorder.trigger_deactivate()
+    recorder.trigger_cleanup()
+    files = sorted(tmp_path.iterdir())
+    assert len(files) > 1
+    assert [m.data for path in files for _, m in read_bag(path).messages("/talk")] == list("012")
+
+
 def test_lost_messages_are_published_and_stay_in_the_bag(harness: Harness, tmp_path: Path) -> None:
     probe = harness.probe({"/diagnostics": DiagnosticArray})
     publisher = probe.create_publisher(String, "/talk", 10)

@@ -204,6 +204,18 @@ def status_of(probe: Probe) -> ReplayStatus:
     return ReplayStatus.from_values({pair.key: pair.value for pair in message.values})
 
 
+def test_a_part_of_a_bag_is_replayed_at_its_rate(harness: Harness, bag: Path) -> None:
+    played = Played(harness, bag, start=0.1, duration=0.2, rate=40.0, topics="/stream", hold=True)
+    probe = played.probe
+    probe.watch("/replay/status", DiagnosticStatus, latched=True)
+    harness.spin_until(lambda: probe.count("/replay/status") and status_of(probe).ended, "its end")
+    harness.spin_until(lambda: probe.count("/stream") >= 20, "all are heard")
+    assert played.texts() == ALL[10:31][: probe.count("/stream")]
+    end = status_of(probe)
+    assert end.rate == 40.0
+    assert end.duration_s == pytest.approx(0.2)
+
+
 def test_a_replay_that_holds_goes_back_in_time(harness: Harness, bag: Path) -> None:
     played = Played(harness, bag, hold=True)
     probe = played.probe

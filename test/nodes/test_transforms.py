@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +21,7 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
 from spacerobot_ros.bag.reader import columns
-from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TransformTemplate
+from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TRANSFORMS, TransformTemplate
 from spacerobot_ros.messages.definitions import _OWN_DEFINITIONS
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.kinematics import ForwardKinematics
@@ -28,6 +29,7 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.nodes.common.messages import KnownFrames, compose_poses
+from spacerobot_ros.nodes.plant import publisher
 from spacerobot_ros.nodes.plant.publisher import TransformPublisher
 from spacerobot_ros.resources import resource_names, robot_file
 from spacerobot_ros.simulation.actuators import build_plant
@@ -63,7 +65,9 @@ def world_poses(
     return found
 
 
-def record_states(harness: Harness, bag: Path, robot: str, **plant: Any) -> Bag:
+def record_states(
+    harness: Harness, bag: Path, robot: str, recorded: Mapping[str, Any] = {}, **plant: Any
+) -> Bag:
     """Record some states of a robot whose joints are where none of them is at zero."""
     n = len(load_robot(robot_file(robot)).joint_names)
     shape = [0.02 + 0.013 * i for i in range(n)]
@@ -80,7 +84,7 @@ def record_states(harness: Harness, bag: Path, robot: str, **plant: Any) -> Bag:
     }
     node = harness.make(PlantNode, values, autostart=False)
     node.require(node.trigger_configure)
-    recorder = harness.make(RecorderNode, {"bag": str(bag)}, autostart=False)
+    recorder = harness.make(RecorderNode, {"bag": str(bag), **recorded}, autostart=False)
     recorder.watch([node])
     recorder.start()
     harness.spin_until(lambda: {"/odom", "/joint_states", "/robot_description"} <= recorder.topics)
@@ -154,6 +158,36 @@ def test_frames_have_the_prefix_that_they_are_given(harness: Harness, tmp_path: 
         assert transform.header.frame_id == "orbit" or transform.header.frame_id.startswith("one/")
     _, odom = next(iter(bag["/odom"].messages()))
     assert (odom.header.frame_id, odom.child_frame_id) == ("orbit", "one/base_link")
+
+
+def test_a_recorder_writes_frames_as_often_as_it_is_to(harness: Harness, tmp_path: Path) -> None:
+    every = {"tf_period": 0.2}
+    bag = record_states(harness, tmp_path / "bag.mcap", "planar_chain", every, tf_period=0.0)
+    assert set(np.diff([time for time, _ in bag["/tf"].messages()])) == {200_000_000}
+
+
+def test_a_plant_sends_frames_as_often_and_of_as_many_links_as_it_is_to(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[bytes] = []
+    send_raw = PlantNode.send_raw
+
+    def keep(node: PlantNode, kind: Any, topic: str, *arguments: Any) -> Any:
+        if topic == TRANSFORMS:
+            return SimpleNamespace(take=sent.append)
+        return send_raw(node, kind, topic, *arguments)
+
+    # As if the package of their message were installed.
+    monkeypatch.setattr(publisher, "transform_class", lambda: Odometry)
+    monkeypatch.setattr(PlantNode, "send_raw", keep)
+    given = {"robot": "planar_chain", "tick_rate": 50.0, "tf_period": 0.06, "tf_links": False}
+    node = harness.make(PlantNode, {**given, "actuation": "effort"})
+    harness.spin_until(lambda: node.tick > 12)
+    store = get_typestore(Stores.ROS2_JAZZY)
+    messages: list[Any] = [store.deserialize_cdr(raw, TRANSFORM_TYPE) for raw in sent]
+    frames = [transform for message in messages for transform in message.transforms]
+    assert [each.child_frame_id for each in frames] == ["base_link"] * len(sent)
+    assert set(np.diff([nanoseconds(each.header.stamp) for each in frames])) == {60_000_000}
 
 
 @pytest.mark.parametrize("robot", resource_names("urdf", ".urdf"))

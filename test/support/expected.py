@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.figure_prints import analysis_prints, report_prints
+from support.figure_prints import PICTURES, analysis_prints, report_prints
 from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
 
@@ -267,6 +267,7 @@ def main() -> None:
     """Write the files."""
     reports = {name: report_prints(name) for name in BAGS}
     reports |= {f"analysis of {name}": analysis_prints(name) for name in ANALYSED}
+    reports |= {f"picture: {name}": print_of() for name, print_of in PICTURES.items()}
     pages = {name: print_of() for name, print_of in CAMPAIGNS.items()}
     for path, content in (
         (PARAMETERS, parameters()),

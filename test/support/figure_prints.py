@@ -16,6 +16,7 @@ import re
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -28,10 +29,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
+from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.analysis import analyze
-from spacerobot_ros.report.figures import WIDTH, ReportFigure, drawing
+from spacerobot_ros.planning.core.workspaces import Workspaces
+from spacerobot_ros.report import planning_figures
+from spacerobot_ros.report.figures import WIDTH, PictureFormat, ReportFigure, drawing
 from spacerobot_ros.report.figures_over_time import (
     momentum_figure,
     shape_figure,
@@ -139,6 +143,70 @@ def analysis_prints(name: str) -> dict[str, str]:
     with drawing():
         draw = _planar_figure if found.planar.controllable else _spatial_figure
         return prints_of(draw(found))
+
+
+def _coarse_map(name: str, joints: tuple[int, int, int], shape: list[float]) -> dict[str, str]:
+    """Return the maps of curvature of a robot on a coarse grid, at a shape and of some joints."""
+    robot = SpaceRobot.from_file(robot_file(name))
+    conditions = np.array([3.0, 1.5, np.inf, 40.0, 7.0])
+    nominal = SimpleNamespace(joints=joints)
+    found: Any = SimpleNamespace(
+        robot=robot, nominal=nominal, shape=np.array(shape), conditions=conditions
+    )
+    with drawing(), patch.multiple(planning_figures, _FINE_GRID=5, _COARSE_GRID=4):
+        return prints_of(planning_figures._spatial_figure(found))
+
+
+def _workspaces() -> dict[str, str]:
+    """Return the picture of workspaces in space and, where joints turn freely, in a plane."""
+    found: Any = SimpleNamespace(
+        workspaces=(
+            Workspaces("hand <1>", True, (0.1, 1.9), ((0.1, 0.3), (0.8, 0.8), (1.4, 1.9)), 3, 9),
+            Workspaces("hand <1>", False, (0.0, 2.1), ((0.5, 0.7),), 2, 4),
+        )
+    )
+    drawn: dict[str, str] = {}
+
+    def picture(figure: Figure, format: PictureFormat) -> bytes:
+        drawn.update(prints_of(figure))
+        drawn["format"] = format.value
+        return b""
+
+    with patch.object(planning_figures, "picture_of", picture):
+        planning_figures.draw_workspaces(found, PictureFormat.PDF)
+    return drawn
+
+
+def _plan() -> dict[str, str]:
+    """Return the picture of a plan of three ticks for two sliders and a joint that turns."""
+    positions = np.array([[0.0, 0.1, -0.2], [0.05, 0.1, -0.1], [0.07, 0.0, 0.1], [0.04, -0.1, 0.1]])
+    turns = Rotation.from_rotvec(np.outer([0.0, 0.1, 0.25, 0.4], [0.2, -0.5, 0.8]))
+    path = SimpleNamespace(
+        time=np.array([0.0, 0.125, 0.25, 0.375]),
+        position=np.outer([0.0, 0.01, 0.03, 0.02], [1.0, -2.0, 0.5]),
+        quaternion=turns.as_quat(),
+    )
+    trial: Any = SimpleNamespace(positions=positions, path=path, method="some", duration=0.375)
+    units = [SimpleNamespace(unit=unit) for unit in ("m", "m", "rad")]
+    robot = SimpleNamespace(
+        joint_names=("left", "right", "wrist"), description=SimpleNamespace(movable_joints=units)
+    )
+    goal = SimpleNamespace(
+        position=np.array([0.03, -0.05, 0.0]),
+        quaternion=Rotation.from_rotvec([0.1, -0.15, 0.3]).as_quat(),
+    )
+    problem: Any = SimpleNamespace(robot=robot, goal=goal, control_period=0.125)
+    with drawing():
+        return prints_of(planning_figures._plan_figure(problem, trial))
+
+
+PICTURES: dict[str, Callable[[], dict[str, str]]] = {
+    "maps of an arm": lambda: _coarse_map("three_joint_arm", (0, 1, 2), [0.1, -0.7, 1.5]),
+    "maps of sliders": lambda: _coarse_map("sliding_masses", (0, 2, 1), [0.1, -0.2, 0.3]),
+    "workspaces": _workspaces,
+    "plan": _plan,
+}
+"""Pictures of ``analyze`` and ``plan`` from made-up analyses and plans."""
 
 
 def _command(command: Any) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
+import viser
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
@@ -32,6 +33,7 @@ from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer.reachability import Check, Verdict, question_of
+from spacerobot_ros.viewer.server import free_port
 from spacerobot_ros.viewer.state import Measured, StackState
 
 URDF = load_robot(robot_file("sliding_masses")).urdf
@@ -50,7 +52,7 @@ def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
 class Stack:
     """A probe that says what a plant and its replay say, and hears what the viewer sends."""
 
-    def __init__(self, harness: Harness) -> None:
+    def __init__(self, harness: Harness, **parameters: Any) -> None:
         self.harness = harness
         topics = {"/goal_pose": PoseStamped, "/fault_injection": String, "/replay/seek": Float64}
         self.probe: Probe = harness.probe(topics, name="stack")
@@ -68,7 +70,7 @@ class Stack:
         self.odom = create(Odometry, "/odom", 10)
         self.joints = create(JointState, "/joint_states", 10)
         self.momentum = create(Float64MultiArray, "/momentum", 10)
-        overrides = {"port": 0, "update_rate": 60.0}
+        overrides = {"port": 0, "update_rate": 60.0, **parameters}
         self.viewer = harness.add(
             ViewerNode(
                 context=harness.context,
@@ -199,6 +201,31 @@ def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness
     assert stack.probe.last("/fault_injection").data == "clear"
     stack.press(page.faults._inject)
     stack.until(lambda: "The fault '- -' is refused" in stack.log(), "no fault is known yet")
+
+
+def test_the_page_is_as_its_parameters_say(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    themes: list[bool] = []
+    monkeypatch.setattr(
+        viser.GuiApi, "configure_theme", lambda _, dark_mode, **__: themes.append(dark_mode)
+    )
+    port = free_port("127.0.0.1", 0)
+    stack = Stack(
+        harness, port=port, update_rate=40.0, dark=True, world_frame="orbit", check_goals=False
+    )
+    assert stack.viewer.url == f"http://127.0.0.1:{port}/"
+    assert themes == [True]
+    assert "drawn 40 times a second" in stack.viewer.start_message()
+    assert 25_000_000 in {timer.timer_period_ns for timer in stack.viewer.timers}
+    page, names = stack.page, names_of(load_robot(robot_file("sliding_masses")))
+    stack.describe()
+    stack.until(lambda: stack.move(0.25, names) or page.editor.placed, "a goal is shown")
+    stack.drag(np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]))
+    stack.press(page._buttons._fly)
+    stack.until(lambda: stack.probe.count("/goal_pose") == 1, "a goal")
+    assert stack.probe.last("/goal_pose").header.frame_id == "orbit"
+    stack.until(lambda: "check_goals" in page.editor._verdict.content, "why it is not checked")
 
 
 def test_a_goal_has_the_joint_positions_that_the_page_shows(harness: Harness) -> None:
