@@ -401,7 +401,9 @@ class Scenario:
         return replace(self, goal=aimed, published=(), has_goal=True)._with_goal_topics()
 
     def _with_goal_topics(self) -> Scenario:
-        """Return the scenario with a planner that takes goals of all its end-effectors."""
+        """Return the scenario with a planner that takes goals of all its end-effectors, whose poses
+        the plant publishes.
+        """
         links = [each.link for each in self.goal.end_effectors if each.link]
         if not links or "planner" not in self.commanders:
             return self
@@ -409,7 +411,10 @@ class Scenario:
         missing = [link for link in links if link not in (*listed, DEFAULT_END_EFFECTOR)]
         if not missing:
             return self
-        return self.with_overrides("planner", {"end_effectors": [*listed, *missing]})
+        heard = self.with_overrides("planner", {"end_effectors": [*listed, *missing]})
+        published = heard.plant.end_effectors
+        more = [link for link in missing if link not in published]
+        return heard.with_overrides("plant", {"end_effectors": [*published, *more]})
 
     def require_goal(self) -> None:
         """Raise an error if the scenario has no goal, such as one made from a robot file.

@@ -8,7 +8,7 @@ quantity in :mod:`spacerobot_ros.simulation.sensors`.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 _POSE_MEMBERS = (*(f"position.{x}" for x in "xyz"), *(f"orientation.{x}" for x in "xyzw"))
@@ -150,6 +150,15 @@ _TOPIC_TABLE = (
         "pose of the link `end_effector_frame` in the world: the truth",
         when="the robot has that link",
         state=(StateField("pose", "end_effector_pose", _POSE_MEMBERS),),
+    ),
+    Topic(
+        "end_effector/pose",
+        _POSE_STAMPED_TYPE,
+        _PUBLISHED_BY_PLANT,
+        "pose of the link in the world, as measured: of the base and the joints that `odom` and "
+        "`joint_states` carry; likewise `NAME/pose` of every link in the plant's `end_effectors`",
+        when="the plant's `end_effectors` list the link",
+        state=(StateField("pose", "pose_of_end_effector", _POSE_MEMBERS),),
     ),
     Topic(
         "momentum",
@@ -397,11 +406,23 @@ TOPICS_NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/he
 
 def goal_topic(end_effector: str) -> str:
     """Return the topic of the goals of an end-effector: its name, in letters that topics have."""
-    return re.sub(r"\W", "_", end_effector, flags=re.ASCII) + "/goal_pose"
+    return _name_in_topics(end_effector) + "/goal_pose"
+
+
+def pose_topic(end_effector: str) -> Topic:
+    """Return the entry of the poses of an end-effector, by its name in letters that topics have."""
+    name = _name_in_topics(end_effector)
+    state = StateField("pose", f"pose_of_{name}", _POSE_MEMBERS)
+    return replace(TOPICS["end_effector/pose"], name=f"{name}/pose", state=(state,))
+
+
+def _name_in_topics(link: str) -> str:
+    return re.sub(r"\W", "_", link, flags=re.ASCII)
 
 
 def topic_named(name: str) -> Topic:
-    """Return the entry of a topic; goals of any end-effector have that of ``end_effector``.
+    """Return the entry of a topic; goals and poses of any end-effector have that of
+    ``end_effector``.
 
     Raises
     ------
@@ -410,9 +431,14 @@ def topic_named(name: str) -> Topic:
     """
     if name not in TOPICS and name.endswith("/goal_pose"):
         return replace(TOPICS[goal_topic("end_effector")], name=name)
+    if name not in TOPICS and name.endswith("/pose"):
+        return pose_topic(name.removesuffix("/pose"))
     return TOPICS[name]
 
 
-def state_topics() -> list[Topic]:
-    """Return the topics that carry the plant's state, in the order of publication."""
-    return [topic for topic in TOPICS.values() if topic.state]
+def state_topics(end_effectors: Iterable[str] = ()) -> list[Topic]:
+    """Return the topics that carry the state of a plant that publishes the poses of some
+    end-effectors, in the order of publication.
+    """
+    poses = {topic.name: topic for topic in map(pose_topic, end_effectors)}
+    return [topic for topic in {**poses, **TOPICS}.values() if topic.state]

@@ -434,6 +434,11 @@ class RecordedRobot:
         self.bag = bag
         self.namespace = namespace
 
+    def topic_names(self) -> list[str]:
+        """Return the names of all topics of the robot, without its namespace."""
+        prefix = f"{self.namespace}/"
+        return [name.removeprefix(prefix) for name in self.bag.topics if name.startswith(prefix)]
+
     def get(self, name: str) -> TopicSeries | None:
         """Return a topic of the stack; None if it has no message or another type."""
         topic = f"{self.namespace}/{name}"

@@ -186,7 +186,8 @@ class Flight:
         found = self.series.get(name)
         if found is not None:
             return found
-        return Signal.empty(_QUANTITY_SIZES.get(name, len(self.joint_names)))
+        usual = 7 if name.startswith("pose_of_") else len(self.joint_names)
+        return Signal.empty(_QUANTITY_SIZES.get(name, usual))
 
     @property
     def time(self) -> Array:

@@ -38,7 +38,7 @@ from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.scenario import COMMANDERS, CONFIGS, Published, Scenario
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import TOPICS, StateField, goal_topic
+from spacerobot_ros.topics import TOPICS, StateField, Topic, goal_topic, topic_named
 
 _SAME_CLOCK_TOLERANCE = 1.0
 """Stamps this near to the log times, in s, come from the same clock."""
@@ -152,7 +152,7 @@ class FlightBag:
         found = [Signal.empty(width)]
         for series in self.series_of(name):
             values = series.table(fields, width)
-            if TOPICS[name].type == TOPICS["joint_states"].type:
+            if topic_named(name).type == TOPICS["joint_states"].type:
                 values = _sort_by_name(values, series, self.names(name))
             whole = np.isfinite(values).all(axis=1)
             found.append(Signal(self._times(series)[whole], values[whole]))
@@ -210,7 +210,15 @@ class FlightBag:
         ):
             for field in TOPICS[name].state if self.series_of(name) else ():
                 makers[field.quantity] = partial(self.quantity, name, field)
+        for topic in self._poses_of_end_effectors():
+            makers[topic.state[0].quantity] = partial(self.quantity, topic.name, topic.state[0])
         return _LazyMapping(makers)
+
+    def _poses_of_end_effectors(self) -> Iterator[Topic]:
+        """Yield the topics ``NAME/pose`` that the bag has."""
+        for name in dict.fromkeys(name for part in self.parts for name in part.topic_names()):
+            if name.endswith("/pose") and self.series_of(name):
+                yield topic_named(name)
 
     def _times(self, series: TopicSeries) -> Array:
         return series.stamp if self.stamped else series.time

@@ -25,7 +25,7 @@ from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.model.visuals import meshes_for_bag
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import TOPICS, Topic, goal_topic, state_topics, topic_named
+from spacerobot_ros.topics import TOPICS, Topic, goal_topic, pose_topic, state_topics, topic_named
 from spacerobot_ros.version import __version__
 
 if TYPE_CHECKING:
@@ -88,7 +88,8 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
     yield _Stream(clock, stamps, stamped_copies(encode(clock.type), clock.type, stamps, {}))
     lost = flight.quantities["pose_lost"][:, 0] > 0 if "pose_lost" in flight.quantities else None
     every = max(1, round(config.base_pose_period * SECOND / period))
-    for topic in state_topics():
+    poses = {"odom", *(pose_topic(name).name for name in config.end_effectors)}
+    for topic in state_topics(config.end_effectors):
         if not all(field.quantity in quantities for field in topic.state):
             continue
         names = thrusters if topic.entries_of == "thrusters" else flight.joint_names
@@ -100,7 +101,7 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
             if quantities[field.quantity].shape[1]
         }
         rows = np.ones(len(stamps), dtype=bool)
-        if topic.name == "odom" and lost is not None:
+        if topic.name in poses and lost is not None:
             rows = ~lost
         if not topic.every_tick:
             rows = np.arange(len(stamps)) % every == 0

@@ -302,7 +302,7 @@ def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
     recorded, period, names = flight.recorded, flight.config.period_ns, flight.robot.joint_names
     published: list[_PublishedTopic] = []
     clock = recorded["odom"].stamp_ns
-    for topic in sorted(state_topics(), key=_comparison_rank):
+    for topic in sorted(state_topics(flight.config.end_effectors), key=_comparison_rank):
         series = recorded.get(topic.name)
         if series is None:
             continue

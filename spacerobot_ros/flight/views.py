@@ -113,6 +113,9 @@ def _quantity_labels(flight: Flight) -> dict[str, tuple[str, ...]]:
     names: dict[str, tuple[str, ...]] = {"propellant": ("",), "pose_lost": ("",)}
     for part in ("measured_pose", "end_effector_pose"):
         names[part] = _COLUMN_NAMES["pose"]
+    names |= {
+        name: _COLUMN_NAMES["pose"] for name in flight.quantities if name.startswith("pose_of_")
+    }
     names["measured_twist"] = _COLUMN_NAMES["twist"]
     names["measured_q"] = names["measured_qdot"] = flight.joint_names
     for name in ("momentum_expected", "base_wrench_realised"):

@@ -125,6 +125,9 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     thrusters_excluded: str = parameter("", "names of thrusters out of use, separated by spaces")
     world_frame: str = parameter("world", "name of the inertial frame")
     end_effector_frame: str = parameter("", "link of end_effector_pose; '': 'end_effector', if any")
+    end_effectors: tuple[str, ...] = parameter(
+        (), "links whose measured poses are published on NAME/pose", texts=True
+    )
     base_pose_period: float = parameter(
         0.0,
         "simulated time between base_pose; 0: every tick. Realtime: at most 0.5 s of wall time",

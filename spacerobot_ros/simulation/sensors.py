@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS, POSE_AXES, Fault
-from spacerobot_ros.topics import Topic, state_topics
+from spacerobot_ros.topics import Topic, pose_topic, state_topics
 
 _NOISE_PARAMETERS = {
     "position": "position_noise",
@@ -178,6 +179,10 @@ class ReportedState:
         self.sensors = Sensors(plant, config.sensors, config.control_period)
         self._link = _end_effector_index(plant.robot, config.end_effector_frame)
         self._end_effector_pose = np.zeros(7)
+        self._end_effectors = config.end_effectors
+        self._links = _link_indices(plant.robot, config.end_effectors)
+        self._poses_of_links = [np.zeros(7) for _ in self._links]
+        self._link_poses = plant.robot.buffered("link_poses") if self._links else None
         self._thrusters = thrusters_in(plant)
         self._sensors_used = self.sensors.used
         self.quantities = self._quantities()
@@ -187,7 +192,7 @@ class ReportedState:
         """The state topics that this plant publishes now, in the order of publication."""
         return [
             topic
-            for topic in state_topics()
+            for topic in state_topics(self._end_effectors)
             if all(field.quantity in self.quantities for field in topic.state)
         ]
 
@@ -207,7 +212,13 @@ class ReportedState:
         """
         self.sensors.measure()
         if self._link is not None:
-            self._place_end_effector(self._link)
+            plant = self._plant
+            _place(self._end_effector_pose, plant.pose, plant.link_R, plant.link_r, self._link)
+        if self._link_poses is not None:
+            measured = self.sensors if self.sensors.used else self._plant
+            link_R, link_r = self._link_poses(measured.q)
+            for index, pose in zip(self._links, self._poses_of_links, strict=True):
+                _place(pose, measured.pose, link_R, link_r, index)
         if self.sensors.used == self._sensors_used:
             return False
         self._sensors_used = self.sensors.used
@@ -228,6 +239,8 @@ class ReportedState:
         }
         if self._link is not None:
             quantities["end_effector_pose"] = self._end_effector_pose
+        for name, pose in zip(self._end_effectors, self._poses_of_links, strict=True):
+            quantities[pose_topic(name).state[0].quantity] = pose
         if plant.takes_wrench:
             quantities["expected_momenta"] = plant.expected_momenta
         if self._sensors_used:
@@ -246,11 +259,29 @@ class ReportedState:
             }
         return quantities
 
-    def _place_end_effector(self, index: int) -> None:
-        plant, target = self._plant, self._end_effector_pose
-        R_WB, r_WB = matrix_from_quaternion(plant.pose[3:]), plant.pose[:3]
-        target[:3] = r_WB + R_WB @ plant.link_r[:, index]
-        target[3:] = quaternion_from_matrix(R_WB @ plant.link_R[:, 3 * index : 3 * index + 3])
+
+def _place(target: Array, base: Array, link_R: Array, link_r: Array, index: int) -> None:
+    """Write the pose (7,) of a link in W, for that of the base and those of all links in B."""
+    R_WB = matrix_from_quaternion(base[3:])
+    target[:3] = base[:3] + R_WB @ link_r[:, index]
+    target[3:] = quaternion_from_matrix(R_WB @ link_R[:, 3 * index : 3 * index + 3])
+
+
+def _link_indices(robot: SpaceRobot, names: Sequence[str]) -> list[int]:
+    """Return the indices of the links in the parameter ``end_effectors``."""
+    links = list(robot.link_names)
+    for name in names:
+        if name not in links:
+            raise ParameterError(
+                f"Parameter 'end_effectors' names '{name}', but the robot has no such link; "
+                f"it has {', '.join(links)}."
+            )
+    if len({pose_topic(name).name for name in names}) < len(names):
+        raise ParameterError(
+            "Parameter 'end_effectors' names links with one topic NAME/pose: "
+            f"{', '.join(names)}; name each once."
+        )
+    return [links.index(name) for name in names]
 
 
 def _end_effector_index(robot: SpaceRobot, name: str) -> int | None:

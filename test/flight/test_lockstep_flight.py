@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,7 +110,7 @@ def test_a_flight_is_the_one_through_the_nodes(
     assert told == [(e.kind, e.message) for e in through_ros.events if e.goal_id]
 
 
-def chain(**settings: float) -> Scenario:
+def chain(**settings: Any) -> Scenario:
     """Return a short flight of a planner and a controller."""
     scenario = load_scenario("planar_chain")
     for node in (*scenario.commanders, "plant"):
@@ -118,11 +119,15 @@ def chain(**settings: float) -> Scenario:
 
 
 def test_what_is_saved_is_verified_and_read_back(tmp_path: Path) -> None:
-    flight = fly_scenario(chain(**{"sensors.joint_noise": 1e-7}))
+    links = {"end_effectors": ["segment_2", "base_link"]}
+    flight = fly_scenario(chain(**{"sensors.joint_noise": 1e-7}, **links))
     flight.save(tmp_path / "saved.mcap")
     verified = verify_bag(tmp_path / "saved.mcap")
     assert verified.difference is None
     assert verified.ticks == len(flight.time) - 1
+    assert {"/segment_2/pose", "/base_link/pose"} <= set(verified.topics)
+    of_base = flight.signal("pose_of_base_link").values
+    np.testing.assert_allclose(of_base[:, :3], flight.pose[:, :3], atol=1e-12)
     read = read_run(tmp_path / "saved.mcap")
     assert_same(flight, read)
     assert [e.message for e in read.events] == [e.message for e in flight.events]
@@ -138,12 +143,14 @@ def test_what_is_saved_is_verified_and_read_back(tmp_path: Path) -> None:
         ("measured_q", 1e-7, "/joint_states"),
         ("twist", 1e-7, "/odom_true"),
         ("expected_momenta", 1e-7, "/momentum_expected"),
+        ("pose_of_segment_1", 1e-7, "/segment_1/pose"),
     ],
 )
 def test_a_saved_flight_with_another_number_is_not_verified(
     quantity: str, noise: float, topic: str, tmp_path: Path
 ) -> None:
-    flight = fly_scenario(chain(**{"sensors.joint_noise": noise}), longest=2.0)
+    settings = {"sensors.joint_noise": noise, "end_effectors": ["segment_1"]}
+    flight = fly_scenario(chain(**settings), longest=2.0)
     flight.signal(quantity).values[20, 1] += 1e-6
     flight.save(tmp_path / "saved.mcap")
     difference = verify_bag(tmp_path / "saved.mcap").difference

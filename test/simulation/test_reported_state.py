@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message
+from scipy.spatial.transform import Rotation
 from std_msgs.msg import Float64MultiArray
+from support.oracles import PinocchioOracle
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
@@ -69,6 +71,36 @@ def test_the_end_effector_is_where_the_link_is() -> None:
     # A quarter turn about z.
     expected = [1.0 - in_base[1], 2.0 + in_base[0], 3.0 + in_base[2]]
     np.testing.assert_allclose(state.quantities["end_effector_pose"][:3], expected, atol=1e-12)
+
+
+def test_named_links_are_where_pinocchio_sees_them_in_the_measured_state() -> None:
+    named = ("link_3", "base_link", "link_1")
+    config = PlantConfig(
+        end_effectors=named,
+        initial_position=(1.0, 2.0, 3.0),
+        initial_orientation=(0.1, -0.5, 0.3, 0.8),
+        initial_joint_positions=(0.3, -0.7, 0.5),
+    )
+    plant = build_plant(ARM, config)
+    state = ReportedState(plant, config)
+    oracle = PinocchioOracle(robot_file("three_joint_arm").read_text("utf-8"), ARM.joint_names)
+    for fault in ("clear", f"sensor_bias {ARM.joint_names[1]} 0.4", "sensor_bias position_x 0.7"):
+        plant.inject(fault)
+        plant.step(np.array([0.1, -0.3, 0.2]))
+        state.update()
+        pose, q = state.quantities["measured_pose"], state.quantities["measured_q"]
+        oracle.set_configuration(q, pose[3:], pose[:3])
+        for name in named:
+            R_WE, r_WE = oracle.frame_W(name)
+            published = state.quantities[f"pose_of_{name}"]
+            np.testing.assert_allclose(published[:3], r_WE, atol=1e-12)
+            R = Rotation.from_quat(published[3:]).as_matrix()
+            np.testing.assert_allclose(R, R_WE, atol=1e-12)
+    assert names(state)[:3] == [f"{name}/pose" for name in named]
+    with pytest.raises(ParameterError, match="'end_effectors' names 'claw'"):
+        reported(ARM, end_effectors=("link_1", "claw"))
+    with pytest.raises(ParameterError, match="name each once"):
+        reported(ARM, end_effectors=("link_1", "link_1"))
 
 
 class _Streams:

@@ -41,7 +41,7 @@ from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import SECOND, set_stamp, stamp_bytes
-from spacerobot_ros.topics import TOPICS, Topic
+from spacerobot_ros.topics import TOPICS, Topic, pose_topic
 
 PROPELLANT_KEY = "propellant_kg"
 """Diagnostics key of the propellant used."""
@@ -305,7 +305,7 @@ class StatePublisher:
     def __init__(
         self, node: FlightNode, robot: SpaceRobot, state: ReportedState, config: PlantConfig
     ) -> None:
-        self._node, self._robot, self._state = node, robot, state
+        self._node, self._robot, self._state, self._config = node, robot, state, config
         self._world = config.world_frame
         self._base = config.frame_prefix + robot.base_link
         self._outputs: dict[str, RawOutput] = {}
@@ -325,7 +325,8 @@ class StatePublisher:
         self._every_tick = [
             (output, template) for topic, output, template in streams if topic.every_tick
         ]
-        (self._odom,) = (template for topic, _, template in streams if topic.name == "odom")
+        poses = {"odom", *(pose_topic(name).name for name in self._config.end_effectors)}
+        self._of_measured_pose = [template for topic, _, template in streams if topic.name in poses]
 
     def publish_description(self) -> None:
         """Publish the URDF on robot_description."""
@@ -336,10 +337,10 @@ class StatePublisher:
 
         ``all_topics``: those too that are not published in every tick.
         """
-        lost = self._odom if self._state.sensors.dropout else None
+        lost = self._of_measured_pose if self._state.sensors.dropout else ()
         stamp = stamp_bytes(time_ns)
         for output, template in self._all if all_topics else self._every_tick:
-            if template is not lost:
+            if template not in lost:
                 output.take(template.serialised(stamp))
 
     def has_new_readers(self) -> bool:
