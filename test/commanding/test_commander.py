@@ -188,6 +188,32 @@ def test_after_a_standstill_only_the_last_state_is_answered(planner: Rig) -> Non
     assert planner.host.commands[-1] == 9
 
 
+def test_without_a_standstill_every_state_is_answered_as_it_comes(planner: Rig) -> None:
+    """Five milliseconds are none; the host hands the next ones over itself."""
+    planner.state(1)
+    assert planner.commander.take_accepted_jump() == ""
+    waiting: tuple[list[Stamped], list[Stamped]] = ([], [planner.stamped(3)])
+    planner.host.waiting = waiting
+    planner.wall += 0.004
+    planner.state(2)
+    assert planner.host.waiting is waiting
+    assert planner.host.commands == [1, 2]
+    assert planner.host.lines == []
+
+
+def test_faults_of_messages_are_logged_from_the_start_of_the_clock_once_a_period(
+    robot: SpaceRobot,
+) -> None:
+    rig = Rig(PlannerCommander, config(PlannerConfig, **METHOD), robot.n)
+    rig.wall = 0.0
+    rig.use(robot)
+    rig.commander.activate()
+    for wall, count in ((0.0, 1), (4.99, 1), (5.0, 2), (9.99, 2), (10.0, 3)):
+        rig.wall = wall
+        rig.joints(1, n=7)
+        assert rig.host.lines == [("error", "joint_states: joint 'wing' is unknown.")] * count
+
+
 def test_joints_of_another_robot_are_skipped_and_logged_once(planner: Rig) -> None:
     planner.state(1)
     for _ in range(3):

@@ -132,7 +132,8 @@ def test_the_goal_is_a_ghost_of_the_base_and_the_path_a_line(name: str) -> None:
     assert [[p.x, p.y, p.z] for p in line.points] == PATH.position.tolist()
     assert numbers(line.pose) == [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
     assert line.scale.x > 0
-    assert line.color.a == 1.0
+    colour = (line.color.r, line.color.g, line.color.b, line.color.a)
+    assert colour == pytest.approx((0.95, 0.6, 0.1, 1.0))
 
 
 def test_a_path_begins_at_its_start() -> None:

@@ -8,7 +8,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import rclpy
 from mcap.reader import make_reader
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
@@ -157,3 +159,42 @@ def test_descriptions_are_texts(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(ParameterError, match="'describe'"):
             recorder._read_descriptions(str(path))
+
+
+@pytest.mark.parametrize(
+    ("settings", "given"),
+    [
+        (
+            {"max_size": 2.5, "max_duration": 0.75, "when_exists": "refuse"},
+            (2_500_000, 750_000_000, False),
+        ),
+        ({"when_exists": "next"}, (0, 0, True)),
+    ],
+)
+def test_a_recorder_opens_its_bag_with_the_bounds_that_it_is_given(
+    tmp_path: Path,
+    ros_context: rclpy.Context,
+    monkeypatch: pytest.MonkeyPatch,
+    settings: dict[str, Any],
+    given: tuple[Any, ...],
+) -> None:
+    opened: list[dict[str, Any]] = []
+
+    def write(path: str, **options: Any) -> BagWriter:
+        opened.append({"path": path, **options})
+        return BagWriter(path)
+
+    monkeypatch.setattr(recorder, "BagWriter", write)
+    values = {"bag": str(tmp_path / "a.mcap"), "compression": "lz4", **settings}
+    node = recorder.RecorderNode(
+        context=ros_context,
+        parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],
+    )
+    try:
+        (options,) = opened
+        assert (options["path"], options["compression"]) == (values["bag"], "lz4")
+        bounds = (options["max_size"], options["max_duration_ns"], options["next_free"])
+        assert bounds == given
+        assert options["overwrite"] is False
+    finally:
+        node.destroy_node()
