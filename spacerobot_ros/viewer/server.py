@@ -31,6 +31,12 @@ if TYPE_CHECKING:
 class ViewerConfig(WatchdogConfig):
     """Parameters of the viewer: address, drawing rate, and goal checks."""
 
+    watchdog_timeout: float = parameter(
+        1.5,
+        "wall time without a heartbeat after which the page shows a node as silent; 0: never",
+        unit="s",
+        minimum=0.0,
+    )
     host: str = parameter(
         "127.0.0.1",
         "address that the page is served at; any other one lets other machines steer the robot",

@@ -116,8 +116,8 @@ class Stand:
             state=lambda: self.state, time_ns=lambda: 2_000_000_000, forget_state=bool, use=bool
         )
 
-        def listen(streams: Any, node: Any, frame: str, on_status: Any) -> Any:
-            self.on_status = on_status
+        def listen(streams: Any, node: Any, frame: str, on_status: Any, silent: float) -> Any:
+            self.on_status, self.silent_after = on_status, silent
             return listener
 
         def ask(node: Any, name: str) -> Any:
@@ -139,7 +139,8 @@ class Stand:
             "RemoteParameters": ask,
         }.items():
             monkeypatch.setattr(viewer, name, part)
-        overrides = [Parameter("update_rate", value=1.0), Parameter("world_frame", value="w")]
+        given = {"update_rate": 1.0, "world_frame": "w", "watchdog_timeout": 4.5}
+        overrides = [Parameter(name, value=value) for name, value in given.items()]
         self.node = Viewer(context=context, parameter_overrides=overrides)
 
     def cancel(self) -> bool:
@@ -172,6 +173,10 @@ def stand(monkeypatch: pytest.MonkeyPatch, ros_context: rclpy.Context) -> Iterat
     stand = Stand(monkeypatch, ros_context)
     yield stand
     stand.node.destroy_node()
+
+
+def test_nodes_are_silent_after_as_long_as_the_parameter_says(stand: Stand) -> None:
+    assert stand.silent_after == 4.5
 
 
 @pytest.mark.parametrize(

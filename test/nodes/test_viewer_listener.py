@@ -57,7 +57,7 @@ class Streams:
 class Viewed:
     """A listener, the callbacks of its node, and its wall time."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *silent_after: float) -> None:
         self.now, self.streams, self.reported = 1000.0, Streams(), list[tuple[str, str]]()
         wall = SimpleNamespace(monotonic=lambda: self.now, time_ns=lambda: 77)
         monkeypatch.setattr(listening, "time", wall)
@@ -68,7 +68,8 @@ class Viewed:
             self.heard[topic] = callback
 
         node: Any = SimpleNamespace(create_subscription=create)
-        self.listener = Listener(node, node, "world", lambda *words: self.reported.append(words))
+        report = lambda *words: self.reported.append(words)  # noqa: E731
+        self.listener = Listener(node, node, "world", report, *silent_after)
         self.listener.use(ROBOT)
 
     def look(self, seconds: float = 0.0) -> StackState:
@@ -317,6 +318,21 @@ def test_nodes_fall_silent_and_are_hidden_after_a_minute(viewed: Viewed) -> None
     state = viewed.look()
     assert state.planner is not None
     assert state.planned_path is not None
+
+
+@pytest.mark.parametrize(
+    ("silent_after", "silent"), [(0.5, {"/planner": 0.75}), (4.0, {}), (0, {})]
+)
+def test_nodes_fall_silent_after_the_time_that_is_given(
+    silent_after: float, silent: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    viewed = Viewed(monkeypatch, silent_after)
+    viewed.beat("/planner")
+    assert viewed.look(0.75).silent == silent
+    viewed.beat("/planner")
+    for _ in range(30):
+        state = viewed.look(1.0)
+    assert bool(state.silent) == bool(silent_after)
 
 
 def test_a_viewer_that_stood_still_excuses_the_nodes(viewed: Viewed) -> None:

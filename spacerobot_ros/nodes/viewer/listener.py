@@ -43,8 +43,8 @@ from spacerobot_ros.viewer.state import Firing, Measured, Momenta, Part, StackSt
 LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of streams: only the last message is kept, without acknowledgement."""
 
-_SILENCE_TIMEOUT = 1.5
-"""Wall time without a heartbeat after which an active node counts as silent, s."""
+_SUSPENSION = 1.5
+"""Wall time between two calls after which this process counts as suspended meanwhile, s."""
 
 _TIME_UNTIL_SILENT_NODE_IS_HIDDEN = 60.0
 """Wall time after which a silent node and its last reports are no longer shown, s."""
@@ -109,12 +109,20 @@ class Listener:
     on_status
         Called for every status with ``plant``, ``planner``, ``controller`` or ``replay`` and the
         full name of the node that published it.
+    silent_after
+        Wall time without a heartbeat after which an active node counts as silent, s; 0: none does.
     """
 
     def __init__(
-        self, streams: Node, node: Node, frame: str, on_status: Callable[[str, str], None]
+        self,
+        streams: Node,
+        node: Node,
+        frame: str,
+        on_status: Callable[[str, str], None],
+        silent_after: float = 1.5,
     ) -> None:
         self._frame, self._on_status = frame, on_status
+        self._silent_after = silent_after or math.inf
         self._odom = Latest(streams, Odometry, "odom")
         self._joints = Latest(streams, JointState, "joint_states")
         self._end_effector = Latest(streams, PoseStamped, "end_effector_pose")
@@ -177,7 +185,7 @@ class Listener:
         silent = {
             name: now - beat.at
             for name, beat in beats
-            if beat.pulse is Pulse.ACTIVE and now - beat.at > _SILENCE_TIMEOUT
+            if beat.pulse is Pulse.ACTIVE and now - beat.at > self._silent_after
         }
         inactive = tuple(name for name, beat in beats if beat.pulse is Pulse.INACTIVE and beat.role)
         statuses = {
@@ -329,17 +337,18 @@ class Listener:
 
     def _hide_lost_nodes(self, now: float) -> None:
         """Hide the reports of nodes that have long been silent, and of a replay that is over."""
-        if now - self._last_call > _SILENCE_TIMEOUT:
+        if now - self._last_call > _SUSPENSION:
             # This process was suspended, so the other nodes were not silent.
             gap = now - self._last_call
             self._beats = {n: replace(b, at=b.at + gap) for n, b in self._beats.items()}
         self._last_call = now
         a_plant_runs = any(
-            beat.role == Role.PLANT.value and beat.is_alive(now) for beat in self._beats.values()
+            beat.role == Role.PLANT.value and beat.is_alive(now, self._silent_after)
+            for beat in self._beats.values()
         )
         for name, beat in tuple(self._beats.items()):
             is_replay = beat.role == Role.REPLAY.value
-            over = is_replay and a_plant_runs and not beat.is_alive(now)
+            over = is_replay and a_plant_runs and not beat.is_alive(now, self._silent_after)
             if not over and (
                 beat.pulse is Pulse.BUSY or now - beat.at <= _TIME_UNTIL_SILENT_NODE_IS_HIDDEN
             ):
@@ -360,8 +369,8 @@ class _Heartbeat:
     pulse: Pulse
     role: str
 
-    def is_alive(self, now: float) -> bool:
-        """Whether the node is active and not silent."""
+    def is_alive(self, now: float, silent_after: float) -> bool:
+        """Whether the node is active and not silent: for less than ``silent_after`` s."""
         return self.pulse is Pulse.BUSY or (
-            self.pulse is Pulse.ACTIVE and now - self.at <= _SILENCE_TIMEOUT
+            self.pulse is Pulse.ACTIVE and now - self.at <= silent_after
         )

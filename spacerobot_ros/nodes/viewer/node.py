@@ -148,7 +148,9 @@ class ViewerNode(FlightNode):
             start_parameter_services=False,
             enable_rosout=False,
         )
-        self._listener = Listener(self._streams, self, config.world_frame, self._on_status)
+        self._listener = Listener(
+            self._streams, self, config.world_frame, self._on_status, config.watchdog_timeout
+        )
         self.create_subscription(String, "robot_description", self._on_description, LATCHED)
         self.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
         self.create_subscription(RosoutLog, "/rosout", self._on_log, _ROSOUT_QOS)
