@@ -14,12 +14,14 @@ from support.expected import (
     PARAMETERS,
     PLANS,
     REPORTS,
+    VIEWER,
     differences,
     parameters,
     plans,
 )
 from support.figure_prints import PARTS, PICTURES, analysis_prints, report_part
 from support.page_prints import CAMPAIGNS
+from support.viewer_prints import SITUATIONS, viewer_prints
 
 WRITE = "If this is wanted, `make expected` writes the file anew."
 
@@ -73,8 +75,16 @@ def test_pictures_of_commands_stay_as_they_are(name: str) -> None:
     assert not problems, "\n".join([*problems, WRITE])
 
 
+@pytest.mark.parametrize("name", SITUATIONS)
+def test_the_page_of_the_viewer_stays_as_it_is(name: str) -> None:
+    pytest.importorskip("viser")
+    problems = differences(viewer_prints(name), json.loads(VIEWER.read_text("utf-8"))[name])
+    assert not problems, "\n".join([*problems[:40], WRITE])
+
+
 @pytest.mark.parametrize("name", CAMPAIGNS)
 def test_pages_of_campaigns_stay_as_they_are(name: str) -> None:
+    pytest.importorskip("pyarrow")
     kept = json.loads(CAMPAIGN_PAGES.read_text("utf-8"))
     problems = differences(CAMPAIGNS[name](), kept[name])
     assert not problems, "\n".join([*problems[:40], WRITE])

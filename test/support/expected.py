@@ -16,6 +16,7 @@ import numpy as np
 from support.figure_prints import PICTURES, analysis_prints, report_prints
 from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
+from support.viewer_prints import SITUATIONS, viewer_prints
 
 from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
 from spacerobot_ros.control.config import ControllerConfig
@@ -40,6 +41,7 @@ from spacerobot_ros.viewer.server import ViewerConfig
 FOLDER = Path(__file__).parents[1] / "expected"
 PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"
 REPORTS, CAMPAIGN_PAGES = FOLDER / "reports.json", FOLDER / "campaigns.json"
+VIEWER = FOLDER / "viewer.json"
 BAGS = ("arm_attitude", "planar_chain", "servicer_thrusters", "sliding_masses")
 ANALYSED = ("planar_chain", "three_joint_arm")
 
@@ -274,6 +276,7 @@ def main() -> None:
         (PLANS, plans()),
         (REPORTS, reports),
         (CAMPAIGN_PAGES, pages),
+        (VIEWER, {name: viewer_prints(name) for name in SITUATIONS}),
     ):
         path.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
         print(path)
