@@ -1,0 +1,219 @@
+"""What each name under ``disperse`` changes in a flight: exactly one number, in its unit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.campaigns import campaign
+
+from spacerobot_ros.campaign.targets import (
+    DrawnFlight,
+    _start_positions,
+    description_of,
+    targets_of,
+)
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.parameters import values_of
+from spacerobot_ros.scenario import Scenario
+
+FAULTS = [
+    "joint_stuck slider_2 at 5 until 9",
+    "joint_slow slider_1 0.5 until 7",
+    "actuator_bias slider_3 0.125",
+]
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    """Return sliders that start askew, off the origin, with faults."""
+    given = {
+        "plant.faults": FAULTS,
+        "plant.initial_position": [1.0, 2.0, 3.0],
+        "plant.initial_orientation": [0.5, -0.1, 0.7, 0.5],
+        "plant.initial_joint_positions": [0.5, -0.25, 0.125],
+    }
+    return campaign(set=given).scenario
+
+
+def changes(scenario: Scenario, flight: DrawnFlight) -> dict[str, Any]:
+    """Return what differs from the scenario, by node and parameter, and the mass properties."""
+    found: dict[str, Any] = {}
+    for node in ("plant", *scenario.commanders):
+        before, after = (values_of(each.config(node)) for each in (scenario, flight.scenario))
+        found |= {f"{node}.{key}": after[key] for key in after if after[key] != before[key]}
+    for name, usual in (("mass", 1.0), ("inertia", 1.0), ("com", 0.0)):
+        values = getattr(flight, name)
+        if np.any(values != usual):
+            found[name] = values.tolist()
+    return found
+
+
+def applied(name: str, scenario: Scenario, value: Any) -> tuple[list[Any], dict[str, Any]]:
+    flight = DrawnFlight.of(scenario)
+    targets = targets_of(name, scenario)
+    for target in targets:
+        flight = target.apply(flight, value)
+    return targets, changes(scenario, flight)
+
+
+CASES: dict[str, tuple[float, str, dict[str, Any]]] = {
+    "plant.tick_rate": (12.5, "Hz", {"plant.tick_rate": 12.5}),
+    "planner.position_tolerance": (0.07, "m", {"planner.position_tolerance": 0.07}),
+    "plant.initial_joint_positions[1]": (
+        0.75,
+        "m or rad",
+        {"plant.initial_joint_positions": (0.5, 0.75, 0.125)},
+    ),
+    "plant.initial_joint_positions[slider_3]": (
+        0.75,
+        "m or rad",
+        {"plant.initial_joint_positions": (0.5, -0.25, 0.75)},
+    ),
+    "plant.initial_joint_velocities[0]": (
+        0.25,
+        "m/s or rad/s",
+        {"plant.initial_joint_velocities": (0.25, 0.0, 0.0)},
+    ),
+    "plant.initial_position[2]": (5.5, "m", {"plant.initial_position": (1.0, 2.0, 5.5)}),
+    "initial.position.y": (0.25, "m", {"plant.initial_position": (1.0, 2.25, 3.0)}),
+    "initial.joints.slider_2": (
+        0.5,
+        "m or rad",
+        {"plant.initial_joint_positions": (0.5, 0.25, 0.125)},
+    ),
+    "faults[0].at": (
+        6.5,
+        "s",
+        {"plant.faults": ("joint_stuck slider_2 at 6.5 until 9", *FAULTS[1:])},
+    ),
+    "faults[0].until": (
+        8.5,
+        "s",
+        {"plant.faults": ("joint_stuck slider_2 at 5 until 8.5", *FAULTS[1:])},
+    ),
+    "faults[1].at": (
+        2.5,
+        "s",
+        {"plant.faults": (FAULTS[0], "joint_slow slider_1 0.5 at 2.5 until 7", FAULTS[2])},
+    ),
+    "faults[1].value": (
+        0.75,
+        "",
+        {"plant.faults": (FAULTS[0], "joint_slow slider_1 0.75 until 7", FAULTS[2])},
+    ),
+    "faults[2].until": (
+        4.5,
+        "s",
+        {"plant.faults": (*FAULTS[:2], "actuator_bias slider_3 0.125 until 4.5")},
+    ),
+    "mass": (1.25, "1", {"mass": [1.25, 1.25, 1.25, 1.25]}),
+    "mass.mass_2": (0.75, "1", {"mass": [1.0, 1.0, 0.75, 1.0]}),
+    "inertia.mass_3": (1.5, "1", {"inertia": [1.0, 1.0, 1.0, 1.5]}),
+    "com.mass_1.y": (
+        0.25,
+        "m",
+        {"com": [[0.0, 0.0, 0.0], [0.0, 0.25, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]},
+    ),
+    "com.*": (0.5, "m", {"com": [[0.5, 0.5, 0.5]] * 4}),
+}
+"""A value for each name, the unit of the name, and all that it changes."""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_name_changes_what_it_says_and_nothing_else(name: str, scenario: Scenario) -> None:
+    value, unit, expected = CASES[name]
+    targets, found = applied(name, scenario, value)
+    assert found == expected
+    assert {target.unit for target in targets} == {unit}
+    assert not any(target.text for target in targets)
+
+
+def test_several_bodies_have_a_target_each_or_one_together(scenario: Scenario) -> None:
+    bodies = ["base_link", "mass_1", "mass_2", "mass_3"]
+    assert [t.name for t in targets_of("mass.*", scenario)] == [f"mass.{each}" for each in bodies]
+    assert [t.name for t in targets_of("mass", scenario)] == ["mass"]
+    assert [t.name for t in targets_of("com.mass_2.*", scenario)] == [
+        "com.mass_2.x",
+        "com.mass_2.y",
+        "com.mass_2.z",
+    ]
+    assert [t.name for t in targets_of("com.*.z", scenario)] == [f"com.{b}.z" for b in bodies]
+
+
+def test_whole_numbers_stay_whole(scenario: Scenario) -> None:
+    _, found = applied("plant.sensors.seed", scenario, 6.7)
+    assert found == {"plant.sensors.seed": 7}
+
+
+@pytest.mark.parametrize("name", ["initial.rotvec.y", "goal.rotvec.y"])
+def test_turns_are_about_the_axes_of_the_robot(name: str, scenario: Scenario) -> None:
+    flight = targets_of(name, scenario)[0].apply(DrawnFlight.of(scenario), 0.25)
+    if name.startswith("initial"):
+        before: Any = scenario.plant.initial_orientation
+        after: Any = flight.scenario.plant.initial_orientation
+    else:
+        before, after = scenario.goal.quaternion, flight.scenario.goal.quaternion
+    turn = Rotation.from_quat(before).inv() * Rotation.from_quat(after)
+    np.testing.assert_allclose(turn.as_rotvec(), [0.0, 0.25, 0.0], atol=1e-12)
+
+
+def test_goals_are_shifted_in_the_world(scenario: Scenario) -> None:
+    flight = targets_of("goal.position.z", scenario)[0].apply(DrawnFlight.of(scenario), -0.5)
+    moved = np.subtract(flight.scenario.goal.position, scenario.goal.position)
+    np.testing.assert_allclose(moved, [0.0, 0.0, -0.5], atol=1e-15)
+
+
+def test_joints_start_as_near_to_zero_as_their_limits_allow() -> None:
+    plain = campaign().scenario
+    assert _start_positions(plain) == [0.0, 0.0, 0.0]
+    given = plain.with_overrides("plant", {"initial_joint_positions": [0.1, 0.2, -0.3]})
+    assert _start_positions(given) == [0.1, 0.2, -0.3]
+
+
+def test_masses_go_into_the_description_of_the_plant_alone(scenario: Scenario) -> None:
+    """Commanders that have no robot of their own believe in the one without dispersions."""
+    flight = DrawnFlight.of(scenario)
+    assert flight.inertial is None
+    assert flight.with_masses_in_urdf() is flight
+    for name, value in (("mass.mass_2", 1.5), ("inertia.mass_2", 2.0), ("com.mass_2.x", 0.25)):
+        flight = targets_of(name, scenario)[0].apply(flight, value)
+    heavier, usual = flight.inertial, InertialParameters.of(flight.nominal)
+    assert heavier is not None
+    described = InertialParameters.of(description_of(flight.with_masses_in_urdf().scenario))
+    for found in (heavier, described):
+        np.testing.assert_allclose(found.masses, usual.masses * [1.0, 1.0, 1.5, 1.0])
+        np.testing.assert_allclose(found.inertias[2], 3.0 * usual.inertias[2])
+        np.testing.assert_allclose(found.inertias[1], usual.inertias[1])
+        np.testing.assert_allclose(found.centers[2], usual.centers[2] + [0.25, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("tick_rate", "is nothing that can be dispersed"),
+        ("coordinated_control.tick_rate", "flies with planner"),
+        ("plant.tick_rat", "has no parameter 'tick_rat'. Did you mean 'tick_rate'?"),
+        ("plant.tf_links", "is neither a number nor a text"),
+        ("plant.initial_orientation[0]", "disperse initial.rotvec.x, y and z"),
+        ("plant.initial_position", "say which number of the list: plant.initial_position[0]"),
+        ("plant.tick_rate[0]", "it is no list"),
+        ("plant.initial_position[3]", "'3' is none of the places 0 to 2 of the list."),
+        ("plant.initial_joint_positions[3]", "nor one of the joints slider_1, slider_2, slider_3"),
+        ("mass.mass_9", "the robot has no body 'mass_9'; it has base_link, mass_1"),
+        ("com.mass_1", "'com.mass_1' must be com.BODY.x, y, z or *, or com.*; the bodies are base"),
+        ("com.mass_1.w", "must be com.BODY.x"),
+        ("initial.velocity.x", "initial.position.x, initial.position.y"),
+        ("initial.joints.slider_9", "has no joint 'slider_9'; it has slider_1, slider_2, slider_3"),
+        ("end_effector_goal.position.x", "has no goal for the end-effector"),
+        ("faults[3].at", "plant.faults has 3 fault(s); the first is faults[0]."),
+        ("faults[0].value", "a fault of the kind joint_stuck has no value"),
+    ],
+)
+def test_names_that_are_none_are_refused(name: str, words: str, scenario: Scenario) -> None:
+    with pytest.raises(ParameterError) as caught:
+        targets_of(name, scenario)
+    assert words in str(caught.value)
