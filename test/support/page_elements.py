@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -116,9 +117,15 @@ class Elements:
         )
         return found
 
-    def shown(self) -> list[dict[str, Any]]:
-        """Return what is shown, numbers to five digits."""
-        return [{"kind": each.kind, **_plain(each.shown)} for each in self.elements]
+    def shown(self) -> dict[str, dict[str, Any]]:
+        """Return what is shown by kind and label of the element, numbers to five digits."""
+        found: dict[str, dict[str, Any]] = {}
+        for each in self.elements:
+            names = (each.shown.get(key) for key in ("label", "title", "name"))
+            key = " ".join([each.kind.removeprefix("add_"), *filter(None, names)])
+            unused = (key if n == 1 else f"{key} ({n})" for n in count(1))
+            found[next(name for name in unused if name not in found)] = _plain(each.shown)
+        return found
 
 
 def _plain(value: Any) -> Any:
