@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -28,7 +29,7 @@ from spacerobot_ros.planning import (
 )
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.methods.optimal import OptimalGait
-from spacerobot_ros.resources import robot_file
+from spacerobot_ros.resources import robot_file, share_directory
 
 GOALS = int(os.environ.get("SPACEROBOT_CLEAR_GOALS", "2"))
 CLEARANCE = 0.01
@@ -38,12 +39,15 @@ ROBOTS = ("three_joint_arm", "seven_joint_arm", "servicer", "surveyor", "quadrup
 class Distances:
     """Distances of a robot by Pinocchio, whose model has the convex hulls of meshes."""
 
-    def __init__(self, robot: SpaceRobot, clearance: Clearance, start: Array) -> None:
+    def __init__(
+        self, robot: SpaceRobot, clearance: Clearance, start: Array, packages: Path
+    ) -> None:
         path = str(robot_file(robot.description.name))
         self._model = pinocchio.buildModelFromUrdf(path)
-        share = str(robot_file("surveyor").resolve().parents[2])
+        # Paths of meshes begin with the name of the package, whatever the folder's name is.
+        (packages / "spacerobot_ros").symlink_to(share_directory())
         self._solids = pinocchio.buildGeomFromUrdf(
-            self._model, path, pinocchio.GeometryType.VISUAL, package_dirs=[share]
+            self._model, path, pinocchio.GeometryType.VISUAL, package_dirs=[str(packages)]
         )
         for each in self._solids.geometryObjects:
             if hasattr(each.geometry, "buildConvexHull"):
@@ -112,11 +116,11 @@ def row(robot: SpaceRobot, request: PlanRequest, distances: Distances) -> Row:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
-def test_plans_to_random_goals_keep_clear(name: str) -> None:
+def test_plans_to_random_goals_keep_clear(name: str, tmp_path: Path) -> None:
     robot = SpaceRobot.from_file(robot_file(name))
     rng = np.random.default_rng(20260)
     start = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
-    distances = Distances(robot, Clearance(robot.description, CLEARANCE), start)
+    distances = Distances(robot, Clearance(robot.description, CLEARANCE), start, tmp_path)
     rows = []
     for number in range(GOALS):
         axis = rng.normal(size=3)
