@@ -112,6 +112,8 @@ setup(
         ],
         # Exact distances between links; pin, which the tests use, brings it as well.
         "collision": ["coal"],
+        # A second engine: spacerobot verify --engine mujoco.
+        "mujoco": ['mujoco>=4; python_version >= "3.11"'],
         # The 3D view of reports is MeshCat's. Only its script is used, but the package brings much.
         "viewer": ["meshcat", *MESHES, *VIEWER],
         "campaign": CAMPAIGN,

@@ -25,6 +25,7 @@ from spacerobot_ros.model.compilation import c_compiler
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
+from spacerobot_ros.simulation.mujoco_engine import mujoco_spec, without_environment
 
 _INTEGRATION_STEP = 0.001
 """Integration step of the dynamics benchmark, s."""
@@ -33,9 +34,6 @@ _STEPS_PER_CALL = 1000
 """Number of steps in one call of an engine."""
 
 _DYNAMICS_ROUNDS = 21
-
-_MIN_INERTIA = 1e-12
-"""Least moment of inertia in MuJoCo, which has no point masses, kg m^2."""
 
 
 def median_cpu_times(
@@ -144,14 +142,8 @@ def mujoco_model(mujoco: Any, description: RobotDescription, step: float) -> Any
 
     It integrates by Runge-Kutta 4 with steps of ``step`` s, as the plant does.
     """
-    spec = mujoco.MjSpec.from_string(description.urdf)
-    spec.worldbody.first_body().add_freejoint()
-    spec.compiler.boundinertia = _MIN_INERTIA
-    model = spec.compile()
-    for name in ("CONSTRAINT", "GRAVITY", "SENSOR", "SPRING", "DAMPER", "ISLAND", "AUTORESET"):
-        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    model.opt.timestep = step
+    model = mujoco_spec(mujoco, description).compile()
+    without_environment(mujoco, model, step)
     return model
 
 

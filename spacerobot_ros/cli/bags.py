@@ -225,15 +225,21 @@ def salvage_command(bag: Path, out: Path | None) -> None:
     type=click.FloatRange(min=0.0),
     help="Largest deviation that counts as equal (SI units; relative above 1).",
 )
-def verify_command(bag: Path, tolerance: float) -> None:
+@click.option(
+    "--engine",
+    type=click.Choice(["mujoco"]),
+    help="Have this engine fly the commands, too, and compare its states.",
+)
+def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
     """Re-simulate a BAG from its commands, and compare the states.
 
-    Exit code 0: every recorded state follows from the commands; 1: one does not, or the bag lacks
-    states by its own counts; 2: bad input.
+    Exit code 0: every recorded state follows from the commands; 1: one does not, the bag lacks
+    states by its own counts, or the other engine differs; 2: bad input.
     """
+    from spacerobot_ros.flight.second_opinion import AGREEMENT
     from spacerobot_ros.flight.verification import verify_bag
 
-    result = verify_bag(bag, tolerance)
+    result = verify_bag(bag, tolerance, mujoco=engine == "mujoco")
     click.echo(f"flown again {result.ticks} ticks, {result.duration:.9g} s")
     click.echo(f"compared    {result.messages} messages on {', '.join(result.topics)}")
     where = result.largest_at
@@ -244,3 +250,13 @@ def verify_command(bag: Path, tolerance: float) -> None:
     if result.missing:
         fail(f"The bag is not whole: {result.missing}")
     click.echo("verified    every published state follows from the commands")
+    if (other := result.second_opinion) is not None:
+        click.echo(f"engine      {other.engine}, {other.integrator}")
+        click.echo(
+            f"deviates    {other.position:.2g} m, {other.attitude:.2g} rad, joints "
+            f"{other.joints:.2g} m or rad, most at {other.time:.9g} s of {other.ticks} ticks"
+        )
+        if not other.agrees:
+            fail(f"{other.engine} differs by more than {AGREEMENT:g} m or rad.")
+        if other.until:
+            click.echo(f"note        compared until {other.until}")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.flight.reading import namespaces
+from spacerobot_ros.flight.second_opinion import EngineFlight, SecondOpinion
 from spacerobot_ros.messages.readers import CommandReader, UnreadableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import parse_robot
@@ -81,6 +82,8 @@ class Verification:
         Number of messages that were compared, and the topics that they are on.
     missing
         Message about states that the bag lacks, by its own counts; empty: it lacks none.
+    second_opinion
+        The differences to another engine under the same commands, if it was asked.
     largest, largest_at
         The largest deviation before the first difference, as a share of max(1, expected value), and
         where it is.
@@ -96,9 +99,12 @@ class Verification:
     difference: Difference | None
     topics: tuple[str, ...] = ()
     missing: str = ""
+    second_opinion: SecondOpinion | None = None
 
 
-def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Verification:
+def verify_bag(
+    path: str | os.PathLike[str], tolerance: float = TOLERANCE, *, mujoco: bool = False
+) -> Verification:
     """Re-simulate a bag from its first state, and look for the first difference.
 
     Parameters
@@ -107,13 +113,15 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
         As for :func:`~spacerobot_ros.bag.read_bag`.
     tolerance
         Deviation that is no difference, absolute below 1 (SI units) and relative above.
+    mujoco
+        Whether MuJoCo flies the commands, too, which the plant's actuators realise.
 
     Raises
     ------
     RecordingError
         There is no such bag, it is damaged, or it holds no flight in lockstep.
     SpaceRobotError
-        Its robot or its plant's parameters are refused.
+        Its robot or its plant's parameters are refused, or MuJoCo is not installed.
     """
     flight = _RecordedPlant.of(read_bag(path))
     published = _published_topics(flight)
@@ -131,7 +139,8 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
             "has a state in every tick."
         )
     initial = _initial_state(first, published, flight)
-    resimulation = _resimulate(flight, initial, _rates_at(first, published, flight), first, last)
+    rates = _rates_at(first, published, flight)
+    resimulation = _resimulate(flight, initial, rates, first, last, mujoco=mujoco)
     if flight.config.actuation == "velocity" and not _has_efforts(published):
         # An earlier version, which did not compute the efforts of servos, published zeros.
         resimulation.states["effort"][:] = 0.0
@@ -142,7 +151,7 @@ def verify_bag(path: str | os.PathLike[str], tolerance: float = TOLERANCE) -> Ve
         published = [p.after(first) for p in published]
     _require_no_reset(flight, published, resimulation)
     found = _Comparison(flight, published, resimulation, tolerance).result()
-    return replace(found, missing=missing)
+    return replace(found, missing=missing, second_opinion=_second_opinion(resimulation, published))
 
 
 # -- the contents of the bag ------------------------------------------------------------------
@@ -416,7 +425,7 @@ class _Resimulation:
     ``states`` are the quantities of the topics, (ticks + 1, size) each, from tick ``first`` to tick
     ``end``; ``stopped`` says why the plant went no further, ``latched`` in which tick a fault
     latched, after which nothing moved. ``commanded_ticks`` are those with a command for the joints,
-    ``refusals`` those whose command was refused, with its topic.
+    ``refusals`` those whose command was refused, with its topic. ``engine`` has flown beside it.
     """
 
     first: int
@@ -426,14 +435,21 @@ class _Resimulation:
     stopped: str = ""
     latched: int | None = None
     refusals: dict[int, tuple[str, Refusal]] = field(default_factory=dict)
+    engine: EngineFlight | None = None
 
 
 def _resimulate(
-    flight: _RecordedPlant, initial: InitialState | None, rates: Floats, first: int, last: int
+    flight: _RecordedPlant,
+    initial: InitialState | None,
+    rates: Floats,
+    first: int,
+    last: int,
+    *,
+    mujoco: bool,
 ) -> _Resimulation:
     """Step the plant of a flight from tick ``first`` to tick ``last``, or as far as it goes.
 
-    ``rates`` (n,) are the joint velocities in the first state.
+    ``rates`` (n,) are the joint velocities in the first state. ``mujoco``: MuJoCo flies beside it.
     RecordingError where sensors err, whose noise is only known from the very first state on.
     """
     plant = build_plant(flight.robot, flight.config, initial)
@@ -451,6 +467,8 @@ def _resimulate(
     recorded = [flight.commands(source) for source in commands.sources]
     states: dict[str, Floats] = {}
     done = _Resimulation(first, last, states, frozenset(recorded[0]))
+    if mujoco:
+        done.engine = EngineFlight(plant, flight.config.period_ns / SECOND)
     for tick in range(first, last + 1):
         if state.update() or tick == first:
             # Sensors that begin to err add the true states.
@@ -478,7 +496,22 @@ def _resimulate(
         except SpaceRobotError as error:
             done.end, done.stopped = tick, str(error)
             break
+        if done.engine is not None:
+            done.engine.follow()
     return done
+
+
+def _second_opinion(
+    resimulation: _Resimulation, published: list[_PublishedTopic]
+) -> SecondOpinion | None:
+    """Return the differences of the engine to the true states in the bag; None: none has flown."""
+    if resimulation.engine is None:
+        return None
+    topics = {p.topic.name: p for p in published}
+    odom, joints = (topics.get(f"{name}_true", topics[name]) for name in ("odom", "joint_states"))
+    ticks, rows, columns = np.intersect1d(odom.ticks, joints.ticks, return_indices=True)
+    n = joints.values.shape[1] // 3
+    return resimulation.engine.compared(ticks, odom.values[rows, :7], joints.values[columns, :n])
 
 
 def _require_no_reset(

@@ -22,6 +22,7 @@ from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.options import numbers
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.flight.second_opinion import SecondOpinion
 from spacerobot_ros.flight.verification import Difference, Verification
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.planning import METHODS, BasePath, GaitSchedule, Goal, PoseError
@@ -412,8 +413,9 @@ def verified(patch: pytest.MonkeyPatch, *words: str, **changes: Any) -> Result:
     at = Difference(1.25, "/odom", "pose.pose.position.y", 0.5, 0.25)
     whole = Verification(340, 34.0, 1705, 1.5e-13, at, None, ("/joint_states", "/odom"))
 
-    def verify(path: Path, tolerance: float) -> Verification:
+    def verify(path: Path, tolerance: float, *, mujoco: bool) -> Verification:
         assert (str(path), tolerance) == ("a.mcap", changes.pop("tolerance", 1e-9))
+        assert mujoco == ("second_opinion" in changes)
         return replace(whole, **changes)
 
     patch.setattr(verification, "verify_bag", verify)
@@ -433,6 +435,26 @@ def test_the_lines_of_a_verification(monkeypatch: pytest.MonkeyPatch) -> None:
     assert nothing[2] == "largest     0"
     lenient = verified(monkeypatch, "--tolerance", "0.01", tolerance=0.01)
     assert lenient.exit_code == 0, lenient.output
+
+
+def test_the_lines_of_a_second_opinion(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = SecondOpinion("MuJoCo 9.8", "by steps", 339, 2e-9, 3.2e-9, 9.8e-9, 17.5)
+
+    def told(other: SecondOpinion) -> Result:
+        return verified(monkeypatch, "--engine", "mujoco", second_opinion=other)
+
+    agrees = told(found)
+    assert agrees.exit_code == 0
+    assert agrees.stdout.splitlines()[4:] == [
+        "engine      MuJoCo 9.8, by steps",
+        "deviates    2e-09 m, 3.2e-09 rad, joints 9.8e-09 m or rad, most at 17.5 s of 339 ticks",
+    ]
+    note = told(replace(found, until="a joint is held")).stdout.splitlines()[-1]
+    assert note == "note        compared until a joint is held"
+    for name in ("position", "attitude", "joints"):
+        differs = told(replace(found, **{name: 1.1e-8}))
+        assert differs.exit_code == 1
+        assert differs.stderr == "MuJoCo 9.8 differs by more than 1e-08 m or rad.\n"
 
 
 def test_a_difference_is_exit_1_and_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

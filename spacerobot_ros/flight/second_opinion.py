@@ -1,0 +1,151 @@
+"""A second opinion on a recorded flight: its commands flown by another engine.
+
+The engine gets the joint rates, or the efforts and the wrench, that the plant's actuators have
+realised in each tick, after limits and faults; its states are compared with those in the bag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import attitude_error
+from spacerobot_ros.simulation.actuators import FaultyPlant
+from spacerobot_ros.simulation.effort_plant import EffortPlant
+from spacerobot_ros.simulation.mujoco_engine import EFFORT_STEP, VELOCITY_STEP, MujocoEngine
+from spacerobot_ros.simulation.plant import Plant, WrappedPlant
+
+AGREEMENT = 1e-8
+"""Largest deviation, m or rad, of an engine that agrees with a flight."""
+
+
+@dataclass(frozen=True)
+class SecondOpinion:
+    """The largest differences between a flight and another engine under the same commands.
+
+    Attributes
+    ----------
+    engine
+        Name and version of the engine.
+    integrator
+        Its integrator, with the longest step.
+    ticks
+        Number of ticks that were compared.
+    position, attitude, joints
+        Largest differences of the base's position, m, and attitude, rad, and of joint positions, m
+        or rad.
+    time
+        Simulated time of the largest one, s.
+    until
+        Reason why the engine flew no further; empty: it flew to the end.
+    """
+
+    engine: str
+    integrator: str
+    ticks: int
+    position: float
+    attitude: float
+    joints: float
+    time: float
+    until: str = ""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether all differences are at most :data:`AGREEMENT`."""
+        return max(self.position, self.attitude, self.joints) <= AGREEMENT
+
+
+class EngineFlight:
+    """Flies a robot in MuJoCo beside a plant, tick by tick.
+
+    Parameters
+    ----------
+    plant
+        The plant at its first state.
+    period
+        Duration of a tick, s.
+
+    Raises
+    ------
+    SpaceRobotError
+        MuJoCo is not installed, or refuses the robot.
+    """
+
+    def __init__(self, plant: FaultyPlant, period: float) -> None:
+        self._plant, self._period = plant, period
+        dynamics: Plant = plant
+        while isinstance(dynamics, WrappedPlant):
+            dynamics = dynamics.plant
+        self._effort_plant = dynamics if isinstance(dynamics, EffortPlant) else None
+        self._engine = MujocoEngine(plant.robot.description, plant.pose, plant.q)
+        self._engine.move(plant.twist, plant.qdot)
+        self._momenta = plant.expected_momenta.copy()
+        self._stopped = plant.limit_counts["stroke"].copy()
+        self._faults = plant.active
+        self._first = plant.tick
+        self._poses, self._shapes = [self._engine.pose], [self._engine.q]
+        self._until = ""
+
+    def follow(self) -> None:
+        """Fly the tick that the plant has just taken."""
+        if self._until:
+            return
+        plant = self._effort_plant
+        if plant is None:
+            self._engine.step_under_velocities(self._plant.qdot, self._momenta, self._period)
+        elif reason := self._unknown_force():
+            self._until = f"{reason} at {self._plant.time:.9g} s, which the engine does not model"
+            return
+        else:
+            self._engine.step_under_efforts(plant.effort, plant.wrench, self._period)
+        self._poses.append(self._engine.pose)
+        self._shapes.append(self._engine.q)
+
+    def _unknown_force(self) -> str:
+        """Return a clause on a force in the last tick that the commands do not have; or none."""
+        plant, before = self._plant, self._faults
+        self._faults = plant.active
+        names = plant.robot.joint_names
+        stuck = [each.target for each in (*before, *plant.active) if each.kind == "joint_stuck"]
+        if stuck:
+            return f"joint '{stuck[0]}' is held"
+        stopped = np.flatnonzero(plant.limit_counts["stroke"] > self._stopped)
+        return f"joint '{names[int(stopped[0])]}' is at its stop" if stopped.size else ""
+
+    def compared(self, ticks: npt.NDArray[np.int64], poses: Array, shapes: Array) -> SecondOpinion:
+        """Return the differences to the states in a bag.
+
+        Parameters
+        ----------
+        ticks
+            (N,) ticks of the states.
+        poses, shapes
+            (N, 7) poses of the base, and (N, n) joint positions.
+        """
+        rows = ticks - self._first
+        known = (rows >= 0) & (rows < len(self._poses))
+        rows = rows[known]
+        own = np.array(self._poses)[rows]
+        place = np.linalg.norm(own[:, :3] - poses[known, :3], axis=1)
+        turn = np.array(
+            [
+                np.linalg.norm(attitude_error(a, b))
+                for a, b in zip(own[:, 3:], poses[known, 3:], strict=True)
+            ]
+        )
+        bend = np.abs(np.array(self._shapes)[rows] - shapes[known]).max(axis=1, initial=0.0)
+        worst = int(np.argmax(np.maximum(np.maximum(place, turn), bend)))
+        step = VELOCITY_STEP if self._effort_plant is None else EFFORT_STEP
+        return SecondOpinion(
+            engine=self._engine.name,
+            integrator=f"Runge-Kutta 4 with steps of at most {step:g} s",
+            ticks=len(rows) - 1,
+            position=float(place.max()),
+            attitude=float(turn.max()),
+            joints=float(bend.max()),
+            time=float(ticks[known][worst]) * self._period,
+            until=self._until,
+        )

@@ -1,0 +1,197 @@
+"""A free-floating robot in MuJoCo, moved by the commands that a plant has carried out.
+
+An independent engine: masses, kinematics and inertia matrices are MuJoCo's, from the same URDF.
+Under efforts it integrates the equations of motion by its own Runge-Kutta 4. Under velocities the
+base follows from MuJoCo's momentum matrices, by a Runge-Kutta 4 here. Contacts, stops and friction
+are off.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import RobotDescriptionError, SpaceRobotError
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
+
+EFFORT_STEP = 0.001
+"""Longest Runge-Kutta step under efforts, s."""
+
+VELOCITY_STEP = 0.01
+"""Longest Runge-Kutta step of the base under held velocities, s."""
+
+
+_MIN_INERTIA = 1e-12
+"""Smallest principal inertia, kg m^2: MuJoCo takes no point masses."""
+
+
+def import_mujoco() -> Any:
+    """Return the module of MuJoCo.
+
+    Raises
+    ------
+    SpaceRobotError
+        It is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError as error:
+        raise SpaceRobotError(
+            "MuJoCo is not installed: pip install 'spacerobot_ros[mujoco]'."
+        ) from error
+    return mujoco
+
+
+def mujoco_spec(mujoco: Any, description: RobotDescription) -> Any:
+    """Return MuJoCo's specification of a robot whose base is free; its shapes are left out.
+
+    Raises
+    ------
+    RobotDescriptionError
+        MuJoCo refuses the robot, or a joint follows another one.
+    """
+    if description.has_mimic_joints:
+        raise RobotDescriptionError(
+            f"Robot '{description.name}' has joints that follow others (<mimic>), which MuJoCo "
+            "does not read from a URDF."
+        )
+    root = ElementTree.fromstring(description.urdf)
+    for link in root.iter("link"):
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(shape)  # MuJoCo would look for the files of meshes.
+    try:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+    except ValueError as error:
+        raise _refused(description, error) from error
+    spec.compiler.boundinertia = _MIN_INERTIA
+    spec.worldbody.first_body().add_freejoint()
+    return spec
+
+
+def without_environment(mujoco: Any, model: Any, step: float) -> None:
+    """Have a model integrate free motion by Runge-Kutta 4 with steps of ``step`` s."""
+    for name in ("CONSTRAINT", "GRAVITY", "SENSOR", "SPRING", "DAMPER", "ISLAND", "AUTORESET"):
+        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    model.opt.timestep = step
+
+
+def _refused(description: RobotDescription, error: ValueError) -> RobotDescriptionError:
+    reason = str(error).removesuffix(".")
+    return RobotDescriptionError(f"MuJoCo refuses robot '{description.name}': {reason}.")
+
+
+class MujocoEngine:
+    """A robot in free space, in MuJoCo.
+
+    Parameters
+    ----------
+    description
+        The robot.
+    pose
+        (7,) position ``r_WB``, m, and quaternion ``R_WB`` (x, y, z, w) of the base at the start.
+    q
+        (n,) joint positions at the start, m or rad.
+
+    Raises
+    ------
+    RobotDescriptionError
+        MuJoCo refuses the robot, or a joint follows another one.
+    SpaceRobotError
+        MuJoCo is not installed.
+    """
+
+    def __init__(self, description: RobotDescription, pose: Array, q: Array) -> None:
+        self._mujoco = mujoco = import_mujoco()
+        spec = mujoco_spec(mujoco, description)
+        # The wrench turns with the base, at every stage of every step.
+        spec.worldbody.first_body().add_site(name="wrench")
+        for axis in np.eye(6):
+            spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_SITE, target="wrench", gear=axis.tolist())
+        names = description.joint_names
+        for name in names:
+            spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+        try:
+            self._model = spec.compile()
+        except ValueError as error:
+            raise _refused(description, error) from error
+        without_environment(mujoco, self._model, EFFORT_STEP)
+        self._data = mujoco.MjData(self._model)
+        joints = [self._model.joint(name) for name in names]
+        self._q = [int(joint.qposadr[0]) for joint in joints]
+        self._qdot = [int(joint.dofadr[0]) for joint in joints]
+        self._place(pose, q)
+
+    @property
+    def name(self) -> str:
+        """Name and version of the engine."""
+        return f"MuJoCo {self._mujoco.__version__}"
+
+    @property
+    def pose(self) -> Array:
+        """(7,) position, m, and quaternion (x, y, z, w) of the base link."""
+        return np.append(self._data.qpos[:3], np.roll(self._data.qpos[3:7], -1))
+
+    @property
+    def q(self) -> Array:
+        """(n,) joint positions, m or rad."""
+        return np.array(self._data.qpos[self._q])
+
+    def move(self, twist: Array, qdot: Array) -> None:
+        """Set the twist (6,) ``v_WB_B``, ``omega_WB_B`` of the base and the joint rates (n,)."""
+        R_WB = matrix_from_quaternion(self.pose[3:])
+        self._data.qvel[:3] = R_WB @ twist[:3]
+        self._data.qvel[3:6] = twist[3:]
+        self._data.qvel[self._qdot] = qdot
+
+    def step_under_efforts(self, effort: Array, wrench: Array, duration: float) -> None:
+        """Fly for ``duration`` s under joint efforts (n,) and a base wrench (6,) in B."""
+        steps = math.ceil(duration / EFFORT_STEP - 1e-9)
+        self._model.opt.timestep = duration / steps
+        self._data.ctrl[:6] = wrench
+        self._data.ctrl[6:] = effort
+        self._mujoco.mj_step(self._model, self._data, steps)
+
+    def step_under_velocities(self, qdot: Array, momenta: Array, duration: float) -> None:
+        """Fly for ``duration`` s at joint rates (n,) and constant momenta.
+
+        ``momenta`` (6,) are linear, kg m/s, over angular about the centre of mass, kg m^2/s, in W.
+        """
+        steps = math.ceil(duration / VELOCITY_STEP - 1e-9)
+        h = duration / steps
+
+        def rate(pose: Array, q: Array) -> Array:
+            self._place(pose, q)
+            v_W, omega_B = self._base_velocity(qdot, momenta)
+            return np.append(v_W, quaternion_multiply(pose[3:], np.append(omega_B, 0.0)) / 2)
+
+        for _ in range(steps):
+            pose, q = self.pose, self.q
+            k1 = rate(pose, q)
+            k2 = rate(pose + h / 2 * k1, q + h / 2 * qdot)
+            k3 = rate(pose + h / 2 * k2, q + h / 2 * qdot)
+            k4 = rate(pose + h * k3, q + h * qdot)
+            pose = pose + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            self._place(pose, q + h * qdot)
+
+    def _place(self, pose: Array, q: npt.ArrayLike) -> None:
+        self._data.qpos[:3] = pose[:3]
+        self._data.qpos[3:7] = np.roll(pose[3:] / np.linalg.norm(pose[3:]), 1)
+        self._data.qpos[self._q] = q
+
+    def _base_velocity(self, qdot: Array, momenta: Array) -> tuple[Array, Array]:
+        """Return the base's velocity in W and its rate in B, by MuJoCo's momentum matrices."""
+        mujoco, model, data = self._mujoco, self._model, self._data
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        linear, angular = np.zeros((2, 3, model.nv))
+        mujoco.mj_jacSubtreeCom(model, data, linear, 1)
+        mujoco.mj_angmomMat(model, data, angular, 1)
+        A = np.vstack([float(model.body_subtreemass[1]) * linear, angular])
+        base = np.linalg.solve(A[:, :6], momenta - A[:, self._qdot] @ qdot)
+        return base[:3], base[3:]
