@@ -55,8 +55,7 @@ def analyze_command(
     picture: Path | None,
     json_file: Path | None,
 ) -> None:
-    """Analyse what loops of the joints of ROBOT do to its base, and where its end-effector comes
-    to dynamic singularities.
+    """Analyse the loops, dynamic singularities and workspaces of ROBOT.
 
     ROBOT is a name or a URDF file. The methods that suit it are listed.
     """

@@ -28,7 +28,7 @@ def test_a_search_reports_every_start_and_the_best_so_far() -> None:
     with report_progress(seen.append):
         gait = plan(
             "sliding_masses", position=(0.2, -0.1, 0.05), rotvec=(0.1, 0.0, 0.1), starts=3,
-            answers=3, agreeing=0, intervals=16, control_period=0.1,
+            answers=3, agreeing=0, intervals=16, control_period=0.1, cache=0,
         )  # fmt: skip
     starts = [each.starts for each in seen]
     assert starts[:3] == [1, 2, 3]
