@@ -451,8 +451,12 @@ def test_the_lines_of_a_second_opinion(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
     note = told(replace(found, until="a joint is held")).stdout.splitlines()[-1]
     assert note == "note        compared until a joint is held"
-    for name in ("position", "attitude", "joints"):
-        differs = told(replace(found, **{name: 1.1e-8}))
+    for other in (
+        replace(found, position=1.1e-8),
+        replace(found, attitude=1.1e-8),
+        replace(found, joints=1.1e-8),
+    ):
+        differs = told(other)
         assert differs.exit_code == 1
         assert differs.stderr == "MuJoCo 9.8 differs by more than 1e-08 m or rad.\n"
 
