@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,10 +53,10 @@ ROBOTS = {
 @pytest.mark.parametrize(
     ("name", "method"), [(name, each) for name, (_, given) in ROBOTS.items() for each in given]
 )
-def test_flights_with_errors_keep_clear(name: str, method: str) -> None:
+def test_flights_with_errors_keep_clear(name: str, method: str, tmp_path: Path) -> None:
     robot = SpaceRobot.from_file(robot_file(name))
     start = np.clip(np.array(ROBOTS[name][0] or np.zeros(robot.n)), robot.lower, robot.upper)
-    distances = Distances(robot, Clearance(robot.description, CLEARANCE), start)
+    distances = Distances(robot, Clearance(robot.description, CLEARANCE), start, tmp_path)
     rng = np.random.default_rng(77)
     nearest, outcomes, corrections = [], Counter[str](), 0
     for number in range(DRAWS):
