@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.crossing import LINKS, URDF, distance
 
-from spacerobot_ros import fly, load_scenario, read_bag
+from spacerobot_ros import fly, read_bag
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.flight.flight import Flight
@@ -155,18 +155,20 @@ def test_a_flight_that_does_not_measure_it_has_no_clearance(
 
 
 @pytest.mark.slow
-def test_the_nodes_publish_the_clearances_that_a_flight_without_ros_has(tmp_path: Path) -> None:
-    scenario = load_scenario("reach").with_overrides("plant", {"clearance_period": 0.25})
-    summary = run_scenario(scenario, tmp_path / "ros.mcap").summary
-    flight = fly(scenario)
-    assert summary["clearance_m"] == pytest.approx(flight.measures.clearance, abs=1e-9)
-    flight.save(tmp_path / "alone.mcap")
-    named = []
+def test_the_nodes_report_what_a_flight_without_ros_does(
+    through: Flight, tmp_path: Path, ros_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+    summary = run_scenario(through.scenario, tmp_path / "ros.mcap").summary
+    assert summary["clearance_m"] == pytest.approx(through.measures.clearance, abs=1e-9)
+    through.save(tmp_path / "alone.mcap")
+    said = []
     for name in ("ros", "alone"):
-        series = read_bag(tmp_path / f"{name}.mcap")["/clearance"]
-        named.append([(m.name, m.message) for _, m in series.messages()])
-    assert named[0] == named[1]
-    assert len(named[0]) == 7
+        bag = read_bag(tmp_path / f"{name}.mcap")
+        events = [m.message for _, m in bag["/events"].messages() if "touch" in m.message]
+        said.append([(m.name, m.message) for _, m in bag["/clearance"].messages()] + events)
+    assert said[0] == said[1]
+    assert len(said[0]) > 100
 
 
 def test_flights_recorded_before_there_was_a_clearance_are_without() -> None:
