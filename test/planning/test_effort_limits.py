@@ -10,11 +10,16 @@ import numpy.typing as npt
 import pytest
 from planning.test_optimal import FOLDER
 from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
+from support.oracles.oracle import Motion
 from support.planners import planner_of
 from support.tracked_flight import TrackedFlight, track, with_effort_limits
 from support.urdf_text import link
 
+from spacerobot_ros import fly
+from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, plan
@@ -165,6 +170,59 @@ def test_a_tenth_of_the_efforts(name: str, start: list[float], turn: list[float]
     slow = plan(robot, **asked, effort_limits=1)
     assert_flies(robot, slow, turn, 1e-4)
     assert slow.duration < fast.duration * 3.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "start", "turn"),
+    [
+        ("planar_chain", CHAIN_START, [0.0, 0.0, 0.3]),
+        ("three_joint_arm", [0.0, -np.pi / 4, np.pi / 2], [0.2, -0.3, 0.25]),
+        ("sliding_masses", [0.0, 0.0, 0.0], [0.2, -0.1, 0.1]),
+        ("servicer", [0.0, -1.2, 2.0, 0.0, 0.8, 0.0], [0.1, -0.2, 0.5]),
+        ("seven", [0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0], [0.05, -0.03, 0.04]),
+    ],
+)
+def test_bags_of_servos_with_a_tenth_of_the_efforts_keep_them(
+    name: str, start: list[float], turn: list[float], tmp_path: Path
+) -> None:
+    """No option is set; efforts are Pinocchio's, of the positions and velocities in the bag."""
+    urdf = seven_joints() if name == "seven" else (FOLDER / f"{name}.urdf").read_text("utf-8")
+    free = SpaceRobot.from_urdf(urdf)
+    quick = {"answers": 1, "intervals": 40, "cache": 0}
+    chosen: dict[str, Any] = {f"planner.optimal.{k}": value for k, value in quick.items()}
+    chosen |= {f"{node}.tick_rate": 50.0 for node in ("plant", "planner")}
+    chosen |= {"planner.position_tolerance": 10.0, "planner.optimal.base_position": 2}
+    chosen["plant.initial_joint_positions"] = start
+    asked: dict[str, Any] = {"rotvec": turn, "method": "optimal", "parameters": chosen}
+    fast = fly(free, (0.0, 0.0, 0.0), **asked)
+    taken = np.abs(fast.effort).max(axis=0)
+    limits = dict(zip(free.joint_names, (0.1 * taken).tolist(), strict=True))
+    robot = SpaceRobot.from_urdf(with_effort_limits(urdf, limits))
+    slow = fly(robot, (0.0, 0.0, 0.0), **asked)
+    assert slow.outcome is Outcome.REACHED
+    slow.save(tmp_path / "slow.mcap")
+    joints = read_bag(tmp_path / "slow.mcap")["/joint_states"]
+    q, rates, efforts = (joints.field(each) for each in ("position", "velocity", "effort"))
+    oracle = PinocchioOracle(urdf, robot.joint_names)
+    largest = np.zeros(robot.n)
+    for k in range(len(q) - 1):
+        mean, change = (rates[k] + rates[k + 1]) / 2, (rates[k + 1] - rates[k]) * 50.0
+        twist = oracle.base_twist(q[k], mean)
+        attitude = np.array([0.0, 0.0, 0.0, 1.0])
+        motion = Motion(q[k], mean, attitude, np.zeros(3), np.zeros(3), twist[3:])
+        # The base goes as no force from outside acts; the joints are accelerated.
+        at_rest = oracle.forward_dynamics(motion, np.zeros(6), np.zeros(robot.n))[6:]
+        by_joint = [
+            oracle.forward_dynamics(motion, np.zeros(6), unit)[6:] - at_rest
+            for unit in np.eye(robot.n)
+        ]
+        tau = np.linalg.solve(np.column_stack(by_joint), change - at_rest)
+        np.testing.assert_allclose(efforts[k + 1], tau, rtol=1e-6, atol=1e-6 * taken.max())
+        largest = np.maximum(largest, np.abs(tau))
+    share = largest / robot.effort_limit
+    assert 0.9 < share.max() <= 1 + 1e-5
+    assert slow.time[-1] > 1.3 * fast.time[-1]
 
 
 def test_efforts_have_a_reserve_where_a_controller_is_given_a_reference(chain: SpaceRobot) -> None:

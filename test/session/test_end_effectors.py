@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation
 from support.hand_motion import end_of_motion
 
 from spacerobot_ros import fly
+from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.reading import read_run
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.scenario import Scenario, load_scenario, scenario_text
+from spacerobot_ros.scenario import Scenario, load_scenario, scenario_or_robot, scenario_text
 from spacerobot_ros.session.run import run_scenario
 
 QUICK = {"optimal.answers": 1, "optimal.intervals": 20, "optimal.cache": 0}
@@ -27,6 +29,43 @@ def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def quick(name: str) -> Scenario:
     return load_scenario(name).with_overrides("planner", QUICK)
+
+
+TEN_GOALS = [
+    *(("three_joint_arm", ("end_effector",), seed) for seed in range(4)),
+    *(("seven_joint_arm", ("link_7",), seed) for seed in range(3)),
+    *(("dual_arm", ("left_link_7", "right_link_7"), seed) for seed in range(3)),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "links", "seed"), TEN_GOALS)
+def test_random_goals_on_the_topics_of_hands_are_reached(
+    name: str, links: tuple[str, ...], seed: int, tmp_path: Path
+) -> None:
+    """Positions where a random motion of the joints leads; the bag has the poses of the hands."""
+    urdf, rng = robot_file(name).read_text("utf-8"), np.random.default_rng(seed)
+    robot = SpaceRobot.from_urdf(urdf)
+    start = rng.uniform(-0.4, 0.4, robot.n).clip(robot.lower, robot.upper)
+    end = (start + rng.uniform(-0.5, 0.5, robot.n)).clip(robot.lower, robot.upper)
+    way = start + np.linspace(0.0, 1.0, 60)[:, np.newaxis] * (end - start)
+    aims = end_of_motion(urdf, robot.joint_names, way, list(links))
+    settings = {"initial_joint_positions": start.tolist(), "tick_rate": 20.0}
+    scenario = (
+        scenario_or_robot(name)
+        .with_overrides("plant", {**settings, "end_effectors": list(links)})
+        .with_overrides("planner", {**QUICK, "method": "optimal", "tick_rate": 20.0})
+        .with_overrides("planner", {"clearance": 0.0})
+        .with_end_effectors([EndEffectorGoal(link, aims[link][0]) for link in links], frozenset())
+    )
+    result = run_scenario(scenario, tmp_path / "run.mcap")
+    assert result.succeeded
+    bag = read_bag(tmp_path / "run.mcap")
+    for link in links:
+        goal, pose = bag[f"/{link}/goal_pose"], bag[f"/{link}/pose"]
+        xyz = [f"pose.position.{axis}" for axis in "xyz"]
+        np.testing.assert_allclose(goal.table(xyz, 3)[-1], aims[link][0], atol=1e-12)
+        np.testing.assert_allclose(pose.table(xyz, 3)[-1], aims[link][0], atol=1e-5)
 
 
 @pytest.mark.slow
