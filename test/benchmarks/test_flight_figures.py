@@ -333,6 +333,8 @@ def test_the_plant_goes_before_its_commanders(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     assert not real_time.prioritise(stack)
+    monkeypatch.delattr(os, "sched_setscheduler")
+    assert not real_time.prioritise(stack), "a system without it"
 
 
 def test_memory_is_of_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -583,9 +585,13 @@ def test_a_long_flight_has_a_verdict_samples_and_a_picture(
         "threads",
     ]
     assert figure.axes[-1].get_xlabel() == "wall time [min]"
+    assert figure.get_size_inches().tolist() == [9.0, 9.0]
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == list(samples)
     for axes in figure.axes:
         assert [line.get_label() for line in axes.lines] == ["plant", "recorder"]
         assert axes.get_ylim()[0] == 0.0
+        assert {line.get_linewidth() for line in axes.lines} == {1.0}
+        assert axes.get_xgridlines()[0].get_alpha() == 0.3
         assert axes.lines[0].get_xdata()[-1] == 2.0
         assert np.all(axes.lines[1].get_ydata()[:30] == 20.0)
 
