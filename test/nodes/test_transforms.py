@@ -160,6 +160,7 @@ def test_frames_have_the_prefix_that_they_are_given(harness: Harness, tmp_path: 
     assert (odom.header.frame_id, odom.child_frame_id) == ("orbit", "one/base_link")
 
 
+@pytest.mark.slow
 def test_a_recorder_writes_frames_as_often_as_it_is_to(harness: Harness, tmp_path: Path) -> None:
     every = {"tf_period": 0.2}
     bag = record_states(harness, tmp_path / "bag.mcap", "planar_chain", every, tf_period=0.0)
