@@ -261,6 +261,7 @@ def _frame(axes: Axes) -> str:
 def _line(line: Line2D) -> str:
     style = f"{to_hex(line.get_color())} {line.get_linewidth():g} {line.get_linestyle()}"
     style += f" {line.get_marker()} {line.get_markersize():g} {line.get_drawstyle()}"
+    style += f" {line.get_markeredgewidth():g}" if line.get_marker() != "None" else ""
     return f"{style} {_look(line)} {_numbers(line.get_xydata())}"
 
 
@@ -283,5 +284,8 @@ def _texts(axes: Axes) -> list[Text]:
 
 def _text(text: Text) -> str:
     place = _numbers(text.get_position())
-    style = f"{to_hex(text.get_color())} {text.get_fontsize():.4g}"
+    style = f"{to_hex(text.get_color())} {text.get_fontsize():.4g} {text.get_fontweight()}"
+    style += (
+        f" {text.get_horizontalalignment()} {text.get_verticalalignment()} {text.get_rotation():g}"
+    )
     return f"{text.get_text()} {place} {style} {_look(text)}"
