@@ -125,7 +125,9 @@ def test_a_loop_of_the_size_turns_the_base_by_the_angle(guesses: InitialGuesses)
     assert still._loop_size(START, half, 0.3) == 1.0
 
 
-@pytest.mark.parametrize("loop", set(initial_guesses._LOOPS), ids=lambda each: each.__name__)
+@pytest.mark.parametrize(
+    "loop", dict.fromkeys(initial_guesses._LOOPS), ids=lambda each: each.__name__
+)
 @pytest.mark.parametrize("joints", [2, 3, 5])
 def test_loops_are_closed_and_of_about_unit_size(loop: initial_guesses.Loop, joints: int) -> None:
     s, rng, sizes = np.linspace(0.0, 1.0, 4001), np.random.default_rng(4), []
