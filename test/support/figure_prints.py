@@ -31,11 +31,20 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 from scipy.spatial.transform import Rotation
 
+from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.planning.core.workspaces import Workspaces
 from spacerobot_ros.report import planning_figures
-from spacerobot_ros.report.figures import WIDTH, PictureFormat, ReportFigure, drawing
+from spacerobot_ros.report.events import _MARKS, FlightEvent, draw_events, event_style
+from spacerobot_ros.report.figures import (
+    WIDTH,
+    PictureFormat,
+    ReportFigure,
+    drawing,
+    new_figure,
+    panel,
+)
 from spacerobot_ros.report.figures_over_time import (
     momentum_figure,
     shape_figure,
@@ -200,7 +209,26 @@ def _plan() -> dict[str, str]:
         return prints_of(planning_figures._plan_figure(problem, trial))
 
 
+def _events() -> dict[str, str]:
+    """Return the looks of all kinds of events on a page and in the picture below a time axis."""
+    kinds = list(_MARKS)
+    about = {"fault": "joint_stuck elbow", "method": "some", "node": "/plant", "goal_id": "7.5"}
+    events = [
+        FlightEvent(0.5 * number, "/node", Event(kind, "Something.", about=about))
+        for number, kind in enumerate(kinds)
+    ]
+    found = {kind.value: _command(event_style(kind)) for kind in kinds}
+    found |= {f"text of {each.event.kind.value}": each.text for each in events}
+    with drawing():
+        figure = new_figure(3.0)
+        axes = panel(figure, 0.75, 1.0, 6.0, 1.5)
+        axes.set_xlim(0.25, 5.0)
+        draw_events(axes, events)
+        return found | prints_of(figure)
+
+
 PICTURES: dict[str, Callable[[], dict[str, str]]] = {
+    "marks of events": _events,
     "maps of an arm": lambda: _coarse_map("three_joint_arm", (0, 1, 2), [0.1, -0.7, 1.5]),
     "maps of sliders": lambda: _coarse_map("sliding_masses", (0, 2, 1), [0.1, -0.2, 0.3]),
     "workspaces": _workspaces,
