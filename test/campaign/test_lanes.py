@@ -37,9 +37,8 @@ def flown(engine: LanesEngine | FlightsEngine, made: Campaign) -> dict[int, Row]
     return {row.draw.number: row for row in rows}
 
 
-@pytest.mark.parametrize(
-    ("tolerance", "most"), some_fast([(0.05, 3), (0.0012, 3), (0.0012, 0)], (0.0012, 3))
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("tolerance", "most"), [(0.05, 3), (0.0012, 3), (0.0012, 0)])
 def test_the_same_draw_is_the_same_flight_in_every_engine(tolerance: float, most: int) -> None:
     """A tight tolerance makes some need a correction, which lanes leave to the planner."""
     settings = {

@@ -43,7 +43,7 @@ def analyzed(folder: Path, robot: str, *more: str) -> tuple[dict[str, Any], list
     ("robot", "suits", "rank", "first"),
     [
         ("sliding_masses", {"lie_bracket", "area_loop"}, 3, "optimal"),
-        ("three_joint_arm", {"area_loop"}, 3, "optimal"),
+        pytest.param("three_joint_arm", {"area_loop"}, 3, "optimal", marks=pytest.mark.slow),
         ("planar_chain", {"square_path"}, 1, "optimal"),
     ],
 )

@@ -239,11 +239,12 @@ def test_a_verified_bag_and_one_that_is_not(monkeypatch: pytest.MonkeyPatch) -> 
     asked: list[Any] = []
     result = SimpleNamespace(
         **{"ticks": 40, "duration": 2.0, "messages": 120, "topics": ["odom", "momentum"]},
-        **{"largest": 1.25e-10, "difference": None, "missing": None},
+        **{"largest": 1.25e-10, "difference": None, "missing": None, "second_opinion": None},
         largest_at=SimpleNamespace(field="pose", topic="odom", time=0.35),
     )
 
-    def verify(bag: Path, tolerance: float) -> Any:
+    def verify(bag: Path, tolerance: float, *, mujoco: bool) -> Any:
+        assert not mujoco
         asked.append((bag, tolerance))
         return result
 

@@ -33,6 +33,7 @@ print(schedule.duration, flight)
 """
 
 
+@pytest.mark.slow
 def test_plan_fly_and_plot_in_eight_lines_without_ros() -> None:
     """In a process of its own, which must not have loaded ROS."""
     assert len(EIGHT_LINES.strip().splitlines()) <= 8

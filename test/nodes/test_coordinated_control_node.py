@@ -16,7 +16,6 @@ from std_msgs.msg import String
 from support.control_loop import KD, KP, SHAPE, TICK_NS, TIP, URDF, Loop, pose
 from support.ros_harness import LATCHED, Harness, nanoseconds
 from support.sentences import assert_one_sentence
-from support.slow import some_fast
 
 from spacerobot_ros.nodes import CoordinatedControlNode, PlantNode
 
@@ -50,7 +49,8 @@ def test_without_a_goal_the_pose_of_the_first_state_is_held(harness: Harness) ->
     assert nanoseconds(loop.probe.last("base_wrench").header.stamp) == 2 * TICK_NS
 
 
-@pytest.mark.parametrize("law", some_fast(["transposed_jacobian", "model_based"], "model_based"))
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["transposed_jacobian", "model_based"])
 def test_a_drifting_robot_is_brought_back_to_where_it_was(harness: Harness, law: str) -> None:
     """The whole loop: a plant that drifts and tumbles, and nobody who gives a goal."""
     harness.make(

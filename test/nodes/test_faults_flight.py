@@ -108,6 +108,7 @@ def test_without_a_tolerance_noisy_rates_are_taken_for_drift(harness: Harness) -
     assert_one_sentence(status.message, "drifts")
 
 
+@pytest.mark.slow
 def test_a_goal_is_aborted_while_its_end_is_averaged(harness: Harness) -> None:
     flight = sliders(harness, averaging=2000)
     flight.send(*TURNED)

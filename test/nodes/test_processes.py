@@ -143,6 +143,7 @@ def test_a_bad_start_ends_with_a_sentence_and_exit_code_2(
         assert_one_sentence(sentence, *mentions)
 
 
+@pytest.mark.slow
 def test_a_signal_ends_a_node_with_exit_code_0(
     start: Start, harness: Harness, tmp_path: Path
 ) -> None:

@@ -25,7 +25,10 @@ from spacerobot_ros.planning.methods.registry import method_options
 Array = npt.NDArray[np.float64]
 
 FOLDER = Path(__file__).parents[2] / "urdf"
-QUICK: dict[str, Any] = {"cache": 0, "answers": 1, "intervals": 30, "control_period": 0.1}
+QUICK: dict[str, Any] = {
+    **{"cache": 0, "answers": 1, "intervals": 30},
+    **{"control_period": 0.1, "clearance": 0.0},
+}
 PLACE, ATTITUDE = np.array([0.4, -0.3, 0.2]), Rotation.from_rotvec([0.3, -0.5, 0.4])
 ARM = np.array([0.4, -0.9, 1.1])
 
@@ -97,6 +100,7 @@ def test_a_pose_is_reached_with_the_base_free() -> None:
     assert_within_limits(robot_of("seven_joint_arm"), schedule)
 
 
+@pytest.mark.slow
 def test_the_attitude_of_the_base_is_reached_with_a_position() -> None:
     r, _ = beside("seven_joint_arm", SEVEN, SEVEN_END, "link_7")
     turned = (ATTITUDE * Rotation.from_rotvec([0.02, 0.03, -0.04])).as_rotvec()

@@ -90,6 +90,7 @@ def test_joints_stay_out_of_a_box(arm: SpaceRobot) -> None:
     assert of_arm(arm, turn, keep_out=box).positions[:, 1].max() <= -0.7
 
 
+@pytest.mark.slow
 def test_margins_are_kept_but_where_the_goal_is_in_them(arm: SpaceRobot) -> None:
     turn, margin = [0.2, -0.1, 0.3], np.array([2.5, 1.0, 0.0])
     schedule = of_arm(arm, turn, joint_margin=margin.tolist())

@@ -92,6 +92,7 @@ def test_thrusters_of_a_robot_that_nothing_pushes_are_refused(tmp_path: Path) ->
         run_scenario(scenario, tmp_path / "no.mcap")
 
 
+@pytest.mark.slow
 def test_a_short_flight_tells_what_thrusters_do(tmp_path: Path) -> None:
     """Two seconds of it: topics, diagnostics, and the warning of a direction that is missing."""
     path = tmp_path / "run.mcap"
