@@ -18,6 +18,11 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line)
 
 
+def sentence_case(text: str) -> str:
+    """Return a text with a capital first letter, as the beginning of a sentence."""
+    return text[:1].upper() + text[1:]
+
+
 class SpaceRobotError(Exception):
     """Base of all errors of this package; the message is one sentence for the user.
 

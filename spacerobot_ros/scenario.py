@@ -17,10 +17,11 @@ import yaml
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.laws.registry import LAWS
-from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
+from spacerobot_ros.model.urdf import load_world
 from spacerobot_ros.parameters import Value, configured, declared, reconfigured, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
@@ -60,6 +61,7 @@ _SCENARIO_KEYS = (
     "published",
     "published_method",
     "kills",
+    "world",
     "goal_joint_positions",
     "end_effector_goals",
     *(f"{goal}_{part}" for goal in _GOAL_KEYS for part in ("position", "orientation", "rotvec")),
@@ -263,7 +265,8 @@ class Scenario:
         name = planner.robot or plant.robot
         if not name:
             raise ParameterError(f"The scenario '{self.name}' names no robot; see plant.robot.")
-        robot = SpaceRobot.from_file(robot_file(name))
+        described = planner.described(plant.described(load_robot(robot_file(name))))
+        robot = SpaceRobot(described)
         self.require_shape_of(robot)
         goal = self.goal.for_robot(robot.description)
         return PlanningProblem(self.name, robot, InitialState.of(plant), goal, planner)
@@ -481,7 +484,8 @@ def load_scenario(name: str) -> Scenario:
         raise ParameterError(
             f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
         )
-    in_file = _parameters_by_node(content, path)
+    in_file = _sections(content, path)
+    commanders = tuple(name for name in COMMANDERS if name in in_file) or ("planner",)
     unknown = sorted(set(map(str, values)) - set(_SCENARIO_KEYS))
     if unknown:
         raise ParameterError(
@@ -498,20 +502,46 @@ def load_scenario(name: str) -> Scenario:
             if any(key.startswith("end_effector_goal_") for key in values)
             else None
         ),
-        commanders=tuple(name for name in COMMANDERS if name in in_file) or ("planner",),
+        commanders=commanders,
         published=_parse_published(values.get("published", {}), path),
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
-        in_file={node: _with_robot_beside(path, values) for node, values in in_file.items()},
+        in_file=in_file,
     )._with_goal_topics()
 
 
-def _with_robot_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Return the parameters of a scenario file; a robot file beside it is named by its path."""
-    robot = values.get("robot")
-    if isinstance(robot, str) and is_path(robot) and (path.parent / robot).is_file():
-        return {**values, "robot": str((path.parent / robot).resolve())}
-    return values
+def _with_files_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
+    """Return the parameters of a scenario file; robots and worlds beside it have their paths."""
+    beside = {
+        name: str((path.parent / file).resolve())
+        for name in ("robot", "world")
+        if isinstance(file := values.get(name), str)
+        and is_path(file)
+        and (path.parent / file).is_file()
+    }
+    return {**values, **beside}
+
+
+def _with_world(
+    in_file: dict[str, dict[str, Any]], world: str, path: Path
+) -> dict[str, dict[str, Any]]:
+    """Return the parameters of a scenario file with its obstacles for the plant and the planner.
+
+    Raises
+    ------
+    ParameterError
+        There is no such file, or it is refused.
+    """
+    try:
+        file = (path.parent / world).resolve()
+        load_world(file)
+    except RobotDescriptionError as error:
+        raise ParameterError(f"The world of the scenario file {path} is refused: {error}") from None
+    return in_file | {
+        node: {"world": str(file), **in_file[node]}
+        for node in ("plant", "planner")
+        if node in in_file
+    }
 
 
 def scenario_or_robot(name: str) -> Scenario:
@@ -645,7 +675,19 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     ParameterError
         The file cannot be read, or a section has no ``ros__parameters`` with parameters under it.
     """
-    return _parameters_by_node(_read_content(path), path)
+    return _sections(_read_content(path), path)
+
+
+def _sections(content: Mapping[Any, Any], path: Path) -> dict[str, dict[str, Any]]:
+    """Return the parameters by node of a file, with the paths of files that they name."""
+    in_file = {
+        node: _with_files_beside(path, parameters)
+        for node, parameters in _parameters_by_node(content, path).items()
+    }
+    section = content.get("scenario")
+    values = section.get("ros__parameters") if isinstance(section, dict) else None
+    world = values.get("world") if isinstance(values, dict) else None
+    return in_file if world is None else _with_world(in_file, str(world), path)
 
 
 def _read_content(path: Path) -> dict[Any, Any]:

@@ -23,8 +23,8 @@ from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.measures import metric_names
-from spacerobot_ros.model.urdf import load_robot
-from spacerobot_ros.resources import is_path
+from spacerobot_ros.model.urdf import load_robot, parse_robot
+from spacerobot_ros.resources import is_path, robot_file
 from spacerobot_ros.scenario import load_scenario, scenario_text
 from spacerobot_ros.version import __version__
 
@@ -342,7 +342,13 @@ def self_contained(campaign: Campaign) -> Campaign:
     scenario = campaign.scenario
     for node in ("plant", *scenario.commanders):
         config = scenario.config(node)
-        if config.robot and is_path(config.robot) and not config.robot_description:
-            text = {"robot_description": load_robot(config.robot).urdf, "robot": ""}
+        named = config.robot and not config.robot_description
+        if config.world or (named and is_path(config.robot)):
+            robot = description_of(campaign.scenario)
+            if config.robot_description:
+                robot = parse_robot(config.robot_description)
+            elif config.robot:
+                robot = load_robot(robot_file(config.robot))
+            text = {"robot_description": config.described(robot).urdf, "robot": "", "world": ""}
             scenario = scenario.with_overrides(node, text)
     return replace(campaign, scenario=scenario)

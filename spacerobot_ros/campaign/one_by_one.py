@@ -108,7 +108,7 @@ def nominal_robots(scenario: Scenario) -> Robots:
         error, seed = 0.0, 0
         if isinstance(config, BelievedRobotConfig):
             error, seed = config.model_error, config.model_error_seed
-        return _build_robot(node, text, config.robot, error, seed)
+        return _build_robot(node, text, config.robot, config.world, error, seed)
 
     return Robots.of(scenario, build)
 
@@ -136,17 +136,19 @@ def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
 
 def plant_robot(flight: DrawnFlight) -> SpaceRobot:
     """Return the robot of the plant without dispersions of its masses."""
-    robot = _build_robot("plant", flight.nominal.urdf, "", 0.0, 0)
+    robot = _build_robot("plant", flight.nominal.urdf, "", "", 0.0, 0)
     assert robot is not None
     return robot
 
 
 @lru_cache(maxsize=32)
-def _build_robot(node: str, text: str, name: str, error: float, seed: int) -> SpaceRobot | None:
+def _build_robot(
+    node: str, text: str, name: str, world: str, error: float, seed: int
+) -> SpaceRobot | None:
     # Each node has its own robot, because a robot's functions have buffers.
     if error:
-        return robot_of(BelievedRobotConfig(text, name, error, seed))
-    return robot_of(RobotConfig(text, name))
+        return robot_of(BelievedRobotConfig(text, name, world, error, seed))
+    return robot_of(RobotConfig(text, name, world))
 
 
 class RosEngine(_OneByOneEngine):

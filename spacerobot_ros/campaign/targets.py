@@ -15,6 +15,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
+from spacerobot_ros.model.shared_parameters import RobotConfig
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.parameters import Parameter, declared, values_of
 from spacerobot_ros.planning import Goal
@@ -148,12 +149,13 @@ def description_of(scenario: Scenario) -> RobotDescription:
         raise ParameterError(
             f"the scenario '{scenario.name}' names no robot for its plant: set plant.robot."
         )
-    return _load_description(plant.robot, plant.robot_description)
+    return _load_description(plant.robot, plant.robot_description, plant.world)
 
 
 @cache
-def _load_description(robot: str, text: str) -> RobotDescription:
-    return parse_robot(text) if text else load_robot(robot_file(robot))
+def _load_description(robot: str, text: str, world: str) -> RobotDescription:
+    described = parse_robot(text) if text else load_robot(robot_file(robot))
+    return RobotConfig(world=world).described(described)
 
 
 # -- names ------------------------------------------------------------------------------------

@@ -133,11 +133,18 @@ def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:
 
 
 def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:
-    """Return a line with the nearest approach of two links in a plan."""
+    """Return a line with the nearest approach of two links, or to an obstacle, in a plan."""
     from spacerobot_ros.collision import CollisionGeometry, PathCheck
+    from spacerobot_ros.planning import RobotState
+    from spacerobot_ros.planning.core.prediction import BasePrediction
 
-    geometry = CollisionGeometry(problem.robot.description)
-    nearest = PathCheck(geometry).nearest(trial.positions)
+    robot, positions = problem.robot, trial.positions
+    geometry, base = CollisionGeometry(robot.description), None
+    if robot.description.world is not None:
+        step = problem.config.integration_step
+        start = RobotState(trial.path.position[0], trial.path.quaternion[0], positions[0])
+        base = BasePrediction(robot, problem.control_period, step).poses(start, positions)
+    nearest = PathCheck(geometry).nearest(positions, base)
     if nearest is not None:
         return f"clearance   {nearest}"
     reasons = Counter(geometry.ignored.values())

@@ -11,7 +11,7 @@ is drawn.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -19,17 +19,25 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.collision.distances import DistanceFunction, distance_function
-from spacerobot_ros.collision.rounded_box import RoundedBox
+from spacerobot_ros.collision.rounded_box import RoundedBox, nearest_points
 from spacerobot_ros.errors import MeshError
-from spacerobot_ros.model.description import Array, JointKind, RobotDescription, Shape
+from spacerobot_ros.model.description import Array, JointKind, Pose, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
+from spacerobot_ros.model.rotations import matrices_from_quaternions
 
 _SHAPES, _SEED = 1000, 0
 """Random shapes at which a pair is in contact that always is, and the seed of their draw."""
 
 _HALF_RANGE = {JointKind.PRISMATIC: 1.0}
 """Half the range that is drawn from of a joint without limits, m; pi for joints that turn."""
+
+
+_WORLD = -1
+"""Index of the body of obstacles."""
+
+_FAR_AWAY = 1e9
+"""Distance of obstacles where the pose of the base is not known, m: they are not looked at."""
 
 
 class LinkPair(NamedTuple):
@@ -41,17 +49,61 @@ class LinkPair(NamedTuple):
     def __str__(self) -> str:
         return f"'{self.first}' and '{self.second}'"
 
+    @property
+    def subject(self) -> str:
+        """The two as the subject of a sentence, in lower case."""
+        return f"links {self}"
+
+
+class ObstaclePair(LinkPair):
+    """Names of a link and of an obstacle, which is a link of the world."""
+
+    __slots__ = ()
+
+    @property
+    def subject(self) -> str:
+        """The two as the subject of a sentence, in lower case."""
+        return f"link '{self.first}' and obstacle '{self.second}'"
+
+
+class BasePoses(NamedTuple):
+    """Poses of the base in the world: ``r_WB`` (N, 3), m, and quaternions (N, 4) of ``R_WB``."""
+
+    position: Array
+    quaternion: Array
+
+    def rows(self, rows: npt.NDArray[np.int64] | slice) -> BasePoses:
+        """Return some of them."""
+        return BasePoses(self.position[rows], self.quaternion[rows])
+
+    def between(self, before: npt.NDArray[np.int64], share: Array) -> BasePoses:
+        """Return poses (K,) between neighbours: shares (K, 1) of the way from ``before`` (K,)."""
+        r, x = self
+        position = (1 - share) * r[before] + share * r[before + 1]
+        next_ = (
+            x[before + 1] * np.where(np.sum(x[before] * x[before + 1], axis=1) < 0, -1, 1)[:, None]
+        )
+        quaternion = (1 - share) * x[before] + share * next_
+        return BasePoses(position, quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
+
+    @property
+    def world(self) -> tuple[Array, Array]:
+        """Attitudes ``R_BW`` (N, 3, 3) and positions ``r_BW_B`` (N, 3) of the world, m."""
+        R_BW = np.swapaxes(matrices_from_quaternions(self.quaternion), 1, 2)
+        return R_BW, -np.einsum("nab,nb->na", R_BW, self.position)
+
 
 @dataclass(frozen=True)
 class Solid:
-    """One convex solid of a robot.
+    """One convex solid of a robot or an obstacle.
 
     Attributes
     ----------
     link
         Name of its link.
     body
-        Index of the rigid body that the link is part of; 0: the base.
+        Index of the rigid body that the link is part of; 0: the base, -1: an obstacle, whose link
+        frame is that of the world here.
     shape
         Its description in the URDF.
     enclosure
@@ -66,18 +118,24 @@ class Solid:
     enclosure: RoundedBox
     vertices: Array | None = field(default=None, repr=False)
 
+    @property
+    def is_obstacle(self) -> bool:
+        """Whether it is fixed in the world."""
+        return self.body == _WORLD
+
 
 Poses = tuple[Array, Array]
-"""Attitudes ``R_BL`` (N, L, 3, 3) and positions ``r_BL_B`` (N, L, 3) of the links of a robot."""
+"""Attitudes ``R_BL`` (N, L, 3, 3) and positions ``r_BL_B`` (N, L, 3) of the links of a robot; among
+obstacles, the world is the last of them."""
 
 
 class CollisionGeometry:
-    """The solids of a robot, and the distances between them.
+    """The solids of a robot and of the obstacles around it, and the distances between them.
 
     Parameters
     ----------
     robot
-        The robot.
+        The robot, with its world.
     mesh_of
         Returns the triangles of a visual of the kind ``mesh`` in the frame of its link; a mesh for
         which it raises a :class:`.MeshError` is left out.
@@ -101,9 +159,17 @@ class CollisionGeometry:
         self.robot = robot
         self._kinematics = ForwardKinematics(robot)
         self.solids, self.notes = solids_of(robot, mesh_of)
+        if robot.world is not None:
+            obstacles, notes = solids_of(robot.world, mesh_of)
+            frames = robot.world.frames
+            self.solids += tuple(_in_world(each, frames[each.link][1]) for each in obstacles)
+            self.notes += notes
         self.ignored: dict[LinkPair, str] = {}
         links = self._kinematics.links
-        self._link_of = np.array([links.index(each.link) for each in self.solids], dtype=int)
+        self._link_of = np.array(
+            [len(links) if each.is_obstacle else links.index(each.link) for each in self.solids],
+            dtype=int,
+        )
         self._centers = np.array([each.enclosure.pose.r for each in self.solids]).reshape(-1, 3)
         self._radii = np.array([each.enclosure.bounding_radius for each in self.solids])
         self.pairs = self._distinct_pairs()
@@ -127,12 +193,49 @@ class CollisionGeometry:
 
     def links_of(self, pair: int) -> LinkPair:
         """Return the links of a pair."""
-        first, second = (self.solids[i].link for i in self.pairs[pair])
-        return LinkPair(first, second)
+        first, second = (self.solids[i] for i in self.pairs[pair])
+        kind = ObstaclePair if second.is_obstacle else LinkPair
+        return kind(first.link, second.link)
 
-    def poses(self, shapes: Array) -> Poses:
-        """Return the poses of all links at shapes (..., n), m or rad."""
-        return self._kinematics.link_poses(shapes)
+    @cached_property
+    def with_obstacles(self) -> npt.NDArray[np.bool_]:
+        """Whether pairs (P,) are of a link and an obstacle."""
+        return np.array([self.solids[j].is_obstacle for _, j in self.pairs], dtype=np.bool_)
+
+    def poses(self, shapes: Array, base: BasePoses | None = None) -> Poses:
+        """Return the poses of all links, and of the world, if there is one.
+
+        Parameters
+        ----------
+        shapes
+            (..., n), m or rad; with a base (N, n).
+        base
+            Poses of the base; None: obstacles are far away.
+        """
+        R, r = self._kinematics.link_poses(shapes)
+        if self.robot.world is None:
+            return R, r
+        at = shapes.shape[:-1]
+        R_BW = np.broadcast_to(np.eye(3), (*at, 3, 3))
+        r_BW = np.full((*at, 3), _FAR_AWAY)
+        if base is not None:
+            R_BW, r_BW = base.world
+        return (
+            np.concatenate([R, R_BW[..., np.newaxis, :, :]], axis=-3),
+            np.concatenate([r, r_BW[..., np.newaxis, :]], axis=-2),
+        )
+
+    def place(self, pair: int, shape: Array, base: BasePoses) -> Array:
+        """Return the place (3,) in W, m, where a link is about nearest to an obstacle.
+
+        ``shape`` is (n,), and ``base`` has one pose.
+        """
+        R, r = self.poses(shape[np.newaxis], base)
+        i, j = self.pairs[pair]
+        first, second = self.solids[i].enclosure, self.solids[j].enclosure
+        link, R_BW, r_BW = self._link_of[i], R[:, -1], r[:, -1]
+        r_BP = nearest_points(first, R[:, link], r[:, link], second, R_BW, r_BW)
+        return np.asarray(R_BW[0].T @ (r_BP - r_BW)[0])
 
     def lower_bounds(self, poses: Poses) -> Array:
         """Return lower bounds (N, P), m, of the distances of all pairs, by balls around solids."""
@@ -158,16 +261,18 @@ class CollisionGeometry:
         distances, pairs = self.nearest_at(shape[np.newaxis])
         return float(distances[0]), int(pairs[0])
 
-    def nearest_at(self, shapes: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+    def nearest_at(
+        self, shapes: Array, base: BasePoses | None = None
+    ) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the smallest distances (N,) at shapes (N, n), m, and their pairs (N,).
 
-        Without pairs the distances are infinite.
+        Without pairs the distances are infinite; without poses of the base, obstacles do not count.
         """
         distances = np.full(len(shapes), np.inf)
         pairs = np.zeros(len(shapes), dtype=np.int64)
         if not len(self.pairs) or not len(shapes):
             return distances, pairs
-        R, r = self.poses(shapes)
+        R, r = self.poses(shapes, base)
         bounds = self.lower_bounds((R, r))
         # Pairs that may be the nearest come first, so that most others need not be looked at.
         for pair in np.argsort(bounds.min(axis=0), kind="stable").tolist():
@@ -198,6 +303,9 @@ class CollisionGeometry:
         found = []
         for j, second in enumerate(self.solids):
             for i, first in enumerate(self.solids[:j]):
+                if second.is_obstacle:
+                    found += [] if first.is_obstacle else [(i, j)]
+                    continue
                 bodies = first.body, second.body
                 if bodies[0] == bodies[1] or parents[bodies[0]] == bodies[1]:
                     continue
@@ -232,16 +340,20 @@ class CollisionGeometry:
 
     # -- motion -------------------------------------------------------------------------------
 
-    def reaches(self, shapes: Array) -> Array:
+    def reaches(self, shapes: Array) -> tuple[Array, Array]:
         """Return how far solids move against each other: at most ``reaches @ |dtheta|`` (P,), m.
 
         ``reaches`` (P, m) is the largest distance of a point of the pair from each of the moving
-        joints at any of the shapes (N, n), for joints between the two; zero for others.
+        joints at any of the shapes (N, n), for joints between the two; zero for others. Of pairs
+        with obstacles, the distances (P,) from the base are returned, too; zero for others.
         """
         bodies = self.robot.bodies
         travel = np.abs(self.moving_positions(shapes)).max(axis=0)
         reach = np.zeros((len(self.solids), len(bodies) - 1))
+        from_base = np.zeros(len(self.solids))
         for number, solid in enumerate(self.solids):
+            if solid.is_obstacle:
+                continue
             _, pose = self.robot.frames[solid.link]
             middle = pose @ solid.enclosure.pose
             far = float(np.linalg.norm(middle.r)) + solid.enclosure.bounding_radius
@@ -253,13 +365,27 @@ class CollisionGeometry:
                 reach[number, index - 1] = 1.0 if slides else far
                 far += float(np.linalg.norm(body.origin.r)) + slides * travel[index - 1]
                 index = body.parent
+            from_base[number] = far
         first, second = reach[self.pairs[:, 0]], reach[self.pairs[:, 1]]
-        return np.where((first > 0) & (second > 0), 0.0, first + second)
+        apart = np.where((first > 0) & (second > 0), 0.0, first + second)
+        return apart, np.where(self.with_obstacles, from_base[self.pairs[:, 0]], 0.0)
 
     def moving_positions(self, shapes: Array) -> Array:
         """Return the positions (N, m) of all moving joints at shapes (N, n), m or rad."""
         G, b = self.robot.coupling
         return np.asarray(shapes @ G.T + b)
+
+
+def _in_world(obstacle: Solid, pose: Pose) -> Solid:
+    """Return an obstacle in the frame of the world, from its link's frame at a pose there."""
+    box, vertices = obstacle.enclosure, obstacle.vertices
+    return replace(
+        obstacle,
+        body=_WORLD,
+        shape=replace(obstacle.shape, pose=pose @ obstacle.shape.pose),
+        enclosure=replace(box, pose=pose @ box.pose),
+        vertices=None if vertices is None else vertices @ pose.R.T + pose.r,
+    )
 
 
 def _random_shapes(robot: RobotDescription) -> Array:

@@ -2,7 +2,8 @@
 
 A pair of solids moves against each other by at most v in a tick (``CollisionGeometry.reaches``). So
 its distance within the tick is at least ``(d_0 + d_1 - v) / 2``, with d_0 and d_1 those at its
-ends. Ticks where that is less than what is asked for are halved until v is small.
+ends. Ticks where that is less than what is asked for are halved until v is small. Against obstacles
+the base moves, too, along a straight line and about one axis within a tick.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spacerobot_ros.collision.geometry import CollisionGeometry, LinkPair
+from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair
 from spacerobot_ros.model.description import Array
 
 _RESOLUTION = 5e-4
@@ -35,6 +36,8 @@ class Approach:
         When, in ticks from the first shape.
     shape
         (n,) there, m or rad.
+    place
+        (3,) there, in W, m, on the obstacle; None: the pair are two links.
     """
 
     links: LinkPair
@@ -42,11 +45,65 @@ class Approach:
     distance: float
     tick: float
     shape: Array
+    place: Array | None = None
 
     def __str__(self) -> str:
+        where = "" if self.place is None else f" near {np.round(self.place, 3).tolist()} m"
         if self.distance <= 0:
-            return f"links {self.links} touch, {-self.distance:.3g} m deep"
-        return f"links {self.links} come within {self.distance:.3g} m"
+            return f"{self.links.subject} touch, {-self.distance:.3g} m deep{where}"
+        return f"{self.links.subject} come within {self.distance:.3g} m{where}"
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A path of the shape, with the base where obstacles count.
+
+    Attributes
+    ----------
+    positions
+        (N + 1, n) shapes at the ticks, m or rad.
+    base
+        Poses of the base at the ticks; None: obstacles do not count.
+    bounds
+        (N + 1, P) lower bounds of the distances of pairs at the ticks, m.
+    motion
+        (N, P): how far pairs move against each other at most in each tick, m.
+    """
+
+    positions: Array
+    base: BasePoses | None
+    bounds: Array
+    motion: Array
+
+    @classmethod
+    def of(cls, geometry: CollisionGeometry, positions: Array, base: BasePoses | None) -> _Path:
+        bounds = geometry.lower_bounds(geometry.poses(positions, base))
+        reaches, from_base = geometry.reaches(positions)
+        moved = np.abs(np.diff(geometry.moving_positions(positions), axis=0))
+        motion = moved @ reaches.T
+        if base is not None and geometry.with_obstacles.any():
+            straight = np.linalg.norm(np.diff(base.position, axis=0), axis=1)
+            # Quaternions turn by half the angle.
+            chord = np.linalg.norm(np.diff(base.quaternion, axis=0), axis=1)
+            turned = 4 * np.arcsin(np.minimum(np.minimum(chord, np.sqrt(4 - chord**2)) / 2, 1.0))
+            motion += np.outer(turned, from_base) + np.outer(straight, geometry.with_obstacles)
+        return cls(positions, base, bounds, motion)
+
+    @property
+    def least(self) -> Array:
+        """Lower bounds (P,) of the distances along the whole path, m."""
+        if not len(self.motion):
+            return np.asarray(self.bounds.min(axis=0))
+        return np.asarray(((self.bounds[:-1] + self.bounds[1:] - self.motion) / 2).min(axis=0))
+
+    def at(self, ticks: Array) -> tuple[Array, BasePoses | None]:
+        """Return shapes (K, n) and poses of the base at times (K,) in ticks."""
+        if len(self.positions) == 1:
+            return self.positions, self.base
+        before = np.minimum(ticks.astype(int), len(self.positions) - 2)
+        share = (ticks - before)[:, np.newaxis]
+        shapes = (1 - share) * self.positions[before] + share * self.positions[before + 1]
+        return shapes, None if self.base is None else self.base.between(before, share)
 
 
 class PathCheck:
@@ -61,7 +118,9 @@ class PathCheck:
     def __init__(self, geometry: CollisionGeometry) -> None:
         self.geometry = geometry
 
-    def approaches(self, positions: Array, required: Array) -> list[Approach]:
+    def approaches(
+        self, positions: Array, required: Array, base: BasePoses | None = None
+    ) -> list[Approach]:
         """Return the nearest approaches of all pairs that come nearer than required.
 
         Parameters
@@ -70,55 +129,50 @@ class PathCheck:
             (N + 1, n) shapes at the ticks, along straight lines in between; m or rad.
         required
             (P,) smallest distances of the pairs, m; minus infinity: any.
+        base
+            Poses of the base at the ticks; None: obstacles do not count.
         """
-        geometry = self.geometry
-        if not len(geometry.pairs):
+        if not len(self.geometry.pairs):
             return []
-        motion = self._motion(positions)
-        bounds = geometry.lower_bounds(geometry.poses(positions))
-        least = (bounds[:-1] + bounds[1:] - motion) / 2 if len(motion) else bounds
-        near = np.flatnonzero(least.min(axis=0) < required)
-        found = (self._nearest(positions, motion, bounds, p, required[p]) for p in near.tolist())
+        path = _Path.of(self.geometry, positions, base)
+        near = np.flatnonzero(path.least < required)
+        found = (self._nearest(path, p, required[p]) for p in near.tolist())
         return sorted((each for each in found if each), key=lambda each: each.distance)
 
-    def nearest(self, positions: Array) -> Approach | None:
-        """Return the nearest approach of all pairs along a path (N + 1, n); None without pairs."""
-        geometry = self.geometry
-        if not len(geometry.pairs):
+    def nearest(self, positions: Array, base: BasePoses | None = None) -> Approach | None:
+        """Return the nearest approach of all pairs along a path (N + 1, n); None without pairs.
+
+        ``base`` are the poses of the base at the ticks; None: obstacles do not count.
+        """
+        if not len(self.geometry.pairs):
             return None
-        motion = self._motion(positions)
-        bounds = geometry.lower_bounds(geometry.poses(positions))
-        least = (bounds[:-1] + bounds[1:] - motion) / 2 if len(motion) else bounds
-        least = least.min(axis=0)
+        path = _Path.of(self.geometry, positions, base)
+        least = path.least
         best: Approach | None = None
         for pair in np.argsort(least, kind="stable").tolist():
             if best is not None and least[pair] >= best.distance:
                 break
             limit = np.inf if best is None else best.distance
-            best = self._nearest(positions, motion, bounds, pair, limit) or best
+            best = self._nearest(path, pair, limit) or best
         return best
 
-    def _motion(self, positions: Array) -> Array:
-        """Return how far pairs move against each other at most in each tick, (N, P), m."""
-        moved = np.abs(np.diff(self.geometry.moving_positions(positions), axis=0))
-        return np.asarray(moved @ self.geometry.reaches(positions).T)
-
-    def _nearest(
-        self, positions: Array, motion: Array, bounds: Array, pair: int, limit: float
-    ) -> Approach | None:
+    def _nearest(self, path: _Path, pair: int, limit: float) -> Approach | None:
         """Return the nearest approach of a pair; None where it does not come nearer than limit."""
-        geometry = self.geometry
+        geometry, motion, bounds = self.geometry, path.motion, path.bounds
 
         def distances(ticks: Array) -> Array:
-            before = np.minimum(ticks.astype(int), len(positions) - 2)
-            share = (ticks - before)[:, np.newaxis]
-            shapes = (1 - share) * positions[before] + share * positions[before + 1]
-            return geometry.distances(pair, geometry.poses(shapes))
+            return geometry.distances(pair, geometry.poses(*path.at(ticks)))
 
-        if len(positions) == 1:
-            distance = float(geometry.distances(pair, geometry.poses(positions))[0])
-            found = Approach(geometry.links_of(pair), pair, distance, 0.0, positions[0])
-            return found if distance < limit else None
+        def approach(distance: float, tick: float) -> Approach:
+            shapes, base = path.at(np.array([tick]))
+            place = None
+            if base is not None and geometry.with_obstacles[pair]:
+                place = geometry.place(pair, shapes[0], base)
+            return Approach(geometry.links_of(pair), pair, distance, tick, shapes[0], place)
+
+        if not len(motion):
+            distance = float(distances(np.zeros(1))[0])
+            return approach(distance, 0.0) if distance < limit else None
         close = (bounds[:-1, pair] + bounds[1:, pair] - motion[:, pair]) / 2 < limit
         starts = np.flatnonzero(close)
         if not len(starts):
@@ -144,11 +198,7 @@ class PathCheck:
             left, right = np.concatenate([left, middle]), np.concatenate([middle, right])
             d_0, d_1 = np.concatenate([d_0, d]), np.concatenate([d, d_1])
             v = np.concatenate([v, v]) / 2
-        if best >= limit:
-            return None
-        k = min(int(at), len(positions) - 2)
-        shape = (1 - (at - k)) * positions[k] + (at - k) * positions[k + 1]
-        return Approach(geometry.links_of(pair), pair, best, at, shape)
+        return approach(best, at) if best < limit else None
 
 
 def names(approaches: Iterable[Approach]) -> list[LinkPair]:

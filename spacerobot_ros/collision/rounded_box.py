@@ -140,12 +140,32 @@ def separation(
     return np.asarray(best - radii)
 
 
-def _directions(c_1: Array, A: Array, c_2: Array, B: Array, a: Array, b: Array) -> Array:
-    """Return unit vectors (N, 3) from about the nearest point of a box to that of another."""
+def nearest_points(
+    first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
+) -> Array:
+    """Return the points (N, 3) of the core of the second box that are about nearest to the first.
+
+    Parameters are those of :func:`separation`.
+    """
+    c_1, c_2 = r_1 + R_1 @ first.pose.r, r_2 + R_2 @ second.pose.r
+    cores = R_1 @ first.pose.R, R_2 @ second.pose.R
+    return _nearest_points(c_1, cores[0], c_2, cores[1], first.half, second.half)[1]
+
+
+def _nearest_points(
+    c_1: Array, A: Array, c_2: Array, B: Array, a: Array, b: Array
+) -> tuple[Array, Array]:
+    """Return about the nearest points (N, 3) of two boxes, by alternating projections."""
     x, y = c_1, c_2
     for _ in range(_PROJECTIONS):
         x = _projected(y, c_1, A, a)
         y = _projected(x, c_2, B, b)
+    return x, y
+
+
+def _directions(c_1: Array, A: Array, c_2: Array, B: Array, a: Array, b: Array) -> Array:
+    """Return unit vectors (N, 3) from about the nearest point of a box to that of another."""
+    x, y = _nearest_points(c_1, A, c_2, B, a, b)
     way = y - x
     return np.asarray(way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-300))
 

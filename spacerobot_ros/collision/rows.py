@@ -6,6 +6,11 @@ from the axis of a rod, less the radius; or, of a box, the largest distance from
 smoothed, which tells the depth inside as well. A row is the smooth minimum of the field over the
 balls. So rows are near to the distances but are no bounds of them: a path that keeps them is
 checked exactly afterwards.
+
+Rows of two links depend on the shape q alone. Those of a link and an obstacle depend on the turn X
+of the base since the start, too: at zero momentum the centre of mass C of the system rests, and a
+point of the link at ``r_BP(q)`` in the base is, seen from C in the attitude of the base at the
+start, at ``X (r_BP(q) - r_BC(q))``, where the obstacle is at rest.
 """
 
 from __future__ import annotations
@@ -138,11 +143,16 @@ class DistanceRows:
         ``q -> dd/dq`` (K, n).
     hessian
         ``(q, lambda) -> `` the Hessian (n, n) of ``lambda' d``.
+    of_obstacles
+        Whether one of each pair is an obstacle: the functions then take ``y = [q; X]`` (n + 4) in
+        place of q, with a quaternion X of any norm, and the numbers ``w`` (:func:`world_values`)
+        after that.
     """
 
     values: ca.Function
     jacobian: ca.Function
     hessian: ca.Function
+    of_obstacles: bool = False
 
     @classmethod
     def of(cls, geometry: CollisionGeometry, pairs: Sequence[int]) -> DistanceRows:
@@ -164,10 +174,44 @@ class DistanceRows:
             ca.Function("distances_hess", [q, multipliers], [ca.cse(hessian)]),
         )
 
+    @classmethod
+    def from_obstacles(
+        cls, geometry: CollisionGeometry, pair: int, center_of_mass: ca.Function
+    ) -> DistanceRows:
+        """Derive that of a link and an obstacle; ``center_of_mass`` is ``q -> r_BC``, of SX."""
+        robot = geometry.robot
+        n = len(robot.joint_names)
+        y, w, multiplier = ca.SX.sym("y", n + 4), ca.SX.sym("w", 12), ca.SX.sym("lambda")
+        q, X = y[:n], y[n:]
+        link, obstacle = (geometry.solids[i] for i in geometry.pairs[pair])
+        R_BL, r_BL = _pose_of_link(robot, link, _chain(robot, link.body), joint_positions(robot, q))
+        R_X = symbolic_rotations.matrix_from_quaternion(X / ca.norm_2(X))
+        of_link = R_X @ R_BL, R_X @ (r_BL - center_of_mass(q))
+        of_world = ca.reshape(w[:9], 3, 3), w[9:]
+        d = _smooth_distance((_Form.of(link), _Form.of(obstacle)), [of_link, of_world])
+        hessian = ca.hessian(multiplier * d, y)[0]
+        return cls(
+            ca.Function("distances", [y, w], [ca.cse(d)]),
+            ca.Function("distances_jac", [y, w], [ca.cse(ca.jacobian(d, y))]),
+            ca.Function("distances_hess", [y, w, multiplier], [ca.cse(hessian)]),
+            of_obstacles=True,
+        )
+
+
+def world_values(R_0W: Array, r_0W: Array) -> Array:
+    """Return the numbers (12,) of a pose of the world, seen from the centre of mass at the start:
+    ``R_0W`` (3, 3), column after column, and ``r_0W`` (3,), m.
+    """
+    return np.concatenate([R_0W.T.ravel(), r_0W])
+
 
 def _row(robot: RobotDescription, first: Solid, second: Solid, q: ca.SX) -> ca.SX:
     forms = _Form.of(first), _Form.of(second)
-    poses = _relative_poses(robot, first, second, q)
+    return _smooth_distance(forms, _relative_poses(robot, first, second, q))
+
+
+def _smooth_distance(forms: tuple[_Form, _Form], poses: Sequence[tuple[ca.SX, ca.SX]]) -> ca.SX:
+    """Return about the distance of two forms, whose links are at poses in one frame, m."""
     values = []
     for balls, field in _roles(*forms):
         R_a, r_a = poses[balls]
@@ -195,22 +239,30 @@ def _relative_poses(
     theta = joint_positions(robot, q)
     chains = [_chain(robot, each.body) for each in (first, second)]
     common = len([1 for a, b in zip(*chains, strict=False) if a == b])
-    poses = []
-    for solid, chain in zip((first, second), chains, strict=True):
-        R, r = ca.SX.eye(3), ca.SX(3, 1)
-        for index in chain[common:]:
-            body = robot.bodies[index]
-            joint = body.joint
-            assert joint is not None
-            r = r + R @ ca.sparsify(ca.DM(body.origin.r))
-            R = R @ ca.sparsify(ca.DM(body.origin.R))
-            if joint.kind is JointKind.PRISMATIC:
-                r = r + R @ ca.sparsify(ca.DM(joint.axis)) * theta[index - 1]
-            else:
-                R = R @ symbolic_rotations.matrix_about_axis(joint.axis, theta[index - 1])
-        _, pose = robot.frames[solid.link]
-        poses.append((R @ ca.sparsify(ca.DM(pose.R)), r + R @ ca.DM(pose.r)))
-    return poses
+    return [
+        _pose_of_link(robot, solid, chain[common:], theta)
+        for solid, chain in zip((first, second), chains, strict=True)
+    ]
+
+
+def _pose_of_link(
+    robot: RobotDescription, solid: Solid, chain: Sequence[int], theta: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """Return the pose of a solid's link in the body that carries the first of a chain."""
+    R, r = ca.SX.eye(3), ca.SX(3, 1)
+    for index in chain:
+        body = robot.bodies[index]
+        joint = body.joint
+        if joint is None:
+            continue
+        r = r + R @ ca.sparsify(ca.DM(body.origin.r))
+        R = R @ ca.sparsify(ca.DM(body.origin.R))
+        if joint.kind is JointKind.PRISMATIC:
+            r = r + R @ ca.sparsify(ca.DM(joint.axis)) * theta[index - 1]
+        else:
+            R = R @ symbolic_rotations.matrix_about_axis(joint.axis, theta[index - 1])
+    _, pose = robot.frames[solid.link]
+    return R @ ca.sparsify(ca.DM(pose.R)), r + R @ ca.DM(pose.r)
 
 
 def _chain(robot: RobotDescription, body: int) -> list[int]:

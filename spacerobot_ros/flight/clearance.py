@@ -1,4 +1,5 @@
-"""The clearance of a flight: the smallest distance between links in its true states.
+"""The clearance of a flight: the smallest distance between links, and to obstacles, in its true
+states.
 
 A flight without ROS reports clearances and contacts as the plant's node does:
 :meth:`FlightClearance.statuses` and :meth:`FlightClearance.contacts`.
@@ -11,8 +12,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
-from spacerobot_ros.collision import Approach, CollisionGeometry, PathCheck
+from spacerobot_ros.collision import Approach, BasePoses, CollisionGeometry, PathCheck
 from spacerobot_ros.events import Event
 from spacerobot_ros.model.description import Array, RobotDescription, Shape
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
@@ -31,19 +33,22 @@ class FlightClearance:
         (N,) times of the states, s; at least one.
     shapes
         (N, n) true positions of the robot's joints, m or rad.
+    base
+        The true poses (N,) of the base; None: obstacles do not count.
     """
 
     geometry: CollisionGeometry
     time: Array
     shapes: Array
+    base: BasePoses | None = None
 
     @classmethod
     def of(
         cls,
         robot: RobotDescription,
         joint_names: Sequence[str],
-        time: Array,
-        q: Array,
+        q: tuple[Array, Array],
+        pose: tuple[Array, Array],
         mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh,
     ) -> FlightClearance | None:
         """Return the clearance of a flight; None without states, or where no pair of links counts.
@@ -52,29 +57,37 @@ class FlightClearance:
         ----------
         robot
             The robot.
-        joint_names, time, q
-            The names of columns, the times (N,), s, and the joint positions (N, n), m or rad.
+        joint_names
+            The names of the columns of ``q``.
+        q, pose
+            Times (N,), s, and joint positions (N, n), m or rad; times (M,) and poses (M, 7) of the
+            base, which count among obstacles alone, and then the states of equal times.
         mesh_of
             As for :class:`~spacerobot_ros.collision.geometry.CollisionGeometry`.
         """
-        names = list(joint_names)
+        (time, shapes), names, base = q, list(joint_names), None
+        if robot.world is not None:
+            time, of_joints, of_base = np.intersect1d(time, pose[0], return_indices=True)
+            shapes, poses = shapes[of_joints], pose[1][of_base]
+            base = BasePoses(poses[:, :3], poses[:, 3:])
         if not len(time) or not set(robot.joint_names) <= set(names):
             return None
         geometry = CollisionGeometry(robot, mesh_of)
         if not len(geometry.pairs):
             return None
-        return cls(geometry, time, q[:, [names.index(name) for name in robot.joint_names]])
+        columns = [names.index(name) for name in robot.joint_names]
+        return cls(geometry, time, shapes[:, columns], base)
 
     @cached_property
     def nearest(self) -> Approach:
         """The nearest approach of two links, between the states too."""
-        found = PathCheck(self.geometry).nearest(self.shapes)
+        found = PathCheck(self.geometry).nearest(self.shapes, self.base)
         assert found is not None
         return found
 
     def statuses(self, every: int) -> list[ClearanceStatus]:
         """Return the clearances of one state in ``every``, as the plant publishes them."""
-        distances, pairs = self.geometry.nearest_at(self.shapes[::every])
+        distances, pairs = self._nearest_at(slice(None, None, every))
         return [
             ClearanceStatus(distance, self.geometry.links_of(pair), time)
             for distance, pair, time in zip(
@@ -86,17 +99,28 @@ class FlightClearance:
         """Return the events of contacts in one state in ``every``, as the plant reports them."""
         if not self.geometry.exact:
             return []
-        shapes, time = self.shapes[::every], self.time[::every]
-        distances, _ = self.geometry.nearest_at(shapes)
+        chosen = np.arange(0, len(self.time), every)
+        distances, _ = self._nearest_at(chosen)
         touching = distances <= 0
         touching[1:] |= touching[:-1]  # Contacts end in the state after.
         monitor = ClearanceMonitor(self.geometry, self.geometry.links)
         events: list[Event] = []
-        for row in np.flatnonzero(touching).tolist():
-            R, r = self.geometry.poses(shapes[row])
+        links = len(self.geometry.links)
+        for row in chosen[touching].tolist():
+            R, r = (each[:links] for each in self.geometry.poses(self.shapes[row]))
             link_R = np.ascontiguousarray(R.transpose(1, 0, 2).reshape(3, -1))
-            events += monitor.measure(link_R, r.T, float(time[row]))[1]
+            pose = np.zeros(7)
+            if self.base is not None:
+                pose[:3], pose[3:] = self.base.position[row], self.base.quaternion[row]
+            events += monitor.measure(link_R, r.T, pose, float(self.time[row]))[1]
         return events
+
+    def _nearest_at(
+        self, rows: slice | npt.NDArray[np.int64]
+    ) -> tuple[Array, npt.NDArray[np.int64]]:
+        """Return the smallest distances, m, and their pairs in some states."""
+        base = None if self.base is None else self.base.rows(rows)
+        return self.geometry.nearest_at(self.shapes[rows], base)
 
     @property
     def nearest_time(self) -> float:
@@ -109,7 +133,7 @@ class FlightClearance:
         These are ``most`` states at about equal intervals, and the nearest approach.
         """
         rows = np.unique(np.linspace(0, len(self.time) - 1, most).round().astype(int))
-        distances, _ = self.geometry.nearest_at(self.shapes[rows])
+        distances, _ = self._nearest_at(rows)
         time = self.time[rows]
         place = int(np.searchsorted(time, self.nearest_time))
         return (

@@ -350,7 +350,10 @@ class Flight:
         """
         if self.robot is None or not self.measures_clearance:
             return None
-        return FlightClearance.of(self.robot, self.joint_names, self.signal("q").time, self.q)
+        q, pose = self.signal("q"), self.signal("pose")
+        return FlightClearance.of(
+            self.robot, self.joint_names, (q.time, q.values), (pose.time, pose.values)
+        )
 
     @cached_property
     def measures(self) -> Measures:

@@ -468,7 +468,8 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
     urdf, own = bag.parts[0].urdf, nodes.get("plant", {}).get("robot", "")
     for values in nodes.values():
         if urdf is not None and values.get("robot") in ("", own):
-            values["robot_description"] = urdf.decode(errors="replace")
+            # The text of the robot carries its obstacles.
+            values |= {"robot_description": urdf.decode(errors="replace"), "world": ""}
     published: tuple[Published, ...] = ()
     goal = end_effector_goal = None
     with suppress(KeyError, TypeError, ValueError):

@@ -162,6 +162,7 @@ class RobotDescription:
     ``bodies`` are in topological order, the base first; the movable joints are those of
     ``bodies[1:]`` that follow no other, in that order. ``frames`` maps every link to its body and
     its pose in it. ``disabled_collisions`` are pairs of links whose contact does not count.
+    ``world`` are the obstacles around the robot, whose root link is the frame W; None: none.
     """
 
     name: str
@@ -171,6 +172,7 @@ class RobotDescription:
     frames: dict[str, tuple[int, Pose]]
     urdf: str
     disabled_collisions: frozenset[frozenset[str]] = frozenset()
+    world: RobotDescription | None = None
 
     @property
     def base_link(self) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.model_functions import SymbolicModels
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.model.urdf import load_robot, parse_robot
+from spacerobot_ros.model.urdf import load_robot, load_world, parse_robot
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.times import SECOND
@@ -22,10 +23,24 @@ class RobotConfig:
     robot: str = parameter(
         "", "URDF file, or the name of a robot of this package (sliding_masses, ...)"
     )
+    world: str = parameter(
+        "", "URDF file of obstacles that are fixed in the world; '': those that the robot carries"
+    )
 
     def described(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot with what this configuration says of it beside its URDF."""
-        return robot
+        """Return the robot with what this configuration says of it beside its URDF.
+
+        Raises
+        ------
+        ParameterError
+            The obstacles are refused.
+        """
+        if not self.world:
+            return robot
+        try:
+            return with_world(robot, load_world(self.world))
+        except RobotDescriptionError as error:
+            raise ParameterError(f"Parameter 'world' is refused: {error}") from error
 
     def assumed_robot(self, robot: RobotDescription) -> RobotDescription:
         """Return the robot with the mass properties that the configured node assumes."""

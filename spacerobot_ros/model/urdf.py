@@ -13,12 +13,12 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
-from xml.etree.ElementTree import Element, ParseError, fromstring
+from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 import numpy as np
 
@@ -71,6 +71,31 @@ def load_robot(path: str | Path) -> RobotDescription:
         The file cannot be read, is not URDF, or does not describe a free-floating tree.
     """
     path = Path(path)
+    robot = _loaded(path, parse_robot)
+    beside = path.with_name(f"{path.name.split('.')[0]}.srdf")
+    if not beside.is_file():
+        return robot
+    try:
+        return with_srdf(robot, beside)
+    except RobotDescriptionError as error:
+        raise RobotDescriptionError(f"{path}: {error}") from error
+
+
+def load_world(path: str | Path) -> RobotDescription:
+    """Read obstacles that are fixed in the world from a URDF or xacro file.
+
+    The frame of the root link is that of the world, W. No link needs a mass.
+
+    Raises
+    ------
+    RobotDescriptionError
+        The file cannot be read or is not URDF, or :func:`parse_world` refuses it.
+    """
+    return _loaded(Path(path), parse_world)
+
+
+def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescription:
+    """Return the description of a file, whose paths of meshes become absolute."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
@@ -83,9 +108,7 @@ def load_robot(path: str | Path) -> RobotDescription:
         text = _expand_xacro(path)
     try:
         folder = path.resolve().parent
-        robot = parse_robot(with_mesh_files(text, lambda mesh: mesh_beside(mesh, folder)))
-        beside = path.with_name(f"{path.name.split('.')[0]}.srdf")
-        return with_srdf(robot, beside) if beside.is_file() else robot
+        return parse(with_mesh_files(text, lambda mesh: mesh_beside(mesh, folder)))
     except RobotDescriptionError as error:
         remedy = ""
         if path.suffix != ".xacro" and ("<xacro:" in text or "${" in text):
@@ -137,6 +160,42 @@ def parse_robot(text: str) -> RobotDescription:
         The text is not URDF, or does not describe a free-floating tree of prismatic, revolute,
         continuous and fixed joints with positive definite inertia.
     """
+    description = _read_tree(text)
+    for number, body in enumerate(description.bodies):
+        if describe_inertia_flaw(body.inertia.about_com):
+            _refuse_impossible_inertia(
+                [link for link in description.links if description.frames[link.name][0] == number]
+            )
+    _require_mass(description)
+    _require_common_range(description)
+    return description
+
+
+def parse_world(text: str) -> RobotDescription:
+    """Read obstacles that are fixed in the world from a URDF text; see :func:`load_world`.
+
+    Raises
+    ------
+    RobotDescriptionError
+        The text is not URDF, has a joint that moves, or no shape.
+    """
+    world = _read_tree(text)
+    if world.moving_joints:
+        joint = world.moving_joints[0]
+        raise RobotDescriptionError(
+            f"Obstacles are fixed in the world, and joint '{joint.name}' is {joint.kind.value}: "
+            'give it type="fixed".'
+        )
+    if not any(link.collisions or link.shapes for link in world.links):
+        raise RobotDescriptionError(
+            f"The world '{world.name}' has no obstacle: give its links <collision> or <visual> "
+            "elements."
+        )
+    return world
+
+
+def _read_tree(text: str) -> RobotDescription:
+    """Return the links and joints of a URDF text, whatever their masses."""
     if text.count("<link") > _MAX_LINKS:
         raise RobotDescriptionError(
             f"The robot description has more than {_MAX_LINKS} links: its equations would take "
@@ -160,12 +219,8 @@ def parse_robot(text: str) -> RobotDescription:
     }
     joints = _with_leaders([_read_joint(each, links) for each in root.findall("joint")])
     bodies, frames = weld_links(links, joints)
-    for number, body in enumerate(bodies):
-        if describe_inertia_flaw(body.inertia.about_com):
-            _refuse_impossible_inertia(
-                [link for link in links.values() if frames[link.name][0] == number]
-            )
-    description = RobotDescription(
+    carried = root.find("world/robot")
+    return RobotDescription(
         name=root.get("name", ""),
         links=tuple(links.values()),
         joints=tuple(joints),
@@ -173,10 +228,8 @@ def parse_robot(text: str) -> RobotDescription:
         frames=frames,
         urdf=text,
         disabled_collisions=disabled_pairs(root, list(links), "The robot description"),
+        world=None if carried is None else parse_world(tostring(carried, encoding="unicode")),
     )
-    _require_mass(description)
-    _require_common_range(description)
-    return description
 
 
 # -- links ------------------------------------------------------------------------------------
@@ -460,7 +513,7 @@ _OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": 
 """Descriptions of other file formats by their root elements."""
 
 _ELEMENTS_READ = {
-    "robot": ("link", "joint", "material", "disable_collisions"),
+    "robot": ("link", "joint", "material", "disable_collisions", "world"),
     "link": ("inertial", "visual", "collision"),
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
     "material": ("color",),

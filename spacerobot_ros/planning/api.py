@@ -10,9 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import GoalError, ParameterError
-from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
+from spacerobot_ros.model.urdf import load_world
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
@@ -42,6 +44,7 @@ def plan(
     tolerance: Tolerance = _DEFAULT_TOLERANCE,
     integration_step: float = DEFAULT_INTEGRATION_STEP,
     clearance: float = DEFAULT_CLEARANCE,
+    world: RobotDescription | str | Path | None = None,
     **options: Any,
 ) -> GaitSchedule:
     """Plan a gait: ``plan("sliding_masses", position=(0.3, 0, 0.1), rotvec=(0.5, 0, 0))``.
@@ -68,7 +71,11 @@ def plan(
         Duration of a command (s), largest error at the goal, and longest step of the prediction
         (s): the plant's, for a flight that ends where the plan does.
     clearance
-        Smallest distance of links on the way, m; 0: contacts are not looked at.
+        Smallest distance of links on the way, m; 0: contacts are not looked at. Among obstacles, 0
+        stands for 0.01 m.
+    world
+        Obstacles that are fixed in the world (:func:`.load_world`), or their URDF file; None: those
+        that the robot carries.
 
     Raises
     ------
@@ -76,6 +83,8 @@ def plan(
         The goal is refused or cannot be reached; the message says why.
     ParameterError
         There is no such robot, method or option, or one is refused.
+    RobotDescriptionError
+        The robot or the world is refused.
     """
     if not isinstance(robot, SpaceRobot):
         robot = SpaceRobot.from_file(robot_file(str(robot)))
@@ -100,9 +109,19 @@ def plan(
         control_period,
         integration_step,
         options_of_method,
-        Clearance.wanted(robot.description, clearance),
+        Clearance.wanted(_among_obstacles(robot, world), clearance),
     )
     return planner.plan(PlanRequest(_start_state(robot, start), goal, tolerance))
+
+
+def _among_obstacles(
+    robot: SpaceRobot, world: RobotDescription | str | Path | None
+) -> RobotDescription:
+    if world is None:
+        return robot.description
+    if not isinstance(world, RobotDescription):
+        world = load_world(world)
+    return with_world(robot.description, world)
 
 
 def end_effector_goals(

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.axes import Axes
 
+from spacerobot_ros.errors import sentence_case
 from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Joint
 from spacerobot_ros.model.rotations import (
@@ -583,7 +584,7 @@ def clearance_figure(flight: FlightReport) -> ReportFigure | None:
         limit_name="contact",
     )
     nearest = clearance.nearest
-    sentence = f"{str(nearest)[0].upper()}{str(nearest)[1:]} at {clearance.nearest_time:.6g} s"
+    sentence = f"{sentence_case(str(nearest))} at {clearance.nearest_time:.6g} s"
     caption = f"Smallest distance between two links that no joint connects. {sentence}"
     if touching:
         caption += "; below the dotted line links touch, by the shapes in the URDF"

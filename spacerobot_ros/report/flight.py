@@ -260,9 +260,13 @@ class FlightReport:
                 raise MeshError(f"The bag does not carry the mesh '{shape.resource}'.")
             return self.meshes[shape.resource].moved(shape.pose, shape.size)
 
-        shape = self.shape
+        shape, pose = self.shape, self.signal("pose")
         return FlightClearance.of(
-            self.robot, self.joint_names, shape.time, shape.values, mesh_of=carried
+            self.robot,
+            self.joint_names,
+            (shape.time, shape.values),
+            (pose.time, pose.values),
+            mesh_of=carried,
         )
 
     # -- names --------------------------------------------------------------------

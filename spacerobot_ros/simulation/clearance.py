@@ -1,4 +1,4 @@
-"""The clearance of a plant in flight: the smallest distance between its links, and their contacts.
+"""The clearance of a plant in flight: the smallest distance of its links, and their contacts.
 
 A plant integrates the motion of bodies that do not push each other: it goes on through a contact,
 and reports that it does.
@@ -47,8 +47,8 @@ class ClearanceStatus:
     def message(self) -> str:
         """The status as a sentence."""
         if self.distance > 0:
-            return f"Links {self.links} are {self.distance:.3g} m apart."
-        return f"Links {self.links} touch, {-self.distance:.3g} m deep."
+            return f"{_subject(self.links)} are {self.distance:.3g} m apart."
+        return f"{_subject(self.links)} touch, {-self.distance:.3g} m deep."
 
     def to_values(self) -> dict[str, str]:
         """Return the status as key-value pairs of a DiagnosticStatus."""
@@ -105,7 +105,7 @@ class ClearanceMonitor:
         return cls(geometry, links)
 
     def measure(
-        self, link_R: Array, link_r: Array, time_s: float
+        self, link_R: Array, link_r: Array, pose: Array, time_s: float
     ) -> tuple[ClearanceStatus, list[Event]]:
         """Return the clearance, and an event for each contact that has begun or ended.
 
@@ -113,25 +113,32 @@ class ClearanceMonitor:
         ----------
         link_R, link_r
             Attitudes (3, 3 L) and positions (3, L), m, of the links in B.
+        pose
+            (7,) position, m, and quaternion (x, y, z, w) of the base in W.
         time_s
             Simulated time, s.
         """
-        distance, pair = self._nearest.nearest(link_R, link_r)
+        distance, pair = self._nearest.nearest(link_R, link_r, pose)
         status = ClearanceStatus(distance, self._nearest.geometry.links_of(pair), time_s)
         before = self._touching
         if distance > 0 and not before:
             return status, []
-        self._touching = self._nearest.touching(link_R, link_r)
+        self._touching = self._nearest.touching(link_R, link_r, pose)
         return status, [
             *(_contact_event(each, time_s) for each in sorted(self._touching - before)),
             *(_contact_event(each, time_s, over=True) for each in sorted(before - self._touching)),
         ]
 
 
+def _subject(links: LinkPair) -> str:
+    """Return two links, or a link and an obstacle, as the beginning of a sentence."""
+    return links.subject[0].upper() + links.subject[1:]
+
+
 def _contact_event(links: LinkPair, time_s: float, *, over: bool = False) -> Event:
     about = {"first": links.first, "second": links.second}
     if over:
-        message = f"Links {links} no longer touch."
+        message = f"{_subject(links)} no longer touch."
         return Event(EventKind.CONTACT_ENDED, message, _OK, time_s, about=about)
-    message = f"Links {links} touch; the simulation goes on through the contact."
+    message = f"{_subject(links)} touch; the simulation goes on through the contact."
     return Event(EventKind.CONTACT, message, _ERROR, time_s, about=about)

@@ -363,7 +363,8 @@ class Planner:
         values = {name: json.loads(text) for name, text in parameters.items() if name in known}
         values = {name: value for name, value in values.items() if value is not None}
         # The robot is that of the question, wherever the planner takes its own from.
-        self._config = configured(PlannerConfig, {**values, "robot_description": "", "robot": ""})
+        elsewhere = {"robot_description": "", "robot": "", "world": ""}
+        self._config = configured(PlannerConfig, {**values, **elsewhere})
         self._worker = PlanningWorker(robot_from_text(urdf, self._config), self._config)
 
 

@@ -52,14 +52,17 @@ def through() -> Flight:
     return fly(sliders, goal, rotvec=turn, method="lie_bracket", parameters=PARAMETERS)
 
 
+NO_POSES = (np.zeros(0), np.zeros((0, 7)))
+
+
 def test_the_nearest_approach_of_a_flight_may_be_between_two_states() -> None:
     # The balls pass the middle at 1.3 s, between two states that are 1 s apart.
     shapes = np.array([[-0.65, -1.3], [-0.15, -0.3], [0.35, 0.7], [0.4, 0.7]])
     time = np.array([0.0, 1.0, 2.0, 5.0])
     robot = parse_robot(URDF)
-    assert FlightClearance.of(robot, ("y", "z"), time, shapes) is None
+    assert FlightClearance.of(robot, ("y", "z"), (time, shapes), NO_POSES) is None
     # A bag may have its joints in another order than the robot.
-    found = FlightClearance.of(robot, ("x", "y"), time, shapes[:, ::-1])
+    found = FlightClearance.of(robot, ("x", "y"), (time, shapes[:, ::-1]), NO_POSES)
     assert found is not None
     assert list(found.nearest.links) == LINKS
     assert found.nearest.distance == pytest.approx(0.1 - 0.12, abs=1e-4)
@@ -71,7 +74,8 @@ def test_the_nearest_approach_of_a_flight_may_be_between_two_states() -> None:
 
 def test_contacts_of_states_begin_and_end() -> None:
     way = np.linspace(-1.0, 1.0, 21)[:, np.newaxis] * [0.15, 0.3]
-    found = FlightClearance.of(parse_robot(URDF), ("y", "x"), np.arange(21) / 4, way)
+    q = np.arange(21) / 4, way
+    found = FlightClearance.of(parse_robot(URDF), ("y", "x"), q, NO_POSES)
     assert found is not None
     for every in (1, 2):
         touching = np.flatnonzero(distance(way)[::every] <= 0) * every / 4

@@ -30,7 +30,7 @@ def test_a_plant_goes_on_through_a_contact_and_says_so() -> None:
     events: list[Event] = []
     shapes = []
     for tick in range(13):
-        status, news = monitor.measure(plant.link_R, plant.link_r, tick / 20)
+        status, news = monitor.measure(plant.link_R, plant.link_r, plant.pose, tick / 20)
         found.append(status)
         events += news
         shapes.append(plant.q.copy())
@@ -73,13 +73,16 @@ def test_the_nearest_pair_is_that_of_all_distances(name: str) -> None:
     together, pairs = geometry.nearest_at(shapes)
     np.testing.assert_allclose(together, each.min(axis=0), atol=1e-9)
     np.testing.assert_array_equal(pairs, each.argmin(axis=0))
-    nearest = NearestPair(geometry, geometry.links)
+    nearest, pose = (
+        NearestPair(geometry, geometry.links),
+        np.array([0.3, -0.2, 0.1, 0, 0, 0.6, 0.8]),
+    )
     for k in range(len(shapes)):
         poses = R[k].transpose(1, 0, 2).reshape(3, -1), r[k].T
-        found, _ = nearest.nearest(*poses)
+        found, _ = nearest.nearest(poses[0], poses[1], pose)
         assert found == pytest.approx(together[k], abs=1e-9)
         touching = {geometry.links_of(p) for p in np.flatnonzero(each[:, k] <= 0).tolist()}
-        assert nearest.touching(*poses) == touching
+        assert nearest.touching(poses[0], poses[1], pose) == touching
     assert (each.min(axis=0) < 0).any()
 
 

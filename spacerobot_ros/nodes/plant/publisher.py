@@ -449,7 +449,9 @@ class ClearancePublisher:
     def publish(self, time_ns: int) -> None:
         """Publish the present clearance, and events of contacts that have begun or ended."""
         plant = self._plant
-        status, events = self._monitor.measure(plant.link_R, plant.link_r, time_ns / SECOND)
+        status, events = self._monitor.measure(
+            plant.link_R, plant.link_r, plant.pose, time_ns / SECOND
+        )
         record = StatusRecord(self._name, status.level, status.message, status.to_values())
         self._stream.take(record.encoded())
         for event in events:

@@ -1,4 +1,4 @@
-"""Clearance of plans: how near the bodies of a robot may come to each other on the way."""
+"""Clearance of plans: how near the bodies of a robot may come to each other and to obstacles."""
 
 from __future__ import annotations
 
@@ -8,14 +8,32 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.collision import Approach, CollisionGeometry, PathCheck
-from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.collision import (
+    Approach,
+    BasePoses,
+    CollisionGeometry,
+    LinkPair,
+    ObstaclePair,
+    PathCheck,
+)
+from spacerobot_ros.errors import (
+    ParameterError,
+    PlanningError,
+    Proof,
+    UnreachableError,
+    sentence_case,
+)
 from spacerobot_ros.model.description import Array, RobotDescription
 
 _LOG = logging.getLogger(__name__)
 
 DEFAULT_CLEARANCE = 0.01
 """Smallest distance between two links of a plan, m; 0: contacts are not looked at."""
+
+_CLEARANCE_OF_OBSTACLES = 0.01
+"""Smallest distance among obstacles where none is asked for, m."""
+
+_DISABLED = ", or have an SRDF disable the pair (planner.srdf)"
 
 _EXACT = 1e-6
 """Error of a distance, m."""
@@ -29,14 +47,14 @@ may be a little nearer."""
 
 
 class Clearance:
-    """The smallest distance that plans of one robot keep between its links.
+    """The smallest distance that plans of one robot keep between its links, and from obstacles.
 
     Parameters
     ----------
     robot
-        The robot.
+        The robot, with its world.
     distance
-        Smallest distance of links that no joint connects, m.
+        Smallest distance of links that no joint connects, and of links and obstacles, m.
     """
 
     def __init__(self, robot: RobotDescription, distance: float) -> None:
@@ -48,6 +66,8 @@ class Clearance:
     def wanted(cls, robot: RobotDescription, distance: float) -> Clearance | None:
         """Return the clearance of a robot that is asked for; None: none, by a distance of zero.
 
+        Among obstacles, a distance of zero stands for 0.01 m.
+
         Raises
         ------
         ParameterError
@@ -55,6 +75,8 @@ class Clearance:
         """
         if not 0.0 <= distance < np.inf:
             raise ParameterError(f"clearance is {distance}; it must be a distance in m, 0 or more.")
+        if robot.world is not None:
+            distance = distance or _CLEARANCE_OF_OBSTACLES
         return cls(robot, distance) if distance else None
 
     def of(self, robot: RobotDescription) -> Clearance:
@@ -65,6 +87,11 @@ class Clearance:
     def geometry(self) -> CollisionGeometry:
         """The solids of the robot."""
         return CollisionGeometry(self._robot)
+
+    @property
+    def has_obstacles(self) -> bool:
+        """Whether the motion of the base counts, too, as there are obstacles."""
+        return bool(self.geometry.with_obstacles.any())
 
     @cached_property
     def _check(self) -> PathCheck:
@@ -83,11 +110,12 @@ class Clearance:
             ]
         )
 
-    def required(self, start: Array) -> Array:
+    def required(self, start: Array, base: BasePoses | None = None) -> Array:
         """Return the distances (P,) that all pairs keep from a start (n,) on, m.
 
         A pair that is nearer than the clearance at the start does not come nearer than there.
         Links that are in contact at the start are not looked at (minus infinity), with a warning.
+        ``base`` is the pose of the base there; None: obstacles do not count.
 
         Raises
         ------
@@ -98,29 +126,33 @@ class Clearance:
         required = np.full(len(geometry.pairs), self.distance)
         if not len(required):
             return required
-        poses = geometry.poses(start[np.newaxis])
+        poses = geometry.poses(start[np.newaxis], base)
         for pair in np.flatnonzero(geometry.lower_bounds(poses)[0] <= self.distance).tolist():
             distance = float(geometry.distances(pair, poses)[0])
             if distance <= 0:
                 required[pair] = -np.inf
-                self._warn_of_contact(str(geometry.links_of(pair)))
+                self._warn_of_contact(geometry.links_of(pair))
             elif distance < _NEARER * self.distance:
+                links = geometry.links_of(pair)
+                remedy = "" if isinstance(links, ObstaclePair) else _DISABLED
                 raise PlanningError(
-                    f"Links {geometry.links_of(pair)} are {distance:.3g} m apart at the start, "
-                    f"nearer than planner.clearance = {self.distance:g} m: make it smaller, or "
-                    "have an SRDF disable the pair (planner.srdf)."
+                    f"{sentence_case(links.subject)} are {distance:.3g} m apart at the start, "
+                    f"nearer than planner.clearance = {self.distance:g} m: make it smaller{remedy}."
                 )
             else:
                 required[pair] = min(self.distance, distance)
         return required - _EXACT
 
-    def _warn_of_contact(self, links: str) -> None:
-        if links not in self._warned:
-            self._warned.add(links)
+    def _warn_of_contact(self, links: LinkPair) -> None:
+        if links.subject not in self._warned:
+            self._warned.add(links.subject)
+            remedy = ""
+            if not isinstance(links, ObstaclePair):
+                remedy = " If they only look so, have an SRDF disable the pair (planner.srdf)."
             _LOG.warning(
-                "Links %s are in contact at the start: their contact is ignored. If they only look "
-                "so, have an SRDF disable the pair (planner.srdf).",
-                links,
+                "%s are in contact at the start: their contact is ignored.%s",
+                sentence_case(links.subject),
+                remedy,
             )
 
     def is_roomy(self, shapes: Array) -> npt.NDArray[np.bool_]:
@@ -136,7 +168,12 @@ class Clearance:
             roomy[at] = geometry.distances(pair, (R[at], r[at])) >= room
         return roomy
 
-    def approaches(self, positions: Array, required: Array | None = None) -> list[Approach]:
+    def approaches(
+        self,
+        positions: Array,
+        required: Array | None = None,
+        base: BasePoses | None = None,
+    ) -> list[Approach]:
         """Return the nearest approaches of pairs that come too near, nearest first.
 
         Parameters
@@ -146,12 +183,14 @@ class Clearance:
         required
             (P,) distances that are to be kept, m; None: those :meth:`required` from the first
             shape on.
+        base
+            Poses of the base at the ticks; None: obstacles do not count.
         """
         if not len(self.geometry.pairs):
             return []
         if required is None:
-            required = self.required(positions[0])
-        return self._check.approaches(positions, required)
+            required = self.required(positions[0], None if base is None else base.rows(slice(1)))
+        return self._check.approaches(positions, required, base)
 
     def clause(self, approach: Approach, control_period: float | None) -> str:
         """Return a clause about a path that comes too near; no control period: of no times."""
@@ -163,18 +202,22 @@ class Clearance:
             f"{approach}{when} at the shape {shape}, and planner.clearance is {self.distance:g} m"
         )
 
-    def require_shape(self, start: Array, shape: Array) -> None:
+    def require_shape(self, shape: Array, required: Array, base: BasePoses | None = None) -> None:
         """Check that links do not come too near in the shape (n,) of a goal.
+
+        ``required`` are the distances (P,) of all pairs, m, and ``base`` is the pose of the base
+        there, if it is known.
 
         Raises
         ------
         UnreachableError
             They do; the message says which.
         """
-        found = self.approaches(shape[np.newaxis], self.required(start))
+        found = self.approaches(shape[np.newaxis], required, base)
         if found:
+            subject = "shape" if found[0].place is None else "pose"
             raise UnreachableError(
-                f"The shape of the goal is in collision: {found[0]}; planner.clearance is "
+                f"The {subject} of the goal is in collision: {found[0]}; planner.clearance is "
                 f"{self.distance:g} m.",
                 Proof.COLLISION,
             )

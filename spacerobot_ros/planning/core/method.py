@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.errors import GoalError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -214,12 +215,13 @@ class GaitMethod(ABC):
         Raises
         ------
         PlanningError
-            Links come too near to each other; ``is_clear``: that has been checked.
+            Links come too near to each other or to obstacles; ``is_clear``: that has been checked.
         """
         if not self.plans_for_end_effectors:
             self._require_goal_of_base(goal)
         if not is_clear:
-            self._require_clear(positions)
+            start = RobotState(path.position[0], path.quaternion[0], positions[0])
+            self._require_clear(positions, self._base_poses(start, positions))
         if self._joint_efforts is not None:
             beyond = self._joint_efforts.beyond_limits(positions, velocity)
             notes = {**notes, BEYOND_EFFORT_LIMITS: beyond} if beyond else notes
@@ -276,21 +278,41 @@ class GaitMethod(ABC):
                 f"{END_EFFECTOR_METHOD} plans for end-effectors."
             )
 
-    def _require_clear(self, positions: Array) -> None:
-        """Refuse shapes (K, n) on the way, with straight lines in between, where links come too
-        near to each other.
+    @property
+    def _has_obstacles(self) -> bool:
+        """Whether there are obstacles around the robot that schedules keep clear of."""
+        return self.clearance is not None and self.clearance.has_obstacles
+
+    def _base_poses(
+        self, start: RobotState, positions: Array, attitudes: Array | None = None
+    ) -> BasePoses | None:
+        """Return the poses of the base at the ticks of shapes (N + 1, n); None without obstacles.
+
+        ``start`` is a state of the same motion: that of the first shape, unless ``attitudes``
+        (N + 1, 4) are given.
         """
-        if clause := self._too_near(positions):
+        if not self._has_obstacles:
+            return None
+        return self._prediction.poses(start, positions, attitudes)
+
+    def _require_clear(self, positions: Array, base: BasePoses | None = None) -> None:
+        """Refuse shapes (K, n) on the way, with straight lines in between, where links come too
+        near to each other or, at the poses of the ``base``, to obstacles.
+        """
+        if clause := self._too_near(positions, base):
             raise PlanningError(f"On the way {clause}.")
 
-    def _too_near(self, positions: Array, *, at_ticks: bool = True) -> str:
+    def _too_near(
+        self, positions: Array, base: BasePoses | None = None, *, at_ticks: bool = True
+    ) -> str:
         """Return the clause that says where links come too near; empty: nowhere.
 
         ``positions`` (K, n) are shapes with straight lines in between, ``at_ticks`` or not.
+        Without poses of the ``base``, obstacles do not count.
         """
         if self.clearance is None:
             return ""
-        found = self.clearance.approaches(positions)
+        found = self.clearance.approaches(positions, base=base)
         period = self.control_period if at_ticks else None
         return self.clearance.clause(found[0], period) if found else ""
 

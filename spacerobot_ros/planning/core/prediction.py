@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import count_steps
-from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_from_quaternion
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import BasePath
 
@@ -68,6 +69,21 @@ class BasePrediction:
                 for t, q, quaternion in zip(time, shapes, quaternions, strict=True)
             ]
         )
+
+    def poses(
+        self, state: RobotState, positions: Array, attitudes: Array | None = None
+    ) -> BasePoses:
+        """Return the poses of the base at every tick of the shapes (N + 1, n), at zero momentum.
+
+        ``attitudes`` (N + 1, 4) are those at the ticks, if they are known already.
+        """
+        if attitudes is None:
+            attitudes = self.attitudes(positions, state.quaternion, np.zeros(3))
+        R_0B = matrix_from_quaternion(state.quaternion)
+        r_WC = state.position + R_0B @ self._robot.center_of_mass(state.q)
+        centers = self._robot.function("center_of_mass", compile=False)(positions.T).full().T
+        R_WB = matrices_from_quaternions(attitudes)
+        return BasePoses(r_WC - np.einsum("nab,nb->na", R_WB, centers), attitudes)
 
     def path(self, state: RobotState, positions: Array, attitudes: Array | None = None) -> BasePath:
         """Return the base path of the shapes ``positions`` (N + 1, n), at some of the ticks.

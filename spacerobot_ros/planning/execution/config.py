@@ -114,7 +114,8 @@ class PlannerConfig(CommanderConfig):
     options: Mapping[str, Any] = registered(METHODS)
 
     def described(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot with the disabled pairs of the SRDF."""
+        """Return the robot with the disabled pairs of the SRDF, among the obstacles."""
+        robot = super().described(robot)
         return with_srdf(robot, self.srdf) if self.srdf else robot
 
     @property

@@ -28,7 +28,7 @@ from spacerobot_ros.model.rotations import attitude_error, quaternion_inverse, q
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import best_sampled_brackets
-from spacerobot_ros.planning.core.goal import Controlled, PoseError
+from spacerobot_ros.planning.core.goal import Controlled, PoseError, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes, straight_motion
 from spacerobot_ros.planning.methods.nominal_shape import (
@@ -171,7 +171,7 @@ class AreaLoopGait(GaitMethod):
             if planned < self.options.cycles_per_plan:
                 before = len(gait.positions)
                 gait, cycle_notes, cycles = self._add_cycle(
-                    gait, target, left, nominal, tolerance.attitude, flown
+                    state, gait, target, left, nominal, tolerance.attitude, flown
                 )
                 flown += 1
                 notes = {**cycle_notes, "cycles": float(planned + 1)}
@@ -182,6 +182,7 @@ class AreaLoopGait(GaitMethod):
 
     def _add_cycle(
         self,
+        state: RobotState,
         gait: _PlannedMotion,
         target: Array,
         left: Array,
@@ -193,7 +194,8 @@ class AreaLoopGait(GaitMethod):
 
         Also returned are the paper's symbols and the expected number of cycles for the goal.
 
-        Cycles go on until the attitude is off by ``enough`` (rad); ``flown`` are done.
+        The gait begins in ``state``. Cycles go on until the attitude is off by ``enough`` (rad);
+        ``flown`` are done.
         """
         S = self.options.k * np.linalg.solve(nominal.M, left).astype(float)
         # Edges scale with the square root of areas.
@@ -206,7 +208,7 @@ class AreaLoopGait(GaitMethod):
                 f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
                 f"{flown} are flown."
             )
-        share = self._shrink_until_clear(gait, S, share, nominal)
+        share = self._shrink_until_clear(state, gait, S, share, nominal)
         for _ in range(_MAX_CYCLE_TRIALS):
             path = edge_path(share * S, nominal.longest)
             after = self._add_legs(gait, self._edge_ends(path, nominal))
@@ -240,9 +242,16 @@ class AreaLoopGait(GaitMethod):
         )
 
     def _shrink_until_clear(
-        self, gait: _PlannedMotion, S: Array, share: float, nominal: NominalShape
+        self,
+        state: RobotState,
+        gait: _PlannedMotion,
+        S: Array,
+        share: float,
+        nominal: NominalShape,
     ) -> float:
         """Return a share of areas ``S`` (3,), up to a given one, on whose loop links keep clear.
+
+        ``state`` is the start of the gait.
 
         Raises
         ------
@@ -255,7 +264,9 @@ class AreaLoopGait(GaitMethod):
         for _ in range(_MAX_SHRINKS):
             path = edge_path(share * S, nominal.longest)
             loop = self._add_legs(gait, self._edge_ends(path, nominal))
-            too_near = self._too_near(loop.positions[len(gait.positions) - 1 :])
+            added = slice(len(gait.positions) - 1, None)
+            shapes, attitudes = loop.positions[added], loop.attitudes[added]
+            too_near = self._too_near(shapes, self._base_poses(state, shapes, attitudes))
             if not too_near:
                 return share
             share /= 2

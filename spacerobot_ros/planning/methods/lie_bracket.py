@@ -125,7 +125,9 @@ class LieBracketGait(GaitMethod):
             "c": [2 * float((z_f - state.q)[i]) / t1 for i in self.sliders],
         }
         positions = np.vstack([slide, turn])
-        return self._schedule_of(goal, positions, path, symbols | notes, is_clear=True)
+        # In every cycle the base is elsewhere.
+        is_clear = not self._has_obstacles
+        return self._schedule_of(goal, positions, path, symbols | notes, is_clear=is_clear)
 
     def final_shape(self, state: RobotState, goal: Goal, enough: float = 0.0) -> Array:
         """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the present one.

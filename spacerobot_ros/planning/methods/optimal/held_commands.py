@@ -30,7 +30,10 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
-from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
+from spacerobot_ros.planning.methods.optimal.kept_distances import (
+    DistanceLibrary,
+    KeptDistances,
+)
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -98,6 +101,18 @@ class ManoeuvreModel:
     efforts: LimitedEfforts | None = None
     end_effectors: EndEffectorRows | None = None
     distances: DistanceLibrary | None = None
+
+    def begin(self, boundary: BoundaryConditions) -> KeptDistances | None:
+        """Return the distances that are kept between two ends; None: any.
+
+        Raises
+        ------
+        PlanningError
+            Links are too near at an end.
+        """
+        if self.distances is None:
+            return None
+        return self.distances.begin(boundary, turn_is_known=len(self.axes) == 3)
 
 
 class CommandHolder:

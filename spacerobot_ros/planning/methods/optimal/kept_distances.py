@@ -1,4 +1,5 @@
-"""Pairs of links that a solver keeps apart: only those that a solution without has brought near.
+"""Pairs of links, and of links and obstacles, that a solver keeps apart: only those that a solution
+without has brought near.
 
 Rows for all pairs would be dear, and few of them matter. So a problem is solved without any first.
 Where held commands bring links too near, by the exact check, the problem with rows for these pairs
@@ -13,10 +14,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from spacerobot_ros.collision import Approach
-from spacerobot_ros.collision.rows import DistanceRows
+from spacerobot_ros.collision import Approach, BasePoses
+from spacerobot_ros.collision.rows import DistanceRows, world_values
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
 from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
 
 ROUNDS = 6
@@ -24,6 +28,8 @@ ROUNDS = 6
 
 _ROOM = 2e-3
 """Room beyond the clearance that a pair is given: held commands change the path, m."""
+
+_NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 _AT_ENDS = 1e-4
 """Least room at the ends, where the shape is given, m."""
@@ -36,31 +42,70 @@ class DistanceLibrary:
     ----------
     clearance
         The clearance of plans.
+    robot, prediction
+        The model, and the prediction of the base motion.
     """
 
-    def __init__(self, clearance: Clearance) -> None:
+    def __init__(self, clearance: Clearance, robot: SpaceRobot, prediction: BasePrediction) -> None:
         self.clearance = clearance
+        self._robot, self._prediction = robot, prediction
         self._rows: dict[int, DistanceRows] = {}
 
     def of(self, pairs: Sequence[int]) -> list[DistanceRows]:
         """Return the rows of pairs."""
         for pair in pairs:
             if pair not in self._rows:
-                self._rows[pair] = DistanceRows.of(self.clearance.geometry, [pair])
+                self._rows[pair] = self._derive(pair)
         return [self._rows[pair] for pair in pairs]
 
-    def begin(self, boundary: BoundaryConditions) -> KeptDistances:
+    def _derive(self, pair: int) -> DistanceRows:
+        geometry = self.clearance.geometry
+        if not geometry.with_obstacles[pair]:
+            return DistanceRows.of(geometry, [pair])
+        center_of_mass = self._robot.function("center_of_mass", compile=False)
+        return DistanceRows.from_obstacles(geometry, pair, center_of_mass)
+
+    def begin(self, boundary: BoundaryConditions, *, turn_is_known: bool) -> KeptDistances:
         """Return the pairs that are kept apart between two ends: none yet.
+
+        ``turn_is_known``: the turn of the base at the end is that of the boundary conditions.
 
         Raises
         ------
         PlanningError
             Links are too near at an end.
         """
-        required = self.clearance.required(boundary.start)
+        start = boundary.start[np.newaxis]
+        required = self.clearance.required(
+            boundary.start, self.base_poses(boundary, start, _NO_TURN[np.newaxis])
+        )
         if boundary.final is not None:
-            self.clearance.require_shape(boundary.start, boundary.final)
-        return KeptDistances(self, boundary, required)
+            base = None
+            if turn_is_known:
+                end, turn = boundary.final[np.newaxis], boundary.turn[np.newaxis]
+                base = self.base_poses(boundary, end, turn)
+            self.clearance.require_shape(boundary.final, required, base)
+        return KeptDistances(self, boundary, required, turn_is_known=turn_is_known)
+
+    def base_poses(
+        self, boundary: BoundaryConditions, shapes: Array, turns: Array
+    ) -> BasePoses | None:
+        """Return the poses of the base at shapes (K, n) and turns (K, 4) since the start.
+
+        None: there are no obstacles, so that it does not count.
+        """
+        if boundary.state is None or not self.clearance.has_obstacles:
+            return None
+        attitudes = quaternion_multiply(boundary.state.quaternion, turns)
+        return self._prediction.poses(boundary.state, shapes, attitudes)
+
+    def world(self, boundary: BoundaryConditions) -> Array:
+        """Return the numbers (12,) of the pose of the world (:func:`.world_values`)."""
+        state = boundary.state
+        assert state is not None
+        R_0W = matrix_from_quaternion(state.quaternion).T
+        r_WC = state.position + R_0W.T @ self._robot.center_of_mass(state.q)
+        return world_values(R_0W, -R_0W @ r_WC)
 
 
 class KeptDistances:
@@ -74,12 +119,20 @@ class KeptDistances:
         Both ends.
     required
         (P,) the distances that all pairs are to keep, m.
+    turn_is_known
+        As for :meth:`DistanceLibrary.begin`.
     """
 
     def __init__(
-        self, library: DistanceLibrary, boundary: BoundaryConditions, required: Array
+        self,
+        library: DistanceLibrary,
+        boundary: BoundaryConditions,
+        required: Array,
+        *,
+        turn_is_known: bool,
     ) -> None:
         self._library, self._boundary, self._required = library, boundary, required
+        self._turn_is_known = turn_is_known
         self._room: dict[int, float] = {}
 
     @property
@@ -87,9 +140,13 @@ class KeptDistances:
         """Their numbers."""
         return tuple(sorted(self._room))
 
-    def approaches(self, positions: Array) -> list[Approach]:
-        """Return the pairs that come too near along held commands (N + 1, n), nearest first."""
-        return self._library.clearance.approaches(positions, self._required)
+    def approaches(self, positions: Array, turns: Array) -> list[Approach]:
+        """Return the pairs that come too near along held commands (N + 1, n), nearest first.
+
+        ``turns`` (N + 1, 4) are those of the base since the start.
+        """
+        base = self._library.base_poses(self._boundary, positions, turns)
+        return self._library.clearance.approaches(positions, self._required, base)
 
     def message(self, approach: Approach, control_period: float) -> str:
         """Return a clause about a path that comes too near."""
@@ -102,7 +159,9 @@ class KeptDistances:
 
     def copy(self) -> KeptDistances:
         """Return the same pairs, to add others to."""
-        other = KeptDistances(self._library, self._boundary, self._required)
+        other = KeptDistances(
+            self._library, self._boundary, self._required, turn_is_known=self._turn_is_known
+        )
         other._room = dict(self._room)
         return other
 
@@ -114,11 +173,19 @@ class KeptDistances:
 
     def within(self, limits: MotionLimits) -> MotionLimits:
         """Return limits with the distances that the rows keep."""
-        ends = [self._boundary.start]
+        ends, turns = [self._boundary.start], [_NO_TURN]
         if self._boundary.final is not None:
             ends.append(self._boundary.final)
-        least = []
+            turns.append(self._boundary.turn)
+        known = len(ends) if self._turn_is_known else 1
+        shapes, turned = np.array(ends).T, np.hstack([ends, turns])[:known].T
+        least, world = [], np.zeros(0)
         for pair, rows in zip(self.pairs, self._library.of(self.pairs), strict=True):
-            at_ends = float(rows.values(np.array(ends).T).full().min()) - _AT_ENDS
+            if rows.of_obstacles:
+                world = self._library.world(self._boundary)
+                values = rows.values(turned, np.tile(world[:, np.newaxis], turned.shape[1]))
+            else:
+                values = rows.values(shapes)
+            at_ends = float(values.full().min()) - _AT_ENDS
             least.append(min(self._required[pair] + self._room[pair], at_ends))
-        return replace(limits, distances=np.array(least))
+        return replace(limits, distances=np.array(least), world=world)

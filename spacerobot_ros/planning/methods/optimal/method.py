@@ -161,7 +161,11 @@ class OptimalGait(GaitMethod):
             self._specification.axes,
             self._constraints,
             self._efforts,
-            distances=None if self.clearance is None else DistanceLibrary(self.clearance),
+            distances=(
+                None
+                if self.clearance is None
+                else DistanceLibrary(self.clearance, robot, self._prediction)
+            ),
         )
         self._base_goals = self._goal_kind(self._specification, self._model)
         self._end_effector_goals: dict[tuple[object, ...], _GoalKind] = {}
@@ -245,6 +249,7 @@ class OptimalGait(GaitMethod):
             self._limits,
             self._constraints.direction_W,
         )
+        boundary = replace(boundary, state=state)
         # A manoeuvre ends within the margin if its goal does.
         limits = self._limits.within(margin, q, boundary.likely)
         if request.motion is not None:
@@ -432,7 +437,7 @@ class OptimalGait(GaitMethod):
             "shape": np.zeros(0) if shape is None else shape,
             "time": np.array([self.control_period, self.integration_step]),
             "tolerance": np.array([tolerance.position, tolerance.attitude]),
-            **vars(self._limits),
+            **{name: values for name, values in vars(self._limits).items() if name != "world"},
         }
         for each in goal.end_effectors:
             numbers[f"end_effector {each.link}"] = np.array(each.values)
@@ -523,8 +528,8 @@ class OptimalGait(GaitMethod):
             if np.abs(rows[0]).max() > _MAX_CACHED_END_ERROR:
                 raise CandidateError("it ends with end-effectors elsewhere")
         self._constraints.check(positions, attitudes, period)
-        if self.clearance is not None and (near := self.clearance.approaches(positions)):
-            raise CandidateError(self.clearance.clause(near[0], period))
+        if too_near := self._too_near(positions, self._base_poses(state, positions, attitudes)):
+            raise CandidateError(too_near)
 
 
 @dataclass(frozen=True)

@@ -202,7 +202,7 @@ def _pack_parameters(
         [
             *(boundary.start, boundary.turn, boundary.direction, center, boundary.end_effectors),
             *(typical, weights),
-            limits.distances,
+            *(limits.distances, limits.world),
         ]
     )
 

@@ -14,6 +14,7 @@ from spacerobot_ros.model import SpaceRobot, symbolic_rotations
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.parameters import parameter
+from spacerobot_ros.planning.core.goal import RobotState
 
 
 @dataclass(frozen=True)
@@ -199,6 +200,8 @@ class BoundaryConditions:
         (7 k,) goals of k links (:meth:`.EndEffectorRows.pack`).
     ends
         Ends of the guesses, in turn; none: the likely shape, and the turn.
+    state
+        The state at the start.
     """
 
     start: Array
@@ -210,13 +213,15 @@ class BoundaryConditions:
     velocity: Array | float = 0.0
     end_effectors: Array = field(default_factory=lambda: np.zeros(0))
     ends: tuple[PossibleEnd, ...] = ()
+    state: RobotState | None = None
 
 
 @dataclass(frozen=True)
 class MotionLimits:
     """Bounds (n,) of the joints: ``lower`` and ``upper`` in m or rad, ``velocity`` a second,
     ``acceleration`` a second squared; ``distances`` (K,) are the smallest ones, m, of the pairs of
-    links that a solver keeps apart.
+    links that a solver keeps apart. Where one of a pair is an obstacle, ``world`` (12,) is the pose
+    of the world (:func:`.world_values`).
     """
 
     lower: Array
@@ -224,6 +229,7 @@ class MotionLimits:
     velocity: Array
     acceleration: Array
     distances: Array = field(default_factory=lambda: np.zeros(0))
+    world: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: MotionOptions, method: str = "optimal") -> MotionLimits:

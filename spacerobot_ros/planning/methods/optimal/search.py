@@ -268,6 +268,7 @@ class ManoeuvreSearch:
         self._constraints, self._efforts = model.constraints, model.efforts
         self._end_effectors = model.end_effectors
         self._distances = model.distances
+        self._begin = model.begin
         self._holder = CommandHolder(model)
         self._stages: dict[tuple[bool, bool], Stages] = {}
         self._solvers: dict[tuple[int, bool, float, tuple[int, ...]], MultipleShooting] = {}
@@ -303,7 +304,7 @@ class ManoeuvreSearch:
                 f"Manoeuvres take at least {_MIN_TICKS} control periods of {self._period:g} s, "
                 f"more than optimal.longest = {options.longest:g} s."
             )
-        kept = None if self._distances is None else self._distances.begin(boundary)
+        kept = self._begin(boundary)
         progress = _Progress(boundary, limits, quaternion, options, cancellation, library, gentle)
         found = self._search_on_grids(progress, intervals)
         if found and kept is not None:
@@ -348,7 +349,7 @@ class ManoeuvreSearch:
         kept = progress.kept
         assert kept is not None
         in_order = sorted(found, key=lambda one: one.duration)
-        if not kept.approaches(in_order[0].held.positions):
+        if not kept.approaches(in_order[0].held.positions, in_order[0].held.quaternions):
             return found
         freed: list[Manoeuvre] = []
         for each in in_order:
@@ -377,7 +378,7 @@ class ManoeuvreSearch:
         """
         kept = progress.kept
         assert kept is not None
-        near = kept.approaches(manoeuvre.held.positions)
+        near = kept.approaches(manoeuvre.held.positions, manoeuvre.held.quaternions)
         if not near:
             return manoeuvre
         coarser = intervals // _COARSE_GRID_RATIO
@@ -405,12 +406,15 @@ class ManoeuvreSearch:
         """
         kept = progress.kept
         assert kept is not None
-        solution, near = manoeuvre.solution, kept.approaches(manoeuvre.held.positions)
+        solution, near = (
+            manoeuvre.solution,
+            kept.approaches(manoeuvre.held.positions, manoeuvre.held.quaternions),
+        )
         for _ in range(ROUNDS):
             kept.add(near)
             solution = self._solve_apart(progress, solution, intervals, tolerance)
             made = self._make_held_commands(progress, solution)
-            near = kept.approaches(made.held.positions)
+            near = kept.approaches(made.held.positions, made.held.quaternions)
             if not near:
                 return replace(made, kept_apart=len(kept.pairs))
         raise CandidateError(kept.message(near[0], self._period))
@@ -653,7 +657,7 @@ class MotionSearch:
         solver: Callable[[int, bool, float, tuple[int, ...]], MultipleShooting],
     ) -> None:
         self._robot, self._period = model.robot, model.control_period
-        self._constraints, self._distances = model.constraints, model.distances
+        self._constraints, self._begin = model.constraints, model.begin
         self._holder = CommandHolder(model)
         self._solver = solver
 
@@ -679,7 +683,7 @@ class MotionSearch:
             The search was cancelled.
         """
         boundary = replace(boundary, velocity=self._initial_velocity(motion, limits))
-        kept = None if self._distances is None else self._distances.begin(boundary)
+        kept = self._begin(boundary)
         coarser = intervals
         if intervals >= _COARSE_GRID_RATIO_IN_MOTION * _MIN_COARSE_INTERVALS_IN_MOTION:
             coarser = intervals // _COARSE_GRID_RATIO_IN_MOTION
@@ -747,7 +751,7 @@ class MotionSearch:
             return held
         kept = kept.copy()
         for _ in range(ROUNDS):
-            near = kept.approaches(held.positions)
+            near = kept.approaches(held.positions, held.quaternions)
             if not near:
                 return held
             kept.add(near)
@@ -756,7 +760,7 @@ class MotionSearch:
             held = self._make_held_commands(
                 solver, boundary, within, candidate, motion, options, stop
             )
-        if near := kept.approaches(held.positions):
+        if near := kept.approaches(held.positions, held.quaternions):
             raise CandidateError(kept.message(near[0], self._period))
         return held
 

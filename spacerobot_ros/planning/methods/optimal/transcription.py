@@ -119,8 +119,8 @@ class Stages:
     turn
         ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step that begins at q.
     distances
-        Distances of pairs of links in an interval, less the smallest ones that are allowed, both
-        as its rows and ``>= 0``; None: none.
+        Distances of pairs of links, and of links and obstacles, in an interval, less the smallest
+        ones that are allowed, both as its rows and ``>= 0``; None: none.
     """
 
     joints: int
@@ -277,31 +277,50 @@ def _interval(
 def _distances(n: int, pairs: Sequence[DistanceRows], instants: int) -> Block:
     """Return the distances at equally spaced instants of an interval, by the chain rule.
 
-    The last instant is the end of the interval.
+    The last instant is the end of the interval. The turn of the base there is about the weighted
+    mean of those at the knots; rows take it at any norm.
     """
     # In MX, whose functions call those of the pairs: made anew for every choice of pairs.
     h, s, v, v_next = ca.MX.sym("h"), *(ca.MX.sym(name, n) for name in ("s", "v", "v+"))
-    z, least = ca.vertcat(h, s, v, v_next), ca.MX.sym("least", len(pairs))
+    X, X_next = ca.MX.sym("X", 4), ca.MX.sym("X+", 4)
+    z, least = ca.vertcat(h, X, s, v, X_next, v_next), ca.MX.sym("least", len(pairs))
+    world = ca.MX.sym("world", 12 if any(rows.of_obstacles for rows in pairs) else 0)
     multipliers = ca.MX.sym("lambda", least.numel() * instants)
     values, jacobian, hessian = [], [], ca.MX(z.numel(), z.numel())
-    unit = ca.DM.eye(n)
+    unit, unit_X = ca.DM.eye(n), ca.DM.eye(4)
     of_instants = ca.vertsplit(multipliers, least.numel())
     for number, by_row in enumerate(of_instants, 1):
         tau = number / instants
         # The point is s + h (b v + c v+).
         b, c = tau - 1 / 2 - tau**2 / 2, tau**2 / 2
         point = s + h * (b * v + c * v_next)
-        P = ca.horzcat(b * v + c * v_next, unit, b * h * unit, c * h * unit)
-        J = ca.vertcat(*(rows.jacobian(point) for rows in pairs))
-        values.append(ca.vertcat(*(rows.values(point) for rows in pairs)) - least)
+        turned = ca.vertcat(point, (1 - tau) * X + tau * X_next)
+        P = ca.vertcat(
+            ca.horzcat(
+                *(b * v + c * v_next, ca.MX(n, 4), unit, b * h * unit),
+                *(ca.MX(n, 4), c * h * unit),
+            ),
+            ca.horzcat(
+                *(ca.MX(4, 1), (1 - tau) * unit_X, ca.MX(4, 2 * n)),
+                *(tau * unit_X, ca.MX(4, n)),
+            ),
+        )
+        slopes, curvature = [], ca.MX(n + 4, n + 4)
+        for row, (rows, multiplier) in enumerate(zip(pairs, ca.vertsplit(by_row), strict=True)):
+            at = (turned, world) if rows.of_obstacles else (point,)
+            J, H = rows.jacobian(*at), rows.hessian(*at, multiplier)
+            if not rows.of_obstacles:
+                J, H = ca.horzcat(J, ca.MX(1, 4)), ca.diagcat(H, ca.MX(4, 4))
+            values.append(rows.values(*at) - least[row])
+            slopes.append(J)
+            curvature += H
+        J = ca.vertcat(*slopes)
         jacobian.append(J @ P)
-        curvature = ca.MX(n, n)
-        for rows, multiplier in zip(pairs, ca.vertsplit(by_row), strict=True):
-            curvature += rows.hessian(point, multiplier)
-        slope = (J.T @ by_row).T
-        bend = ca.vertcat(ca.horzcat(0, ca.DM(1, n), b * slope, c * slope), ca.MX(3 * n, 1 + 3 * n))
-        hessian += ca.triu(P.T @ curvature @ P) + bend
-    z_p, J = [z, least], ca.vertcat(*jacobian)
+        slope = (J[:, :n].T @ by_row).T
+        bend = ca.horzcat(ca.MX(1, 5 + n), b * slope, ca.MX(1, 4), c * slope)
+        hessian += ca.triu(P.T @ curvature @ P)
+        hessian += ca.vertcat(bend, ca.MX(z.numel() - 1, z.numel()))
+    z_p, J = [z, ca.vertcat(least, world)], ca.vertcat(*jacobian)
     return Block(
         ca.Function("distances", z_p, [ca.vertcat(*values)]),
         ca.Function("distances_jac", z_p, [ca.vertcat(*values), J]),
@@ -502,7 +521,7 @@ def program(stages: Stages, intervals: int) -> Program:
     rows = equalities + N * (stages.path + kept)
     if stages.distances is not None:
         of_distances = equalities + N * stages.path + np.arange(N * kept).reshape(N, kept)
-        variables = np.hstack([zero, s[:-1], v[:-1], v[1:]])
+        variables = np.hstack([zero, X[:-1], s[:-1], v[:-1], X[1:], v[1:]])
         placed.append(_PlacedBlock(stages.distances, variables, of_distances, p["distances"]))
     change = ca.reshape(x[a.ravel().tolist()], n, N) / ca.repmat(p["typical"], 1, N)
     f = p["weights"][0] * N * x[0] + p["weights"][1] * ca.sumsqr(change) / N
