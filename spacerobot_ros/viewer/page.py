@@ -372,6 +372,7 @@ class Log:
 
 
 _ROBOT_PATH = "/robot"
+_OBSTACLES_PATH = "/obstacles"
 
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Period of drawing of the slower parts, wall s."""
@@ -487,6 +488,7 @@ class Page:
             self._server.scene, _ROBOT_PATH, robot, on_note=lambda text: self.note(Notice(text, 1))
         )
         self._drawing.base.visible = False  # Until its first state comes.
+        scene.draw_obstacles(self._server.scene, _OBSTACLES_PATH, robot.world)
         self._show_collision_shapes()
 
     def _show_collision_shapes(self) -> None:

@@ -162,6 +162,24 @@ class RobotDrawing:
             frame.wxyz = wxyz(pose[3:])
 
 
+def draw_obstacles(scene: viser.SceneApi, path: str, world: RobotDescription | None) -> None:
+    """Draw the shapes of obstacles by which distances are measured; None: there are none."""
+    if world is None:
+        return
+    for number, visual in enumerate(collision_visuals(world)):
+        _, pose = world.frames[visual.link]
+        red, green, blue, _ = visual.shape.rgba
+        scene.add_mesh_simple(
+            f"{path}/{number}",
+            visual.mesh.vertices @ pose.R.T + pose.r,
+            visual.mesh.faces.astype(np.uint32),
+            color=(round(255 * red), round(255 * green), round(255 * blue)),
+            flat_shading=True,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+
 def reach_of(robot: RobotDescription) -> float:
     """Return an upper bound of the distance of any part from the origin of the base, m."""
     farthest: dict[str, float] = {robot.base_link: 0.0}

@@ -23,6 +23,8 @@ from spacerobot_ros.messages.builders import path_message
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.urdf import parse_world
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.nodes.common.messages import goal_markers, goal_of, shape_marker, shape_of
 from spacerobot_ros.nodes.plant.publisher import LinkMarkers, PlantReport, timing_status
 from spacerobot_ros.planning import BasePath, Goal
@@ -377,3 +379,31 @@ def test_shapes_are_drawn_where_they_are() -> None:
     turn = Rotation.from_euler("z", 180, degrees=True) * Rotation.from_euler("x", 90, degrees=True)
     left = Rotation.from_quat(found[3:]).inv() * turn
     assert left.magnitude() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_obstacles_are_drawn_where_they_rest() -> None:
+    from rclpy.serialization import deserialize_message
+    from visualization_msgs.msg import MarkerArray
+
+    world = parse_world(
+        '<robot name="w"><link name="w"/><link name="post"><collision>'
+        '<origin xyz="0.5 0 0"/><geometry><box size="1 2 3"/></geometry></collision></link>'
+        '<joint name="j" type="fixed"><parent link="w"/><child link="post"/>'
+        '<origin xyz="1 -2 4" rpy="0 0 1.5707963267948966"/></joint></robot>'
+    )
+    robot = with_world(parse_robot(URDF), world)
+    for pose in ([1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8], [0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.8]):
+        plant: Any = SimpleNamespace(
+            robot=SimpleNamespace(description=robot),
+            pose=np.array(pose),
+            link_R=np.hstack([np.eye(3), np.eye(3)]),
+            link_r=np.zeros((3, 2)),
+        )
+        node: Any = FakeNode()
+        LinkMarkers(node, plant, "map").publish(7_250_000_000)
+        *_, post = deserialize_message(node.published[0], MarkerArray).markers
+        assert (post.ns, post.id, post.header.frame_id) == ("post", 2, "map")
+        assert numbers(post.pose) == pytest.approx(
+            [1.0, -1.5, 4.0, 0, 0, math.sqrt(0.5), math.sqrt(0.5)]
+        )
+        assert (post.scale.x, post.scale.y, post.scale.z) == (1.0, 2.0, 3.0)

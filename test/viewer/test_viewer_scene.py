@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion
-from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.model.urdf import parse_robot, parse_world
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer import scene
 from spacerobot_ros.viewer.page import CAMERA, Page, Plots, _Plot
@@ -215,3 +216,27 @@ def test_collision_shapes_are_shown_on_request(server: Any) -> None:
     again = page._drawing._collision_shapes
     assert again is not None
     assert len(again) == len(collision_visuals(load_robot(robot_file("three_joint_arm"))))
+
+
+def test_obstacles_are_drawn_where_they_rest() -> None:
+    drawn: dict[str, tuple[Any, dict[str, Any]]] = {}
+
+    def add(path: str, vertices: Any, faces: Any, **look: Any) -> None:
+        assert len(faces)
+        drawn[path] = vertices, look
+
+    place: Any = SimpleNamespace(add_mesh_simple=add)
+    scene.draw_obstacles(place, "/obstacles", None)
+    assert drawn == {}
+    world = parse_world(
+        '<robot name="w"><link name="w"/><link name="post"><visual>'
+        '<origin xyz="0.5 0 0"/><geometry><box size="1 2 3"/></geometry>'
+        '<material name="m"><color rgba="0.2 0.4 1 1"/></material></visual></link>'
+        '<joint name="j" type="fixed"><parent link="w"/><child link="post"/>'
+        '<origin xyz="1 -2 4" rpy="0 0 1.5707963267948966"/></joint></robot>'
+    )
+    scene.draw_obstacles(place, "/obstacles", world)
+    ((path, (vertices, look)),) = drawn.items()
+    assert (path, look["color"]) == ("/obstacles/0", (51, 102, 255))
+    np.testing.assert_allclose(vertices.min(axis=0), [0.0, -2.0, 2.5], atol=1e-12)
+    np.testing.assert_allclose(vertices.max(axis=0), [2.0, -1.0, 5.5], atol=1e-12)

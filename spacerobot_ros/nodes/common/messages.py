@@ -112,7 +112,7 @@ def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str
         marker = shape_marker(shape, frame, "goal", len(markers))
         marker.color.a = 0.25
         placed = base @ link_pose @ shape.pose
-        _set_pose(marker.pose, placed.r, quaternion_from_matrix(placed.R))
+        set_pose(marker.pose, placed.r, quaternion_from_matrix(placed.R))
         markers.append(marker)
     line = Marker(ns="planned_path", id=len(markers), type=Marker.LINE_STRIP, action=Marker.ADD)
     line.header.frame_id = frame
@@ -128,7 +128,7 @@ def goal_message(goal: Goal, frame: str, time_ns: int) -> PoseStamped:
     message = PoseStamped()
     message.header.frame_id = frame
     set_stamp(message.header.stamp, time_ns)
-    _set_pose(message.pose, goal.position, goal.quaternion)
+    set_pose(message.pose, goal.position, goal.quaternion)
     return message
 
 
@@ -154,7 +154,7 @@ def pose_array(position: Any, orientation: Any) -> Array | None:
     return pose
 
 
-def _set_pose(pose: Any, position: Array, quaternion: Array) -> None:
+def set_pose(pose: Any, position: Array, quaternion: Array) -> None:
     """Set the numbers of a geometry_msgs/Pose."""
     p, o = pose.position, pose.orientation
     p.x, p.y, p.z = position.tolist()

@@ -28,6 +28,7 @@ from spacerobot_ros.nodes.common.messages import (
     diagnostic_name,
     diagnostic_status,
     message_class,
+    set_pose,
     shape_marker,
     transform_class,
 )
@@ -476,12 +477,20 @@ class LinkMarkers:
             for shape in link.shapes:
                 markers.append(shape_marker(shape, world_frame, link.name, len(markers)))
                 self._poses.append((index, shape.pose))
+        if (world := plant.robot.description.world) is not None:
+            for link in world.links:
+                for shape in link.shapes or link.collisions:
+                    marker = shape_marker(shape, world_frame, link.name, len(markers))
+                    at = world.frames[link.name][1] @ shape.pose
+                    set_pose(marker.pose, at.r, quaternion_from_matrix(at.R))
+                    markers.append(marker)
         self._publisher: Any = node.create_publisher(MarkerArray, "markers", STREAM)
         self._template = MessageTemplate(
             MARKER_ARRAY_TYPE, serialize_message(MarkerArray(markers=markers))
         )
         self._targets = [
-            self._template.floats(f"markers[{i}].pose.position.x", 7) for i in range(len(markers))
+            self._template.floats(f"markers[{i}].pose.position.x", 7)
+            for i in range(len(self._poses))
         ]
 
     def publish(self, time_ns: int) -> None:
