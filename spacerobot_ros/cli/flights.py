@@ -182,7 +182,7 @@ def _clearance_line(summary: dict[str, Any]) -> list[str]:
     first, second = summary["clearance_links"]
     distance, time = summary["clearance_m"], summary["clearance_time_s"]
     fact = f"come within {distance:.3g} m" if distance > 0 else f"touch, {-distance:.3g} m deep,"
-    return [f"clearance   links '{first}' and '{second}' {fact} at {time:.6g} s"]
+    return [f"clearance   '{first}' and '{second}' {fact} at {time:.6g} s"]
 
 
 def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:

@@ -117,10 +117,10 @@ def test_end_effector_and_propellant_have_lines_where_there_are_some(
 def test_the_clearance_has_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     found = {"clearance_m": 0.01234, "clearance_links": ["a", "b"], "clearance_time_s": 2.5}
     lines = run(monkeypatch, SUMMARY | found, *GOAL).stdout.splitlines()
-    assert lines.pop(-2) == "clearance   links 'a' and 'b' come within 0.0123 m at 2.5 s"
+    assert lines.pop(-2) == "clearance   'a' and 'b' come within 0.0123 m at 2.5 s"
     assert lines == LINES.splitlines()
     touching = run(monkeypatch, SUMMARY | found | {"clearance_m": -0.5}, *GOAL).stdout
-    assert "clearance   links 'a' and 'b' touch, 0.5 m deep, at 2.5 s" in touching
+    assert "clearance   'a' and 'b' touch, 0.5 m deep, at 2.5 s" in touching
 
 
 def test_a_flight_that_misses_its_goal_is_exit_1_and_the_sentence(
