@@ -173,6 +173,7 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	$(FLY) servicer_thrusters --set coordinated_control.time_limit=5
 	$(FLY) reach
 	$(FLY) two_hands
+	$(FLY) strut
 
 # What mkdocs prints of its theme's successor is no warning of the build.
 .PHONY: docs

@@ -179,10 +179,12 @@ def test_a_recorder_opens_its_bag_with_the_bounds_that_it_is_given(
     given: tuple[Any, ...],
 ) -> None:
     opened: list[dict[str, Any]] = []
+    writers: list[BagWriter] = []
 
     def write(path: str, **options: Any) -> BagWriter:
         opened.append({"path": path, **options})
-        return BagWriter(path)
+        writers.append(BagWriter(path))
+        return writers[-1]
 
     monkeypatch.setattr(recorder, "BagWriter", write)
     values = {"bag": str(tmp_path / "a.mcap"), "compression": "lz4", **settings}
@@ -198,3 +200,5 @@ def test_a_recorder_opens_its_bag_with_the_bounds_that_it_is_given(
         assert options["overwrite"] is False
     finally:
         node.destroy_node()
+        for writer in writers:
+            writer.close()
