@@ -22,6 +22,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from support.command_line import CliRunner
 from support.sentences import assert_one_sentence
+from support.slow import some_fast
 
 from spacerobot_ros.bag import Bag, BagWriter, RecordingError, read_bag
 from spacerobot_ros.bag.tables import ExportFormat, TopicTable, export
@@ -196,7 +197,7 @@ def from_mat(struct: dict[str, Any], path: str) -> Any:
     return struct
 
 
-@pytest.mark.parametrize("which", ["small", "servicer"])
+@pytest.mark.parametrize("which", some_fast(["small", "servicer"], "small"))
 def test_the_same_bag_in_three_formats_is_equal(which: str, tmp_path: Path, bag: Bag) -> None:
     opened = bag if which == "small" else read_bag(SERVICER)
     tables = [opened.table(topic) for topic in opened]

@@ -77,6 +77,7 @@ def test_the_papers_nominal_shape() -> None:
     assert any("condition 3.6" in line for line in analysis_lines(findings))
 
 
+@pytest.mark.slow
 def test_the_best_shape_is_better_than_the_papers() -> None:
     found = analysis_json(analyze(SpaceRobot.from_file(robot_file("three_joint_arm"))))
     assert found["at_shape"]["condition"] < 3.60

@@ -109,6 +109,7 @@ def test_broken_scenario_file_is_named(tmp_path: Path) -> None:
     assert "is refused" in spacerobot("run", str(path)).output
 
 
+@pytest.mark.slow
 def test_own_robot_in_an_own_scenario(tmp_path: Path) -> None:
     """Another robot is a URDF and a parameter file, nothing else."""
     urdf = (

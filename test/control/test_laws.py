@@ -135,6 +135,7 @@ def test_compiled_law_gives_the_numbers_of_the_interpreted(
         np.testing.assert_allclose(one.tau, other.tau, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_random_chain_flies_both_poses() -> None:
     """Six turning joints with axes and masses anyhow, the base's centre of mass off its origin."""
     rng = np.random.default_rng(4)

@@ -23,6 +23,7 @@ from control.flights import (
 )
 from control.pinocchio_plant import PinocchioPlant
 from scipy.spatial.transform import Rotation
+from support.slow import some_fast
 
 from spacerobot_ros.control import (
     PROFILES,
@@ -91,6 +92,7 @@ def test_both_poses_are_reached(name: str) -> None:
         assert not status.singular
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", INVERTIBLE)
 def test_both_poses_are_reached_with_a_tenth_of_the_thrust(name: str) -> None:
     """The goal at once, and thrusters that give a tenth of what that demands."""
@@ -125,7 +127,9 @@ def ten_percent_either_way() -> Callable[[], float]:
     return lambda: float(rng.uniform(0.9, 1.1))
 
 
-@pytest.mark.parametrize("error", [ten_percent_heavier, ten_percent_either_way])
+@pytest.mark.parametrize(
+    "error", some_fast([ten_percent_heavier, ten_percent_either_way], ten_percent_either_way)
+)
 @pytest.mark.parametrize("profile", ["quintic", "step"])
 def test_both_poses_are_reached_with_wrong_masses(
     error: Callable[[], Callable[[], float]], profile: str

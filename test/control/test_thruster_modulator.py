@@ -50,6 +50,7 @@ def pulse_lengths(on_times: Array) -> list[float]:
     return lengths
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**31),

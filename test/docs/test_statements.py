@@ -89,6 +89,7 @@ def test_a_figure_is_there_with_the_command_that_measures_it(
     assert f"spacerobot {command}" in text_of(page)
 
 
+@pytest.mark.slow
 def test_composite_bodies_take_a_part_of_the_operations() -> None:
     shares = []
     for name in ("dual_arm", "sliding_masses"):

@@ -178,6 +178,7 @@ QUANTITIES: dict[str, Callable[[SpaceRobot, Case], Array]] = {
 }
 
 
+@pytest.mark.slow
 def test_compiled_and_interpreted_numbers_agree(
     compiled_code: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -407,6 +407,7 @@ def test_nothing_is_renamed_before_it_is_on_the_disk(
     assert done == ["file", "name", "folder"]
 
 
+@pytest.mark.slow
 def test_two_processes_that_build_one_object_both_have_it(cache: Path, compiler: Compiler) -> None:
     """Either ends its compiler only when the other has begun."""
     compiler(

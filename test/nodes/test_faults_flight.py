@@ -178,6 +178,7 @@ def test_wrong_masses_cost_corrections_and_not_the_goal(harness: Harness, seed: 
 # -- stuck joints -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_the_remaining_joints_cannot_do_is_said(harness: Harness) -> None:
     flight = sliders(harness, "joint_stuck slider_1 at 1")
     status = flight.fly(*TURNED)
@@ -219,6 +220,7 @@ def test_the_arm_goes_on_without_its_elbow(harness: Harness, noise: float) -> No
     assert float(flight.plant.plant.momentum[:6] @ flight.plant.plant.momentum[:6]) < 1e-20
 
 
+@pytest.mark.slow
 def test_the_next_goal_is_tried_with_all_joints(harness: Harness) -> None:
     flight = sliders(harness, "joint_stuck slider_1 at 1")
     assert values_of(flight.fly(*TURNED))["state"] == "failed"

@@ -92,6 +92,7 @@ def test_empty_lists_keep_their_type_through_the_services(harness: Harness) -> N
     assert plant.config.initial_joint_positions == (1.0, 2.0, 0.0)
 
 
+@pytest.mark.slow
 def test_a_plant_is_another_after_its_cleanup(harness: Harness) -> None:
     plant = harness.make(NODE_TYPES["plant"], LOCKSTEP)
     remote = Remote(harness, plant)

@@ -173,6 +173,7 @@ def test_statuses_name_the_goal_by_its_stamp(harness: Harness) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_a_planner_that_starts_again_resumes_its_goal_by_its_id(
     harness: Harness, tmp_path: Path
 ) -> None:
@@ -198,6 +199,7 @@ def test_a_planner_that_starts_again_resumes_its_goal_by_its_id(
 # -- without a stop ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_goal_that_is_changed_in_flight_causes_no_stop(harness: Harness) -> None:
     chain: dict[str, Any] = {"robot": "planar_chain"}
     optimal = {"method": "optimal", "optimal.cache": 0, "optimal.answers": 1, "takeover_time": 0.3}

@@ -214,6 +214,7 @@ def rates(rig: Rig) -> Any:
     return np.abs(np.array(rig.probe.last("joint_states").velocity))
 
 
+@pytest.mark.slow
 def test_motors_bring_the_joints_to_rest_when_their_commander_falls_silent(
     harness: Harness,
 ) -> None:

@@ -18,6 +18,7 @@ COUNT = int(os.environ.get("SPACEROBOT_ACTIONS", "2000"))
 MODES = pytest.mark.parametrize("real_time", [False, True], ids=["lockstep", "real_time"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("setup", "real_time", "count"),
     [

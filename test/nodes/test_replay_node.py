@@ -479,6 +479,7 @@ def test_the_command_ends_cleanly_on_a_signal(harness: Harness, bag: Path, ros_d
     assert "Traceback" not in errors
 
 
+@pytest.mark.slow
 def test_the_command_refuses_a_bag_that_was_cut(bag: Path, ros_domain: int) -> None:
     bag.write_bytes(bag.read_bytes()[:-20])
     with command(bag, ros_domain) as process:

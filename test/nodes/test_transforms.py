@@ -148,6 +148,7 @@ def test_a_bag_has_the_frames_of_odom_and_of_pinocchio(
     assert set(gaps) == {100_000_000}
 
 
+@pytest.mark.slow
 def test_frames_have_the_prefix_that_they_are_given(harness: Harness, tmp_path: Path) -> None:
     bag = record_states(
         harness, tmp_path / "bag.mcap", "planar_chain", frame_prefix="one/", world_frame="orbit"

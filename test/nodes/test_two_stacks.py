@@ -87,6 +87,7 @@ class NamedStack:
         return not self.recorder.questions
 
 
+@pytest.mark.slow
 def test_two_stacks_side_by_side_have_each_a_bag_that_verifies(
     harness: Harness, tmp_path: Path
 ) -> None:

@@ -225,6 +225,7 @@ def test_nodes_that_end_or_rest_in_order_are_not_missed(harness: Harness) -> Non
     assert states[-1] == ("/plant", "inactive")
 
 
+@pytest.mark.slow
 def test_a_planner_that_plans_is_busy_and_not_silent(
     harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:

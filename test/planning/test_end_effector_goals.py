@@ -85,6 +85,7 @@ SEVEN = np.array([0.3, 0.2, -0.4, -1.7, 0.5, 1.6, 0.8])
 SEVEN_END = np.array([-0.6, 0.8, 0.3, -1.1, -0.4, 2.3, 0.1])
 
 
+@pytest.mark.slow
 def test_a_pose_is_reached_with_the_base_free() -> None:
     r, R = beside("seven_joint_arm", SEVEN, SEVEN_END, "link_7")
     schedule = plan(

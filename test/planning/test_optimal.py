@@ -167,6 +167,7 @@ def test_least_effort_takes_the_time_it_is_given_and_less_acceleration() -> None
     np.testing.assert_allclose(slow.path.quaternion[-1][:3] * 2, turn, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_corrections_meet_the_goal_where_masses_are_not_as_believed() -> None:
     """Masses and inertias 5 % off: within three times 0.05 deg after at most two corrections."""
     text = (FOLDER / "three_joint_arm.urdf").read_text()

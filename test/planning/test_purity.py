@@ -128,7 +128,14 @@ def content(schedule: GaitSchedule) -> dict[str, Any]:
     return values
 
 
-_LONG = {"area_loop of six joints", "optimal with sliders", "auto", "remaining_joints"}
+_LONG = {
+    "area_loop",
+    "lie_bracket",
+    "area_loop of six joints",
+    "optimal with sliders",
+    "auto",
+    "remaining_joints",
+}
 _NAMES = [pytest.param(each, marks=pytest.mark.slow if each in _LONG else ()) for each in CASES]
 
 

@@ -240,6 +240,7 @@ def with_wrong_masses(
     return loop, took / first.schedule.duration
 
 
+@pytest.mark.slow
 def test_the_shrinking_horizon_makes_up_for_wrong_masses() -> None:
     for horizon, state in ((True, "reached"), (False, "failed")):
         loop, share = with_wrong_masses("planar_chain", 1, None, horizon=horizon)

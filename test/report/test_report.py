@@ -348,6 +348,7 @@ def test_a_robot_without_shapes_and_with_odd_names(tmp_path: Path) -> None:
     assert page.tables["joints"][1][0] == "a$^_b$" * 8 + "0"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank")
 def test_runs_stand_side_by_side(folder: Path, flown: Page, tmp_path: Path) -> None:
     assert flown.figures

@@ -188,6 +188,7 @@ def message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
+@pytest.mark.slow
 def test_without_a_compiler_the_numbers_are_the_same(
     result: RunResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -202,6 +202,7 @@ def test_a_long_tick_is_many_short_ones_in_little_code() -> None:
     assert code(count) < 1.4 * code(1)
 
 
+@pytest.mark.slow
 def test_compiled_flight_is_the_interpreted_one(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

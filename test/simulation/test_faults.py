@@ -351,6 +351,7 @@ def test_energy_is_lost_when_a_moving_joint_jams() -> None:
     np.testing.assert_allclose(plant.momentum[:6], before[:6], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_held_joint_is_like_one_that_is_fixed_in_the_urdf() -> None:
     """Another robot, in whose URDF the joint is fixed, is the reference."""
     text = urdf("servicer")

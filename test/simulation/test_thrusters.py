@@ -70,6 +70,7 @@ def test_momenta_are_what_the_thrusters_put_in() -> None:
     assert plant.unmet_ticks == 0
 
 
+@pytest.mark.slow
 def test_thrusters_follow_the_ideal_wrench() -> None:
     """With pulses as short as one likes they give the wanted wrench to rounding; with 20 ms they
     end near the ideal flight."""
