@@ -81,7 +81,7 @@ class PlannerNode(CommanderNode):
         self._markers_topic = self.create_publisher(MarkerArray, "markers", STREAM)
         self.listen("planner/status")
         self.take_goals("goal_pose")
-        for name in self._end_effectors():
+        for name in self.config.goal_links:
             self.take_goals(goal_topic(name), name)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.create_service(Trigger, "~/statistics", self._on_statistics)
@@ -119,14 +119,6 @@ class PlannerNode(CommanderNode):
             self._message.feed("velocity", setpoint.velocity)
 
     # -- inputs -------------------------------------------------------------------------------
-
-    def _end_effectors(self) -> list[str]:
-        """Return the names of end-effectors that take goals.
-
-        Where a controller moves the robot, goals of its end-effector are for the controller.
-        """
-        default = [DEFAULT_END_EFFECTOR] if self.config.output == "commands" else []
-        return list(dict.fromkeys((*default, *self.config.end_effectors)))
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or an end-effector.

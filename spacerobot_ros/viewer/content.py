@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 
 import numpy as np
@@ -12,12 +13,16 @@ import numpy as np
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.planning import PoseError
+from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.planning import Goal, PoseError
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import FAULT_KINDS, Targets, parse_fault
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.viewer.reachability import Check, Verdict
-from spacerobot_ros.viewer.state import Momenta, Notice, Part, StackState
+from spacerobot_ros.viewer.scene import link_pose
+from spacerobot_ros.viewer.state import Measured, Momenta, Notice, Part, StackState
 
 Color = tuple[int, int, int]
 
@@ -78,8 +83,13 @@ def progress(state: StackState) -> float:
     return min(1.0, max(0.0, 1.0 - left / planner.manoeuvre_time_s))
 
 
-def status_html(state: StackState, *, described: bool = True) -> str:
-    """Return the state of the stack; ``described``: whether a robot is known."""
+def status_html(
+    state: StackState, errors: Mapping[Part, GoalDistance] | None = None, *, described: bool = True
+) -> str:
+    """Return the state of the stack; ``described``: whether a robot is known.
+
+    ``errors`` are those of :func:`goal_errors`; those of links that the planner moves have lines.
+    """
     lines = []
     silence = silence_message(state)
     if silence:
@@ -114,6 +124,11 @@ def status_html(state: StackState, *, described: bool = True) -> str:
         status = state.planner
         text = _node_html("Planner", status.state.value, status.message, status.state.level)
         lines.append(_grey_out(text, offline="planner" in state.absent))
+        lines.extend(
+            _line_html(f"{part} is {error} from its goal.", None)
+            for part, error in (errors or {}).items()
+            if state.goals[part].end_effectors
+        )
     if state.controller is not None:
         control = state.controller
         text = _node_html("Controller", control.state.value, control.message, control.state.level)
@@ -240,16 +255,51 @@ def log_html(notices: Iterable[Notice]) -> str:
 # -- errors, momenta ----------------------------------------------------------------------------
 
 
-def goal_error(state: StackState, part: Part) -> tuple[float, float] | None:
-    """Return the distance of a part from its goal, m and rad; None without goal or pose."""
-    goal = state.goals.get(part)
-    pose = state.tool
-    if part == "base":
-        pose = None if state.measured is None else state.measured.pose
-    if goal is None or pose is None:
+@dataclass(frozen=True)
+class GoalDistance:
+    """How far a part is from its goal: ``distance``, m, and ``angle``, rad; None: any attitude."""
+
+    distance: float
+    angle: float | None
+
+    def __str__(self) -> str:
+        turn = "" if self.angle is None else f" and {self.angle:.3g} rad"
+        return f"{self.distance:.3g} m{turn}"
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The distance, and the angle where the attitude counts."""
+        return (self.distance,) if self.angle is None else (self.distance, self.angle)
+
+
+def goal_errors(state: StackState, kinematics: ForwardKinematics) -> dict[Part, GoalDistance]:
+    """Return how far each part with a goal is from it, as far as poses are known."""
+    measured, errors = state.measured, {}
+    for part, goal in state.goals.items():
+        aim: Goal | EndEffectorGoal = goal
+        pose: Array | None
+        if goal.end_effectors:
+            (aim,) = goal.end_effectors
+            pose = _measured_pose(kinematics, aim.link, measured)
+        elif part == BASE_GOAL_KEY:
+            pose = None if measured is None else measured.pose
+        else:
+            pose = state.tool
+        if pose is not None:
+            any_attitude = aim.quaternion is None
+            wanted = Goal(aim.position, pose[3:] if aim.quaternion is None else aim.quaternion)
+            error = PoseError.between(pose[:3], pose[3:], wanted)
+            errors[part] = GoalDistance(error.distance, None if any_attitude else error.angle)
+    return errors
+
+
+def _measured_pose(
+    kinematics: ForwardKinematics, link: str, measured: Measured | None
+) -> Array | None:
+    """Return the pose (7,) of a link; None: it is not known, or the robot has no such link."""
+    if measured is None or link not in kinematics.links:
         return None
-    error = PoseError.between(pose[:3], pose[3:], goal)
-    return error.distance, error.angle
+    return link_pose(kinematics, link, measured.pose, measured.q)
 
 
 def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:

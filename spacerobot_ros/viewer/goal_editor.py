@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from spacerobot_ros.errors import GoalError
-from spacerobot_ros.model.description import Array, Joint, RobotDescription
+from spacerobot_ros.model.description import (
+    DEFAULT_END_EFFECTOR,
+    Array,
+    Joint,
+    RobotDescription,
+)
+from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_inverse,
     quaternion_multiply,
 )
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.viewer.content import (
     COLORS,
     check_html,
@@ -24,7 +33,7 @@ from spacerobot_ros.viewer.content import (
     shortened,
 )
 from spacerobot_ros.viewer.reachability import Check, Verdict
-from spacerobot_ros.viewer.scene import RobotDrawing, wxyz, xyzw
+from spacerobot_ros.viewer.scene import RobotDrawing, link_pose, wxyz, xyzw
 from spacerobot_ros.viewer.state import Part
 
 if TYPE_CHECKING:
@@ -40,13 +49,25 @@ _HIDDEN_GHOST_DISTANCE = 0.01
 """Distance from the robot below which the ghost is hidden, in robot lengths and rad."""
 
 _BASE_GIZMO, _TOOL_GIZMO = "/goal", "/end_effector_goal"
-_PART_OF: dict[str, Part] = {_BASE_GIZMO: "base", _TOOL_GIZMO: "end_effector"}
+
+_MARK_SIZE = 0.12
+"""Radius of the mark at the goal of an end-effector, as a share of the size of its gizmo."""
+
+
+class Asked(Enum):
+    """What a goal asks for of a part of the robot."""
+
+    NOTHING = "free"
+    POSITION = "position"
+    POSE = "pose"
 
 
 class GoalEditor:
     """Lets users choose a goal; it sends nothing itself.
 
-    The gizmo of the end-effector moves along with that of the base, and can be moved alone.
+    A goal for a planner is for the base or for end-effectors, or for both, as users choose. A goal
+    for a controller is for the base and for the controller's end-effector: the gizmo of that one
+    moves along with that of the base, and can be moved alone.
 
     Parameters
     ----------
@@ -63,13 +84,16 @@ class GoalEditor:
     ) -> None:
         self._server, self._defer, self._on_note = server, defer, on_note
         self._gizmos: dict[str, Any] = {}
+        self._marks: dict[str, Any] = {}
         self._poses: dict[str, Array] = {}
         self._ghost: RobotDrawing | None = None
+        self._present: tuple[Array, Array] | None = None
         self._changed_at: float | None = None
         self._check = Check(Verdict.UNCHECKED)
         gui = server.gui
         self._none_taken = gui.add_html(hint_html("A recording takes no goals."), visible=False)
         self._verdict = gui.add_html(check_html(self._check))
+        self._parts = _AskedParts(gui, defer, on_note, self._on_parts_chosen)
         # Any: for mypy viser's values are read-only.
         self._position: Any = gui.add_vector3("Goal (m)", (0.0, 0.0, 0.0), step=0.01)
         self._angles: Any = gui.add_vector3("Roll, pitch, yaw (deg)", (0.0, 0.0, 0.0), step=1.0)
@@ -116,9 +140,12 @@ class GoalEditor:
     def show_robot(self, robot: RobotDescription | None, reach: float) -> None:
         """Start over with another robot, in an empty scene; None: there is none."""
         self._gizmos.clear()
+        self._marks.clear()
         self._poses.clear()
-        self._ghost, self._changed_at = None, None
+        self._ghost, self._present, self._changed_at = None, None, None
         self._reach, self._robot = reach, robot
+        self._kinematics = None if robot is None else ForwardKinematics(robot)
+        self._parts.offer(())
         # The check of another robot's goal does not apply: it has other joints.
         self.show_check(Check(Verdict.UNCHECKED))
         self._final.show_robot(robot)
@@ -134,9 +161,12 @@ class GoalEditor:
                 self._robot,
                 color=COLORS[Verdict.UNCHECKED],
             )
+        self._present = base, q
         self._final.robot_is_at(q)
         self._final.fill()
         self._move_gizmo(_BASE_GIZMO, base)
+        for link in self._parts.links:
+            self._place_link_gizmo(link)
         if tool is not None and self.has_tool:
             self._move_gizmo(_TOOL_GIZMO, tool)
         self.robot_is_at(base, q)
@@ -149,6 +179,7 @@ class GoalEditor:
         The ghost takes these joint positions unless a plan or a user sets others, and is hidden
         where it would only colour the robot.
         """
+        self._present = pose, q
         self._final.robot_is_at(q)
         if self._ghost is None:
             return
@@ -157,11 +188,19 @@ class GoalEditor:
             final = self._final.positions
             shape = q if final is None else final
             self._ghost.set_joint_positions(shape)
-        self._ghost.base.visible = not self._is_at_goal(pose, q, shape)
+        goal = self._ghost_pose(pose)
+        # The ghost hangs on the gizmo of the base, so that it follows the mouse at once.
+        self._ghost.place(relative_pose(self._poses[_BASE_GIZMO], goal))
+        self._ghost.base.visible = not self._is_at_goal(goal, pose, q, shape)
 
-    def _is_at_goal(self, pose: Array, q: Array, shape: Array) -> bool:
+    def _ghost_pose(self, pose: Array) -> Array:
+        """Return the pose (7,) of the ghost's base: of the goal, or, if free, as predicted."""
+        if self._parts.asked(BASE_GOAL_KEY) is not Asked.NOTHING:
+            return self._poses[_BASE_GIZMO]
+        return pose if self._check.base is None else self._check.base
+
+    def _is_at_goal(self, goal: Array, pose: Array, q: Array, shape: Array) -> bool:
         """Whether a robot at a pose and joint positions ``q`` coincides with the ghost."""
-        goal = self._poses[_BASE_GIZMO]
         distance = float(np.linalg.norm(goal[:3] - pose[:3]))
         turned = 2.0 * math.acos(min(1.0, abs(float(goal[3:] @ pose[3:]))))
         bent = float(np.abs(shape - q).max(initial=0.0))
@@ -176,6 +215,21 @@ class GoalEditor:
         if _TOOL_GIZMO in self._gizmos:
             self._gizmos[_TOOL_GIZMO].visible = there and self._tool_too.value
 
+    def offer_end_effectors(self, links: Iterable[str]) -> None:
+        """Offer goals of the links for which the planner takes some."""
+        offered = tuple(links)
+        if offered == self._parts.links:
+            return  # The choice of users stays.
+        for link in self._parts.links:
+            if _link_gizmo(link) in self._gizmos:
+                self._gizmos[_link_gizmo(link)].visible = False
+        self._parts.offer(offered)
+        self._on_parts_chosen(BASE_GOAL_KEY)
+
+    def show_end_effectors(self, *, there: bool) -> None:
+        """Show or hide the choice of end-effectors, whose goals planners take."""
+        self._parts.show(visible=there)
+
     def show_shape(self, *, there: bool) -> None:
         """Show or hide the final joint positions, which planners take."""
         self._final.show(visible=there)
@@ -186,26 +240,34 @@ class GoalEditor:
         for handle in (*fields, *self._gizmos.values()):
             handle.visible = visible
         self._none_taken.visible = not visible
+        if visible:
+            self._show_parts()
 
     def goals(self) -> dict[Part, Goal]:
-        """Return the goals to send.
+        """Return the goals to send, by part; one of a link has it among its end-effectors.
 
         Raises
         ------
         GoalError
             A pose is not finite or its quaternion not of unit length.
         """
-        names = [_BASE_GIZMO]
-        if self._tool_too.visible and self._tool_too.value:
-            names.append(_TOOL_GIZMO)
-        shapes = {_BASE_GIZMO: self._final.positions}
-        return {
-            _PART_OF[name]: Goal.checked(
-                self._poses[name][:3].tolist(), self._poses[name][3:].tolist(), shapes.get(name)
-            )
-            for name in names
-            if name in self._poses
-        }
+        if not self.placed:
+            return {}
+        shape = self._final.positions
+        goals: dict[Part, Goal] = {}
+        if self._parts.asked(BASE_GOAL_KEY) is not Asked.NOTHING:
+            goals[BASE_GOAL_KEY] = self._goal_at(_BASE_GIZMO, shape)
+        if self._tool_too.visible and self._tool_too.value and self.has_tool:
+            goals[DEFAULT_END_EFFECTOR] = self._goal_at(_TOOL_GIZMO)
+        for link, asked in self._parts.asked_links().items():
+            pose = self._poses[_link_gizmo(link)]
+            aim = EndEffectorGoal.checked(link, pose if asked is Asked.POSE else pose[:3])
+            goals[link] = Goal.of_end_effectors([aim], joint_positions=shape)
+        return goals
+
+    def _goal_at(self, gizmo: str, shape: Array | None = None) -> Goal:
+        pose = self._poses[gizmo]
+        return Goal.checked(pose[:3].tolist(), pose[3:].tolist(), shape)
 
     def goals_at_rest(self, now: float) -> dict[Part, Goal] | None:
         """Return the goals once after every change, when they have come to rest; else None."""
@@ -236,17 +298,21 @@ class GoalEditor:
             self._verdict.content = text
         if self._ghost is not None:
             self._ghost.paint(COLORS[check.verdict])
+            for mark in self._marks.values():
+                mark.color = COLORS[check.verdict]
             if check.shape is not None:
                 self._ghost.set_joint_positions(check.shape)
+            if self._present is not None:
+                self.robot_is_at(*self._present)
 
     # -- changes by users --------------------------------------------------------------------------
 
     def _add_gizmo(self, name: str, scale: float) -> None:
         gizmo = self._server.scene.add_transform_controls(name, scale=scale, depth_test=False)
         self._gizmos[name] = gizmo
-        if name == _TOOL_GIZMO:
-            self._server.scene.add_icosphere(
-                f"{name}/mark", 0.12 * scale, color=COLORS[Verdict.UNCHECKED], opacity=0.6,
+        if name != _BASE_GIZMO:
+            self._marks[name] = self._server.scene.add_icosphere(
+                f"{name}/mark", _MARK_SIZE * scale, color=COLORS[self._check.verdict], opacity=0.6,
                 cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
 
@@ -275,8 +341,9 @@ class GoalEditor:
             self._on_note(str(error))
             self._show_fields()
             return
-        self._set_goal(_BASE_GIZMO, np.concatenate([goal.position, goal.quaternion]))
-        self._move_gizmo(_BASE_GIZMO, self._poses[_BASE_GIZMO])
+        gizmo = _gizmo_of(self._parts.shown)
+        self._set_goal(gizmo, np.concatenate([goal.position, goal.quaternion]))
+        self._move_gizmo(gizmo, self._poses[gizmo])
 
     def _set_goal(self, name: str, pose: Array) -> None:
         before = self._poses.get(name, pose)
@@ -298,14 +365,160 @@ class GoalEditor:
         self._gizmos[name].position = pose[:3]
         self._gizmos[name].wxyz = wxyz(pose[3:])
 
+    def _on_parts_chosen(self, part: Part) -> None:
+        """Take over the choice of users for a part, or another part whose numbers are shown."""
+        if part != BASE_GOAL_KEY and self._parts.asked(part) is not Asked.NOTHING:
+            gizmo = self._gizmos.get(_link_gizmo(part))
+            if gizmo is None or not gizmo.visible:
+                self._place_link_gizmo(part)
+        self._show_parts()
+        self._show_fields()
+        self._mark_changed()
+
+    def _place_link_gizmo(self, link: str) -> None:
+        """Move the gizmo of a link to where the link is."""
+        if self._kinematics is None or self._present is None:
+            return
+        name = _link_gizmo(link)
+        if name not in self._gizmos:
+            self._add_gizmo(name, 0.25 * self._reach)
+            self._gizmos[name].visible = False
+        self._move_gizmo(name, link_pose(self._kinematics, link, *self._present))
+
+    def _show_parts(self) -> None:
+        """Show the gizmos of the parts that the goal asks for, and their handles."""
+        for link in self._parts.links:
+            gizmo = self._gizmos.get(_link_gizmo(link))
+            if gizmo is not None:
+                asked = self._parts.asked(link)
+                gizmo.visible = asked is not Asked.NOTHING
+                gizmo.disable_rotations = asked is Asked.POSITION
+        base = self._gizmos.get(_BASE_GIZMO)
+        if base is not None:
+            # Its node stays visible, because the ghost hangs on it.
+            free = self._parts.asked(BASE_GOAL_KEY) is Asked.NOTHING
+            base.disable_axes = base.disable_sliders = base.disable_rotations = free
+        self._angles.visible = self._parts.asked(self._parts.shown) is not Asked.POSITION
+
     def _show_fields(self) -> None:
-        pose = self._poses.get(_BASE_GIZMO)
+        pose = self._poses.get(_gizmo_of(self._parts.shown))
         if pose is not None:
             x, y, z = (round(float(each), 4) for each in pose[:3])
             self._position.value = (x, y, z)
             turns = np.degrees(rpy_from_quaternion(pose[3:]))
             roll, pitch, yaw = (round(float(each), 2) for each in turns)
             self._angles.value = (roll, pitch, yaw)
+
+
+class _AskedParts:
+    """Controls of the parts of the robot that a goal for a planner asks for.
+
+    Without end-effectors, or without a planner, that is the pose of the base.
+
+    Parameters
+    ----------
+    gui, defer, on_note
+        As for :class:`GoalEditor`.
+    on_change
+        Called with the part when users have changed what the goal asks for, or the part whose
+        numbers are shown.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        defer: Defer,
+        on_note: Callable[[str], None],
+        on_change: Callable[[Part], None],
+    ) -> None:
+        self._gui, self._defer = gui, defer
+        self._on_note, self._on_change = on_note, on_change
+        self._folder = gui.add_folder("Goal for", visible=False)
+        self._menus: dict[Part, Any] = {}
+        self._numbers: Any = gui.add_dropdown(
+            "Numbers of", (BASE_GOAL_KEY,), hint="The part that the numbers below are for."
+        )
+        self._numbers.visible = False
+        self._there = False
+
+        @self._numbers.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:  # Else the page itself wrote the value.
+                self._defer(lambda: self._on_change(self.shown))
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """The links that goals are offered for."""
+        return tuple(part for part in self._menus if part != BASE_GOAL_KEY)
+
+    @property
+    def shown(self) -> Part:
+        """The part whose numbers are shown."""
+        return str(self._numbers.value)
+
+    def asked(self, part: Part) -> Asked:
+        """Return what the goal asks for of a part."""
+        if self._there and part in self._menus:
+            return Asked(self._menus[part].value)
+        return Asked.POSE if part == BASE_GOAL_KEY else Asked.NOTHING
+
+    def asked_links(self) -> dict[str, Asked]:
+        """Return what the goal asks for of each link that it is for."""
+        asked = {link: self.asked(link) for link in self.links}
+        return {link: each for link, each in asked.items() if each is not Asked.NOTHING}
+
+    def offer(self, links: Iterable[str]) -> None:
+        """Offer goals of other links; the goal is for the base again."""
+        for menu in self._menus.values():
+            menu.remove()
+        self._menus = {}
+        with self._folder:
+            for part in (BASE_GOAL_KEY, *links):
+                self._menus[part] = self._add_menu(part)
+        self._update()
+
+    def show(self, *, visible: bool) -> None:
+        """Show or hide the controls."""
+        if (visible and bool(self.links)) != self._there:
+            self._there = not self._there
+            self._update()
+            self._on_change(self.shown)
+
+    def _add_menu(self, part: Part) -> Any:
+        choices = (Asked.POSE, Asked.NOTHING) if part == BASE_GOAL_KEY else tuple(Asked)
+        menu = self._gui.add_dropdown(shortened(part), [each.value for each in choices], hint=part)
+
+        @menu.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:  # Else the page itself wrote the value.
+                self._defer(lambda: self._on_chosen(part))
+
+        return menu
+
+    def _on_chosen(self, part: Part) -> None:
+        if part not in self._menus:
+            return  # The menu of an earlier robot.
+        base, for_links = self._menus[BASE_GOAL_KEY], self.asked_links()
+        chosen = self.asked(part)
+        if not for_links:
+            if part == BASE_GOAL_KEY and chosen is Asked.NOTHING:
+                self._on_note("A goal is for the base or for an end-effector: choose one of them.")
+            base.value = Asked.POSE.value
+        elif list(for_links) == [part] and self._numbers.options == (BASE_GOAL_KEY,):
+            # The first end-effector of a goal for the base: the base is free until users fix it.
+            base.value = Asked.NOTHING.value
+        self._update(part)
+        self._on_change(part)
+
+    def _update(self, part: Part | None = None) -> None:
+        """Show the numbers of a part, if the goal asks for it, else of those of before."""
+        self._folder.visible = self._there
+        parts = [BASE_GOAL_KEY] if self.asked(BASE_GOAL_KEY) is not Asked.NOTHING else []
+        parts += self.asked_links()
+        wanted = [each for each in (part, self.shown) if each in parts]
+        self._numbers.options = tuple(parts)
+        self._numbers.value = [*wanted, *parts][0]
+        self._numbers.visible = len(parts) > 1
 
 
 class _FinalShape:
@@ -396,6 +609,22 @@ class _FinalShape:
     async def _on_field(self, event: Any) -> None:
         if event.client is not None:  # Else the page itself wrote the value.
             self._defer(self._on_change)
+
+
+def _link_gizmo(link: str) -> str:
+    """Return the path of the gizmo of a link; its name may have slashes."""
+    return f"/end_effector_goals/{link.replace('/', '%')}"
+
+
+def _gizmo_of(part: Part) -> str:
+    return _BASE_GIZMO if part == BASE_GOAL_KEY else _link_gizmo(part)
+
+
+def relative_pose(outer: Array, pose: Array) -> Array:
+    """Return a pose (7,) of the world relative to another one, ``outer``."""
+    back = quaternion_inverse(outer[3:])
+    position = matrix_from_quaternion(back) @ (pose[:3] - outer[:3])
+    return np.concatenate([position, quaternion_multiply(back, pose[3:])])
 
 
 def move_along(pose: Array, before: Array, after: Array) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,8 @@ import numpy as np
 from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.faults import FAULT_KINDS, Targets
 from spacerobot_ros.viewer import content, scene
 from spacerobot_ros.viewer.content import History, Trail
@@ -29,6 +31,7 @@ from spacerobot_ros.viewer.state import (
     Inject,
     Measured,
     Notice,
+    Part,
     Request,
     Seek,
     StackState,
@@ -241,10 +244,12 @@ class Plots:
     def __init__(self, gui: viser.GuiApi) -> None:
         self._gui = gui
         self._tab_group = gui.add_tab_group()
-        with self._tab_group.add_tab("Errors"):
+        self._error_tab = self._tab_group.add_tab("Errors")
+        with self._error_tab:
             self._error = _Plot(gui, "Base error", ("m", "rad"), 0.01)
             self._tool = _Plot(gui, "End-effector error", ("m", "rad"), 0.01)
             self._tool.handle.visible = False
+        self._links: dict[Part, _Plot] = {}
         with self._tab_group.add_tab("Momentum"):
             # In millionths, because axis labels have three decimals.
             units = ("1e-6 kg m/s", "1e-6 kg m²/s")
@@ -258,6 +263,7 @@ class Plots:
         self._first = None
         for plot in (self._error, self._tool, self._momentum):
             plot.clear()
+        self._show_links({})
         if self._shape is not None:
             self._shape.handle.remove()
             self._shape = None
@@ -267,18 +273,19 @@ class Plots:
                     self._gui, "Joints (m, rad)", robot.joint_names, 0.01, signed=True
                 )
 
-    def add(self, state: StackState) -> None:
-        """Append the last state to the curves."""
+    def add(self, state: StackState, errors: Mapping[Part, content.GoalDistance]) -> None:
+        """Append the last state, and its distances from goals, to the curves."""
         measured = state.measured
         if measured is None:
             return
         time_s = measured.time_s
-        error, tool = (content.goal_error(state, part) for part in ("base", "end_effector"))
-        if error is not None:
-            self._error.history.add(time_s, error)
-        if tool is not None:
-            self._tool.handle.visible = True
-            self._tool.history.add(time_s, tool)
+        of_links = {part: e for part, e in errors.items() if state.goals[part].end_effectors}
+        self._show_links(of_links)
+        self._error.handle.visible = BASE_GOAL_KEY in errors or not of_links
+        for part, error in errors.items():
+            plot = self._links.get(part, self._error if part == BASE_GOAL_KEY else self._tool)
+            plot.handle.visible = True
+            plot.history.add(time_s, error.numbers)
         if state.momenta is not None:
             if self._first is None:
                 self._first = state.momenta.actual
@@ -287,9 +294,21 @@ class Plots:
         if self._shape is not None:
             self._shape.history.add(time_s, measured.q)
 
+    def _show_links(self, errors: Mapping[Part, content.GoalDistance]) -> None:
+        """Have one plot for each link with an error, and none for others."""
+        for part, plot in tuple(self._links.items()):
+            if part not in errors or plot.width != len(errors[part].numbers):
+                plot.handle.remove()
+                del self._links[part]
+        for part, error in errors.items():
+            if part not in self._links:
+                title, names = f"Error of {content.shortened(part)}", ("m", "rad")
+                with self._error_tab:
+                    self._links[part] = _Plot(self._gui, title, names[: len(error.numbers)], 0.01)
+
     def draw(self) -> None:
         """Redraw the curves."""
-        for plot in (self._error, self._tool, self._momentum, self._shape):
+        for plot in (self._error, self._tool, *self._links.values(), self._momentum, self._shape):
             if plot is not None:
                 plot.draw()
 
@@ -307,6 +326,11 @@ class _Plot:
         Least upper end of the axis, so that rounding errors do not look like peaks.
     signed
         Whether the numbers may be negative.
+
+    Attributes
+    ----------
+    history, width
+        The numbers so far, and how many curves there are.
     """
 
     def __init__(
@@ -338,11 +362,11 @@ class _Plot:
             axes=(axis | {"size": 34}, axis | {"size": 66}),  # type: ignore[arg-type]
             height=_PLOT_PIXELS,
         )
-        self._width = len(names)
+        self.width = len(names)
 
     def clear(self) -> None:
         """Drop the history."""
-        self.history = History(self._width)
+        self.history = History(self.width)
 
     def draw(self) -> None:
         """Send the curves to browsers."""
@@ -476,6 +500,7 @@ class Page:
     def show_robot(self, robot: RobotDescription | None) -> None:
         """Start over with another robot; None: there is none."""
         self._robot, self._table, self._drawing, self._last = robot, None, None, None
+        self._kinematics = None if robot is None else ForwardKinematics(robot)
         self._around: scene.Surroundings | None = None
         self._server.scene.reset()
         reach = 1.0 if robot is None else scene.reach_of(robot)
@@ -546,7 +571,7 @@ class Page:
         if not self.editor.placed and state.replay is None:
             self.editor.place(measured.pose, None, measured.q, self._now)
         self.editor.robot_is_at(measured.pose, measured.q)
-        self._plots.add(state)
+        self._plots.add(state, self._goal_errors(state))
         self._trail.add(measured.time_s, measured.pose[:3])
         if self._is_due("paths", _PATHS_S):
             self._around.flown.draw(self._trail.points)
@@ -558,8 +583,12 @@ class Page:
                 scene.plumes(self._table, names, duty, 0.25 * self._reach)
             )
 
+    def _goal_errors(self, state: StackState) -> dict[Part, content.GoalDistance]:
+        return {} if self._kinematics is None else content.goal_errors(state, self._kinematics)
+
     def _draw_texts(self, state: StackState) -> None:
-        text = content.status_html(state, described=self._robot is not None)
+        errors = self._goal_errors(state)
+        text = content.status_html(state, errors, described=self._robot is not None)
         if text != self._status.content:
             self._status.content = text
         self._bar.visible = content.time_to_go(state) is not None
@@ -570,7 +599,9 @@ class Page:
         if has_tool and state.measured is not None and not self.editor.has_tool:
             self.editor.add_tool(state.tool)
         self.editor.show_tool(there=has_tool and state.replay is None)
-        self.editor.show_shape(there=state.planner is not None and state.replay is None)
+        planned = state.planner is not None and state.replay is None
+        self.editor.show_end_effectors(there=planned)
+        self.editor.show_shape(there=planned)
 
     def _draw_joints(self, robot: RobotDescription, state: StackState) -> None:
         last = state.measured

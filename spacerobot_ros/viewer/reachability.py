@@ -22,12 +22,13 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
+from functools import reduce
 from typing import IO
 
 import numpy as np
 
-from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.errors import GoalError, SpaceRobotError
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
@@ -44,6 +45,7 @@ from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.progress import report_progress
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
 from spacerobot_ros.termination import Terminated, end_child, guarded, start_child
@@ -137,8 +139,8 @@ class Check:
         Text for the user, with the reason of a refusal.
     duration_s
         Duration of the manoeuvre, s; 0 if there is none.
-    shape
-        (n,) joint positions at its end, m or rad; None if there is none.
+    shape, base
+        (n,) joint positions at its end, m or rad, and (7,) pose of the base; None if there is none.
     path
         (k, 3) path of the base, m; None if there is none.
     """
@@ -147,6 +149,7 @@ class Check:
     message: str = ""
     duration_s: float = 0.0
     shape: Array | None = None
+    base: Array | None = None
     path: Array | None = None
 
 
@@ -161,7 +164,7 @@ class Question:
     parameters
         Parameters of the planner, as JSON texts by name.
     state, goal
-        Start and goal of the base.
+        Start of the robot, and the goal of its base, of links, or of both.
     tool, link
         Goal of a link, for a controller, which plans nothing: the check is then whether the arm can
         reach it. None: a planner flies.
@@ -192,12 +195,15 @@ def question_of(
     parameters
         Parameters of ``planner`` and ``controller``, as JSON texts by name, if known.
     """
-    measured, goal, tool = state.measured, goals["base"], goals.get("end_effector")
+    measured = state.measured
     if measured is None or robot is None:
         return "No state received yet."
     pose, q = (measured.pose[:3], measured.pose[3:]), measured.q
     if state.planner is None:
-        if tool is None:
+        goal, tool = goals.get(BASE_GOAL_KEY), goals.get(DEFAULT_END_EFFECTOR)
+        if goal is None:
+            return "The goal is for a planner, and none is running."
+        if tool is None or tool.end_effectors:
             return "No planner is running: a controller flies the base to any pose."
         known = parameters.get("controller", {})
         link = robot.end_effector(json.loads(known.get("end_effector_frame", '""')))
@@ -212,7 +218,50 @@ def question_of(
         return "The planner's parameters have not been received yet."
     momenta = np.zeros(6) if state.momenta is None else state.momenta.actual
     start = RobotState(*pose, q, momenta[:3], momenta[3:])
-    return Question(robot.urdf, parameters["planner"], start, goal)
+    return Question(robot.urdf, parameters["planner"], start, planned_goal(goals))
+
+
+def planned_goal(goals: Mapping[Part, Goal]) -> Goal:
+    """Return goals by part as the one goal of a planner, which that of a controller is not.
+
+    Raises
+    ------
+    GoalError
+        None of the goals is for a planner.
+    """
+    planned = [g for part, g in goals.items() if part == BASE_GOAL_KEY or g.end_effectors]
+    if not planned:
+        raise GoalError("The goal is for the end-effector of a controller alone.")
+    return reduce(Goal.joined_with, planned)
+
+
+def planner_config(parameters: Mapping[str, str]) -> PlannerConfig:
+    """Return the parameters of a planner, given as JSON texts by name; others are left out.
+
+    Raises
+    ------
+    SpaceRobotError
+        A value is refused.
+    """
+    known = {each.name for each in declared(PlannerConfig)}
+    values = {name: json.loads(text) for name, text in parameters.items() if name in known}
+    values = {name: value for name, value in values.items() if value is not None}
+    # The robot is the viewer's, wherever the planner takes its own from.
+    elsewhere = {"robot_description": "", "robot": "", "world": ""}
+    return configured(PlannerConfig, {**values, **elsewhere})
+
+
+def planned_links(
+    parameters: Mapping[str, str] | None, robot: RobotDescription | None
+) -> tuple[str, ...]:
+    """Return the links of a robot for which a planner with such parameters takes goals."""
+    if parameters is None or robot is None:
+        return ()
+    try:
+        names = planner_config(parameters).goal_links
+    except SpaceRobotError:
+        return ()  # The check of any goal reports it.
+    return tuple(name for name in names if name in robot.frames and name != robot.base_link)
 
 
 class GoalChecker:
@@ -355,16 +404,12 @@ class Planner:
         message = f"Reachable in {duration:.4g} s by '{schedule.method}'."
         message += _uncontrolled_text(schedule, question.goal, request.tolerance)
         shown = np.vstack([path[:-1:step], path[-1:]])
-        return Check(Verdict.REACHABLE, message, duration, schedule.positions[-1], shown)
+        base = np.concatenate([path[-1], schedule.path.quaternion[-1]])
+        return Check(Verdict.REACHABLE, message, duration, schedule.positions[-1], base, shown)
 
     def _build_planner(self, urdf: str, parameters: Mapping[str, str]) -> None:
         self._built = None
-        known = {each.name for each in declared(PlannerConfig)}
-        values = {name: json.loads(text) for name, text in parameters.items() if name in known}
-        values = {name: value for name, value in values.items() if value is not None}
-        # The robot is that of the question, wherever the planner takes its own from.
-        elsewhere = {"robot_description": "", "robot": "", "world": ""}
-        self._config = configured(PlannerConfig, {**values, **elsewhere})
+        self._config = planner_config(parameters)
         self._worker = PlanningWorker(robot_from_text(urdf, self._config), self._config)
 
 
@@ -373,9 +418,10 @@ def _uncontrolled_text(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance)
     path, controls = schedule.path, schedule.controls
     error = PoseError.between(path.position[-1], path.quaternion[-1], goal)
     parts = []
-    if "position" not in controls and error.distance > tolerance.position:
+    uncontrolled = goal.base - controls
+    if "position" in uncontrolled and error.distance > tolerance.position:
         parts.append(("position", f"{error.distance:.3g} m"))
-    if "attitude" not in controls and error.angle > tolerance.attitude:
+    if "attitude" in uncontrolled and error.angle > tolerance.attitude:
         parts.append(("attitude", f"{math.degrees(error.angle):.3g} deg"))
     if "shape" not in controls and goal.joint_positions is not None:
         parts.append(("final joint positions", ""))

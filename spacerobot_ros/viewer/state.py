@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Literal
 
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerStatus
@@ -65,8 +64,10 @@ class Firing:
     duty: Array
 
 
-Part = Literal["base", "end_effector"]
-"""The part of the robot that a goal is for."""
+Part = str
+"""The part of the robot that a goal is for: ``base``, the name of a link, or ``end_effector``, also
+for the end-effector of a controller.
+"""
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ class StackState:
     planned_path
         (k, 3) positions of the base predicted by the planner, m.
     goals
-        The last goal sent by anyone, by part.
+        The last goal sent by anyone, by part. A goal for a planner that is for a link has it among
+        its ``end_effectors``; one for the end-effector of a controller is a pose alone.
     silent
         Wall time since the last heartbeat of each node that has fallen silent, s, by name.
     inactive

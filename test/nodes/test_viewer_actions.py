@@ -5,6 +5,7 @@ The page in a browser has tests of its own in ``test/viewer``.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -26,6 +27,7 @@ from spacerobot_ros.model import load_robot
 from spacerobot_ros.nodes import ViewerNode
 from spacerobot_ros.nodes.viewer import node as viewer
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.faults import Targets
@@ -95,7 +97,9 @@ class Stand:
         self.touched: list[float] = []
         self.at_rest: Any = None
         self.checking = False
+        self.offered: list[tuple[str, ...]] = []
         self.editor = SimpleNamespace(
+            offer_end_effectors=self.offered.append,
             moving=False,
             touch=self.touched.append,
             goals_at_rest=lambda now: self.at_rest,
@@ -252,6 +256,56 @@ def test_goals_of_one_request_have_one_stamp_and_all_requests_different_ones(
     assert sent["goal_joint_states"].sent[-1].name == list(ROBOT.joint_names)
     assert len(sent["end_effector/goal_pose"].sent) == 1
     assert len(stand.checks) == 1
+
+
+def test_goals_of_links_are_offered_and_sent_as_the_planner_takes_them(stand: Stand) -> None:
+    def learn(**parameters: Any) -> None:
+        stand.requests[-1].values = {k: json.dumps(v) for k, v in parameters.items()}
+        stand.requests[-1].over = True
+        stand.draw()
+
+    robot = load_robot(robot_file("dual_arm"))
+    links = ["left_link_7", "nobody", robot.base_link, "right_link_7"]
+    stand.hear("robot_description", String(data=robot.urdf))
+    stand.on_status("planner", "/p")
+    learn(end_effectors=links, output="reference")
+    assert stand.offered[-1] == ("left_link_7", "right_link_7")
+    assert len(stand.touched) == 1, "the goal is checked with them"
+    left = EndEffectorGoal("left_link_7", np.array([1.0, 2.0, 4.0]), GOAL.quaternion)
+    right = EndEffectorGoal("right_link_7", np.array([-0.5, 0.25, 8.0]))
+    shape = np.linspace(0.1, 0.7, 14)
+    hands = {aim.link: Goal.of_end_effectors([aim], joint_positions=shape) for aim in (left, right)}
+    stand.draw(Fly(hands))
+    sent = stand.node.sent
+    assert sent["goal_pose"].sent == [], "the base is free"
+    messages = [sent[f"{link}/goal_pose"].sent[0] for link in hands]
+    assert [message.header.stamp for message in messages] == [messages[0].header.stamp] * 2
+    numbers = [
+        [
+            *(getattr(m.pose.position, x) for x in "xyz"),
+            *(getattr(m.pose.orientation, x) for x in "xyzw"),
+        ]
+        for m in messages
+    ]
+    assert numbers == [[1.0, 2.0, 4.0, *GOAL.quaternion], [-0.5, 0.25, 8.0, 0.0, 0.0, 0.0, 0.0]]
+    (named,) = sent["goal_joint_states"].sent
+    assert named.position.tolist() == shape.tolist()
+    assert stand.notes[-1] == ("Goal sent.", 0, "page")
+    # This node does not hear these topics: one subscription is another node's.
+    sent["left_link_7/goal_pose"].matched = 0
+    sent["right_link_7/goal_pose"].matched = 1
+    stand.node.count_subscribers = lambda topic_name: 0  # type: ignore[method-assign]
+    stand.draw(Fly(hands))
+    assert stand.notes[-1] == ("Goal sent.", 0, "page")
+    sent["right_link_7/goal_pose"].matched = 0
+    stand.draw(Fly(hands))
+    assert stand.notes[-1][0].startswith("No planner or controller takes the goal")
+    # Another robot, and a planner of another kind.
+    stand.hear("robot_description", String(data=ROBOT.urdf))
+    assert list(stand.offered[-1]) == []
+    stand.on_status("planner", "/q")
+    learn(end_effectors=[], output="commands")
+    assert list(stand.offered[-1]) == ["end_effector"]
 
 
 @pytest.mark.parametrize(("unmatched", "seconds"), [(True, 4.0), (False, 0.0)])

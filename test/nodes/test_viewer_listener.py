@@ -20,6 +20,7 @@ from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.nodes.viewer import listener as listening
 from spacerobot_ros.nodes.viewer.listener import Listener
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
@@ -271,6 +272,28 @@ def test_goals_of_anyone_are_shown_until_one_is_refused(viewed: Viewed) -> None:
     message.header.frame_id = "elsewhere"
     viewed.heard["goal_pose"](message)
     assert list(viewed.look().goals) == ["end_effector"]
+
+
+def test_goals_of_links_are_those_of_the_planner(viewed: Viewed) -> None:
+    pose, place = (0.5, 0.25, 0.125, *TURNED), (4.0, -2.0, 1.0)
+
+    def tell(**goals: Any) -> dict[str, Goal]:
+        viewed.report("planner/status", PlannerStatus(PlannerState.PLANNING, **goals), "/planner")
+        return dict(viewed.look().goals)
+
+    tool = PoseStamped(pose=pose_of(7.0, 8.0, 9.0))
+    viewed.heard["end_effector/goal_pose"](tool)
+    assert set(tell(goal=pose)) == {"base", "end_effector"}
+    goals = tell(end_effector_goals={"left": pose, "right": place})
+    assert set(goals) == {"end_effector", "left", "right"}, "the base is free"
+    aims = [goals[link].end_effectors[0] for link in ("left", "right")]
+    assert [aim.values for aim in aims] == [pytest.approx(pose), place]
+    assert all(not goals[link].base for link in ("left", "right"))
+    assert tell() == goals, "a status without a goal"
+    assert set(tell(end_effector_goals={"left": (1.0, 2.0)})) == set(goals), "no goal"
+    both = tell(goal=pose, end_effector_goals={"right": pose})
+    assert set(both) == {"base", "end_effector", "right"}
+    assert set(tell(goal=pose)) == {"base", "end_effector"}
 
 
 @pytest.mark.parametrize(

@@ -162,6 +162,17 @@ class Page:
         """Press the checkbox with a label."""
         self._window.evaluate(f"{_fields(label)}[0].click()")
 
+    def choose(self, label: str, option: str) -> None:
+        """Choose an option of the menu with a label."""
+        self._window.evaluate(f"{_fields(label)}[0].click()")
+        options = (
+            "[...document.querySelectorAll('[role=option]')].filter(each => each.checkVisibility())"
+            f".find(each => each.textContent.trim() === {json.dumps(option)})"
+        )
+        self._window.wait_for(f"{options} !== undefined")
+        self._window.evaluate(f"{options}.click()")
+        self.draw()
+
     def numbers(self, label: str) -> list[float]:
         """Return the numbers in the fields with a label."""
         found = self._window.evaluate(f"{_fields(label)}.map(each => each.value)")
@@ -240,7 +251,9 @@ def _fields(label: str) -> str:
     """Return an expression: the inputs beside a label."""
     return (
         "(() => { let at = [...document.querySelectorAll('label, div, p, span')]"
-        f".filter(each => each.textContent.trim() === {json.dumps(label)}).pop();"
+        f".filter(each => each.textContent.trim() === {json.dumps(label)})"
+        # Options of menus may have the same text.
+        ".filter(each => !each.closest('[role=listbox]')).pop();"
         # Sliders have hidden ones.
         "while (at && !at.querySelector('input:not([type=hidden])')) at = at.parentElement;"
         "return [...at.querySelectorAll('input:not([type=hidden])')]; })()"

@@ -9,14 +9,18 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.viewer.content import COLORS
 from spacerobot_ros.viewer.goal_editor import GoalEditor
-from spacerobot_ros.viewer.reachability import Check, Verdict
-from spacerobot_ros.viewer.scene import reach_of
+from spacerobot_ros.viewer.reachability import Check, Verdict, planned_goal
+from spacerobot_ros.viewer.scene import reach_of, xyzw
 from spacerobot_ros.viewer.server import start_server, stop_server
 
 POSE = np.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
@@ -176,3 +180,192 @@ def test_a_robot_with_other_joints_comes_after_a_goal_was_checked(server: Any) -
     page.editor.place(POSE, None, np.zeros(6), 0.0)
     page.editor.robot_is_at(POSE, np.full(6, 0.1))
     assert len(page.ghost()) == 6
+
+
+HANDS = ("left_link_7", "right_link_7")
+TURNED = np.array([0.5, -0.1, 0.7, 0.5])
+STANDING = np.array([1.0, -2.0, 0.5, *TURNED])
+
+
+@pytest.fixture
+def two_hands(server: Any) -> Editor:
+    """The editor of a robot with two arms, whose planner takes goals of both hands."""
+    page = Editor(server, "dual_arm")
+    page.editor.offer_end_effectors(HANDS)
+    page.editor.place(STANDING, None, np.linspace(0.1, 0.7, 14), 0.0)
+    page.editor.show_end_effectors(there=True)
+    return page
+
+
+def where(page: Editor, link: str) -> Array:
+    """Return the pose (7,) of a link by Pinocchio."""
+    model = pin.buildModelFromXML(page.robot.urdf, pin.JointModelFreeFlyer())
+    data, full = model.createData(), pin.neutral(model)
+    full[:7] = STANDING
+    for name, position in zip(page.robot.joint_names, np.linspace(0.1, 0.7, 14), strict=True):
+        full[model.joints[model.getJointId(name)].idx_q] = position
+    pin.framesForwardKinematics(model, data, full)
+    pose: Array = pin.SE3ToXYZQUAT(data.oMf[model.getFrameId(link)])
+    return pose
+
+
+def choose(page: Editor, part: str, asked: str) -> None:
+    page.set(page.editor._parts._menus[part], asked)
+
+
+def gizmo(page: Editor, link: str) -> Any:
+    return page.editor._gizmos[f"/end_effector_goals/{link}"]
+
+
+def test_a_goal_of_a_hand_begins_where_the_hand_is_and_leaves_the_base_free(
+    two_hands: Editor,
+) -> None:
+    page, parts = two_hands, two_hands.editor._parts
+    assert parts._folder.visible
+    assert [menu.label for menu in parts._menus.values()] == ["base", *HANDS]
+    assert set(page.editor.goals()) == {"base"}
+    choose(page, HANDS[1], "position")
+    goals = page.editor.goals()
+    assert set(goals) == {HANDS[1]}
+    assert goals[HANDS[1]].base == frozenset()
+    (aim,) = goals[HANDS[1]].end_effectors
+    at = where(page, HANDS[1])
+    assert (aim.link, aim.quaternion) == (HANDS[1], None)
+    np.testing.assert_allclose(aim.position, at[:3], atol=1e-12)
+    base, hand = page.editor._gizmos["/goal"], gizmo(page, HANDS[1])
+    assert base.disable_axes and base.disable_sliders and base.disable_rotations  # noqa: PT018
+    assert hand.visible
+    assert hand.disable_rotations
+    # Its numbers are those on the page, and typed ones move it.
+    np.testing.assert_allclose(page.editor._position.value, at[:3], atol=1e-4)
+    assert not page.editor._angles.visible
+    page.set(page.editor._position, (0.5, 0.25, -0.75))
+    np.testing.assert_allclose(hand.position, (0.5, 0.25, -0.75))
+    (aim,) = page.editor.goals()[HANDS[1]].end_effectors
+    np.testing.assert_allclose(aim.position, (0.5, 0.25, -0.75))
+    # With an attitude, and where the gizmo is.
+    choose(page, HANDS[1], "pose")
+    assert page.editor._angles.visible
+    assert not hand.disable_rotations
+    page.set(page.editor._angles, (10.0, -20.0, 30.0))
+    (aim,) = page.editor.goals()[HANDS[1]].end_effectors
+    np.testing.assert_allclose(aim.position, (0.5, 0.25, -0.75))
+    assert aim.quaternion is not None
+    wanted = Rotation.from_euler("xyz", (10.0, -20.0, 30.0), degrees=True).as_quat()
+    np.testing.assert_allclose(aim.quaternion, wanted, atol=1e-12)
+    # No goal of the hand: that of the base again.
+    choose(page, HANDS[1], "free")
+    assert set(page.editor.goals()) == {"base"}
+    assert not hand.visible
+    assert not base.disable_axes
+    assert page.editor._angles.visible
+    np.testing.assert_allclose(page.editor._position.value, STANDING[:3])
+    # Asked for again it begins at the hand.
+    choose(page, HANDS[1], "position")
+    np.testing.assert_allclose(hand.position, at[:3], atol=1e-12)
+
+
+def test_a_goal_may_be_of_both_hands_and_of_the_base(two_hands: Editor) -> None:
+    page, parts = two_hands, two_hands.editor._parts
+    choose(page, HANDS[0], "pose")
+    assert not parts._numbers.visible, "one part has numbers"
+    choose(page, HANDS[1], "position")
+    goals = page.editor.goals()
+    assert set(goals) == set(HANDS)
+    left, right = (goals[link].end_effectors[0] for link in HANDS)
+    np.testing.assert_allclose(left.values, where(page, HANDS[0]), atol=1e-12)
+    np.testing.assert_allclose(right.values, where(page, HANDS[1])[:3], atol=1e-12)
+    assert parts._numbers.visible
+    assert (parts._numbers.options, parts.shown) == (HANDS, HANDS[1])
+    page.set(parts._numbers, HANDS[0])
+    np.testing.assert_allclose(page.editor._position.value, left.position, atol=1e-4)
+    choose(page, "base", "pose")
+    assert set(page.editor.goals()) == {"base", *HANDS}
+    assert parts.shown == "base"
+    goal = planned_goal(page.editor.goals())
+    assert goal.base == {"position", "attitude"}
+    assert [each.link for each in goal.end_effectors] == list(HANDS)
+    np.testing.assert_array_equal(goal.position, STANDING[:3])
+    # A change of a hand leaves the base as users chose.
+    choose(page, HANDS[0], "position")
+    assert set(page.editor.goals()) == {"base", *HANDS}
+    # The base moves alone: hands are in the world.
+    page.editor._on_gizmo_moved("/goal", STANDING + np.eye(7)[1])
+    np.testing.assert_allclose(gizmo(page, HANDS[0]).position, left.position)
+    choose(page, "base", "free")
+    assert set(page.editor.goals()) == set(HANDS)
+    for link in HANDS:
+        choose(page, link, "free")
+    assert page.refusals == []
+    choose(page, "base", "free")
+    assert page.refusals == ["A goal is for the base or for an end-effector: choose one of them."]
+    assert set(page.editor.goals()) == {"base"}
+
+
+def test_the_ghost_of_a_free_base_is_where_the_plan_ends(two_hands: Editor) -> None:
+    page, q = two_hands, np.linspace(0.1, 0.7, 14)
+    ghost, marks = page.editor._ghost, page.editor._marks
+    assert ghost is not None
+    choose(page, HANDS[0], "position")
+    # Off the robot, so that the ghost's place in the gizmo is not the place in the world.
+    page.editor._move_gizmo("/goal", np.array([5.0, 5.0, 5.0, 0.1, 0.7, -0.5, 0.5]))
+    page.editor.show_check(Check(Verdict.PLANNING, "Planning for 2 s."))
+    assert not ghost.base.visible, "nothing is predicted"
+    end = np.array([1.5, -2.25, 0.5, *TURNED[[1, 0, 3, 2]]])
+    page.editor.show_check(Check(Verdict.REACHABLE, shape=q + 0.1, base=end))
+    assert ghost.base.visible
+    R = matrix_from_quaternion(xyzw(page.editor._gizmos["/goal"].wxyz))
+    seen = page.editor._gizmos["/goal"].position + R @ ghost.base.position
+    np.testing.assert_allclose(seen, end[:3], atol=1e-12)
+    turned = R @ matrix_from_quaternion(xyzw(ghost.base.wxyz))
+    np.testing.assert_allclose(turned, matrix_from_quaternion(end[3:]), atol=1e-12)
+    assert {mark.color for mark in marks.values()} == {COLORS[Verdict.REACHABLE]}
+    # Where the robot is then, it is not drawn; and a base with a goal is drawn there.
+    page.editor.robot_is_at(end, q + 0.1)
+    assert not ghost.base.visible
+    choose(page, "base", "pose")
+    page.editor.robot_is_at(end, q + 0.1)
+    assert ghost.base.visible
+    np.testing.assert_allclose(ghost.base.position, 0.0, atol=1e-12)
+
+
+def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
+    page, parts = two_hands, two_hands.editor._parts
+    choose(page, HANDS[0], "position")
+    shape = np.full(14, 0.5)
+    page.editor.show_shape(there=True)
+    page.set(page.final._enabled, True)
+    for field, position in zip(page.final._fields, shape, strict=True):
+        field._impl.value = position
+    asked = page.editor.goals()[HANDS[0]].joint_positions
+    assert asked is not None
+    np.testing.assert_array_equal(asked, shape)
+    page.editor.show_end_effectors(there=False)
+    assert not parts._folder.visible
+    assert not gizmo(page, HANDS[0]).visible
+    assert set(page.editor.goals()) == {"base"}
+    page.editor.show_end_effectors(there=True)
+    assert set(page.editor.goals()) == {HANDS[0]}, "as it was chosen"
+    assert gizmo(page, HANDS[0]).visible
+    # A recording takes no goals; after it everything is as before.
+    page.editor.show(visible=False)
+    assert not gizmo(page, HANDS[0]).visible
+    page.editor.show(visible=True)
+    assert gizmo(page, HANDS[0]).visible
+    assert not page.editor._angles.visible
+    # Goals go to the robot, all of them.
+    page.editor._on_gizmo_moved(f"/end_effector_goals/{HANDS[0]}", STANDING)
+    page.editor.place(STANDING, None, np.linspace(0.1, 0.7, 14), 0.0)
+    np.testing.assert_allclose(
+        gizmo(page, HANDS[0]).position, where(page, HANDS[0])[:3], atol=1e-12
+    )
+    # The same planner again, and one that takes no goals of hands.
+    page.editor.offer_end_effectors(HANDS)
+    assert set(page.editor.goals()) == {HANDS[0]}
+    page.editor.goals_at_rest(LATER)
+    page.editor.offer_end_effectors(())
+    assert page.editor.moving, "the goal is another one"
+    page.editor.show_end_effectors(there=True)
+    assert not parts._folder.visible
+    assert not gizmo(page, HANDS[0]).visible
+    assert set(page.editor.goals()) == {"base"}

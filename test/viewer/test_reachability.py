@@ -13,14 +13,27 @@ import pinocchio as pin
 import pytest
 
 from spacerobot_ros import plan
+from spacerobot_ros.errors import GoalError
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning import Goal, RobotState
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.viewer.reachability import Check, GoalChecker, Planner, Question, Verdict
+from spacerobot_ros.viewer.reachability import (
+    Check,
+    GoalChecker,
+    Planner,
+    Question,
+    Verdict,
+    planned_goal,
+    planned_links,
+    question_of,
+)
+from spacerobot_ros.viewer.state import Measured, StackState
 
 URDF = load_robot(robot_file("sliding_masses")).urdf
 ORIGIN = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
@@ -47,6 +60,9 @@ def test_an_answer_is_what_the_planner_would_plan() -> None:
     assert answer.path is not None
     np.testing.assert_allclose(answer.shape, own.positions[-1], atol=1e-9)
     np.testing.assert_allclose(answer.path[-1], own.path.position[-1], atol=1e-12)
+    end = np.concatenate([own.path.position[-1], own.path.quaternion[-1]])
+    assert answer.base is not None
+    np.testing.assert_allclose(answer.base, end, atol=1e-12)
 
 
 def test_joint_positions_of_a_goal_are_asked_for_and_a_method_without_them_says_so() -> None:
@@ -65,6 +81,10 @@ def test_goal_components_that_a_method_does_not_control_are_named_with_their_err
     answer = Planner().answer(chain, Cancellation())
     assert answer.verdict == Verdict.REACHABLE, answer
     assert "'area_loop' does not control the position: it ends 0.5 m off." in answer.message
+    hand = Goal.of_end_effectors([EndEffectorGoal("link_3", np.ones(3))])
+    refused = Planner().answer(replace(chain, goal=hand), Cancellation())
+    assert refused.verdict == Verdict.REFUSED
+    assert refused.message.startswith("area_loop plans for the pose of the base")
     here = replace(chain, goal=Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
     assert "control" not in Planner().answer(here, Cancellation()).message
 
@@ -84,6 +104,80 @@ def test_a_cancelled_check_has_no_answer() -> None:
     cancellation.cancel()
     with pytest.raises(PlanningCancelled):
         Planner().answer(question(0.1, 0.0, 0.0, method="optimal"), cancellation)
+
+
+@pytest.mark.slow
+def test_goals_of_links_are_planned_for_and_the_base_ends_where_the_plan_has_it() -> None:
+    robot = load_robot(robot_file("three_joint_arm"))
+    link, q = robot.links[-1].name, np.array([0.4, -0.9, 1.1])
+    values = {**values_of(PlannerConfig()), "end_effectors": [link], "method": "resolved_rate"}
+    texts = {name: json.dumps(value) for name, value in values.items()}
+    aim = EndEffectorGoal(link, np.array([1.3, 0.9, 0.8]))
+    start = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
+    asked = Question(robot.urdf, texts, start, Goal.of_end_effectors([aim]))
+    answer = Planner().answer(asked, Cancellation())
+    assert answer.verdict == Verdict.REACHABLE, answer
+    assert answer.message == f"Reachable in {answer.duration_s:.4g} s by 'resolved_rate'."
+    assert answer.shape is not None
+    assert answer.base is not None
+    # By Pinocchio the link is at its goal then, with the base off its place.
+    model = pin.buildModelFromXML(robot.urdf, pin.JointModelFreeFlyer())
+    data, full = model.createData(), pin.neutral(model)
+    full[:7] = answer.base
+    for name, position in zip(robot.joint_names, answer.shape, strict=True):
+        full[model.joints[model.getJointId(name)].idx_q] = position
+    pin.framesForwardKinematics(model, data, full)
+    at = data.oMf[model.getFrameId(link)].translation
+    np.testing.assert_allclose(at, aim.position, atol=5e-3)
+    assert np.linalg.norm(answer.base[:3]) > 0.01
+    far = Goal.of_end_effectors([replace(aim, position=np.array([9.0, 0.0, 0.0]))])
+    assert Planner().answer(replace(asked, goal=far), Cancellation()).verdict == Verdict.REFUSED
+
+
+def test_goals_by_part_are_one_goal_of_a_planner() -> None:
+    base = Goal.checked([1.0, 2.0, 3.0], [0.5, -0.1, 0.7, 0.5], [0.25, 0.5])
+    place, pose = (
+        EndEffectorGoal("left", np.array([4.0, 5.0, 6.0])),
+        EndEffectorGoal("right", np.array([7.0, 8.0, 9.0]), base.quaternion),
+    )
+    hands = {each.link: Goal.of_end_effectors([each]) for each in (place, pose)}
+    tool = Goal(base.position, base.quaternion)
+    free = planned_goal(hands)
+    assert free.equals(Goal.of_end_effectors([place, pose]))
+    both = planned_goal({"base": base, "end_effector": tool, **hands})
+    assert both.equals(replace(base, end_effectors=(place, pose)))
+    assert planned_goal({"base": base, "end_effector": tool}).equals(base)
+    with pytest.raises(GoalError, match="of a controller alone"):
+        planned_goal({"end_effector": tool})
+
+
+def test_links_with_goals_are_those_of_the_planner_and_of_the_robot() -> None:
+    servicer, dual_arm = (load_robot(robot_file(name)) for name in ("servicer", "dual_arm"))
+    both = '["left_link_7", "right_link_7", "nobody"]'
+    assert planned_links({}, servicer) == ("end_effector",)
+    assert planned_links({"output": '"reference"'}, servicer) == ()
+    assert planned_links({"end_effectors": both}, dual_arm) == ("left_link_7", "right_link_7")
+    base = json.dumps([servicer.base_link, "end_effector"])
+    assert planned_links({"end_effectors": base}, servicer) == ("end_effector",)
+    assert planned_links({"tick_rate": "-1.0"}, servicer) == ()
+    assert planned_links(None, servicer) == planned_links({}, None) == ()
+
+
+def test_a_goal_of_a_link_is_not_for_a_controller() -> None:
+    servicer = load_robot(robot_file("servicer"))
+    measured = Measured(0.0, np.eye(7)[6], *np.zeros((3, 6)))
+    state = StackState(measured)
+    hand = Goal.of_end_effectors([EndEffectorGoal("end_effector", np.ones(3))])
+    base = Goal.checked(np.ones(3), [0, 0, 0, 1])
+    answer = question_of(state, {"end_effector": hand}, servicer, {})
+    assert answer == "The goal is for a planner, and none is running."
+    answer = question_of(state, {"base": base, "end_effector": hand}, servicer, {})
+    assert answer == "No planner is running: a controller flies the base to any pose."
+    planning = replace(state, planner=PlannerStatus(PlannerState.IDLE))
+    asked = question_of(planning, {"end_effector": hand}, servicer, {"planner": {"a": "1"}})
+    assert isinstance(asked, Question)
+    assert (asked.goal.end_effectors, asked.goal.base) == (hand.end_effectors, frozenset())
+    assert asked.tool is None
 
 
 @pytest.fixture

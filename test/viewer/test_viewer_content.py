@@ -16,12 +16,18 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.collision import LinkPair
-from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model import load_robot
-from spacerobot_ros.model.rotations import matrix_from_quaternion, matrix_from_rpy
+from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    matrix_from_rpy,
+    quaternion_multiply,
+)
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.clearance import ClearanceStatus
@@ -31,6 +37,7 @@ from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.content import History, Trail
 from spacerobot_ros.viewer.goal_editor import move_along, rpy_from_quaternion
 from spacerobot_ros.viewer.reachability import Check, Verdict
+from spacerobot_ros.viewer.scene import link_pose
 from spacerobot_ros.viewer.state import Measured, Momenta, Notice, StackState
 
 HERE = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
@@ -168,21 +175,47 @@ def test_rates_and_efforts_stand_beside_their_own_limits() -> None:
 
 
 def test_errors_are_to_the_goal() -> None:
-    assert content.goal_error(STATE, "base") is None
+    robot = load_robot(robot_file("three_joint_arm"))
+    kinematics = ForwardKinematics(robot)
+
+    def errors(state: StackState) -> dict[str, tuple[float, ...]]:
+        return {part: e.numbers for part, e in content.goal_errors(state, kinematics).items()}
+
+    assert errors(STATE) == {}
     turned = quaternion_of((0.0, 0.0, 0.5))
     goal = Goal(np.array([1.0, 2.0, 5.0]), turned)
-    assert content.goal_error(replace(STATE, goals={"base": goal}), "base") == pytest.approx(
-        (2.0, 0.5)
-    )
-    # That of the end-effector too, whatever the reference is that the controller follows to it.
-    errors = {"end_effector.x": 9.0, "end_effector.rz": 0.9}
-    report = CommandReport("model_based", False, 1.0, 0.0, 0.0, 0.0, 0.0, errors)
-    controlled = ControllerStatus(ControllerState.TRACKING, command=report)
+    state = replace(STATE, goals={"base": goal})
+    assert errors(state) == {"base": pytest.approx((2.0, 0.5))}
+    assert errors(replace(state, measured=None)) == {}
+    # That of a controller's end-effector too, whatever the reference is that it follows to it.
     tool = Goal(np.array([4.0, 6.0, 3.0]), quaternion_of((0.0, 0.2, 0.0)))
-    flying = replace(STATE, controller=controlled, tool=HERE, goals={"end_effector": tool})
-    assert content.goal_error(flying, "end_effector") == pytest.approx((5.0, 0.2))
-    assert content.goal_error(replace(flying, goals={}), "end_effector") is None
-    assert content.goal_error(replace(flying, tool=None), "end_effector") is None
+    flying = replace(STATE, tool=HERE, goals={"end_effector": tool})
+    assert errors(flying) == {"end_effector": pytest.approx((5.0, 0.2))}
+    assert errors(replace(flying, tool=None)) == {}
+
+
+def test_errors_of_links_are_those_of_their_measured_poses() -> None:
+    robot = load_robot(robot_file("three_joint_arm"))
+    kinematics, link = ForwardKinematics(robot), robot.links[-1].name
+    at = link_pose(kinematics, link, HERE, np.zeros(3))
+    off, aside = np.array([0.0, 0.3, 0.4]), quaternion_of((0.25, 0.0, 0.0))
+    pose = EndEffectorGoal(link, at[:3] + off, quaternion_multiply(at[3:], aside))
+    goals = {link: Goal.of_end_effectors([pose])}
+    state = replace(STATE, goals=goals, planner=PlannerStatus(PlannerState.EXECUTING, "Flies."))
+    errors = content.goal_errors(state, kinematics)
+    assert errors[link].numbers == pytest.approx((0.5, 0.25))
+    head = content.status_html(state, errors)
+    assert f"{link} is 0.5 m and 0.25 rad from its goal." in head
+    place = replace(state, goals={link: Goal.of_end_effectors([replace(pose, quaternion=None)])})
+    errors = content.goal_errors(place, kinematics)
+    assert errors[link].numbers == pytest.approx((0.5,))
+    assert f"{link} is 0.5 m from its goal." in content.status_html(place, errors)
+    assert "from its goal" not in content.status_html(place)
+    base = replace(state, goals={"base": Goal(HERE[:3], HERE[3:])})
+    assert "from its goal" not in content.status_html(base, content.goal_errors(base, kinematics))
+    unknown = {"hand": Goal.of_end_effectors([replace(pose, link="hand")])}
+    assert content.goal_errors(replace(state, goals=unknown), kinematics) == {}
+    assert content.goal_errors(replace(state, measured=None), kinematics) == {}
 
 
 def test_momenta_are_compared_with_what_they_should_be() -> None:

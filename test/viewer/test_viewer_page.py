@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from support.chromium import browser, chromium
@@ -219,3 +220,39 @@ def test_a_page_that_is_closed_in_the_middle_of_a_drag_leaves_a_goal_and_no_harm
         page.press("Goal to the robot")
         page.wait_for_text("Goal reachable", "Reachable in 0 s")
         assert window.complaints == []
+
+
+def test_an_end_effector_is_sent_to_a_place_from_the_page(
+    harness: Harness, nodes: Processes, tmp_path: Path
+) -> None:
+    arm = ("--params-file", str(ROOT / "config" / "reach.yaml"))
+    url = nodes.start_viewer()
+    nodes.start("plant", *PLANT, files=arm)
+    nodes.start("planner", *PLANNER, files=arm)
+    watched = Watched(harness)
+    pose = harness.probe({"link_7/pose": PoseStamped}, name="hand")
+
+    def place() -> Array:
+        p = pose.last("link_7/pose").pose.position
+        return np.array([p.x, p.y, p.z])
+
+    with browser(tmp_path / "profile") as window:
+        page = Page(window, url)
+        page.wait_for_text("Goal reachable", "link_7")
+        harness.spin_until(lambda: pose.count("link_7/pose") > 0, "the pose of the hand")
+        page.choose("link_7", "position")
+        page.wait_for_text("Goal reachable", "Reachable in 0 s")
+        np.testing.assert_allclose(page.numbers(POSITION), place(), atol=6e-3)
+        goal = np.add(place(), [-0.15, 0.1, 0.05]).round(2)
+        page.type(POSITION, goal.tolist())
+        page.wait_for_text("Goal reachable", "by 'optimal'", without="in 0 s")
+        page.press("Fly")
+        page.wait_for_text("link_7 is", "m from its goal")
+        watched.wait("planner/status", "state", "reached")
+        assert watched.value("planner/status", "goal") == "", "the base is free"
+        watched.hear()
+        np.testing.assert_allclose(place(), goal, atol=5e-3)
+        page.type(POSITION, (9, 0, 0))
+        page.wait_for_text("Goal refused")
+        assert window.complaints == []
+    assert "Traceback" not in nodes.log("viewer")

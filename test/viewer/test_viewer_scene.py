@@ -16,10 +16,14 @@ from spacerobot_ros.collision.drawn import collision_visuals
 from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import parse_robot, parse_world
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer import scene
+from spacerobot_ros.viewer.content import GoalDistance
 from spacerobot_ros.viewer.page import CAMERA, Page, Plots, _Plot
 from spacerobot_ros.viewer.server import ViewerConfig, start_server, stop_server
 from spacerobot_ros.viewer.state import Measured, Momenta, StackState
@@ -161,7 +165,7 @@ def test_rounding_is_no_peak_and_numbers_of_a_flight_are_seen(server: Any) -> No
     off = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 2.0])
     for time_s, size in ((0.0, 0.0), (1.0, 2e-16), (2.0, 3e-6)):
         measured = Measured(time_s, np.eye(7)[6], zeros, zeros, zeros)
-        plots.add(StackState(measured, momenta=Momenta(actual + size * off, actual, 0.0)))
+        plots.add(StackState(measured, momenta=Momenta(actual + size * off, actual, 0.0)), {})
     plots.draw()
     handle = plots._momentum.handle
     assert [series["label"] for series in handle.series[1:]] == ["1e-6 kg m/s", "1e-6 kg m²/s"]
@@ -173,6 +177,57 @@ def test_rounding_is_no_peak_and_numbers_of_a_flight_are_seen(server: Any) -> No
     assert plots._shape is not None
     ends = plots._shape.handle.scales["y"]["range"]
     assert (ends["min"]["soft"], ends["max"]["soft"]) == (-0.01, 0.01)
+
+
+def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
+    server.gui.reset()
+    plots, zeros = Plots(server.gui), np.zeros(6)
+    plots.show_robot(load_robot(robot_file("servicer")))
+    hand = Goal.of_end_effectors([EndEffectorGoal("hand", np.ones(3))])
+    base = Goal.checked(np.ones(3), [0.0, 0.0, 0.0, 1.0])
+
+    def add(time_s: float, goals: dict[str, Goal], **errors: GoalDistance) -> None:
+        measured = Measured(time_s, np.eye(7)[6], zeros, zeros, zeros)
+        plots.add(StackState(measured, goals=goals), errors)
+        plots.draw()
+
+    def shown() -> list[str]:
+        plain = (plots._error, plots._tool)
+        every = (*plain, *plots._links.values())
+        return [plot.handle.title for plot in every if plot.handle.visible]
+
+    add(0.0, {})
+    assert shown() == ["Base error"]
+    add(1.0, {"hand": hand}, hand=GoalDistance(0.5, None))
+    assert shown() == ["Error of hand"], "the base is free"
+    add(2.0, {"hand": hand}, hand=GoalDistance(0.25, None))
+    time, distance = plots._links["hand"].handle.data
+    assert (time.tolist(), distance.tolist()) == ([1.0, 2.0], [0.5, 0.25])
+    add(3.0, {"hand": hand, "base": base}, hand=GoalDistance(0.2, 0.7), base=GoalDistance(3.0, 2.0))
+    assert shown() == ["Base error", "Error of hand"]
+    assert [column.tolist() for column in plots._links["hand"].handle.data] == [[3.0], [0.2], [0.7]]
+    assert [column.tolist() for column in plots._error.handle.data] == [[3.0], [3.0], [2.0]]
+    add(4.0, {"end_effector": base}, end_effector=GoalDistance(0.75, 0.5))
+    assert shown() == ["Base error", "End-effector error"], "that of a controller"
+    assert plots._tool.handle.data[1].tolist() == [0.75]
+    plots.show_robot(None)
+    assert plots._links == {}
+
+
+def test_a_link_is_where_its_joints_have_it() -> None:
+    robot = load_robot(robot_file("three_joint_arm"))
+    q, link = np.array([0.3, -0.8, 1.1]), robot.links[-1].name
+    base = np.array([1.0, -2.0, 0.5, 0.5, -0.1, 0.7, 0.5])
+    model = pin.buildModelFromXML(robot.urdf, pin.JointModelFreeFlyer())
+    data, full = model.createData(), pin.neutral(model)
+    full[:7] = base
+    for name, position in zip(robot.joint_names, q, strict=True):
+        full[model.joints[model.getJointId(name)].idx_q] = position
+    pin.framesForwardKinematics(model, data, full)
+    wanted = data.oMf[model.getFrameId(link)]
+    pose = scene.link_pose(ForwardKinematics(robot), link, base, q)
+    np.testing.assert_allclose(pose[:3], wanted.translation, atol=1e-12)
+    np.testing.assert_allclose(matrix_from_quaternion(pose[3:]), wanted.rotation, atol=1e-12)
 
 
 def test_plumes_point_against_the_thrust() -> None:

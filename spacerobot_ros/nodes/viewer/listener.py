@@ -34,6 +34,8 @@ from spacerobot_ros.nodes.common.messages import goal_of, pose_array
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.watchdog import Pulse, Role
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.clearance import ClearanceStatus
 from spacerobot_ros.simulation.status import PlantStatus
@@ -308,11 +310,28 @@ class Listener:
             self._statuses[key] = status
             self._reporters[key] = message.name
             self._hidden.pop(message.name, None)
-            if isinstance(status, PlannerStatus) and len(status.goal) == 7:
-                self._goals["base"] = Goal(np.array(status.goal[:3]), np.array(status.goal[3:]))
+            if isinstance(status, PlannerStatus):
+                with suppress(SpaceRobotError):  # A goal that is none, of another package.
+                    self._take_planned_goal(status)
             self._on_status(key, message.name)
 
         return take
+
+    def _take_planned_goal(self, status: PlannerStatus) -> None:
+        """Take the goal of a planner in place of the one before, if the status reports one."""
+        links = {
+            link: Goal.of_end_effectors([EndEffectorGoal.checked(link, values)])
+            for link, values in status.end_effector_goals.items()
+        }
+        if not links and len(status.goal) != 7:
+            return
+        # That of a controller's end-effector stays.
+        self._goals = {part: g for part, g in self._goals.items() if not g.end_effectors}
+        self._goals.pop(BASE_GOAL_KEY, None)
+        if len(status.goal) == 7:
+            pose = np.array(status.goal)
+            self._goals[BASE_GOAL_KEY] = Goal(pose[:3], pose[3:])
+        self._goals |= links
 
     def _on_path(self, message: Path) -> None:
         poses = message.poses

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, ClassVar
 
@@ -17,6 +17,7 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, String
@@ -26,7 +27,7 @@ from spacerobot_ros.control.thrusters import ThrusterTable, find_thrusters
 from spacerobot_ros.errors import SpaceRobotError, printable
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import read_status
-from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.messages import goal_message, shape_message
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
@@ -34,12 +35,20 @@ from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
 from spacerobot_ros.nodes.viewer.listener import Listener
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.execution.goal_file import GoalIds
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import Targets
 from spacerobot_ros.simulation.status import PlantState
+from spacerobot_ros.topics import goal_topic
 from spacerobot_ros.viewer.page import Page
-from spacerobot_ros.viewer.reachability import Check, GoalChecker, Question, Verdict, question_of
+from spacerobot_ros.viewer.reachability import (
+    Check,
+    GoalChecker,
+    Question,
+    Verdict,
+    planned_links,
+    question_of,
+)
 from spacerobot_ros.viewer.server import (
     ViewerConfig,
     is_loopback,
@@ -70,7 +79,8 @@ _ROSOUT_QOS = QoSProfile(
 _LEAST_SHOWN_LOG_LEVEL = 30
 """Least level of shown log messages (rcl_interfaces/Log)."""
 
-_GOAL_TOPICS: Mapping[Part, str] = {"base": "goal_pose", "end_effector": "end_effector/goal_pose"}
+_HEARD_GOALS = (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
+"""Parts whose goals this node hears as well as it sends them."""
 
 _SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
     Request.ABORT: (("planner", "controller"), "abort", None),
@@ -157,10 +167,8 @@ class ViewerNode(FlightNode):
         self.create_subscription(
             ParameterEvent, "/parameter_events", self._on_parameter_change, STREAM
         )
-        self._goal_topics = {
-            part: self.create_publisher(PoseStamped, topic, STREAM)
-            for part, topic in _GOAL_TOPICS.items()
-        }
+        self._goal_topics: dict[Part, Publisher] = {}
+        self._add_goal_topics(_HEARD_GOALS)
         self._shape_topic = self.create_publisher(JointState, "goal_joint_states", STREAM)
         self._fault_topic = self.create_publisher(String, "fault_injection", STREAM)
         self._seek_topic = self.create_publisher(Float64, "replay/seek", STREAM)
@@ -199,6 +207,12 @@ class ViewerNode(FlightNode):
 
     def report_event(self, event: Event) -> None:
         """Publish no event: the viewer is not part of the recorded flight."""
+
+    def _add_goal_topics(self, parts: Iterable[Part]) -> None:
+        for part in parts:
+            if part not in self._goal_topics:
+                topic = "goal_pose" if part == BASE_GOAL_KEY else goal_topic(part)
+                self._goal_topics[part] = self.create_publisher(PoseStamped, topic, STREAM)
 
     # -- drawing --------------------------------------------------------------------------------
 
@@ -257,6 +271,7 @@ class ViewerNode(FlightNode):
         else:
             self._listener.use(self._robot)
         self._page.show_robot(self._robot)
+        self._offer_end_effectors()
         self._show_plant()
 
     def _on_status(self, key: str, name: str) -> None:
@@ -323,8 +338,16 @@ class ViewerNode(FlightNode):
             self._remote_values[key] = request.values
             if key == "plant":
                 self._show_plant()
-            else:
-                self._page.editor.touch(time.monotonic())
+                continue
+            if key == "planner":
+                self._offer_end_effectors()
+            self._page.editor.touch(time.monotonic())
+
+    def _offer_end_effectors(self) -> None:
+        """Offer goals of the robot's links for which the planner takes some."""
+        links = planned_links(self._remote_values.get("planner"), self._robot)
+        self._add_goal_topics(links)
+        self._page.editor.offer_end_effectors(links)
 
     def _show_plant(self) -> None:
         """Update the faults that can be injected, and the thrusters."""
@@ -400,13 +423,16 @@ class ViewerNode(FlightNode):
         time_ns = self._listener.time_ns() + flag + self._sent % 1000
         # An empty message resets the joint positions that another goal may have required.
         names = () if self._robot is None else self._robot.joint_names
-        self._shape_topic.publish(shape_message(goals["base"], names))
+        self._shape_topic.publish(shape_message(next(iter(goals.values())), names))
+        readers = 0
         for part, goal in goals.items():
-            message = goal_message(goal, self.config.world_frame, time_ns)
+            aim = goal.end_effectors[0].as_goal() if goal.end_effectors else goal
+            message = goal_message(aim, self.config.world_frame, time_ns)
             self._goal_topics[part].publish(message)
-        readers = self._goal_topics["base"].get_subscription_count()
-        # One of the publishers belongs to this node.
-        if readers <= 1:
+            # Where this node hears the goal too, one of the readers is its own.
+            own = 1 if part in _HEARD_GOALS else 0
+            readers = max(readers, self._goal_topics[part].get_subscription_count() - own)
+        if not readers:
             self._note("No planner or controller takes the goal: none is running.", 2, "page")
         else:
             self._note("Goal sent.", source="page")

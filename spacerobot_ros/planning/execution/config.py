@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
 from spacerobot_ros.model.shared_parameters import CommanderConfig
 from spacerobot_ros.model.srdf import with_srdf
 from spacerobot_ros.parameters import parameter, registered
@@ -117,6 +117,15 @@ class PlannerConfig(CommanderConfig):
         """Return the robot with the disabled pairs of the SRDF, among the obstacles."""
         robot = super().described(robot)
         return with_srdf(robot, self.srdf) if self.srdf else robot
+
+    @property
+    def goal_links(self) -> tuple[str, ...]:
+        """Names of the links that take goals.
+
+        Where a controller moves the robot, goals of its end-effector are for the controller.
+        """
+        default = [DEFAULT_END_EFFECTOR] if self.output == "commands" else []
+        return tuple(dict.fromkeys((*default, *self.end_effectors)))
 
     @property
     def replanning(self) -> float:
