@@ -472,8 +472,9 @@ class _AskedParts:
         for menu in self._menus.values():
             menu.remove()
         self._menus = {}
+        offered = tuple(links)
         with self._folder:
-            for part in (BASE_GOAL_KEY, *links):
+            for part in (BASE_GOAL_KEY, *offered) if offered else ():
                 self._menus[part] = self._add_menu(part)
         self._update()
 
