@@ -11,6 +11,7 @@ from support.expected import (
     ANALYSED,
     BAGS,
     CAMPAIGN_PAGES,
+    MADE_REPORTS,
     PARAMETERS,
     PLANS,
     REPORTS,
@@ -19,7 +20,15 @@ from support.expected import (
     parameters,
     plans,
 )
-from support.figure_prints import PARTS, PICTURES, analysis_prints, report_part
+from support.figure_prints import (
+    MADE_PARTS,
+    PARTS,
+    PICTURES,
+    analysis_prints,
+    made_part,
+    made_parts,
+    report_part,
+)
 from support.page_prints import CAMPAIGNS
 from support.viewer_prints import SITUATIONS, viewer_prints
 
@@ -65,6 +74,15 @@ def test_plans_stay_as_they_are() -> None:
 def test_reports_stay_as_they_are(name: str, part: str) -> None:
     kept = json.loads(REPORTS.read_text("utf-8"))[name].get(part)
     problems = differences(report_part(name, part), kept)
+    assert not problems, "\n".join([*problems[:40], WRITE])
+
+
+@pytest.mark.parametrize(
+    ("name", "part"), [(name, part) for name in MADE_PARTS for part in made_parts(name)]
+)
+def test_reports_of_made_up_flights_stay_as_they_are(name: str, part: str) -> None:
+    kept = json.loads(MADE_REPORTS.read_text("utf-8"))[name].get(part)
+    problems = differences(made_part(name, part), kept)
     assert not problems, "\n".join([*problems[:40], WRITE])
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.figure_prints import PICTURES, analysis_prints, report_prints
+from support.figure_prints import MADE_PARTS, PICTURES, analysis_prints, made_prints, report_prints
 from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
 from support.viewer_prints import SITUATIONS, viewer_prints
@@ -41,7 +41,7 @@ from spacerobot_ros.viewer.server import ViewerConfig
 FOLDER = Path(__file__).parents[1] / "expected"
 PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"
 REPORTS, CAMPAIGN_PAGES = FOLDER / "reports.json", FOLDER / "campaigns.json"
-VIEWER = FOLDER / "viewer.json"
+VIEWER, MADE_REPORTS = FOLDER / "viewer.json", FOLDER / "made_reports.json"
 BAGS = ("arm_attitude", "planar_chain", "servicer_thrusters", "sliding_masses")
 ANALYSED = ("planar_chain", "three_joint_arm")
 
@@ -276,6 +276,7 @@ def main() -> None:
         (PLANS, plans()),
         (REPORTS, reports),
         (CAMPAIGN_PAGES, pages),
+        (MADE_REPORTS, {name: made_prints(name) for name in MADE_PARTS}),
         (VIEWER, {name: viewer_prints(name) for name in SITUATIONS}),
     ):
         path.write_text(json.dumps(content, indent=1) + "\n", "utf-8")

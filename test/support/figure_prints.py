@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable
 from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 from unittest.mock import patch
 
 import numpy as np
@@ -30,12 +30,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 from scipy.spatial.transform import Rotation
+from support.made_flights import made_flight
 
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.planning.core.workspaces import Workspaces
-from spacerobot_ros.report import planning_figures
+from spacerobot_ros.report import figures_space, planning_figures
 from spacerobot_ros.report.events import _MARKS, FlightEvent, draw_events, event_style
 from spacerobot_ros.report.figures import (
     WIDTH,
@@ -55,6 +56,7 @@ from spacerobot_ros.report.page import charts_of, page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.planning_figures import _planar_figure, _spatial_figure
 from spacerobot_ros.report.scene import scene_of
+from spacerobot_ros.report.solids import Edge, Face, View
 from spacerobot_ros.report.tables import (
     headline,
     joint_table,
@@ -124,6 +126,60 @@ PARTS: dict[str, Callable[[FlightReport], Any]] = {
     },
 }
 """The parts of a report by name; None where a bag has nothing for one."""
+
+
+MADE_PARTS: dict[str, tuple[str, ...]] = {
+    "cycles": ("robot", "pose", "velocities", "loops", "momentum", "path"),
+    "controlled": ("joints",),
+    "planar": ("robot", "loops", "path"),
+    "bare": (),
+}
+"""Made-up flights, and their figures in the style of papers; those of reports are all drawn."""
+
+
+class _RecordingCanvas:
+    """Takes the faces and edges of a robot instead of drawing them."""
+
+    found: ClassVar[list[str]] = []
+
+    def __init__(self, view: View, low: Any, high: Any, width: int) -> None:
+        self.found.append(f"{_numbers(view.paper)} {_numbers(low)} {_numbers(high)} {width}")
+
+    def draw(self, faces: list[Face], edges: list[Edge]) -> None:
+        for parts in (
+            [(f.corners, f.normal, f.fill) for f in faces],
+            [(e.line, e.normals, e.fill) for e in edges],
+        ):
+            # A sum with weights of their own for all numbers.
+            numbers = np.concatenate([np.ravel(each) for part in parts for each in part])
+            weights = 1.0 + np.arange(len(numbers)) % 101
+            self.found.append(f"{len(parts)} {_numbers(numbers @ weights)}")
+
+    def image(self) -> Any:
+        return np.zeros((1, 1, 4))
+
+
+def made_prints(name: str) -> dict[str, Any]:
+    """Return the parts of the report of a made-up flight that has them."""
+    found = {part: made_part(name, part) for part in made_parts(name)}
+    return {part: content for part, content in found.items() if content is not None}
+
+
+def made_parts(name: str) -> list[str]:
+    """Return the names of the parts that are drawn of a made-up flight."""
+    style = "figure {}, paper"
+    left_out = {style.format(figure) for figure in FIGURES if figure not in MADE_PARTS[name]}
+    return [part for part in PARTS if part not in left_out]
+
+
+def made_part(name: str, part: str) -> Any:
+    """Return a part of the report of a made-up flight, and what was drawn of the robot."""
+    _RecordingCanvas.found.clear()
+    with patch.object(figures_space, "Canvas", _RecordingCanvas):
+        content = json.loads(json.dumps(PARTS[part](made_flight(name))))
+    if _RecordingCanvas.found:
+        content |= {"robots": _digest(_RecordingCanvas.found)}
+    return content
 
 
 def report_part(name: str, part: str) -> Any:
