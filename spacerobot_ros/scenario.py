@@ -652,6 +652,8 @@ def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
         links = values.get("end_effector_goals", {}) if name == "goal" else {}
         if not links:
             return goal
+        if not isinstance(links, Mapping):
+            raise TypeError(f"end_effector_goals has no poses by name: {links!r}.")
         of_base = any(f"{name}_{part}" in values for part in ("position", "orientation", "rotvec"))
         goals = [EndEffectorGoal.checked(str(link), pose) for link, pose in links.items()]
         hands = Goal.of_end_effectors(goals).end_effectors

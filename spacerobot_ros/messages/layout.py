@@ -181,10 +181,12 @@ class Layout:
             return
         length = self._read_length()
         self.fixed.append((self.end, self.end + length))
-        if path is not None:
-            # The serialised string ends with a zero.
-            self.leaves[path] = Leaf(self.end, max(length - 1, 0), None, ())
+        begin = self.end
         self._advance(length)
+        if path is not None:
+            # A serialised string ends with a zero; without it middlewares take all bytes.
+            zero = length > 0 and self._message[self.end - 1] == 0
+            self.leaves[path] = Leaf(begin, length - zero, None, ())
 
     def _add_numbers(self, dtype: np.dtype[Any], path: str | None, shape: tuple[int, ...]) -> None:
         size = dtype.itemsize * math.prod(shape)

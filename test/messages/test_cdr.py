@@ -316,6 +316,15 @@ def test_a_reader_sees_that_numbers_have_moved_from_one_field_to_the_next() -> N
     assert reader.layout_changes == 3
 
 
+def test_a_name_without_its_final_zero_is_whole_as_in_other_readers() -> None:
+    raw = bytearray(serialize_message(JointState(name=["ab", "cd"])))
+    raw[raw.index(b"ab\0") + 2] = 1
+    reader = TemplateReader(JOINT_STATE, {})
+    reader.accept(bytes(raw))
+    assert reader.texts("name") == list(deserialize_message(bytes(raw), JointState).name)
+    assert reader.texts("name") == ["ab\x01", "cd"]
+
+
 def test_a_reader_refuses_what_is_no_message() -> None:
     reader = TemplateReader(JOINT_STATE, spans)
     with pytest.raises(UnreadableError, match="its bytes are no JointState"):
