@@ -172,8 +172,8 @@ _TOPIC_TABLE = (
         "momentum_expected",
         _ARRAY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "expected momenta: those of the beginning plus the impulses of the thrusters",
-        when="actuation is effort",
+        "expected momenta: those of the beginning plus the impulses of thrusters and disturbances",
+        when="actuation is effort, or a disturbance acts",
         state=(StateField("data", "expected_momenta", entries=_MOMENTUM_LABELS),),
     ),
     Topic(
@@ -282,6 +282,12 @@ _TOPIC_TABLE = (
         _STRING_TYPE,
         _PUBLISHED_BY_USER,
         "faults for the plant, one a line, or `clear`",
+    ),
+    Topic(
+        "disturbance_injection",
+        _STRING_TYPE,
+        _PUBLISHED_BY_USER,
+        "disturbances of the plant, one a line, or `clear`",
     ),
     Topic(
         "joint_commands",

@@ -140,6 +140,8 @@ class LanesEngine:
         plant = scenario.plant
         if plant.faults or any(each.name.startswith("faults") for each in campaign.dispersions):
             return "it has faults"
+        if plant.disturbances:
+            return "it has disturbances, which engine 'flights' flies"
         if campaign.measures_clearance:
             return "a criterion names clearance_m, and lanes measure no distances between links"
         match scenario.commanders, plant.actuation:

@@ -234,7 +234,7 @@ class _LockstepFlight:
         self._reported = ReportedState(self._plant, config)
         self._commands = CommandValidator(self._plant, config)
         self._monitor = PlantMonitor(self._commands, self._plant, lockstep=True)
-        self._faults_seen = self._plant.active
+        self._injected_seen = self._plant.injected
         self.log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
         self._follower = GoalFollower(GoalIds().of(*_GOAL_STAMP))
         self._decided: _DecisionMoment | None = None
@@ -286,7 +286,7 @@ class _LockstepFlight:
             if not self._step():
                 break
             self._report_state()
-            if self._plant.active is not self._faults_seen:
+            if self._plant.injected is not self._injected_seen:
                 self._report_plant_status(PlantState.RUNNING)
             if ends:
                 break
@@ -392,7 +392,7 @@ class _LockstepFlight:
 
     def _report_plant_status(self, activity: PlantState) -> None:
         """Pass a change of the plant's status to the commanders."""
-        self._faults_seen, self._moment = self._plant.active, _DecisionMoment.AFTER_COMMAND
+        self._injected_seen, self._moment = self._plant.injected, _DecisionMoment.AFTER_COMMAND
         before = self._monitor.status
         self.log.events += self._monitor.update(activity, self._time)
         status = self._monitor.status

@@ -58,6 +58,10 @@ class SecondOpinion:
         return max(self.position, self.attitude, self.joints) <= AGREEMENT
 
 
+def _loads_act(plant: FaultyPlant) -> bool:
+    return plant.loads is not None and plant.loads.act
+
+
 class EngineFlight:
     """Flies a robot in MuJoCo beside a plant, tick by tick.
 
@@ -84,7 +88,7 @@ class EngineFlight:
         self._engine.move(plant.twist, plant.qdot)
         self._momenta = plant.expected_momenta.copy()
         self._stopped = plant.limit_counts["stroke"].copy()
-        self._faults = plant.active
+        self._faults, self._loads_act = plant.active, _loads_act(plant)
         self._first = plant.tick
         self._poses, self._shapes = [self._engine.pose], [self._engine.q]
         self._until = ""
@@ -94,6 +98,11 @@ class EngineFlight:
         if self._until:
             return
         plant = self._effort_plant
+        acted, self._loads_act = self._loads_act, _loads_act(self._plant)
+        if acted or self._loads_act:
+            time = f"{self._plant.time:.9g} s"
+            self._until = f"external loads act at {time}, which the engine does not model"
+            return
         if plant is None:
             self._engine.step_under_velocities(self._plant.qdot, self._momenta, self._period)
         elif reason := self._unknown_force():

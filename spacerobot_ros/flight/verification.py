@@ -174,13 +174,13 @@ class _RecordedPlant:
     robot
         The model.
     injections
-        The faults that were injected in each tick.
+        The faults that were injected in each tick, and the disturbances.
     """
 
     recorded: RecordedRobot
     config: PlantConfig
     robot: SpaceRobot
-    injections: dict[int, list[str]]
+    injections: tuple[dict[int, list[str]], dict[int, list[str]]]
 
     @classmethod
     def of(cls, bag: Bag) -> _RecordedPlant:
@@ -190,11 +190,10 @@ class _RecordedPlant:
         urdf = recorded.urdf
         if urdf is None:
             raise RecordingError(f"The bag {bag.path} holds no description of its robot.")
-        injections: dict[int, list[str]] = {}
-        # Faults have no stamp: they came in the tick of their log time.
-        series = recorded.get("fault_injection")
-        for time_ns, message in series.messages() if series is not None else ():
-            injections.setdefault(time_ns // config.period_ns, []).append(message.data)
+        faults, disturbances = (
+            _injections(recorded, topic, config.period_ns)
+            for topic in ("fault_injection", "disturbance_injection")
+        )
         description = parse_robot(urdf.decode(errors="replace"))
         names = recorded.joint_names
         if names != list(description.joint_names):
@@ -203,7 +202,8 @@ class _RecordedPlant:
                 f"The joint states in the bag {bag.path} are of {', '.join(names)}; its robot has "
                 f"{', '.join(description.joint_names)}."
             )
-        return cls(recorded, config, SpaceRobot(config.assumed_robot(description)), injections)
+        robot = SpaceRobot(config.assumed_robot(description))
+        return cls(recorded, config, robot, (faults, disturbances))
 
     def commands(self, source: CommandSource) -> dict[int, RecordedCommand]:
         """Return the first command of each tick; later ones and those between ticks are stale."""
@@ -226,6 +226,15 @@ class _RecordedPlant:
     def path(self) -> Path:
         """The bag."""
         return self.recorded.bag.path
+
+
+def _injections(recorded: RecordedRobot, topic: str, period_ns: int) -> dict[int, list[str]]:
+    """Return the texts on a topic by tick: without a stamp, that of their log time."""
+    by_tick: dict[int, list[str]] = {}
+    series = recorded.get(topic)
+    for time_ns, message in series.messages() if series is not None else ():
+        by_tick.setdefault(time_ns // period_ns, []).append(message.data)
+    return by_tick
 
 
 def _recorded_robot(bag: Bag) -> RecordedRobot:
@@ -478,13 +487,14 @@ def _resimulate(
             states[quantity][tick - first] = values
         if tick == last:
             break
-        for text in flight.injections.get(tick, ()):
-            with suppress(ParameterError):
-                plant.inject(text)  # A refused fault line changes nothing.
+        for inject, by_tick in zip((plant.inject, plant.disturb), flight.injections, strict=True):
+            for text in by_tick.get(tick, ()):
+                with suppress(ParameterError):
+                    inject(text)  # A refused line changes nothing.
         now = tick * flight.config.period_ns
-        for source, by_tick in zip(commands.sources, recorded, strict=True):
-            if tick in by_tick:
-                refusal = commands.offer(source, now, by_tick[tick], now)
+        for source, commanded in zip(commands.sources, recorded, strict=True):
+            if tick in commanded:
+                refusal = commands.offer(source, now, commanded[tick], now)
                 if refusal is not None:
                     done.refusals.setdefault(tick, (source.topic, refusal))
             elif not state.sensors.dropout:  # A state without a pose needs no answer.

@@ -33,6 +33,11 @@ thruster changes are therefore constant to the last bit, whatever the step:
 The command is ``[tau; f; n]``, (n + 6,): joint efforts (N or N m), then force (N) and torque (N m)
 at the origin of the base link, base components. The attitude is integrated in R^4 and normalised
 after each Runge-Kutta step.
+
+Under external loads (:mod:`spacerobot_ros.model.external_loads`) the state has the time (s) as its
+last entry, and the command the vector of loads. With ``F_k`` the load on composite k and the
+friction d, ``Q_j`` gains ``S_j' F_j - B_j' F_0 - d (K qdot)_j``; both momenta change by ``F_0``,
+the uniform gravity and the friction.
 """
 
 from __future__ import annotations
@@ -43,6 +48,7 @@ import casadi as ca
 
 from spacerobot_ros.model.compilation import dense_function
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.external_loads import ExternalLoads, LoadLayout, external_loads
 from spacerobot_ros.model.inertial_parameters import rotational, symmetric
 from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
@@ -275,14 +281,22 @@ def motion_forces(
 
 
 def shape_forces(
-    system: ShapeSystem, omega: ca.SX, qdot: ca.SX, external: ca.SX, tau: ca.SX
+    system: ShapeSystem,
+    omega: ca.SX,
+    qdot: ca.SX,
+    external: ca.SX,
+    tau: ca.SX,
+    loads: ExternalLoads | None = None,
 ) -> tuple[ca.SX, ca.SX]:
     """Return ``Q`` (n,) of ``K qddot = Q`` and the remaining moment (3,) on the base.
 
-    ``external`` (6,) is the moment (N m) over the force (N) from outside, base components, about
-    the system's centre of mass; ``tau`` (n,) are the joint efforts (N or N m).
+    ``external`` (6,) is the moment (N m) over the force (N) on the base from outside, base
+    components, about the system's centre of mass; ``tau`` (n,) are the joint efforts (N or N m).
     """
     f = motion_forces(system.parts, omega, qdot)
+    if loads is not None:
+        f = tuple(force - load for force, load in zip(f, loads.composites, strict=True))
+        tau = tau - loads.friction * (system.K @ qdot)
     excess = f[0] - external
     kin = system.parts.kin
     if kin.robot.has_mimic_joints:
@@ -299,7 +313,11 @@ def shape_forces(
 
 
 def joint_efforts(
-    kin: TreeKinematics, qdot: ca.SX, qddot: ca.SX, L_B: ca.SX | None = None
+    kin: TreeKinematics,
+    qdot: ca.SX,
+    qddot: ca.SX,
+    L_B: ca.SX | None = None,
+    loads: ExternalLoads | None = None,
 ) -> ca.SX:
     """Return the efforts (n,), N or N m, of a free robot whose shape moves at the rates ``qdot``
     (n,) and changes them by ``qddot`` (n,): inverse dynamics.
@@ -309,18 +327,24 @@ def joint_efforts(
     by ``-diag(D, M 1)^-1 f_0``, where ``f_0`` is the force that the motion of the joints alone
     would demand from outside. So ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no inertia
     matrix of the shape is needed. At zero momentum they are of second degree in time: the same path
-    in half the time takes four times the efforts.
+    in half the time takes four times the efforts. ``loads`` act from outside, if any.
     """
     parts = composites(kin)
     D = SymmetricFactor(parts.rotational)
     relative = -(parts.D_q @ qdot) if L_B is None else L_B - parts.D_q @ qdot
     f = motion_forces(parts, D.solve(relative), qdot, qddot)
+    if loads is not None:
+        f = tuple(force - load for force, load in zip(f, loads.composites, strict=True))
     base = ca.vertcat(D.solve(f[0][:3]), f[0][3:] * kin.per_mass)
     along = (
         ca.dot(S, force) - ca.dot(P, base)
         for S, P, force in zip(parts.S[1:], parts.P[1:], f[1:], strict=True)
     )
-    return kin.gather(ca.vertcat(*along))
+    efforts = kin.gather(ca.vertcat(*along))
+    if loads is None:
+        return efforts
+    momentum = parts.D_qq @ qdot - parts.D_q.T @ D.solve(parts.D_q @ qdot)
+    return efforts + loads.friction * momentum
 
 
 def external_force(kin: TreeKinematics, wrench_B: ca.SX) -> ca.SX:
@@ -353,65 +377,118 @@ def state_slices(n: int) -> tuple[slice, ...]:
     return tuple(slice(a, b) for a, b in zip([0, *ends], ends, strict=False))
 
 
-def shape_equations(kin: TreeKinematics) -> ca.Function:
+def shape_equations(kin: TreeKinematics, *, loaded: bool = False) -> ca.Function:
     """Return the function ``(x, command) -> (K, Q)`` of ``K qddot = Q``."""
-    x, command = _state_symbols(kin)
-    system, _, _, Q = _equations(kin, x, command)
+    x, command = _state_symbols(kin, loaded=loaded)
+    equations = _equations(kin, x, command, loaded=loaded)
     inputs = {"x": x, "command": command, **kin.mass_properties.inputs}
-    return dense_function("shape_equations", inputs, {"K": system.K, "Q": Q})
+    name = "loaded_shape_equations" if loaded else "shape_equations"
+    return dense_function(name, inputs, {"K": equations.system.K, "Q": equations.Q})
 
 
-def state_rate(kin: TreeKinematics, *, holding: bool = False) -> ca.Function:
+def state_rate(kin: TreeKinematics, *, holding: bool = False, loaded: bool = False) -> ca.Function:
     """Return the function ``(x, command) -> x_dot``.
 
     With ``holding`` it takes a third argument ``free`` (n,): 1 for a joint that moves, 0 for one
-    that is held at its present rate.
+    that is held at its present rate. With ``loaded``, external loads act.
     """
-    x, command = _state_symbols(kin)
+    x, command = _state_symbols(kin, loaded=loaded)
     free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)
-    _, quaternion, qdot, p_W, _, _ = (x[part] for part in state_slices(kin.n))
-    system, omega, external, Q = _equations(kin, x, command)
+    _, quaternion, qdot, p_W, L_W, _ = (x[part] for part in state_slices(kin.n))
+    equations = _equations(kin, x, command, loaded=loaded)
+    system = equations.system
     # A held joint is absent from the equations of other joints; its own equation is qddot = 0.
     K = system.K * (free @ free.T)
     for j in range(kin.n):
         K[j, j] = system.K[j, j]
     R_WB = matrix_from_quaternion(quaternion)
+    p_dot, L_dot = R_WB @ equations.external[3:], R_WB @ equations.external[:3]
+    if equations.loads is not None:
+        by_loads = equations.loads.momentum_rates(R_WB, p_W, L_W, kin.total_mass)
+        p_dot, L_dot = p_dot + by_loads[0], L_dot + by_loads[1]
     x_dot = ca.vertcat(
         qdot,
-        quaternion_rate(quaternion, omega),
-        SymmetricFactor(K).solve(Q * free),
-        R_WB @ external[3:],
-        R_WB @ external[:3],
+        quaternion_rate(quaternion, equations.omega),
+        SymmetricFactor(K).solve(equations.Q * free),
+        p_dot,
+        L_dot,
         p_W / kin.total_mass,
+        *([1.0] if loaded else []),
     )
     inputs = {"x": x, "command": command}
     if holding:
         inputs["free"] = free
     inputs |= kin.mass_properties.inputs
-    return dense_function("holding_rate" if holding else "flight_rate", inputs, {"x_dot": x_dot})
+    name = "holding_rate" if holding else "flight_rate"
+    return dense_function(f"loaded_{name}" if loaded else name, inputs, {"x_dot": x_dot})
 
 
-def _state_symbols(kin: TreeKinematics) -> tuple[ca.SX, ca.SX]:
+def servo_rate(kin: TreeKinematics) -> ca.Function:
+    """Return the function ``(x, qdot, loads) -> x_dot`` of a robot whose servos hold ``qdot`` under
+    external loads.
+
+    ``x = [q; quaternion_WB; p_W; L_W; r_WC_W; time]``, (n + 14,); ``loads`` is the vector of
+    :class:`.LoadLayout`.
+    """
+    parts = {"quaternion": 4, "p_W": 3, "L_W": 3, "r_WC_W": 3, "time": 1}
+    symbols = {name: ca.SX.sym(name, count) for name, count in parts.items()}
+    quaternion, p_W, L_W, r_WC_W, time = symbols.values()
+    qdot = ca.SX.sym("qdot", kin.n)
+    vector = ca.SX.sym("loads", LoadLayout(len(kin.robot.links)).size)
+    bodies = composites(kin)
+    loads = external_loads(kin, bodies.J, quaternion, r_WC_W, vector, time)
+    R_WB = matrix_from_quaternion(quaternion)
+    omega = SymmetricFactor(bodies.D).solve(R_WB.T @ L_W - bodies.D_q @ qdot)
+    x_dot = ca.vertcat(
+        qdot,
+        quaternion_rate(quaternion, omega),
+        *loads.momentum_rates(R_WB, p_W, L_W, kin.total_mass),
+        p_W / kin.total_mass,
+        1.0,
+    )
+    x = ca.vertcat(kin.q, *symbols.values())
+    inputs = {"x": x, "qdot": qdot, "loads": vector, **kin.mass_properties.inputs}
+    return dense_function("loaded_servo_rate", inputs, {"x_dot": x_dot})
+
+
+def _state_symbols(kin: TreeKinematics, *, loaded: bool) -> tuple[ca.SX, ca.SX]:
     parts = [
         kin.q if name == "q" else ca.SX.sym(name, part.stop - part.start)
         for name, part in zip(
             ("q", "quaternion", "qdot", "p_W", "L_W", "r_WC_W"), state_slices(kin.n), strict=True
         )
     ]
-    return ca.vertcat(*parts), ca.SX.sym("command", kin.n + 6)
+    if not loaded:
+        return ca.vertcat(*parts), ca.SX.sym("command", kin.n + 6)
+    size = LoadLayout(len(kin.robot.links)).size
+    return ca.vertcat(*parts, ca.SX.sym("time")), ca.SX.sym("command", kin.n + 6 + size)
 
 
-def _equations(
-    kin: TreeKinematics, x: ca.SX, command: ca.SX
-) -> tuple[ShapeSystem, ca.SX, ca.SX, ca.SX]:
-    """Return the shape's system, ``omega_WB_B``, the external moment over force, and ``Q``."""
-    _, quaternion, qdot, _, L_W, _ = (x[part] for part in state_slices(kin.n))
-    tau, wrench_B = command[: kin.n], command[kin.n :]
+@dataclass(frozen=True)
+class _Equations:
+    """The equations of motion in a state: of the shape, with ``omega_WB_B``, the moment over force
+    ``external`` of the wrench on the base, ``Q``, and the external loads, if any.
+    """
+
+    system: ShapeSystem
+    omega: ca.SX
+    external: ca.SX
+    Q: ca.SX
+    loads: ExternalLoads | None
+
+
+def _equations(kin: TreeKinematics, x: ca.SX, command: ca.SX, *, loaded: bool) -> _Equations:
+    _, quaternion, qdot, _, L_W, r_WC_W = (x[part] for part in state_slices(kin.n))
+    tau, wrench_B = command[: kin.n], command[kin.n : kin.n + 6]
     system = shape_system(kin)
+    loads = None
+    if loaded:
+        vector, time = command[kin.n + 6 :], x[-1]
+        loads = external_loads(kin, system.parts.J, quaternion, r_WC_W, vector, time)
     external = external_force(kin, wrench_B)
     omega = system.base_rate(matrix_from_quaternion(quaternion).T @ L_W, qdot)
-    Q, _ = shape_forces(system, omega, qdot, external, tau)
-    return system, omega, external, Q
+    Q, _ = shape_forces(system, omega, qdot, external, tau, loads)
+    return _Equations(system, omega, external, Q, loads)
 
 
 def _joint_motion(kin: TreeKinematics, k: int) -> ca.SX:

@@ -28,6 +28,7 @@ from spacerobot_ros.model.composite_rigid_body import (
     composite_dynamics,
     composites,
     joint_efforts,
+    servo_rate,
     shape_equations,
     state_rate,
     state_slices,
@@ -44,6 +45,7 @@ from spacerobot_ros.model.dynamics import (
     momentum_of_bodies,
     point_jacobian,
 )
+from spacerobot_ros.model.external_loads import LoadLayout, external_loads
 from spacerobot_ros.model.inertial_parameters import (
     InertialParameters,
     SymbolicMassProperties,
@@ -150,8 +152,12 @@ class ModelFunctions:
             "shape_equations": lambda: shape_equations(self._kin),
             "flight_step": self._flight_step,
             "holding_step": lambda: self._flight_step(holding=True),
+            "loaded_shape_equations": lambda: shape_equations(self._kin, loaded=True),
+            "loaded_flight_step": lambda: self._flight_step(loaded=True),
+            "loaded_holding_step": lambda: self._flight_step(holding=True, loaded=True),
             "joint_efforts": self._joint_efforts,
             "servo_efforts": self._servo_efforts,
+            "loaded_servo_efforts": lambda: self._servo_efforts(loaded=True),
             "jacobian": self._jacobian,
             "connection": lambda: self._shape_function("connection", self._connection),
             "curvature": self._curvature,
@@ -159,6 +165,7 @@ class ModelFunctions:
             "base_twist": self._base_twist,
             "rotate": self._rotate,
             "velocity_step": self._velocity_step,
+            "loaded_velocity_step": self._loaded_velocity_step,
             "total_mass": self._total_mass,
         }
 
@@ -223,8 +230,8 @@ class ModelFunctions:
         acceleration = composite_dynamics(self._kin, *velocities, *forces.values())
         return self._dense_model_function("dynamics", {**state, **forces}, {"z0ddot": acceleration})
 
-    def _flight_step(self, *, holding: bool = False) -> ca.Function:
-        rate = state_rate(self._kin, holding=holding)
+    def _flight_step(self, *, holding: bool = False, loaded: bool = False) -> ca.Function:
+        rate = state_rate(self._kin, holding=holding, loaded=loaded)
         return runge_kutta_step(rate, attitude=state_slices(self.n)[1])
 
     def _joint_efforts(self) -> ca.Function:
@@ -234,7 +241,7 @@ class ModelFunctions:
             "joint_efforts", {"q": self._kin.q, **rates}, {"tau": efforts}
         )
 
-    def _servo_efforts(self) -> ca.Function:
+    def _servo_efforts(self, *, loaded: bool = False) -> ca.Function:
         """Return the efforts of servos that change the rates of the joints within ``h``."""
         n, quaternion = self.n, ca.SX.sym("quaternion", 4)
         before, after = ca.SX.sym("before", n), ca.SX.sym("after", n)
@@ -242,10 +249,17 @@ class ModelFunctions:
         mean, change = (before + after) / 2, (after - before) / h
         L_B = matrix_from_quaternion(quaternion).T @ L_W
         inputs = {"quaternion_WB": quaternion, "q": self._kin.q, "before": before, "after": after}
-        efforts = joint_efforts(self._kin, mean, change, L_B)
-        return self._dense_model_function(
-            "servo_efforts", {**inputs, "L_W": L_W, "h": h}, {"tau": efforts}
-        )
+        inputs |= {"L_W": L_W, "h": h}
+        if not loaded:
+            efforts = joint_efforts(self._kin, mean, change, L_B)
+            return self._dense_model_function("servo_efforts", inputs, {"tau": efforts})
+        layout = LoadLayout(len(self.link_names))
+        r_WC_W, vector = ca.SX.sym("r_WC_W", 3), ca.SX.sym("loads", layout.size)
+        J, time = self._inertia.J, vector[layout.time]
+        loads = external_loads(self._kin, J, quaternion, r_WC_W, vector, time)
+        efforts = joint_efforts(self._kin, mean, change, L_B, loads)
+        inputs |= {"r_WC_W": r_WC_W, "loads": vector}
+        return self._dense_model_function("loaded_servo_efforts", inputs, {"tau": efforts})
 
     def _jacobian(self, link: str) -> ca.Function:
         index = self.link_index(link)
@@ -303,6 +317,20 @@ class ModelFunctions:
         return ca.Function(
             f"velocity_step_{count}", list(inputs.values()), [x], list(inputs), ["x_next"]
         )
+
+    def _loaded_velocity_step(self, substeps: str) -> ca.Function:
+        """Return ``(x, qdot, loads, h) -> x`` of :func:`.servo_rate` in some Runge-Kutta steps."""
+        count = int(substeps)
+        step = runge_kutta_step(servo_rate(self._kin), attitude=slice(self.n, self.n + 4))
+        x = ca.MX.sym("x", self.n + 14)
+        qdot, h = ca.MX.sym("qdot", self.n), ca.MX.sym("h")
+        loads = ca.MX.sym("loads", LoadLayout(len(self.link_names)).size)
+        p = [
+            ca.MX.sym(name, symbol.numel())
+            for name, symbol in self._kin.mass_properties.inputs.items()
+        ]
+        x_next = repeat_step(step, count)(x, qdot, loads, h / count, *p)
+        return ca.Function(f"loaded_velocity_step_{count}", [x, qdot, loads, h, *p], [x_next])
 
     def _total_mass(self) -> ca.Function:
         return dense_function(

@@ -43,7 +43,7 @@ class FlightEvent:
         return f"{label}: {', '.join(details)}" if details else label
 
 
-_DETAIL_KEYS = ("fault", "joints", "reason", "method", "node", "first", "second")
+_DETAIL_KEYS = ("fault", "disturbance", "joints", "reason", "method", "node", "first", "second")
 """Keys that distinguish an event from others of its kind."""
 
 
@@ -72,6 +72,8 @@ _MARKS = {
     EventKind.FAULT_INJECTED: _Mark("fault on", "^", _WARN, 1),
     EventKind.FAULT_ENDED: _Mark("fault off", "^", _WARN, 1, hollow=True),
     EventKind.FAULTS_CLEARED: _Mark("faults off", "^", _WARN, 1, hollow=True),
+    EventKind.DISTURBANCE: _Mark("disturbance", "<", _WARN, 1),
+    EventKind.DISTURBANCE_ENDED: _Mark("disturbance over", "<", _WARN, 1, hollow=True),
     EventKind.CONTACT: _Mark("contact", "P", _BAD, 1),
     EventKind.CONTACT_ENDED: _Mark("contact over", "P", _BAD, 1, hollow=True),
     EventKind.LATCHED: _Mark("latched", "s", _BAD, 1),
@@ -95,6 +97,7 @@ _GLYPHS = {
     "v": "▼▽",
     "^": "▲△",
     ">": "▶▷",
+    "<": "◀◁",
     "o": "●○",
     "s": "■□",
     "D": "◆◇",
@@ -108,8 +111,15 @@ _GLYPHS = {
 """Markers of matplotlib as characters, full and hollow."""
 
 _FAULT_KINDS = frozenset(
-    (EventKind.FAULT_INJECTED, EventKind.FAULT_ENDED, EventKind.FAULTS_CLEARED)
+    (
+        EventKind.FAULT_INJECTED,
+        EventKind.FAULT_ENDED,
+        EventKind.FAULTS_CLEARED,
+        EventKind.DISTURBANCE,
+        EventKind.DISTURBANCE_ENDED,
+    )
 )
+"""Kinds of faults and disturbances."""
 _PROMINENT_KINDS = _FAULT_KINDS | {
     EventKind.STUCK_JOINT,
     EventKind.LATCHED,

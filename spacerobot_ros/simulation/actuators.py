@@ -1,4 +1,4 @@
-"""Actuators of a plant: thrusters and actuator faults around the rigid-body dynamics.
+"""Actuators of a plant: thrusters and actuator faults around the rigid-body dynamics; disturbances.
 
 :func:`build_plant` makes the plant of a configuration: :class:`.VelocityPlant` or
 :class:`.EffortPlant`, within a :class:`ThrusterPlant` if thrusters are modelled, within a
@@ -20,8 +20,10 @@ from spacerobot_ros.model import SpaceRobot, integration
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.simulation import effort_plant
 from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.disturbances import Disturbance, disturbance_timeline
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.simulation.faults import FAULT_KINDS, WRENCH_AXES, Fault, FaultTimeline, Targets
+from spacerobot_ros.simulation.loads import PlantLoads
 from spacerobot_ros.simulation.plant import InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
@@ -192,10 +194,11 @@ def thrusters_in(plant: Plant) -> ThrusterPlant | None:
 
 
 class FaultyPlant(WrappedPlant):
-    """A :class:`Plant` whose actuators have the faults of a timeline.
+    """A :class:`Plant` whose actuators have the faults of a timeline, and which disturbances push.
 
     Its state arrays are those of the wrapped plant. A reset sets back neither the time nor the
-    faults. A tick without faults costs one comparison.
+    faults and disturbances. A tick without faults costs one comparison, and as long as there is no
+    disturbance, the plant steps without external loads.
 
     The command of a joint gets bias and noise added, then is scaled if the joint is slow; a stuck
     joint is held in place (:meth:`Plant.hold`). Faults of the wrench act on the commanded wrench,
@@ -213,11 +216,13 @@ class FaultyPlant(WrappedPlant):
         Whether steps take a wrench.
     seed
         Seed of the actuators' noise.
+    disturbances
+        The disturbances, one per line (:func:`.parse_disturbance`).
 
     Raises
     ------
     ParameterError
-        A line is not a fault of this plant.
+        A line is not a fault or disturbance of this plant.
     """
 
     def __init__(
@@ -228,6 +233,7 @@ class FaultyPlant(WrappedPlant):
         *,
         wrench: bool,
         seed: int = 0,
+        disturbances: Iterable[str] = (),
     ) -> None:
         super().__init__(plant)
         self._thrusters = thrusters_in(plant)
@@ -247,7 +253,17 @@ class FaultyPlant(WrappedPlant):
         self._wrench_factor, self._wrench_held = np.ones(6), np.zeros(6)
         self._actuators_sound = True
         self._seen: tuple[Fault, ...] = ()
+        self.disturbances: tuple[Disturbance, ...] = ()
+        """Active disturbances; a new tuple object after every change."""
+        self.injected: tuple[Fault | Disturbance, ...] = ()
+        """Active faults and disturbances; a new tuple object after every change."""
+        self.loads: PlantLoads | None = None
+        """External loads; None: there never were any."""
+        self._disturbances = disturbance_timeline(disturbances, self.robot.link_names)
+        if self._disturbances.entries:
+            self._begin_loads()
         self.apply_active_faults()
+        self._apply_active_disturbances()
 
     @property
     def time(self) -> float:
@@ -267,11 +283,21 @@ class FaultyPlant(WrappedPlant):
         ParameterError
             A line is not a fault of this robot; none of the lines is added.
         """
-        if text.strip() == "clear":
-            self.timeline.clear()
-        else:
-            self.timeline.read(text.splitlines(), self.time)
+        self.timeline.inject(text, self.time)
         self.apply_active_faults()
+
+    def disturb(self, text: str) -> None:
+        """Add disturbances, one per line, while the plant runs; ``clear`` removes them all.
+
+        Raises
+        ------
+        ParameterError
+            A line is not a disturbance of this robot; none of the lines is added.
+        """
+        self._disturbances.inject(text, self.time)
+        if self._disturbances.entries and self.loads is None:
+            self._begin_loads()
+        self._apply_active_disturbances()
 
     def apply_active_faults(self) -> None:
         """Apply the faults that are active at the present time."""
@@ -279,7 +305,7 @@ class FaultyPlant(WrappedPlant):
         self._next_tick = self.timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
         if active is self._seen:
             return
-        self._seen = active
+        self._seen, self.injected = active, (*active, *self.disturbances)
         self._bias[:], self._noise[:], self._factor[:] = 0.0, 0.0, 1.0
         self._wrench_factor[:], self._wrench_held[:] = 1.0, 0.0
         wrench_faulty = False
@@ -311,6 +337,35 @@ class FaultyPlant(WrappedPlant):
             )
             self._disturb_nozzles(self._thrusters, active)
         self._actuators_sound = all(FAULT_KINDS[f.kind].sensor for f in active)
+
+    def _begin_loads(self) -> None:
+        self.loads = PlantLoads(self.robot)
+        self.plant.load(self.loads)
+        self.step = self._loaded_step
+
+    def _loaded_step(self, *commands: Any) -> bool:
+        """Advance a tick under external loads."""
+        assert self.loads is not None
+        if self.tick >= self._next_disturbance:
+            self._apply_active_disturbances()  # The owner may have set the tick.
+        self.loads.time = self.time
+        limited = self._step(*commands)
+        if self.tick >= self._next_disturbance:
+            self._apply_active_disturbances()
+        return limited
+
+    def _apply_active_disturbances(self) -> None:
+        """Apply the disturbances that are active at the present time."""
+        timeline, loads = self._disturbances, self.loads
+        active = timeline.at(self.time + _FAULT_TIME_ROUNDING * self._control_period)
+        self._next_disturbance = timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
+        if active is self.disturbances or loads is None:
+            return
+        self.disturbances, self.injected = active, (*self._seen, *active)
+        loads.in_link[:] = loads.in_world[:] = 0.0
+        for each in active:
+            wrenches = loads.in_link if each.in_link else loads.in_world
+            wrenches[self.robot.link_names.index(each.link)] += (*each.force, *each.torque)
 
     @staticmethod
     def _disturb_nozzles(thrusters: ThrusterPlant, active: tuple[Fault, ...]) -> None:
@@ -390,7 +445,8 @@ def build_plant(
     Raises
     ------
     ParameterError
-        The integration step is too short, or the initial state, a thruster or a fault is refused.
+        The integration step is too short, or the initial state, a thruster, a fault or a
+        disturbance is refused.
     """
     kind, step = PLANTS[config.actuation], config.integration_step
     control_period = config.control_period
@@ -415,5 +471,10 @@ def build_plant(
     plant = kind.plant(robot, control_period, start, step or kind.integration_step)
     plant = with_thrusters(plant, control_period, config.thrusters, config.thrusters_excluded)
     return FaultyPlant(
-        plant, config.faults, control_period, wrench=kind.wrench, seed=config.sensors.seed
+        plant,
+        config.faults,
+        control_period,
+        wrench=kind.wrench,
+        seed=config.sensors.seed,
+        disturbances=config.disturbances,
     )

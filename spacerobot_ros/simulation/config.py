@@ -228,6 +228,12 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "fault lines, e.g. 'joint_stuck joint_2 at 10 until 50'; see docs/faults.md",
         texts=True,
     )
+    disturbances: tuple[str, ...] = parameter(
+        (),
+        "wrenches on links from outside, e.g. 'hand force 1 0 0 in world at 10 until 50'; see "
+        "docs/disturbances.md",
+        texts=True,
+    )
     sensors: SensorConfig = group(SensorConfig())
 
     @property

@@ -1,8 +1,9 @@
 """The plant under efforts: free-flying dynamics driven by joint efforts and a wrench on the base.
 
 One tick is one compiled function: limits, integration, and every quantity that is published. The
-total momenta are states (:mod:`spacerobot_ros.model.composite_rigid_body`): without thrust they are
-constant to the last bit. A tick in which a joint touches a limit is repeated with inelastic stops.
+total momenta are states (:mod:`spacerobot_ros.model.composite_rigid_body`): without thrust and
+external loads they are constant to the last bit. A tick in which a joint touches a limit is
+repeated with inelastic stops.
 
 A stop acts between the two links of its joint, along the joint's coordinate: an internal force,
 which changes neither total momentum; the other joints and the base react to it. With ``K`` the
@@ -28,10 +29,13 @@ import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.external_loads import LoadLayout
 from spacerobot_ros.model.integration import count_steps, repeat_step
 from spacerobot_ros.model.model_functions import Composition
+from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
 _BISECTIONS = 40
@@ -50,16 +54,19 @@ class JointStops:
         The model.
     integration_step
         Longest Runge-Kutta step, s.
+    loaded
+        Whether external loads act: the state ends with the time, the command with the loads.
     """
 
-    def __init__(self, robot: SpaceRobot, integration_step: float) -> None:
+    def __init__(self, robot: SpaceRobot, integration_step: float, *, loaded: bool = False) -> None:
         self._integration_step = integration_step
         self._lower, self._upper = robot.lower, robot.upper
         self._below = robot.lower - _STOP_TOLERANCE * np.maximum(1.0, np.abs(robot.lower))
         self._above = robot.upper + _STOP_TOLERANCE * np.maximum(1.0, np.abs(robot.upper))
         self._q, _, self._qdot, *_ = state_slices(robot.n)
-        self._step = robot.buffered("holding_step")
-        self._equations = robot.buffered("shape_equations")
+        prefix = "loaded_" if loaded else ""
+        self._step = robot.buffered(f"{prefix}holding_step")
+        self._equations = robot.buffered(f"{prefix}shape_equations")
 
     def advance(
         self, state: Array, command: Array, duration: float, locked: Flags | None = None
@@ -232,10 +239,13 @@ class EffortPlant:
         self.control_period = control_period
         self.initial = initial or InitialState()
         n = robot.n
+        self._substeps = substeps
         self._stops = JointStops(robot, control_period / substeps)
         self._advance = robot.composed(
             f"effort_tick_{substeps}", lambda model: tick_function(robot, model, substeps)
         )
+        self._tick: BufferedFunction | LoadedTick = self._advance
+        self._loads: PlantLoads | None = None
         self._state, self._command, self._h = self._advance.inputs
         self._next_state, self.pose, self.twist, self._realised = self._advance.outputs[:4]
         self.momentum, self.link_R, self.link_r, self._limited = self._advance.outputs[4:]
@@ -255,7 +265,7 @@ class EffortPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: from the beginning and by the thrusters."""
+        """Linear over angular momentum (6,) in W: from the beginning, by thrust and loads."""
         _, _, _, p_W, L_W, _ = state_slices(self.robot.n)
         return self._next_state[p_W.start : L_W.stop]
 
@@ -291,6 +301,16 @@ class EffortPlant:
         self._held[:] = joints
         self._holding = bool(joints.any())
 
+    def load(self, loads: PlantLoads) -> None:
+        """Step under external loads from now on; their numbers may change before each step."""
+        robot, substeps = self.robot, self._substeps
+        loaded = robot.composed(
+            f"loaded_effort_tick_{substeps}",
+            lambda model: tick_function(robot, model, substeps, loaded=True),
+        )
+        self._loads, self._tick = loads, LoadedTick(self._advance, loaded, loads)
+        self._stops = JointStops(robot, self.control_period / substeps, loaded=True)
+
     def step(self, effort: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
         """Advance one tick under joint efforts (n,), clipped to their limits, and a base wrench.
 
@@ -311,7 +331,7 @@ class EffortPlant:
         self._state[:] = self._next_state
         self._command[:n] = effort
         self._command[n:] = wrench
-        self._advance.evaluate()
+        self._tick.evaluate()
         if self._limited[0] == 0.0 and not self._holding:
             return False
         return self._apply_limits()
@@ -325,9 +345,14 @@ class EffortPlant:
             if not np.all(np.isfinite(self._command)):
                 raise CommandError(f"A command is not finite: {self._command.tolist()}.")
             if touched or self._holding:
-                self._state[:], stopped = self._stops.advance(
-                    self._state, self._realised, self.control_period, self._held
+                state, command, loads = self._state, self._realised, self._loads
+                if loads is not None:
+                    state = np.append(state, loads.time)
+                    command = np.concatenate([command, loads.vector])
+                after, stopped = self._stops.advance(
+                    state, command, self.control_period, self._held
                 )
+                self._state[:] = after[: self._state.size]
                 self._update_outputs()
         except SpaceRobotError:
             # The plant keeps the state before the tick.
@@ -345,20 +370,31 @@ class EffortPlant:
         self._h[:] = self.control_period
 
 
-def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Function:
-    """Compose the tick from the model's functions; see :class:`EffortPlant` for its results."""
+def tick_function(
+    robot: SpaceRobot, model: Composition, substeps: int, *, loaded: bool = False
+) -> ca.Function:
+    """Compose the tick from the model's functions; see :class:`EffortPlant` for its results.
+
+    With ``loaded``, the vector of external loads is the last input.
+    """
     n = robot.n
     parts = state_slices(n)
     state, command = ca.MX.sym("state", parts[-1].stop), ca.MX.sym("command", n + 6)
     h = ca.MX.sym("h")
     effort = ca.fmin(ca.fmax(command[:n], -robot.effort_limit), robot.effort_limit)
     realised = ca.vertcat(effort, command[n:])
-    march = repeat_step(_step_counting_stops(robot, model), substeps)
-    p = list(model.inputs.values())
-    marched = march(
-        ca.vertcat(state, _count_touching_joints(robot, state)), realised, h / substeps, *p
-    )
-    next_state = marched[:-1]
+    march = repeat_step(_step_counting_stops(robot, model, loaded=loaded), substeps)
+    p, touching = list(model.inputs.values()), _count_touching_joints(robot, state)
+    loads: list[ca.MX] = []
+    if loaded:
+        layout = LoadLayout(len(robot.link_names))
+        loads = [ca.MX.sym("loads", layout.size)]
+        x = ca.vertcat(state, loads[0][layout.time], touching)
+        marched = march(x, ca.vertcat(realised, *loads), h / substeps, *p)
+        next_state = marched[:-2]
+    else:
+        marched = march(ca.vertcat(state, touching), realised, h / substeps, *p)
+        next_state = marched[:-1]
 
     q, quaternion, qdot, p_W, L_W, r_WC_W = (next_state[part] for part in parts)
     v, omega = model("base_twist", quaternion, q, qdot, p_W, L_W)
@@ -371,8 +407,8 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _MAX_FINITE_STATE)
     touched = marched[-1] + diverged
     return model.function(
-        f"effort_tick_{substeps}",
-        [state, command, h],
+        f"loaded_effort_tick_{substeps}" if loaded else f"effort_tick_{substeps}",
+        [state, command, h, *loads],
         [
             next_state,
             ca.vertcat(r_WB_W, quaternion),
@@ -386,14 +422,22 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     )
 
 
-def _step_counting_stops(robot: SpaceRobot, model: Composition) -> ca.Function:
+def _step_counting_stops(
+    robot: SpaceRobot, model: Composition, *, loaded: bool = False
+) -> ca.Function:
     """Return the integration step with one more state, a count of joints on or beyond stops.
 
     The count grows at the end of each step: a joint cannot swing beyond its limit and back in one.
     """
-    watched = ca.MX.sym("x", state_slices(robot.n)[-1].stop + 1)
-    command, h = ca.MX.sym("command", robot.n + 6), ca.MX.sym("h")
-    x = model("flight_step", watched[:-1], command, h)
+    state_size, command_size = state_slices(robot.n)[-1].stop, robot.n + 6
+    if loaded:
+        state_size, command_size = (
+            state_size + 1,
+            command_size + LoadLayout(len(robot.link_names)).size,
+        )
+    watched = ca.MX.sym("x", state_size + 1)
+    command, h = ca.MX.sym("command", command_size), ca.MX.sym("h")
+    x = model("loaded_flight_step" if loaded else "flight_step", watched[:-1], command, h)
     counted = ca.vertcat(x, watched[-1] + _count_touching_joints(robot, x))
     return model.function("watched_step", [watched, command, h], [counted])
 

@@ -8,19 +8,19 @@ never ends. :data:`FAULT_KINDS` has the kinds with their targets and values.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.simulation.timeline import (
+    Timeline,
+    format_times,
+    parse_number,
+    parse_times,
+    refusal_of_line,
+)
 
 _MAX_FAULT_VALUE = 1e6
 """Largest value of a fault, in its unit: squares of much larger ones overflow."""
-
-_MAX_FAULT_TIME = 1e9
-"""Largest time of a fault, s."""
-
-_MAX_FAULTS = 1000
-"""Largest number of faults: more take longer than a tick to search."""
 
 WRENCH_AXES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 """Components of the wrench on the base, in base components."""
@@ -97,9 +97,7 @@ class Fault:
 
     def __str__(self) -> str:
         value = f" {self.value:g}" if FAULT_KINDS[self.kind].value else ""
-        # With six digits, a short fault late in a flight would begin and end at the same time.
-        until = f" until {self.end:.12g}" if math.isfinite(self.end) else ""
-        return f"{self.kind} {self.target}{value} at {self.start:.12g}{until}"
+        return f"{self.kind} {self.target}{value} {format_times(self.start, self.end)}"
 
 
 @dataclass(frozen=True)
@@ -142,10 +140,7 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
     ParameterError
         The line is not a fault of this plant; the message quotes it.
     """
-
-    def refusal(reason: str) -> ParameterError:
-        return ParameterError(f"The fault '{line.strip()[:80]}' is refused: {reason}.")
-
+    refusal = refusal_of_line(line, "fault")
     words = line.split()
     if len(words) < 2:
         raise refusal("it must be KIND TARGET [VALUE] [at SECONDS] [until SECONDS]")
@@ -162,36 +157,16 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
     if kind.value:
         if not rest or rest[0] in ("at", "until"):
             raise refusal(f"{name} needs a value: {kind.value}")
-        value = _parse_number(rest.pop(0), refusal)
+        value = parse_number(rest.pop(0), refusal)
         if not kind.minimum <= value <= kind.maximum:
             raise refusal(
                 f"its value is {value:g} and must be from {kind.minimum:g} to {kind.maximum:g}"
             )
-    times = {"at": now, "until": math.inf}
-    if rest[0::2] not in ([], ["at"], ["until"], ["at", "until"]) or len(rest) % 2:
-        raise refusal(f"after {name} {target} come only 'at SECONDS' and 'until SECONDS'")
-    for word, text in zip(rest[0::2], rest[1::2], strict=True):
-        times[word] = _parse_number(text, refusal)
-        if abs(times[word]) > _MAX_FAULT_TIME:
-            raise refusal(
-                f"its time is {times[word]:g} s and must be at most {_MAX_FAULT_TIME:g} s"
-            )
-    if not times["until"] > times["at"]:
-        raise refusal(f"it ends at {times['until']:g} s and begins at {times['at']:g} s")
-    return Fault(name, target, value, times["at"], times["until"])
+    start, end = parse_times(rest, f"{name} {target}", now, refusal)
+    return Fault(name, target, value, start, end)
 
 
-def _parse_number(text: str, refusal: Callable[[str], ParameterError]) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise refusal(f"'{text[:40]}' is not a finite number")
-    return number
-
-
-class FaultTimeline:
+class FaultTimeline(Timeline[Fault]):
     """The faults of one plant by time.
 
     Parameters
@@ -203,42 +178,9 @@ class FaultTimeline:
     """
 
     def __init__(self, lines: Iterable[str], targets: Targets) -> None:
-        self._targets = targets
-        self.faults: list[Fault] = []
-        self.active: tuple[Fault, ...] = ()
-        """Active faults; a new tuple object after every change."""
-        self.next_change = -math.inf
-        """Time of the next change of ``active``, s."""
-        self.read(lines)
+        super().__init__(lines, lambda line, now: parse_fault(line, targets, now), "fault")
 
-    def read(self, lines: Iterable[str], now: float = 0.0) -> None:
-        """Add a fault per line; a fault without a time begins ``now`` (s).
-
-        Raises
-        ------
-        ParameterError
-            A line is not a fault, or there are too many; none is added.
-        """
-        added = [parse_fault(line, self._targets, now) for line in lines if line.strip()]
-        if len(self.faults) + len(added) > _MAX_FAULTS:
-            raise ParameterError(
-                f"{len(added)} more fault(s) are refused: there are {len(self.faults)}, and at "
-                f"most {_MAX_FAULTS}; inject 'clear' first."
-            )
-        self.faults += added
-        self.next_change = -math.inf
-
-    def clear(self) -> None:
-        """Remove all faults, including future faults."""
-        self.faults.clear()
-        self.next_change = -math.inf
-
-    def at(self, time: float) -> tuple[Fault, ...]:
-        """Return the faults that are active at a time (s), which must not run backwards."""
-        if time >= self.next_change:
-            active = tuple(f for f in self.faults if f.start <= time < f.end)
-            if active != self.active:
-                self.active = active
-            edges = [edge for f in self.faults for edge in (f.start, f.end) if edge > time]
-            self.next_change = min(edges, default=math.inf)
-        return self.active
+    @property
+    def faults(self) -> list[Fault]:
+        """The faults, past and future ones too."""
+        return self.entries

@@ -14,6 +14,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
 from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.loads import PlantLoads
 
 Counts = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -56,6 +57,9 @@ class Plant(Protocol):
     def hold(self, joints: Flags) -> None:
         """Lock the marked joints (n,) at their positions, and release all other joints."""
 
+    def load(self, loads: PlantLoads) -> None:
+        """Step under external loads from now on; their numbers may change before each step."""
+
     @property
     def step(self) -> Callable[..., bool]:
         """Advance a tick under the plant's commands; return whether a joint was limited."""
@@ -66,7 +70,7 @@ class Plant(Protocol):
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: from the beginning and by the thrusters."""
+        """Linear over angular momentum (6,) in W: from the beginning, by thrust and loads."""
 
 
 class WrappedPlant:
@@ -86,12 +90,16 @@ class WrappedPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: from the beginning and by the thrusters."""
+        """Linear over angular momentum (6,) in W: from the beginning, by thrust and loads."""
         return self.plant.expected_momenta
 
     def hold(self, joints: Flags) -> None:
         """Lock the marked joints (n,) at their positions, and release all other joints."""
         self.plant.hold(joints)
+
+    def load(self, loads: PlantLoads) -> None:
+        """Step under external loads from now on; their numbers may change before each step."""
+        self.plant.load(loads)
 
     def reset(self) -> None:
         """Return to the initial state."""

@@ -184,7 +184,7 @@ class ReportedState:
         self._poses_of_links = [np.zeros(7) for _ in self._links]
         self._link_poses = plant.robot.buffered("link_poses") if self._links else None
         self._thrusters = thrusters_in(plant)
-        self._sensors_used = self.sensors.used
+        self._sensors_used, self._loaded = self.sensors.used, plant.loads is not None
         self.quantities = self._quantities()
 
     @property
@@ -219,9 +219,10 @@ class ReportedState:
             link_R, link_r = self._link_poses(measured.q)
             for index, pose in zip(self._links, self._poses_of_links, strict=True):
                 _place(pose, measured.pose, link_R, link_r, index)
-        if self.sensors.used == self._sensors_used:
+        loaded = self._plant.loads is not None
+        if self.sensors.used == self._sensors_used and loaded == self._loaded:
             return False
-        self._sensors_used = self.sensors.used
+        self._sensors_used, self._loaded = self.sensors.used, loaded
         self.quantities = self._quantities()
         return True
 
@@ -241,7 +242,7 @@ class ReportedState:
             quantities["end_effector_pose"] = self._end_effector_pose
         for name, pose in zip(self._end_effectors, self._poses_of_links, strict=True):
             quantities[pose_topic(name).state[0].quantity] = pose
-        if plant.takes_wrench:
+        if plant.takes_wrench or self._loaded:
             quantities["expected_momenta"] = plant.expected_momenta
         if self._sensors_used:
             quantities |= {

@@ -1,4 +1,4 @@
-"""Status of a plant: its state, the reason, and the injected faults."""
+"""Status of a plant: its state, the reason, and the injected faults and disturbances."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from spacerobot_ros.simulation.actuators import FaultyPlant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
-_FAULT_SEPARATOR = "; "
+_SEPARATOR = "; "
+"""Between the lines of faults or disturbances."""
 
 
 class PlantState(str, Enum):
@@ -54,6 +55,8 @@ class PlantStatus:
         Number of rearms and resets, for subscribers that have missed a status.
     faults
         Lines of the active injected faults.
+    disturbances
+        Lines of the active disturbances.
     timeouts
         Number of times that the joints were brought to rest because no command came in time.
     last_command_s
@@ -68,6 +71,7 @@ class PlantStatus:
     rearms: int = 0
     resets: int = 0
     faults: tuple[str, ...] = ()
+    disturbances: tuple[str, ...] = ()
     timeouts: int = 0
     last_command_s: float | None = None
 
@@ -76,7 +80,7 @@ class PlantStatus:
         """Level of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR."""
         if self.latched_fault or self.state in (PlantState.LATCHED, PlantState.FAILED):
             return 2
-        return 1 if self.reason == "timeout" or self.faults else 0
+        return 1 if self.reason == "timeout" or self.faults or self.disturbances else 0
 
     def to_values(self) -> dict[str, str]:
         """Return the status as key-value pairs of a DiagnosticStatus."""
@@ -91,7 +95,10 @@ class PlantStatus:
         }
         if self.last_command_s is not None:
             values["last_command_s"] = f"{self.last_command_s:.9f}"
-        return values | {"faults": _FAULT_SEPARATOR.join(self.faults)}
+        values["faults"] = _SEPARATOR.join(self.faults)
+        if self.disturbances:
+            values["disturbances"] = _SEPARATOR.join(self.disturbances)
+        return values
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> PlantStatus:
@@ -103,7 +110,8 @@ class PlantStatus:
             They are not those of a plant.
         """
         try:
-            faults, last = values.get("faults", ""), values.get("last_command_s")
+            faults, disturbances = (values.get(key, "") for key in ("faults", "disturbances"))
+            last = values.get("last_command_s")
             return cls(
                 state=PlantState(values["state"]),
                 message=message,
@@ -114,7 +122,8 @@ class PlantStatus:
                 resets=int(values.get("resets", "0")),
                 timeouts=int(values.get("timeouts", "0")),
                 last_command_s=None if last is None else float(last),
-                faults=tuple(faults.split(_FAULT_SEPARATOR)) if faults else (),
+                faults=tuple(faults.split(_SEPARATOR)) if faults else (),
+                disturbances=tuple(disturbances.split(_SEPARATOR)) if disturbances else (),
             )
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"The values are not a status of a plant: {error}.") from error
@@ -166,6 +175,7 @@ class PlantMonitor:
                 self._commands.last_stamp_ns / SECOND if self._commands.timeouts else None
             ),
             faults=tuple(str(fault) for fault in self._plant.active),
+            disturbances=tuple(str(each) for each in self._plant.disturbances),
         )
         if now == before:
             return []
@@ -226,6 +236,14 @@ def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
         add(EventKind.FAULT_ENDED, f"A fault has ended: {fault}.", fault=fault)
     if ended and not now.faults:
         add(EventKind.FAULTS_CLEARED, "No fault is active any more.")
+    for each in now.disturbances:
+        if each not in before.disturbances:
+            message = f"A disturbance begins: {each}."
+            add(EventKind.DISTURBANCE, message, 1, disturbance=each)
+    for each in before.disturbances:
+        if each not in now.disturbances:
+            message = f"A disturbance has ended: {each}."
+            add(EventKind.DISTURBANCE_ENDED, message, disturbance=each)
     if now.state is not before.state:
         if before.state is PlantState.PAUSED and now.state is not PlantState.INACTIVE:
             add(EventKind.RESUMED, "Time goes on.")

@@ -1,7 +1,8 @@
 """The plant under velocity actuation: servos hold joint velocities, the base follows from momentum.
 
 One tick is one compiled function: limits, step, and every quantity that is published. The total
-linear and angular momenta are constants of the motion, zero unless the run starts otherwise.
+linear and angular momenta are constants of the motion, zero unless the run starts otherwise; under
+external loads they are states, which change by the impulses.
 """
 
 from __future__ import annotations
@@ -12,9 +13,12 @@ import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.external_loads import LoadLayout
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, count_steps
 from spacerobot_ros.model.model_functions import Composition
+from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
 
@@ -55,9 +59,11 @@ class VelocityPlant:
         self.robot = robot
         self.control_period = control_period
         self.initial = initial or InitialState()
+        self._substeps = substeps
         self._advance = robot.composed(
             f"velocity_tick_{substeps}", lambda model: tick_function(robot, model, substeps)
         )
+        self._tick: BufferedFunction | LoadedTick = self._advance
         inputs, outputs = self._advance.inputs, self._advance.outputs
         self._state, self._command, self._before, self._momenta, self._r_cm, self._h = inputs
         self._next_state, self.pose, self.twist, self.qdot = outputs[:4]
@@ -76,7 +82,7 @@ class VelocityPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: those of the initial state."""
+        """Linear over angular momentum (6,) in W: of the initial state, and by external loads."""
         return self._momenta
 
     def reset(self) -> None:
@@ -101,6 +107,15 @@ class VelocityPlant:
         """Lock the marked joints (n,) at their positions, and release all other joints."""
         self._held = joints.copy() if joints.any() else None
 
+    def load(self, loads: PlantLoads) -> None:
+        """Step under external loads from now on; their numbers may change before each step."""
+        robot, substeps = self.robot, self._substeps
+        loaded = robot.composed(
+            f"loaded_velocity_tick_{substeps}",
+            lambda model: tick_function(robot, model, substeps, loaded=True),
+        )
+        self._tick = LoadedTick(self._advance, loaded, loads, [self._momenta])
+
     def step(self, command: Array) -> bool:
         """Advance one tick under the joint velocities ``command`` (n,), clipped to its limits.
 
@@ -113,7 +128,7 @@ class VelocityPlant:
         self._command[:] = command
         if self._held is not None:
             self._command[self._held] = 0.0
-        self._advance.evaluate()
+        self._tick.evaluate()
         self._r_cm[:] = self._next_r_cm
         if self._limited[0] == 0.0:
             return False
@@ -122,8 +137,14 @@ class VelocityPlant:
         return True
 
 
-def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Function:
-    """Compose the tick from the model's functions; see :class:`VelocityPlant` for its results."""
+def tick_function(
+    robot: SpaceRobot, model: Composition, substeps: int, *, loaded: bool = False
+) -> ca.Function:
+    """Compose the tick from the model's functions; see :class:`VelocityPlant` for its results.
+
+    With ``loaded``, the vector of external loads is the last input, and the momenta after the tick
+    are the last output.
+    """
     n = robot.n
     state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)
     before = ca.MX.sym("before", n)
@@ -139,18 +160,30 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
     by_rate, by_stroke = command != rate, rate != qdot
     limited = ca.vertcat(ca.sum1(by_rate) + ca.sum1(by_stroke), by_rate, by_stroke)
 
-    effort = model("servo_efforts", state[n:], q, before, qdot, L_W, duration)
-    next_state = model(f"velocity_step:{substeps}", state, qdot, L_W, h)
+    loads: list[ca.MX] = []
+    if loaded:
+        layout = LoadLayout(len(robot.link_names))
+        loads = [ca.MX.sym("loads", layout.size)]
+        effort = model(
+            "loaded_servo_efforts", state[n:], q, before, qdot, L_W, duration, r_cm, *loads
+        )
+        x = ca.vertcat(state, momenta, r_cm, loads[0][layout.time])
+        x_next = model(f"loaded_velocity_step:{substeps}", x, qdot, *loads, h)
+        next_state, r_cm_next = x_next[: n + 4], x_next[n + 10 : n + 13]
+        p_W, L_W = x_next[n + 4 : n + 7], x_next[n + 7 : n + 10]
+    else:
+        effort = model("servo_efforts", state[n:], q, before, qdot, L_W, duration)
+        next_state = model(f"velocity_step:{substeps}", state, qdot, L_W, h)
+        r_cm_next = r_cm + p_W * (h / model.total_mass)
     q_next, quaternion = next_state[:n], next_state[n:]
     v, omega = model("base_twist", quaternion, q_next, qdot, p_W, L_W)
-    r_cm_next = r_cm + p_W * (h / model.total_mass)
     center = model("center_of_mass", q_next)
     r_WB = r_cm_next - model("rotate", quaternion, center)
     momentum = model("momentum", quaternion, q_next, v, omega, qdot)
     link_R, link_r = model("link_poses", q_next)
     return model.function(
-        f"velocity_tick_{substeps}",
-        [state, command, before, momenta, r_cm, h],
+        f"loaded_velocity_tick_{substeps}" if loaded else f"velocity_tick_{substeps}",
+        [state, command, before, momenta, r_cm, h, *loads],
         [
             next_state,
             ca.vertcat(r_WB, quaternion),
@@ -162,5 +195,6 @@ def tick_function(robot: SpaceRobot, model: Composition, substeps: int) -> ca.Fu
             link_r,
             ca.densify(limited),
             r_cm_next,
+            *([ca.vertcat(p_W, L_W)] if loaded else []),
         ],
     )

@@ -115,6 +115,7 @@ def status_html(
         text = _node_html("Plant", plant.state.value, plant.message, plant.level)
         lines.append(_grey_out(text, offline="plant" in state.absent))
         lines.extend(_line_html(f"Fault: {each}", 1) for each in state.plant.faults)
+        lines.extend(_line_html(f"Disturbance: {each}", 1) for each in state.plant.disturbances)
     if state.clearance is not None:
         level = state.clearance.level or None
         lines.append(

@@ -215,6 +215,10 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     assert select_engine(stuck, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has faults"):
         select_engine(stuck, "lanes")
+    pushed = campaign(set={"plant.disturbances": ["mass_1 force 1 0 0 at 1"]})
+    assert select_engine(pushed, "auto").name == "flights"
+    with pytest.raises(SpaceRobotError, match="it has disturbances, which engine 'flights' flies"):
+        select_engine(pushed, "lanes")
     near = campaign(criteria={"clearance_m": {"min": 0.0}})
     assert select_engine(near, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="lanes measure no distances between links"):

@@ -307,6 +307,14 @@ def test_faults_are_listed(diagnosed: Diagnosed) -> None:
     assert level == WARN
     assert sentence == f"injected: {values['fault_1']}; {values['fault_2']}"
     assert "slider_2" in values["fault_1"]
+    diagnosed.plant.disturb("mass_1 force 1 0 0\nmass_2 torque 0 0 1")
+    diagnosed.plant.inject("clear")
+    level, sentence, values = diagnosed.status("faults")
+    assert level == WARN
+    assert sentence == (
+        "injected: mass_1 force 1 0 0 in world at 0; mass_2 torque 0 0 1 in world at 0"
+    )
+    assert list(values) == ["disturbance_1", "disturbance_2"]
 
 
 def test_times_are_in_milliseconds() -> None:

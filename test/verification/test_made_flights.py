@@ -49,7 +49,8 @@ class Made:
     ``moved`` are the rates of the sliders in each tick, ``commands`` what was commanded (by default
     the same): of a tick, or of a time in ticks. ``injected`` are faults by time in ticks.
     ``efforts`` are errors of the efforts that the plant publishes, by tick; None: it publishes
-    zeros.
+    zeros. ``disturbed`` are disturbances by time in ticks, which the plant has, ``told`` those
+    that are published (by default the same).
     """
 
     def __init__(
@@ -63,13 +64,16 @@ class Made:
         first: int = 0,
         error: float = 0.0,
         efforts: Mapping[int, float] | None = None,
+        disturbed: Sequence[tuple[float, str]] = (),
+        told: Sequence[tuple[float, str]] | None = None,
     ) -> None:
         self.config = config or config_of()
         self.prefix, self.first, self.error = prefix, first, error
         self.moved = [np.array(rates, dtype=float) for rates in moved]
         self.commands = dict(enumerate(self.moved)) if commands is None else dict(commands)
         self.injected, self.without_pose = injected, without_pose
-        self.efforts = efforts
+        self.efforts, self.disturbed = efforts, disturbed
+        self.told = disturbed if told is None else told
 
     def write(self, path: Path) -> Path:
         with made_bag(path) as (bag, say):
@@ -88,11 +92,16 @@ class Made:
             self._say_state(say, tick, plant, shape)
             if tick == len(self.moved):
                 break
+            for time, text in self.disturbed:
+                if tick <= time < tick + 1:
+                    plant.disturb(text)  # A begin without a time is that of the tick.
             plant.step(self.moved[tick].copy())
             shape = shape + TICK * self.moved[tick]
             np.testing.assert_allclose(plant.q, shape, atol=1e-12)
         for time, text in self.injected:
             say(f"{self.prefix}/fault_injection", String(data=text), time * TICK)
+        for time, text in self.told:
+            say(f"{self.prefix}/disturbance_injection", String(data=text), time * TICK)
         for time, rates in self.commands.items():
             message = JointState(name=NAMES, velocity=[float(x) for x in rates])
             say(f"{self.prefix}/joint_commands", stamped(message, time * TICK), time * TICK)
@@ -165,6 +174,30 @@ def test_all_faults_of_a_tick_act(tmp_path: Path) -> None:
     faults += [(6.0, "clear"), (8.0, "nonsense")]
     made = Made(repaired, ALL, faults).write(tmp_path / "b.mcap")
     assert verify_bag(made).difference is None
+
+
+PUSH = "mass_2 force 0.5 -1 2 torque 0 0.2 0 in link"
+
+
+def test_disturbances_are_flown_again(tmp_path: Path) -> None:
+    moved = [RATES] * 10
+    config = config_of(disturbances=(f"{PUSH} at 0.25 until 0.75",))
+    result = verified(tmp_path, moved, config=config)
+    assert (result.difference, result.messages) == (None, 33)
+    injected = [(4.0, PUSH), (6.7, f"{PUSH} until 0.9"), (8.0, "clear"), (9.0, "nonsense")]
+    made = Made(moved, disturbed=injected[:3], told=injected)
+    assert verify_bag(made.write(tmp_path / "b.mcap")).difference is None
+
+
+def test_a_disturbance_counts_for_the_tick_that_it_came_in(tmp_path: Path) -> None:
+    moved, push = [RATES] * 10, [(3.6, PUSH)]
+    right = Made(moved, disturbed=push, told=[(3.9, PUSH)]).write(tmp_path / "a.mcap")
+    assert verify_bag(right).difference is None
+    wrong = Made(moved, disturbed=push, told=[(4.0, PUSH)]).write(tmp_path / "b.mcap")
+    difference = verify_bag(wrong).difference
+    assert difference is not None
+    assert difference.topic == "/odom"
+    assert difference.time == pytest.approx(4 * TICK)
 
 
 def test_a_command_between_ticks_is_stale(tmp_path: Path) -> None:

@@ -92,6 +92,14 @@ def test_faults_are_flown_and_held_joints_end_the_comparison(tmp_path: Path) -> 
     assert max(found.position, found.attitude, found.joints) < 1e-10
 
 
+def test_a_disturbance_ends_the_comparison(tmp_path: Path) -> None:
+    pushed = ["link_1 force 0 2 0 at 0.3"]
+    found = opinion_of(flown(tmp_path, 0.5, disturbances=pushed))
+    assert found.until == "external loads act at 0.3 s, which the engine does not model"
+    assert found.ticks == 29
+    assert found.joints < 1e-10
+
+
 def test_a_joint_at_its_stop_ends_the_comparison(tmp_path: Path) -> None:
     pushed = ["actuator_bias elbow 20 at 0"]
     found = opinion_of(flown(tmp_path, 1.2, faults=pushed, initial_joint_positions=[-1.0, 2.78]))

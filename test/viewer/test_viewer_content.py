@@ -121,7 +121,7 @@ def test_what_nodes_say_is_no_html() -> None:
     evil = "<img src=x onerror=alert(1)>"
     state = replace(
         STATE,
-        plant=PlantStatus(PlantState.LATCHED, evil, faults=(evil,)),
+        plant=PlantStatus(PlantState.LATCHED, evil, faults=(evil,), disturbances=(evil,)),
         planner=PlannerStatus(PlannerState.REFUSED, evil),
         controller=ControllerStatus(ControllerState.STOPPED, evil),
         silent={evil: 3.0},
@@ -137,6 +137,7 @@ def test_what_nodes_say_is_no_html() -> None:
     urdf = robot.urdf.replace(robot.joint_names[0], "a&lt;b&gt;c")
     assert "&lt;img" in texts[0]
     assert f"Fault: {escape(evil)}" in texts[0]
+    assert f"Disturbance: {escape(evil)}" in texts[0]
     assert all("<img" not in text for text in texts)
     zeros = np.zeros(3)
     table = content.joints_html(parse_robot(urdf), zeros, zeros, zeros)

@@ -170,12 +170,16 @@ class PlantNode(FlightNode):
                 # In lockstep the first command of a tick counts, whichever node publishes it.
                 None if self._real_time is None else self._message_number_callback(source.senders),
             )
-        self.create_subscription(String, "fault_injection", self._on_fault, STREAM)
+        for topic, inject in (
+            ("fault_injection", self.plant.inject),
+            ("disturbance_injection", self.plant.disturb),
+        ):
+            self.create_subscription(String, topic, partial(self._on_injection, inject), STREAM)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/abort", self._on_abort)
         self.create_service(Trigger, "~/rearm", self._on_rearm)
-        self._faults_seen = self.plant.active
+        self._injected_seen = self.plant.injected
         self._publish_status(self._monitor.status)
 
     def activate(self) -> None:
@@ -266,7 +270,7 @@ class PlantNode(FlightNode):
     def _look_at_status(self) -> None:
         """Publish the status if it has changed, and the events since the last call."""
         assert self._monitor is not None
-        self._faults_seen = self.plant.active
+        self._injected_seen = self.plant.injected
         events = self._monitor.update(self._active, self.time_ns / SECOND)
         if self._monitor.status is not self.status:
             self._publish_status(self._monitor.status)
@@ -316,7 +320,7 @@ class PlantNode(FlightNode):
         self._publish()
         if self._lockstep is not None and self._tick % _MAX_UNCONFIRMED_TICKS == 0:
             self._publisher.await_readers()
-        if self.plant.active is not self._faults_seen:
+        if self.plant.injected is not self._injected_seen:
             self._look_at_status()
 
     def _publish(self) -> None:
@@ -416,10 +420,10 @@ class PlantNode(FlightNode):
         if self._active is _RUNNING and self._commands.complete:
             self._step()
 
-    def _on_fault(self, message: String) -> None:
-        """Inject the faults in a message, one a line, or clear all faults ("clear")."""
+    def _on_injection(self, inject: Callable[[str], None], message: String) -> None:
+        """Inject the faults or disturbances in a message, one a line, or remove all ("clear")."""
         try:
-            self.plant.inject(message.data)
+            inject(message.data)
         except ParameterError as error:
             self.get_logger().warning(str(error))
             return

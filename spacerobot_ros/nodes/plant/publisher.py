@@ -228,12 +228,17 @@ class PlantReport:
         )
 
     def _fault_status(self) -> DiagnosticStatus:
-        active = [str(fault) for fault in self._plant.active]
+        active = [str(each) for each in self._plant.injected]
+        faults, disturbances = (
+            [str(each) for each in given]
+            for given in (self._plant.active, self._plant.disturbances)
+        )
         return diagnostic_status(
             self._name("faults"),
             _WARN if active else _OK,
             f"injected: {'; '.join(active)}" if active else "no fault is injected",
-            {f"fault_{i}": fault for i, fault in enumerate(active, 1)},
+            {f"fault_{i}": fault for i, fault in enumerate(faults, 1)}
+            | {f"disturbance_{i}": each for i, each in enumerate(disturbances, 1)},
         )
 
     def _thruster_status(self, thrusters: ThrusterPlant) -> DiagnosticStatus:

@@ -1,0 +1,165 @@
+"""Forces from outside on the links of a robot: wrenches, a gravity gradient, a tilted air table.
+
+All loads of a robot are one vector, whose parts :class:`LoadLayout` names; times are those of the
+plant. The frame W falls freely on a circular orbit with the mean motion n, without turning. The
+orbital frame O has its x axis along the radius outward and its z axis along the orbit's normal, as
+in the equations of Clohessy and Wiltshire; ``R_WO`` is its attitude at time zero. With the unit
+vector o along the radius, a mass element at r from the origin of W accelerates by
+``n^2 (3 o o' - 1) r``, the first order of an inverse-square field (Hughes, Spacecraft Attitude
+Dynamics, chapter 8). Body k, whose centre of mass is at r_k, meets the force and the moment about
+its centre ::
+
+    f_k = m_k n^2 (3 o o' - 1) r_k,    n_k = 3 n^2 o x I_k o
+
+Their sum over the bodies is the moment ``3 n^2 o x D o`` about the system's centre of mass, with
+the locked inertia D, and the force ``M n^2 (3 o o' - 1) r_C`` on that centre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from spacerobot_ros.model.inertial_parameters import rotational
+from spacerobot_ros.model.kinematics import TreeKinematics
+from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
+
+
+@dataclass(frozen=True)
+class LoadLayout:
+    """Slices of a vector of loads.
+
+    Attributes
+    ----------
+    links
+        Number of links L of the robot.
+    """
+
+    links: int
+
+    @property
+    def in_link(self) -> slice:
+        """Force (N) over torque (N m) at the origin of every link, in its frame: (6 L,)."""
+        return slice(0, 6 * self.links)
+
+    @property
+    def in_world(self) -> slice:
+        """Likewise in components of W: (6 L,)."""
+        return slice(6 * self.links, 12 * self.links)
+
+    @property
+    def mean_motion(self) -> slice:
+        """Mean motion of the orbit, rad/s; zero: no gravity gradient."""
+        return self._after_wrenches(0, 1)
+
+    @property
+    def quaternion_WO(self) -> slice:
+        """Attitude (x, y, z, w) of the orbital frame in W at time zero."""
+        return self._after_wrenches(1, 4)
+
+    @property
+    def gravity_W(self) -> slice:
+        """Uniform acceleration (3,), m/s^2."""
+        return self._after_wrenches(5, 3)
+
+    @property
+    def friction(self) -> slice:
+        """Viscous friction of every body over its momentum, 1/s."""
+        return self._after_wrenches(8, 1)
+
+    @property
+    def time(self) -> slice:
+        """Time at the beginning of the tick, s."""
+        return self._after_wrenches(9, 1)
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        return self.time.stop
+
+    def _after_wrenches(self, start: int, count: int) -> slice:
+        start += 12 * self.links
+        return slice(start, start + count)
+
+
+@dataclass(frozen=True)
+class ExternalLoads:
+    """The loads of a state, as expressions in base components.
+
+    Attributes
+    ----------
+    composites
+        Moment over force (6,) about the system's centre of mass, of the wrenches and the gravity
+        gradient, on every composite: a body and all bodies that it carries.
+    gravity_W, friction
+        Uniform acceleration (3,) in W, m/s^2, and friction over momentum, 1/s. Both act on every
+        body by its mass, and so on the momenta and the shape independently.
+    """
+
+    composites: tuple[ca.SX, ...]
+    gravity_W: ca.SX
+    friction: ca.SX
+
+    def momentum_rates(
+        self, R_WB: ca.SX, p_W: ca.SX, L_W: ca.SX, mass: float | ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """Return the rates of both total momenta in W by the loads, N and N m."""
+        moment, force = self.composites[0][:3], self.composites[0][3:]
+        return (
+            R_WB @ force + mass * self.gravity_W - self.friction * p_W,
+            R_WB @ moment - self.friction * L_W,
+        )
+
+
+def external_loads(
+    kin: TreeKinematics,
+    second_moments: tuple[ca.SX, ...],
+    quaternion: ca.SX,
+    r_WC_W: ca.SX,
+    loads: ca.SX,
+    time: ca.SX,
+) -> ExternalLoads:
+    """Return the loads of a state.
+
+    Parameters
+    ----------
+    kin
+        The kinematics.
+    second_moments
+        (3, 3) second moment of mass of every body about its own centre, base components.
+    quaternion
+        (4,) of ``R_WB``.
+    r_WC_W
+        (3,) position of the system's centre of mass, m.
+    loads
+        The vector of :class:`LoadLayout`.
+    time
+        Time, s.
+    """
+    links = [link.name for link in kin.robot.links]
+    layout = LoadLayout(len(links))
+    R_BW = matrix_from_quaternion(quaternion).T
+    forces = [ca.SX(6, 1) for _ in kin.robot.bodies]
+    in_link, in_world = (
+        ca.reshape(loads[part], 6, len(links)) for part in (layout.in_link, layout.in_world)
+    )
+    for i, link in enumerate(links):
+        R_BL, r_BL_B, body = kin.frame(link)
+        force = R_BL @ in_link[:3, i] + R_BW @ in_world[:3, i]
+        torque = R_BL @ in_link[3:, i] + R_BW @ in_world[3:, i]
+        forces[body] += ca.vertcat(torque + ca.cross(r_BL_B - kin.r_BC_B, force), force)
+    n = loads[layout.mean_motion]
+    angle = n * time
+    radius_O = ca.vertcat(ca.cos(angle), ca.sin(angle), 0)
+    o = R_BW @ (matrix_from_quaternion(loads[layout.quaternion_WO]) @ radius_O)
+    r_WC_B = R_BW @ r_WC_W
+    for k, J in enumerate(second_moments):
+        arm = kin.com[k] - kin.r_BC_B
+        r = r_WC_B + arm
+        force = kin.mass(k) * n**2 * (3 * ca.dot(o, r) * o - r)
+        moment = ca.cross(arm, force) + 3 * n**2 * ca.cross(o, rotational(J) @ o)
+        forces[k] += ca.vertcat(moment, force)
+    for k in range(kin.moving_body_count, 0, -1):
+        forces[kin.parent(k)] += forces[k]
+    return ExternalLoads(tuple(forces), loads[layout.gravity_W], loads[layout.friction])
