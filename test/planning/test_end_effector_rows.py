@@ -1,0 +1,254 @@
+"""Rows of end-effectors, turns on the direct way, and inverse kinematics, against other numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from planning.test_end_effector_goals import ARM, ATTITUDE, FOLDER, PLACE, Array, at_rest, robot_of
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.errors import NotFoundError, PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.methods.optimal.end_effectors import (
+    EndEffectorRows,
+    EndEffectorSpecification,
+)
+from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
+from spacerobot_ros.planning.methods.optimal.problem import (
+    MotionLimits,
+    OptimalOptions,
+    PossibleEnd,
+)
+
+LOWER, UPPER = np.array([-1.2, -1.5, -0.4]), np.array([1.6, 0.3, 2.2])
+VELOCITY = np.array([0.4, 0.9, 0.2])
+LIMITS = MotionLimits(LOWER, UPPER, VELOCITY, np.ones(3))
+HAND = "end_effector"
+
+
+@pytest.fixture(scope="module")
+def arm() -> SpaceRobot:
+    return robot_of("three_joint_arm")
+
+
+@pytest.fixture(scope="module")
+def pose_rows(arm: SpaceRobot) -> EndEffectorRows:
+    return EndEffectorRows(arm, [(HAND, True), ("base_link", False)], np.eye(3))
+
+
+def hand_from_center(X: Rotation, q: Array) -> tuple[Array, Rotation]:
+    """Return r_CE and the attitude of the hand in B_0 by Pinocchio, the base turned by X."""
+    model = pin.buildModelFromUrdf(str(FOLDER / "three_joint_arm.urdf"), pin.JointModelFreeFlyer())
+    data, full = model.createData(), pin.neutral(model)
+    full[3:7] = X.as_quat()
+    names = robot_of("three_joint_arm").joint_names
+    for name, position in zip(names, q, strict=True):
+        full[model.joints[model.getJointId(name)].idx_q] = position
+    pin.framesForwardKinematics(model, data, full)
+    pose = data.oMf[model.getFrameId(HAND)]
+    center = pin.centerOfMass(model, data, full)
+    return pose.translation - center, Rotation.from_matrix(pose.rotation)
+
+
+def test_rows_are_distances_and_twice_the_sine_of_half_the_angle(
+    arm: SpaceRobot, pose_rows: EndEffectorRows
+) -> None:
+    rng = np.random.default_rng(3)
+    for angle in (0.4, 2.9):
+        wanted = Rotation.from_rotvec(angle * np.array([0.36, -0.48, 0.8]))
+        goal = EndEffectorGoal(HAND, rng.normal(size=3), wanted.as_quat())
+        base = EndEffectorGoal("base_link", rng.normal(size=3))
+        p = pose_rows.pack(at_rest(ARM), [goal, base])
+        X, q = Rotation.from_rotvec(rng.normal(size=3)), ARM + 0.2
+        values, _, _ = pose_rows.evaluate(X.as_quat()[np.newaxis], q[np.newaxis], p)
+        r_CE, R_E = hand_from_center(X, q)
+        # The centre of mass stays where it is; B_0 is the attitude at the start.
+        start, _ = hand_from_center(Rotation.identity(), ARM)
+        assert start.shape == (3,)
+        r_WC = PLACE + ATTITUDE.apply(arm.center_of_mass(ARM))
+        np.testing.assert_allclose(
+            values[0, :3], r_CE - ATTITUDE.inv().apply(goal.position - r_WC), atol=1e-9
+        )
+        turn = (R_E * (ATTITUDE.inv() * wanted).inv()).as_rotvec()
+        size = np.linalg.norm(turn)
+        np.testing.assert_allclose(values[0, 3:6], 2 * np.sin(size / 2) * turn / size, atol=1e-6)
+        r_CB = -X.apply(arm.center_of_mass(q))
+        np.testing.assert_allclose(
+            values[0, 6:], r_CB - ATTITUDE.inv().apply(base.position - r_WC), atol=1e-9
+        )
+
+
+def test_parameters_are_in_the_frame_of_the_base_at_the_start(
+    arm: SpaceRobot, pose_rows: EndEffectorRows
+) -> None:
+    wanted = Rotation.from_rotvec([0.1, 0.9, -0.4])
+    p = pose_rows.pack(
+        at_rest(ARM),
+        [
+            EndEffectorGoal(HAND, np.array([1.0, 2.0, 3.0]), wanted.as_quat()),
+            EndEffectorGoal("base_link", np.array([-1.0, 0.5, 0.25])),
+        ],
+    )
+    r_WC = PLACE + ATTITUDE.apply(arm.center_of_mass(ARM))
+    np.testing.assert_allclose(p[:3], ATTITUDE.inv().apply(np.array([1.0, 2.0, 3.0]) - r_WC))
+    turned = (Rotation.from_quat(p[3:7]).inv() * ATTITUDE.inv() * wanted).magnitude()
+    assert turned == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(p[7:10], ATTITUDE.inv().apply(np.array([-1.0, 0.5, 0.25]) - r_WC))
+    np.testing.assert_array_equal(p[10:], [0.0, 0.0, 0.0, 1.0])
+
+
+def test_straight_ways_turn_the_base_as_momentum_says(
+    arm: SpaceRobot, pose_rows: EndEffectorRows
+) -> None:
+    ends = np.array([[1.2, -0.2, 0.3], [-0.5, -1.4, 2.0]])
+    found = pose_rows.turns_on_direct_way(ARM, ends)
+    for end, X in zip(ends, found, strict=True):
+
+        def rate(t: float, x: Array, end: Array = end) -> Array:
+            omega = -arm.connection(ARM + t * (end - ARM))[3:] @ (end - ARM)
+            v, w = x[:3], x[3]
+            return np.append(w * omega + np.cross(v, omega), -v @ omega) / 2
+
+        exact = solve_ivp(rate, (0, 1), [0, 0, 0, 1], rtol=1e-10, atol=1e-12).y[:, -1]
+        error = Rotation.from_quat(exact).inv() * Rotation.from_quat(X)
+        assert error.magnitude() < 2e-6
+        assert Rotation.from_quat(X).magnitude() > 0.05
+
+
+def specification(arm: SpaceRobot, goal: Goal) -> EndEffectorSpecification:
+    base = GoalSpecification.of(arm, OptimalOptions())
+    return EndEffectorSpecification.of(arm, base, goal)
+
+
+def position_goal(arm: SpaceRobot, way: Array) -> tuple[EndEffectorSpecification, Array]:
+    """Return the specification of a position that the arm reaches, and its parameters."""
+    rows = EndEffectorRows(arm, [(HAND, False)], np.eye(3))
+    X = rows.turns_on_direct_way(ARM, way[np.newaxis])[0]
+    r_CE, _ = hand_from_center(Rotation.from_quat(X), way)
+    r_WC = PLACE + ATTITUDE.apply(arm.center_of_mass(ARM))
+    goal = Goal.of_end_effectors([EndEffectorGoal(HAND, r_WC + ATTITUDE.apply(r_CE))])
+    found = specification(arm, goal)
+    return found, found.rows.pack(at_rest(ARM), goal.end_effectors)
+
+
+def test_ends_of_guesses_are_at_the_goal_and_the_soonest_is_first(arm: SpaceRobot) -> None:
+    way = np.array([1.3, -0.2, 0.4])
+    found, parameters = position_goal(arm, way)
+    turn = np.array([0.0, 0.0, 0.0, 1.0])
+    ends = found._possible_ends(ARM, LIMITS, parameters, turn)
+    assert 1 <= len(ends) <= 6
+    times = [np.max(np.abs(each.shape - ARM) / VELOCITY) for each in ends]
+    assert times == sorted(times)
+    half = (UPPER - LOWER) / 2
+    for k, each in enumerate(ends):
+        r_CE, _ = hand_from_center(Rotation.from_quat(each.turn), each.shape)
+        assert np.abs(r_CE - parameters[:3]).max() <= 2e-3
+        assert np.all((LOWER - 1e-12 <= each.shape) & (each.shape <= UPPER + 1e-12))
+        exact = found.rows.turns_on_direct_way(ARM, each.shape[np.newaxis])[0]
+        np.testing.assert_allclose(each.turn, exact, atol=1e-12)
+        for other in ends[:k]:
+            assert np.max(np.abs(each.shape - other.shape) / half) > 0.05
+    again = found._possible_ends(ARM, LIMITS, parameters, turn)
+    for one, other in zip(ends, again, strict=True):
+        np.testing.assert_array_equal(one.shape, other.shape)
+
+
+@pytest.mark.parametrize("follows", [True, False])
+def test_inverse_kinematics_with_a_base_that_follows_is_given_or_turns_by_loops(
+    arm: SpaceRobot, follows: bool
+) -> None:
+    found, parameters = position_goal(arm, np.array([1.3, -0.2, 0.4]))
+    shapes = np.array([[1.0, -0.4, 0.6], [0.2, -0.9, 1.4], [1.6, -1.5, -0.4]])
+    given = Rotation.from_rotvec([0.1, -0.2, 0.15]).as_quat()
+    for attitude in (None, given):
+        q, X, miss = found._inverse_kinematics(
+            shapes, ARM, LIMITS, parameters, attitude, follows=follows
+        )
+        assert q.shape == (3, 3)
+        assert np.all((LOWER <= q) & (q <= UPPER))
+        assert miss[0] < 2e-3
+        for k in range(3):
+            r_CE, _ = hand_from_center(Rotation.from_quat(X[k]), q[k])
+            assert np.abs(r_CE - parameters[:3]).max() == pytest.approx(miss[k], abs=1e-9)
+            if attitude is not None:
+                np.testing.assert_array_equal(X[k], given)
+            elif follows:
+                exact = found.rows.turns_on_direct_way(ARM, q[k : k + 1])[0]
+                np.testing.assert_allclose(X[k], exact, atol=1e-12)
+    free = found.rows.turns_on_direct_way(ARM, shapes)
+    assert free.shape == (3, 4)
+
+
+def test_a_place_that_no_shape_reaches_is_not_found(arm: SpaceRobot) -> None:
+    found, parameters = position_goal(arm, np.array([1.3, -0.2, 0.4]))
+    inside = np.concatenate([[0.05, 0.0, 0.02], parameters[3:]])
+    with pytest.raises(NotFoundError) as refusal:
+        found._possible_ends(ARM, LIMITS, inside, np.array([0.0, 0.0, 0.0, 1.0]))
+    text = str(refusal.value)
+    assert text.startswith(
+        "No shape of robot 'three_joint_arm' that puts 'end_effector' to the goal was found from "
+        "128 shapes; the nearest is "
+    )
+    assert text.endswith(
+        " m or rad away. A nearer goal may help, a position instead of a pose, or more freedom of "
+        "the base."
+    )
+    nearest = float(text.split("the nearest is ")[1].split(" m")[0])
+    assert 0.05 < nearest < 1.0
+
+
+def test_the_parts_of_a_goal_are_what_is_controlled(arm: SpaceRobot) -> None:
+    hand = EndEffectorGoal(HAND, np.array([1.0, 0.5, 0.2]), np.array([0.5, 0.5, 0.5, 0.5]))
+    free = Goal.of_end_effectors([hand])
+    pose = Goal.checked([0.1, 0.2, 0.3], ATTITUDE.as_quat())
+    whole, attitude = (
+        free.joined_with(pose),
+        free.joined_with(Goal(pose.position, pose.quaternion, base=frozenset({"attitude"}))),
+    )
+    for goal, controls, links, axes in (
+        (free, {"shape", "end_effectors"}, [(HAND, True)], 0),
+        (
+            whole,
+            {"shape", "end_effectors", "attitude", "position"},
+            [(HAND, True), ("base_link", False)],
+            3,
+        ),
+        (attitude, {"shape", "end_effectors", "attitude"}, [(HAND, True)], 3),
+    ):
+        found = specification(arm, goal)
+        assert found.controls == controls
+        assert list(found.rows.links) == links
+        assert len(found.axes) == axes
+        assert found.rows_at_end is found.rows
+    keys = {EndEffectorSpecification.key(each) for each in (free, whole, attitude)}
+    assert len(keys) == 3
+    place = Goal.of_end_effectors([EndEffectorGoal(HAND, np.array([7.0, 0.0, 0.0]))])
+    assert EndEffectorSpecification.key(place) not in keys
+    moved = Goal.of_end_effectors([EndEffectorGoal(HAND, np.ones(3), hand.quaternion)])
+    assert EndEffectorSpecification.key(moved) == EndEffectorSpecification.key(free)
+
+
+def test_more_than_the_joints_bring_about_is_counted(arm: SpaceRobot) -> None:
+    rows = EndEffectorRows(arm, [(HAND, True), ("base_link", False)], np.eye(3))
+    with pytest.raises(PlanningError) as refusal:
+        rows.require_enough_freedom(fixed_attitude=True)
+    assert str(refusal.value) == (
+        "The goal of 'end_effector' and 'base_link' asks for 9 independent coordinates, and the "
+        "joints of robot 'three_joint_arm' move no more than 3: ask for a position instead of a "
+        "pose, or for less of the base."
+    )
+    # Loops turn the base about its own axis of the first joint, which moves neither of the two.
+    with pytest.raises(PlanningError, match=r"9 independent .* no more than 5: "):
+        rows.require_enough_freedom(fixed_attitude=False)
+    rows = EndEffectorRows(arm, [(HAND, False)], np.eye(3))
+    rows.require_enough_freedom(fixed_attitude=True)
+
+
+def test_a_guess_begins_at_its_end() -> None:
+    end = PossibleEnd(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.6, 0.0, 0.8]))
+    assert end.shape.tolist() == [1.0, 2.0, 3.0]
+    assert end.turn.tolist() == [0.0, 0.6, 0.0, 0.8]
