@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,7 @@ from spacerobot_ros.model.rotations import (
     rotvec_from_quaternion,
 )
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
@@ -531,7 +532,22 @@ def _turns_end_effector(status: Status | None) -> bool:
 
 
 def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
-    """Return the sent goal of a status; None for a status without a goal."""
+    """Return the goal of a status: that of the base as it was sent, and those of links.
+
+    None for a status without a goal.
+    """
+    base = _reported_base_goal(status, goals)
+    links = status.end_effector_goals if isinstance(status, PlannerStatus) else {}
+    try:
+        aims = tuple(EndEffectorGoal.checked(*each) for each in links.items())
+    except PlanningError:
+        return base
+    if not aims:
+        return base
+    return Goal.of_end_effectors(aims) if base is None else replace(base, end_effectors=aims)
+
+
+def _reported_base_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
     for sent in reversed(goals):
         if status.goal_id and status.goal_id == sent.goal_id:
             return sent.goal
@@ -550,13 +566,14 @@ def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
 
 
 def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal | None:
-    """Return the last goal of the flight, or otherwise the last sent goal."""
-    for status in reversed(list(statuses)):
-        if status.state.value in _FLOWN_STATES:
-            goal = reported_goal(status, goals)
-            if goal is not None:
-                return goal
-    return goals[-1].goal if goals else None
+    """Return the last goal of the flight, or otherwise the last one that was sent or reported."""
+    reported = [(each, reported_goal(each, goals)) for each in statuses]
+    for status, goal in reversed(reported):
+        if status.state.value in _FLOWN_STATES and goal is not None:
+            return goal
+    if goals:
+        return goals[-1].goal
+    return next((goal for _, goal in reversed(reported) if goal is not None), None)
 
 
 class FlightLog:

@@ -139,7 +139,7 @@ def figure(flight: Flight) -> Picture:
     time, goal = flight.time, flight.goal
     attitude = np.unwrap([rotvec_from_quaternion(o) for o in flight.pose[:, 3:]], axis=0)
     place = target = None
-    if goal is not None:
+    if goal is not None and goal.base:
         place, target = goal.position, rotvec_from_quaternion(goal.quaternion)
     _plot_lines(panels[0], time, flight.pose[:, :3], "xyz", "position, m", place)
     _plot_lines(panels[1], time, attitude, "xyz", "rotation vector, rad", target)
@@ -184,7 +184,7 @@ def animation(flight: Flight, seconds: float, frames: int) -> Animation:
     skeleton = _Skeleton(flight.required_robot())
     shapes = skeleton.points(flight.pose[rows], flight.q[rows])
     ghost = np.zeros((0, 3))
-    if flight.goal is not None:
+    if flight.goal is not None and flight.goal.base:
         goal = np.concatenate([flight.goal.position, flight.goal.quaternion])
         ghost = skeleton.points(goal[None], flight.q[-1:])[0]
     made = Figure(figsize=(5.6, 5.0), dpi=72)

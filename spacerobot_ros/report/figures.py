@@ -407,6 +407,13 @@ def set_range(axes: Axes, values: Array, extra: Sequence[float] = (), least: flo
     axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
 
 
+def log_range(values: Array, decades: int) -> tuple[float, float]:
+    """Return both ends of a logarithmic axis: so many powers of ten up to the largest value."""
+    largest = float(np.nanmax(values, initial=0.0))
+    top = float(np.ceil(np.log10(largest))) if largest > 0 else -15.0
+    return 10.0 ** (top - decades), 10.0**top
+
+
 def set_time(axes: Axes, start: float, end: float, label: bool = True) -> None:
     """Set the x axis to a span of time in s."""
     if end - start < 1e-9:

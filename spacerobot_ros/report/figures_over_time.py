@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 
 from spacerobot_ros.errors import sentence_case
 from spacerobot_ros.flight.flight import Signal
-from spacerobot_ros.model.description import Joint
+from spacerobot_ros.model.description import Array, Joint
 from spacerobot_ros.model.rotations import (
     quaternion_inverse,
     quaternion_multiply,
@@ -38,6 +38,7 @@ from spacerobot_ros.report.figures import (
     largest_over_time,
     legend_above,
     legend_entry,
+    log_range,
     narrow,
     room_for,
     scaled,
@@ -71,6 +72,9 @@ def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
     """Draw traces over the whole flight; return whether any is drawn as a band."""
     if group.rows:
         return _draw_rows(axes, flight, group, share)
+    if group.decades:
+        _draw_decades(axes, flight, group)
+        return False
     colours = group.colours
     values = np.concatenate([group.signal.values.ravel(), [g[3] for g in group.goals]])
     if group.window is not None:
@@ -104,6 +108,32 @@ def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
     return dense
 
 
+def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
+    """Draw positive traces on a logarithmic axis; smaller values lie on its lower edge."""
+    signal = group.signal
+    floor, top = log_range(signal.values, group.decades)
+    axes.set_yscale("log")
+    axes.set_ylim(floor, top)
+    shown = Signal(signal.time, np.maximum(signal.values, floor))
+    for index, tint in enumerate(group.colours):
+        axes.plot(
+            *largest_over_time(shown, index),
+            color=tint,
+            marker="o" if len(signal) < 3 else "",
+            ms=4,
+            clip_on=False,
+        )
+    for index, bound in group.limits:
+        if floor < bound < top:
+            axes.axhline(bound, color=group.colours[index], lw=1.0, ls=(0, DOTS), zorder=1.8)
+    if group.limits:
+        legend_above(axes, [legend_entry(MUTED, group.limit_name, DOTS)])
+    axes.minorticks_off()
+    axes.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
+    set_time(axes, 0.0, flight.end)
+    axes.set_ylabel(f"{group.label} ({group.unit})")
+
+
 def time_figure(
     flight: FlightReport, name: str, heading: str, caption: str, groups: list[TraceGroup]
 ) -> ReportFigure:
@@ -113,7 +143,10 @@ def time_figure(
     """
     cycles = flight.cycles
     rows, heights = [[1.0]], [2.3]
-    if any(group.rows for group in groups):
+    if any(group.decades for group in groups):
+        cycles = None
+        heights = [1.3]
+    elif any(group.rows for group in groups):
         cycles = None
         heights = [0.4 + 0.14 * len(group.names) if group.rows else 1.6 for group in groups]
     elif cycles is not None and narrow():
@@ -507,12 +540,11 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     )
     bottom = 0.5 + (EVENT_STRIP_HEIGHT if flight.events else 0.0)
     figure, ((above,), (below,)) = sheet([[1.0], [1.0]], [1.6, 1.1], bottom=bottom)
-    largest = float(changes.max())
-    top = np.ceil(np.log10(largest)) if largest > 0 else -15.0
+    floor, top = log_range(changes, _MOMENTUM_DECADES)
     above.set_yscale("log")
-    above.set_ylim(10.0 ** (top - _MOMENTUM_DECADES), 10.0**top)
+    above.set_ylim(floor, top)
     # Values below the axis, such as zero, are drawn on its lower edge.
-    shown = np.maximum(changes, 10.0 ** (top - _MOMENTUM_DECADES))
+    shown = np.maximum(changes, floor)
     for i in range(2):
         above.plot(
             *largest_over_time(Signal(time, shown), i),
@@ -633,6 +665,50 @@ def errors_figure(flight: FlightReport) -> ReportFigure | None:
         "remaining rotation vector"
     )
     return time_figure(flight, "errors", "Output errors", caption, groups)
+
+
+_MOST_DECADES = 8
+"""Largest number of powers of ten of an axis of errors of links."""
+
+
+def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
+    """Distance and angle of each link to its goals; None where no link had a goal."""
+    if not flight.link_errors:
+        return flight.not_drawn or None if flight.link_goals else None
+    groups, parts = [], (("position", "distance", "m"), ("attitude", "angle", "rad"))
+    for number, (link, errors) in enumerate(flight.link_errors.items()):
+        for part, quantity, unit in parts:
+            signal: Signal = getattr(errors, quantity)
+            if not len(signal):
+                continue
+            tolerance = flight.tolerance(part)
+            groups.append(
+                TraceGroup(
+                    signal,
+                    [quantity],
+                    f"{quantity} of {short(link)}",
+                    unit,
+                    [colour(number)],
+                    limits=[] if not tolerance else [(0, tolerance)],
+                    limit_name="tolerance",
+                    decades=_error_decades(signal.values, tolerance),
+                )
+            )
+    caption = (
+        "Distance of each link from the position of its goal, and angle from its attitude where "
+        "that counts, on logarithmic axes; smaller values lie on the lower edge; dotted, the "
+        "tolerance"
+    )
+    if flight.goal is None:
+        caption += "; the base is not controlled"
+    return time_figure(flight, "link_errors", "Errors of end-effectors", caption, groups)
+
+
+def _error_decades(values: Array, tolerance: float | None) -> int:
+    """Return the powers of ten of an axis that has the largest error and the tolerance on it."""
+    _, top = log_range(values, 0)
+    down_to = 0.1 * tolerance if tolerance else 1e-4 * top
+    return int(np.clip(np.ceil(np.log10(top / down_to)), 3, _MOST_DECADES))
 
 
 def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:

@@ -28,6 +28,7 @@ from spacerobot_ros.report.figures import (
     narrow,
     set_range,
     sheet,
+    short,
 )
 from spacerobot_ros.report.figures_over_time import (
     DASHES,
@@ -63,7 +64,7 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
         axes.set_visible(False)
     places = places[: len(indices)]
     for axes, scene, index in zip(places, scenes, indices, strict=True):
-        draw_robot(axes, scene, points, view)
+        draw_robot(axes, scene + flight.drawn.surroundings, points, view)
         axes.set_title(f"t = {flight.position.time[index]:.5g} s")
     keys = draw_goal_and_path(places[-1], flight, view)
     if not narrow():
@@ -72,6 +73,8 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
         "The robot at instants from the first recorded state to the last, to one scale, from the "
         "shapes of its URDF; each moving link in the color that its joint has in the other figures."
     )
+    if flight.obstacles:
+        caption += " Obstacles have the shapes by which distances are measured."
     if flight.goal is not None:
         caption += " Dashed in the last, the base link at the goal."
     caption += flight.missing_meshes
@@ -165,6 +168,9 @@ def _round_length(longest: float) -> float:
 
 
 _PLANNED_COLOUR, _TOOL_COLOUR = PALETTE[1], PALETTE[4]
+_LINK_COLOURS = (_TOOL_COLOUR, *PALETTE[2:4], *PALETTE[5:])
+"""Colours of links with goals."""
+
 _FLIGHT_COLOURS = (PALETTE[0], PALETTE[2], PALETTE[5], *PALETTE[6:])
 """Colours of compared flights; the first colour is for the flight of the report."""
 
@@ -173,8 +179,11 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     """The path of the base in three views, with that of the end-effector and of other flights."""
     if not len(flight.position):
         return NO_STATES
-    goals = [flight.goal] if flight.goal is not None and flight.position_counts else []
-    goals += [sent.goal for sent in flight.tool_goals[-1:]]
+    goals = []
+    if flight.goal is not None and flight.position_counts:
+        goals.append(flight.goal.position)
+    goals += [sent.goal.position for sent in flight.tool_goals[-1:]]
+    goals += [goal.position for goal in flight.link_goals.values()]
     # Beside the reach of an arm, the path of a base without thrust would be a dot.
     shows_tool = len(flight.tool) > 0 and len(flight.tool_goals) > 0
     flown = [flight, *(other for other in beside if len(other.position))]
@@ -185,10 +194,14 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     if shows_tool:
         paths.append((flight.tool.values[:, :3], _TOOL_COLOUR))
         keys.append(legend_entry(_TOOL_COLOUR, "end-effector"))
+    for number, (link, positions) in enumerate(flight.link_positions.items()):
+        tint = _LINK_COLOURS[number % len(_LINK_COLOURS)]
+        paths.append((positions, tint))
+        keys.append(legend_entry(tint, short(link)))
     if flight.planned:
         keys.append(legend_entry(_PLANNED_COLOUR, "planned", DASHES))
     everything = np.concatenate(
-        [path for path, _ in paths] + flight.planned + [goal.position[np.newaxis] for goal in goals]
+        [path for path, _ in paths] + flight.planned + [goal[np.newaxis] for goal in goals]
     )
     middle = (everything.max(axis=0) + everything.min(axis=0)) / 2
     half = 0.56 * max(float(np.ptp(everything, axis=0).max()), 1e-6)
@@ -216,7 +229,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
                 zorder=3,
             )
         for goal in goals:
-            axes.plot(*goal.position[[i, j]], "x", color=GHOST, ms=8, mew=2, zorder=5)
+            axes.plot(*goal[[i, j]], "x", color=GHOST, ms=8, mew=2, zorder=5)
         _set_square_limits(axes, middle[[i, j]], half)
         axes.set_xlabel(f"{'xyz'[i]} (m)")
         axes.set_ylabel(f"{'xyz'[j]} (m)")
@@ -226,6 +239,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     caption = (
         "Path of the base origin"
         + (" and of the end-effector" if shows_tool else "")
+        + (" and of links with goals" if flight.link_positions else "")
         + f" in the world frame{', three views to one scale' if len(views) > 1 else ''}: open "
         "circle, start; full circle, end"
         + ("; cross, goal" if goals else "")

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from spacerobot_ros.collision.drawn import obstacle_visuals
 from spacerobot_ros.control.status import CommandReport, ControllerStatus
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.flight.clearance import FlightClearance
@@ -24,17 +25,27 @@ from spacerobot_ros.flight.reading import (
 )
 from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model import RobotDescription
-from spacerobot_ros.model.description import Array, Joint, Pose, Shape
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, Pose, Shape
+from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh
-from spacerobot_ros.model.rotations import matrix_from_quaternion, rotvec_from_quaternion
-from spacerobot_ros.model.visuals import meshes_from_attachments
+from spacerobot_ros.model.rotations import (
+    matrices_from_quaternions,
+    matrix_from_quaternion,
+    rotation_angles,
+    rotvec_from_quaternion,
+)
+from spacerobot_ros.model.visuals import Visual, meshes_from_attachments
 from spacerobot_ros.planning import METHODS, Goal, PoseError
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.report.events import FlightEvent, drawn_events
 from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, rotvecs
 from spacerobot_ros.report.solids import SolidRobot
 from spacerobot_ros.scenario import COMMANDERS, Published
 from spacerobot_ros.times import SECOND
+
+_LINK_STATES = 2000
+"""States of a flight at which the errors of links are evaluated."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +117,22 @@ class Target:
     start: float
     end: float
     goal: Goal
+
+
+@dataclass(frozen=True)
+class LinkErrors:
+    """How far a link was from its goals, while it had one.
+
+    Attributes
+    ----------
+    distance
+        Distance from the goal (N, 1), m.
+    angle
+        Angle from the attitude of the goal (M, 1), rad; empty where any attitude will do.
+    """
+
+    distance: Signal
+    angle: Signal
 
 
 @dataclass(frozen=True)
@@ -255,19 +282,25 @@ class FlightReport:
         if self.robot is None or not self.flight.measures_clearance:
             return None
 
-        def carried(shape: Shape) -> TriangleMesh:
-            if shape.resource not in self.meshes:
-                raise MeshError(f"The bag does not carry the mesh '{shape.resource}'.")
-            return self.meshes[shape.resource].moved(shape.pose, shape.size)
-
         shape, pose = self.shape, self.signal("pose")
         return FlightClearance.of(
             self.robot,
             self.joint_names,
             (shape.time, shape.values),
             (pose.time, pose.values),
-            mesh_of=carried,
+            mesh_of=self._carried_mesh,
         )
+
+    def _carried_mesh(self, shape: Shape) -> TriangleMesh:
+        """Return a mesh that the bag carries; files that a bag names are not read."""
+        if shape.resource not in self.meshes:
+            raise MeshError(f"The bag does not carry the mesh '{shape.resource}'.")
+        return self.meshes[shape.resource].moved(shape.pose, shape.size)
+
+    @cached_property
+    def obstacles(self) -> tuple[tuple[Visual, Pose], ...]:
+        """The solids of the obstacles, each with the pose of its link in the world."""
+        return () if self.robot is None else obstacle_visuals(self.robot.world, self._carried_mesh)
 
     # -- names --------------------------------------------------------------------
 
@@ -300,6 +333,11 @@ class FlightReport:
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter of a node; None if the bag does not hold it."""
         return self.flight.scenario.in_file.get(node, {}).get(name)
+
+    def tolerance(self, of: str) -> float | None:
+        """Return the planner's tolerance of ``position``, m, or ``attitude``, rad, if known."""
+        value = self.parameter("planner", f"{of}_tolerance")
+        return float(value) if isinstance(value, float | int) else None
 
     @property
     def published(self) -> tuple[Published, ...]:
@@ -339,7 +377,11 @@ class FlightReport:
 
     @cached_property
     def targets(self) -> list[Target]:
-        """Goals of the schedules; without any schedule, the goals that were sent."""
+        """Goals of the base, of the schedules; without any schedule, those that were sent."""
+        return [target for target in self._all_targets if target.goal.base]
+
+    @cached_property
+    def _all_targets(self) -> list[Target]:
         sent = self.flight.goals
         found = [
             (status.time, goal)
@@ -350,13 +392,75 @@ class FlightReport:
 
     @property
     def goal(self) -> Goal | None:
-        """The goal that counts at the end."""
-        return self.flight.goal
+        """The goal of the base that counts at the end; None: there is none, or the base is free."""
+        goal = self.flight.goal
+        return goal if goal is not None and goal.base else None
+
+    @cached_property
+    def link_goals(self) -> dict[str, EndEffectorGoal]:
+        """The goals of links that count at the end, of a planner."""
+        goal = self.flight.goal
+        return {} if goal is None else {each.link: each for each in goal.end_effectors}
+
+    @cached_property
+    def link_errors(self) -> dict[str, LinkErrors]:
+        """Errors of the true poses of links with goals, at up to two thousand states; none where
+        the bag lacks the robot's description or its states.
+        """
+        robot, targets = self.robot, [each for each in self._all_targets if each.goal.end_effectors]
+        if robot is None or self.not_drawn or not targets:
+            return {}
+        links = [each.link for target in targets for each in target.goal.end_effectors]
+        found = {}
+        for link in dict.fromkeys(links):
+            if link in self.link_positions:
+                found[link] = self._errors_of_link(link, targets)
+        return found
+
+    @cached_property
+    def link_positions(self) -> dict[str, Array]:
+        """Positions in the world (k, 3), m, of links that had goals, at the states of
+        :attr:`link_errors`.
+        """
+        return {link: r for link, (_, r) in self._link_poses.items()}
+
+    @cached_property
+    def _link_poses(self) -> dict[str, tuple[Array, Array]]:
+        """R_WL (k, 3, 3) and r_WL (k, 3) of links that had goals."""
+        links = {each.link for target in self._all_targets for each in target.goal.end_effectors}
+        if self.robot is None or self.not_drawn or not links:
+            return {}
+        rows, kinematics = self.samples(_LINK_STATES), ForwardKinematics(self.robot)
+        R_BL, r_BL_B = kinematics.link_poses(self.joints[rows])
+        R_WB = matrices_from_quaternions(self.quaternion[rows])
+        found = {}
+        for number, link in enumerate(kinematics.links):
+            if link in links:
+                r_WL = self.position.values[rows] + np.einsum("kij,kj->ki", R_WB, r_BL_B[:, number])
+                found[link] = R_WB @ R_BL[:, number], r_WL
+        return found
+
+    def _errors_of_link(self, link: str, targets: Sequence[Target]) -> LinkErrors:
+        time = self.position.time[self.samples(_LINK_STATES)]
+        R_WL, r_WL = self._link_poses[link]
+        distances, angles = [Signal.empty(1)], [Signal.empty(1)]
+        for target in targets:
+            aim = next((each for each in target.goal.end_effectors if each.link == link), None)
+            if aim is None:
+                continue
+            now = (time >= target.start) & (time <= target.end)
+            off = np.linalg.norm(aim.position - r_WL[now], axis=1)
+            distances.append(Signal(time[now], off[:, np.newaxis]))
+            if aim.quaternion is not None:
+                turned = rotation_angles(matrix_from_quaternion(aim.quaternion).T @ R_WL[now])
+                angles.append(Signal(time[now], turned[:, np.newaxis]))
+        return LinkErrors(_joined(distances), _joined(angles))
 
     @property
     def tool_goals(self) -> tuple[SentGoal, ...]:
-        """Goals of the end-effector."""
-        return self.flight.end_effector_goals
+        """Goals of the end-effector of a controller."""
+        # A planner takes goals of the link `end_effector` on the same topic, and reports them.
+        return () if DEFAULT_END_EFFECTOR in self.link_goals else self.flight.end_effector_goals
 
     @property
     def tool_targets(self) -> list[Target]:
@@ -372,8 +476,9 @@ class FlightReport:
 
     @property
     def tool_error(self) -> PoseError | None:
-        """Error of the last pose of the end-effector to its last goal."""
-        return self.flight.end_effector_error
+        """Error of the last pose of a controller's end-effector to its last goal."""
+        goals = self.tool_goals
+        return pose_error(self.tool, goals[-1].goal) if goals else None
 
     @property
     def position_counts(self) -> bool:
@@ -428,7 +533,7 @@ class FlightReport:
         """The robot as something to draw; None if the bag lacks its description or its states."""
         if self.robot is None or self.not_drawn:
             return None
-        return SolidRobot(self.robot, self.meshes)
+        return SolidRobot(self.robot, self.meshes, self.obstacles)
 
     @property
     def not_drawn(self) -> str:
@@ -450,8 +555,12 @@ class FlightReport:
     @property
     def missing_meshes(self) -> str:
         """A sentence for captions about meshes that are not in the bag; empty: all are."""
-        links = self.robot.links if self.robot is not None else ()
-        named = {each.resource for link in links for each in link.shapes if each.kind == "mesh"}
+        shapes: list[Shape] = []
+        if self.robot is not None:
+            shapes += [each for link in self.robot.links for each in link.shapes]
+            if (world := self.robot.world) is not None:
+                shapes += [s for link in world.links for s in link.collisions or link.shapes]
+        named = {each.resource for each in shapes if each.kind == "mesh"}
         missing = named - self.meshes.keys()
         if not missing:
             return ""
@@ -530,6 +639,14 @@ class FlightReport:
         """The joint of that name in the robot description."""
         joints = self.robot.movable_joints if self.robot is not None else ()
         return next((joint for joint in joints if joint.name == name), None)
+
+
+def _joined(parts: Sequence[Signal]) -> Signal:
+    """Return signals of one width one after the other."""
+    return Signal(
+        np.concatenate([each.time for each in parts]),
+        np.concatenate([each.values for each in parts]),
+    )
 
 
 def _shift_time(signal: Signal, start: float) -> Signal:

@@ -12,7 +12,7 @@ import numpy as np
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.report.events import FlightEvent, event_style
-from spacerobot_ros.report.figures import ReportFigure, TraceGroup
+from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
 from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page_parts import (
     PagePart,
@@ -124,7 +124,7 @@ def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str
 def _numbers_html(flight: FlightReport) -> list[str]:
     result, joints = result_table(flight), joint_table(flight)
     parts = ["<h2>Numbers of the run</h2>"]
-    if flight.goal is None:
+    if flight.flight.goal is None:
         parts.append('<p class="missing">The bag holds no goal pose.</p>')
     if result.rows:
         parts.append(table("numbers", (), result.rows))
@@ -264,13 +264,15 @@ def _chart_data(group: TraceGroup) -> dict[str, Any]:
     signal = thin_out(group.signal)
     values = signal.values
     if group.decades:
-        largest = float(np.nanmax(values, initial=0.0))
-        top = np.ceil(np.log10(largest)) if largest > 0 else -15.0
         # uPlot's own logarithmic axes go wrong with numbers as small as rounding errors.
-        values = np.log10(np.maximum(values, 10.0 ** (top - group.decades)))
+        floor, _ = log_range(values, group.decades)
+        values = np.log10(np.maximum(values, floor))
+        limits = [[k, float(np.log10(each))] for k, each in group.limits if each > floor]
+    else:
+        low, high = _limit_range(group)
+        limits = [[k, value] for k, value in group.limits if low < value < high]
     if group.rows:
         values = values * 0.8 + np.arange(values.shape[1])[::-1]
-    low, high = _limit_range(group)
     return {
         "label": group.label,
         "unit": group.unit,
@@ -279,7 +281,7 @@ def _chart_data(group: TraceGroup) -> dict[str, Any]:
         "time": _encode_numbers(signal.time, "<f8"),
         "values": [_encode_numbers(column, "<f4") for column in values.T],
         "goals": [list(map(float, goal)) for goal in group.goals],
-        "limits": [[k, value] for k, value in group.limits if low < value < high],
+        "limits": limits,
         "window": group.window,
         "log": group.decades > 0,
         "rows": group.rows,

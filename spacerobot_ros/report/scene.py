@@ -23,10 +23,10 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.model.visuals import Visual, solid_mesh, visuals_of
 from spacerobot_ros.report.figures import FAINT, GHOST, PALETTE
-from spacerobot_ros.report.flight import FlightReport, Target
+from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page_parts import PagePart, package_file
 from spacerobot_ros.report.signals import Cycles, Indices, simplified
-from spacerobot_ros.report.solids import EDGE_COLOUR, SolidRobot, body_color
+from spacerobot_ros.report.solids import EDGE_COLOUR, SolidRobot, body_color, obstacle_color
 
 Command = dict[str, Any]
 
@@ -317,6 +317,7 @@ def scene_of(flight: FlightReport) -> Scene | str:
     frames = key_frames(_scaled_motion(flight, radius), flight.cycles)
     commands = _stage_commands(center, radius, flight.flat)
     commands += _robot_commands(drawn.robot, flight.meshes)
+    commands += _obstacle_commands(flight)
     commands += _path_commands(flight)
     ghosts = _goal_commands(flight, drawn.robot, radius)
     commands += ghosts
@@ -331,6 +332,7 @@ def _center_and_radius(flight: FlightReport, drawn: SolidRobot) -> tuple[Array, 
         clouds.append(drawn.at(flight.joints[index], flight.base_at(index)).points())
     targets = flight.targets if flight.position_counts else []
     clouds += [t.goal.position[np.newaxis] for t in (*targets, *flight.tool_targets)]
+    clouds += [goal.position[np.newaxis] for goal in flight.link_goals.values()]
     points = np.concatenate(clouds)
     low, high = points.min(axis=0), points.max(axis=0)
     return (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
@@ -396,9 +398,13 @@ def _link_paths(robot: RobotDescription) -> dict[str, str]:
     """Return the path of every link in the viewer's tree, which is the tree of the URDF."""
     paths = {robot.base_link: ROBOT}
     for joint in joints_outward(robot):
-        name = joint.child.replace("/", "\N{DIVISION SLASH}")
-        paths[joint.child] = f"{paths[joint.parent]}/link {name}"
+        paths[joint.child] = f"{paths[joint.parent]}/link {_node_name(joint.child)}"
     return paths
+
+
+def _node_name(link: str) -> str:
+    """Return the name of a link without slashes, which separate nodes of the viewer's tree."""
+    return link.replace("/", "\N{DIVISION SLASH}")
 
 
 def _robot_commands(robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> list[Command]:
@@ -410,6 +416,16 @@ def _robot_commands(robot: RobotDescription, meshes: Mapping[str, TriangleMesh])
     for number, visual in enumerate(visuals):
         path = f"{paths[visual.link]}/visual {number}"
         commands += solid(path, visual, body_color(visual.body))
+    return commands
+
+
+def _obstacle_commands(flight: FlightReport) -> list[Command]:
+    """The obstacles, which stand still in the world."""
+    commands: list[Command] = []
+    for number, (visual, pose) in enumerate(flight.obstacles):
+        path = f"{WORLD}/obstacle {number} {_node_name(visual.link)}"
+        commands.append(set_transform(path, matrix_of(pose)))
+        commands += solid(path, visual, obstacle_color(visual))
     return commands
 
 
@@ -438,6 +454,11 @@ def _path_commands(flight: FlightReport) -> list[Command]:
     lines = [("path of the base", flight.position.values, PALETTE[0])]
     if len(flight.tool):
         lines.append(("path of the end-effector", flight.tool.values[:, :3], PALETTE[4]))
+    assert flight.robot is not None
+    tool = flight.robot.end_effector(flight.parameter("plant", "end_effector_frame") or "")
+    for link, positions in flight.link_positions.items():
+        if link != tool or not len(flight.tool):
+            lines.append((f"path of {_node_name(link)}", positions, PALETTE[4]))
     commands = []
     for name, points, tint in lines:
         step = max(1, len(points) // _MAX_LINE_POINTS)
@@ -461,14 +482,20 @@ def _goal_commands(flight: FlightReport, robot: RobotDescription, radius: float)
                 path = f"{WORLD}/goal/{visual.link.replace('/', '_')} {number}"
                 commands.append(set_transform(path, matrix_of(robot.frames[visual.link][1])))
                 commands += solid(path, visual, GHOST, 0.25)
-    targets: list[Target] = flight.tool_targets[-1:]
-    for target in targets:
-        pose = Pose(matrix_from_quaternion(target.goal.quaternion), target.goal.position)
-        path = f"{WORLD}/end-effector goal"
-        commands.append(set_transform(path, matrix_of(pose)))
+    marks: list[tuple[str, Array, Array | None]] = []
+    for target in flight.tool_targets[-1:]:
+        turned = bool(set(flight.controls("end_effector")) & {3, 4, 5})
+        quaternion = target.goal.quaternion if turned else None
+        marks.append(("end-effector goal", target.goal.position, quaternion))
+    for link, goal in flight.link_goals.items():
+        marks.append((f"goal of {_node_name(link)}", goal.position, goal.quaternion))
+    for mark, position, quaternion in marks:
+        R = np.eye(3) if quaternion is None else matrix_from_quaternion(quaternion)
+        path = f"{WORLD}/{mark}"
+        commands.append(set_transform(path, matrix_of(Pose(R, position))))
         ball = Shape("sphere", (0.03 * radius,), Pose())
         commands += solid(f"{path}/mark", Visual("", 0, ball, solid_mesh(ball)), GHOST, 0.4)
-        if set(flight.controls("end_effector")) & {3, 4, 5}:
+        if quaternion is not None:
             for name, unit, tint in zip("xyz", np.eye(3), _AXIS_COLOURS, strict=True):
                 ends = np.array([np.zeros(3), 0.12 * radius * unit])
                 commands.append(segments(f"{path}/{name}", ends, tint))
@@ -499,8 +526,13 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
         "The robot from the shapes of its URDF, each moving link in the color of its joint in the "
         "figures below; lines are the paths of the base (blue)"
     )
-    text += " and of the end-effector (orange)" if len(flight.tool) else ""
+    several = len(flight.link_positions) > 1
+    if several:
+        text += " and of the end-effectors (orange)"
+    elif len(flight.tool) or flight.link_positions:
+        text += " and of the end-effector (orange)"
     text += "; the ghost is the goal" if ghosts else ""
+    text += "; obstacles have the shapes by which distances are measured" * bool(flight.obstacles)
     text += (
         f". {len(frames.indices)} key frames of {len(flight.position)} recorded states; in between "
         "the motion is interpolated"

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_hex, to_rgb
 
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
@@ -183,6 +183,10 @@ class Solids:
     faces: list[Face] = field(default_factory=list)
     edges: list[Edge] = field(default_factory=list)
 
+    def __add__(self, other: Solids) -> Solids:
+        """Return the faces and edges of both."""
+        return Solids(self.faces + other.faces, self.edges + other.edges)
+
     def points(self) -> Array:
         """All corners (k, 3)."""
         return np.concatenate([f.corners for f in self.faces] + [e.line for e in self.edges])
@@ -207,13 +211,23 @@ class Solids:
 class SolidRobot:
     """A robot with its visuals, for pictures of any pose.
 
-    ``meshes`` are the triangles of its meshes by their URIs.
+    ``meshes`` are the triangles of its meshes by their URIs; ``obstacles`` stand still, each with
+    the pose of its link in the world.
     """
 
-    def __init__(self, robot: RobotDescription, meshes: Mapping[str, TriangleMesh]) -> None:
+    def __init__(
+        self,
+        robot: RobotDescription,
+        meshes: Mapping[str, TriangleMesh],
+        obstacles: Iterable[tuple[Visual, Pose]] = (),
+    ) -> None:
         self.robot = robot
         self._visuals = visuals_of(robot, meshes, _MAX_MESH_FACES)
         self.kinematics = ForwardKinematics(robot)
+        self.surroundings = Solids()
+        """Faces and edges of the obstacles."""
+        for visual, pose in obstacles:
+            self.surroundings.add(visual, pose, _rgb(obstacle_color(visual)))
 
     def link_poses(self, q: Array, base: Pose) -> dict[str, Pose]:
         """Poses of all links in the world, at joint positions ``q`` (n,) and a pose of the base."""
@@ -241,6 +255,11 @@ class SolidRobot:
 def _rgb(name: str) -> Colour:
     r, g, b = to_rgb(name)
     return r, g, b
+
+
+def obstacle_color(visual: Visual) -> str:
+    """Return the color of an obstacle, ``#rrggbb``: that of its shape."""
+    return to_hex(visual.shape.rgba[:3])
 
 
 def body_color(body: int) -> str:

@@ -42,6 +42,9 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         turned = set(flight.controls("end_effector")) & {3, 4, 5}
         note = f"{tool.angle:.3g} rad" if turned else ""
         rows.append(("End-effector error", f"{tool.distance:.3g} m", note))
+    for link, left in flight.flight.end_effector_errors.items():
+        turn = f"{left.angle:.3g} rad" if flight.link_goals[link].quaternion is not None else ""
+        rows.append((f"Error of {link}", f"{left.distance:.3g} m", turn))
     if flight.manoeuvre_time is not None:
         rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", _time_to_end_text(flight)))
     if flight.method:
@@ -78,6 +81,8 @@ def result_table(flight: FlightReport) -> Table:
         rows.append(
             (f"Goal attitude{refused}", _format_attitude(rotvec_from_quaternion(goal.quaternion)))
         )
+    if flight.link_goals and goal is None:
+        rows.append(("Goal of the base", "not controlled"))
     if len(flight.position):
         rows.append(("Final position", f"({_format_vector(flight.position.values[-1])}) m"))
         rows.append(
@@ -94,6 +99,7 @@ def result_table(flight: FlightReport) -> Table:
         rows.append(("Errors as measured", ", ".join([*parts, f"{sensed.angle:.4g} rad"])))
     if flight.tool_error is not None:
         rows += _tool_rows(flight, flight.tool_error)
+    rows += _link_rows(flight)
     if flight.manoeuvre_time is not None:
         rows.append(("Manoeuvre time", f"{flight.manoeuvre_time:.6g} s{_schedules_text(flight)}"))
         if to_end := _time_to_end_text(flight):
@@ -121,6 +127,29 @@ def _tool_rows(flight: FlightReport, error: PoseError) -> list[tuple[str, ...]]:
     if set(flight.controls("end_effector")) & {3, 4, 5}:
         angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
         rows.append(("End-effector attitude error", angle))
+    return rows
+
+
+def _link_rows(flight: FlightReport) -> list[tuple[str, ...]]:
+    """Return goal, final position and errors of each link that has a goal at the end."""
+    rows: list[tuple[str, ...]] = []
+    errors = flight.flight.end_effector_errors
+    for link, goal in flight.link_goals.items():
+        attitude = "any attitude"
+        if goal.quaternion is not None:
+            attitude = _format_attitude(rotvec_from_quaternion(goal.quaternion))
+        rows.append((f"Goal of {link}", f"({_format_vector(goal.position)}) m, {attitude}"))
+        if link not in errors:
+            continue
+        error = errors[link]
+        at = goal.position - error.position
+        rows.append((f"Final position of {link}", f"({_format_vector(at)}) m"))
+        distance = f"{error.distance:.4g} m{_tolerance_text(flight, 'position', 'm')}"
+        rows.append((f"Position error of {link}", distance))
+        if goal.quaternion is not None:
+            angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
+            tolerance = _tolerance_text(flight, "attitude", "rad")
+            rows.append((f"Attitude error of {link}", f"{angle}{tolerance}"))
     return rows
 
 
@@ -221,8 +250,8 @@ def _format_attitude(rotvec: Iterable[float]) -> str:
 
 
 def _tolerance_text(flight: FlightReport, what: str, unit: str) -> str:
-    value = flight.parameter("planner", f"{what}_tolerance")
-    return f" (tolerance {value:.4g} {unit})" if isinstance(value, float | int) else ""
+    value = flight.tolerance(what)
+    return "" if value is None else f" (tolerance {value:.4g} {unit})"
 
 
 def _schedules_text(flight: FlightReport) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spacerobot_ros.collision.drawn import collision_visuals
+from spacerobot_ros.collision.drawn import collision_visuals, obstacle_visuals
 from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
@@ -173,10 +173,7 @@ def link_pose(kinematics: ForwardKinematics, link: str, pose: Array, q: Array) -
 
 def draw_obstacles(scene: viser.SceneApi, path: str, world: RobotDescription | None) -> None:
     """Draw the shapes of obstacles by which distances are measured; None: there are none."""
-    if world is None:
-        return
-    for number, visual in enumerate(collision_visuals(world)):
-        _, pose = world.frames[visual.link]
+    for number, (visual, pose) in enumerate(obstacle_visuals(world)):
         red, green, blue, _ = visual.shape.rgba
         scene.add_mesh_simple(
             f"{path}/{number}",

@@ -1,0 +1,320 @@
+"""Reports of flights with goals of links, and of flights among obstacles."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.collision.drawn import obstacle_visuals
+from spacerobot_ros.errors import MeshError
+from spacerobot_ros.flight.flight import SentGoal, goal_at_end, reported_goal
+from spacerobot_ros.model.description import Array, Shape
+from spacerobot_ros.model.meshes import TriangleMesh
+from spacerobot_ros.model.rotations import rotation_angles
+from spacerobot_ros.model.urdf import parse_world
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
+from spacerobot_ros.report.figures_over_time import _error_decades, link_errors_figure
+from spacerobot_ros.report.figures_space import configurations_figure, path_figure
+from spacerobot_ros.report.flight import FlightReport, Target, read_report
+from spacerobot_ros.report.page import _chart_data, _numbers_html
+from spacerobot_ros.report.scene import WORLD, Scene, scene_of
+from spacerobot_ros.report.tables import headline, result_table
+
+BAGS = Path(__file__).parents[2] / "bags"
+LEFT, RIGHT = "left_link_7", "right_link_7"
+TURNED = (0.5, -0.1, 0.7, 0.5)
+
+
+@pytest.fixture(scope="module")
+def hands() -> FlightReport:
+    return read_report(BAGS / "two_hands.mcap")
+
+
+@pytest.fixture(scope="module")
+def strut() -> FlightReport:
+    return read_report(BAGS / "strut.mcap")
+
+
+def other(report: FlightReport, **known: Any) -> FlightReport:
+    """Return a report with some of its parts in place of those of its bag."""
+    made = replace(report)
+    made.__dict__.update(known)
+    return made
+
+
+def poses_by_pinocchio(report: FlightReport, link: str) -> tuple[Array, Array]:
+    """Return R_WL (N, 3, 3) and r_WL (N, 3) of a link at the recorded states."""
+    assert report.robot is not None
+    model = pin.buildModelFromXML(report.robot.urdf, pin.JointModelFreeFlyer())
+    data, full = model.createData(), pin.neutral(model)
+    places = [model.joints[model.getJointId(name)].idx_q for name in report.joint_names]
+    R, r = [], []
+    for k, q in enumerate(report.shape.values):
+        full[:3], full[3:7], full[places] = report.position.values[k], report.quaternion[k], q
+        pin.framesForwardKinematics(model, data, full)
+        pose = data.oMf[model.getFrameId(link)]
+        R.append(pose.rotation.copy())
+        r.append(pose.translation.copy())
+    return np.array(R), np.array(r)
+
+
+def test_errors_of_links_are_those_of_their_true_poses(hands: FlightReport) -> None:
+    assert list(hands.link_errors) == [LEFT, RIGHT]
+    for link, errors in hands.link_errors.items():
+        R, r = poses_by_pinocchio(hands, link)
+        goal = hands.link_goals[link]
+        off = np.linalg.norm(r - goal.position, axis=1)
+        np.testing.assert_array_equal(errors.distance.time, hands.position.time)
+        np.testing.assert_allclose(errors.distance.values[:, 0], off, atol=1e-12)
+        np.testing.assert_allclose(hands.link_positions[link], r, atol=1e-12)
+        if goal.quaternion is None:
+            assert not len(errors.angle)
+            continue
+        wanted = Rotation.from_quat(goal.quaternion).as_matrix()
+        turned = (Rotation.from_matrix(wanted).inv() * Rotation.from_matrix(R)).magnitude()
+        np.testing.assert_allclose(errors.angle.values[:, 0], turned, atol=1e-8)
+    assert hands.link_errors[LEFT].distance.values[0, 0] > 0.3
+    assert hands.link_errors[LEFT].angle.values[0, 0] > 0.3
+
+
+def test_each_goal_counts_until_the_next(hands: FlightReport) -> None:
+    left, right = (
+        EndEffectorGoal(link, np.array([1.0, -2.0, k])) for k, link in ((3.0, LEFT), (4.0, RIGHT))
+    )
+    base = Goal.checked([5.0, 6.0, 7.0], TURNED)
+    both = replace(base, end_effectors=(replace(left, position=np.zeros(3)),))
+    targets = [
+        Target(0.0, 0.4, Goal.of_end_effectors([left, right])),
+        Target(0.4, 0.7, base),
+        Target(0.7, 1.35, both),
+    ]
+    report = other(hands, _all_targets=targets)
+    assert report.targets == targets[1:], "goals of the base"
+    errors, time = report.link_errors, hands.position.time
+    early, late = time <= 0.4, time >= 0.7
+    np.testing.assert_allclose(errors[RIGHT].distance.time, time[early])
+    np.testing.assert_allclose(errors[LEFT].distance.time, [*time[early], *time[late]])
+    _, r = poses_by_pinocchio(hands, LEFT)
+    off = [*np.linalg.norm(r[early] - left.position, axis=1), *np.linalg.norm(r[late], axis=1)]
+    np.testing.assert_allclose(errors[LEFT].distance.values[:, 0], off, atol=1e-12)
+    unknown = Target(0.0, 1.0, Goal.of_end_effectors([replace(left, link="nobody")]))
+    assert other(hands, _all_targets=[unknown]).link_errors == {}
+    assert other(hands, _all_targets=[]).link_errors == {}
+
+
+def rows_of(report: FlightReport) -> dict[str, str]:
+    return {row[0]: row[1] for row in result_table(report).rows}
+
+
+def test_the_tables_have_goal_and_errors_of_each_link(hands: FlightReport) -> None:
+    rows = rows_of(hands)
+    assert rows["Goal of the base"] == "not controlled"
+    assert not any(name.startswith(("Goal position", "Position error of the")) for name in rows)
+    assert rows[f"Goal of {RIGHT}"] == "(1.10000, -0.80000, 0.30000) m, any attitude"
+    attitude = "rotation vector (0.00000, 0.78540, 0.00000) rad, 45.000° in all"
+    assert rows[f"Goal of {LEFT}"] == f"(1.00000, 0.90000, 0.40000) m, {attitude}"
+    assert rows[f"Final position of {LEFT}"] == "(1.00000, 0.90000, 0.40000) m"
+    for part, unit in (("Position", "m"), ("Attitude", "rad")):
+        assert rows[f"{part} error of {LEFT}"].endswith(f" (tolerance 0.001 {unit})")
+    assert f"Attitude error of {RIGHT}" not in rows
+    tiles = {label: (value, note) for label, value, note in headline(hands)}
+    assert tiles[f"Error of {LEFT}"][0].endswith(" m")
+    assert tiles[f"Error of {LEFT}"][1].endswith(" rad")
+    assert tiles[f"Error of {RIGHT}"][1] == ""
+    assert "no goal pose" not in "".join(_numbers_html(hands))
+    # A base with a goal beside those of links has rows as ever.
+    flight = replace(hands.flight, goal=replace(hands.flight.goal, base=POSE))  # type: ignore[type-var]
+    rows = rows_of(replace(hands, flight=flight))
+    assert "Goal of the base" not in rows
+    assert rows["Goal position"] == "(0.00000, 0.00000, 0.00000) m"
+
+
+def test_the_figure_has_a_panel_for_each_error_with_the_tolerance(hands: FlightReport) -> None:
+    figure = link_errors_figure(hands)
+    assert isinstance(figure, ReportFigure)
+    assert [(each.label, each.unit) for each in figure.groups] == [
+        (f"distance of {LEFT}", "m"), (f"angle of {LEFT}", "rad"), (f"distance of {RIGHT}", "m"),
+    ]  # fmt: skip
+    assert [each.limits for each in figure.groups] == [[(0, 0.001)]] * 3
+    assert "the base is not controlled" in figure.caption
+    # From 1 m down to a tenth of the tolerance.
+    assert [each.decades for each in figure.groups] == [4, 4, 4]
+    for group, axes in zip(figure.groups, figure.figure.axes, strict=False):
+        assert axes.get_yscale() == "log"
+        assert axes.get_ylim() == pytest.approx((1e-4, 1.0))
+        assert axes.get_ylabel() == f"{group.label} ({group.unit})"
+        heights = [np.asarray(line.get_ydata()) for line in axes.lines]
+        assert any(np.all(each == 0.001) for each in heights), "the tolerance"
+    path = path_figure(hands)
+    assert isinstance(path, ReportFigure)
+    assert "of links with goals" in path.caption
+
+
+def test_flights_without_goals_of_links_have_no_figure_of_them(strut: FlightReport) -> None:
+    assert strut.link_goals == {}
+    assert link_errors_figure(strut) is None
+
+
+def test_a_bag_without_states_says_why_there_are_no_errors(hands: FlightReport) -> None:
+    blind = other(replace(hands, position=hands.position.between(9.0, 10.0)))
+    sentence = link_errors_figure(blind)
+    assert isinstance(sentence, str)
+    assert sentence.startswith("The bag holds no base poses (odom)")
+
+
+@pytest.mark.parametrize(
+    ("largest", "tolerance", "decades"),
+    [
+        (0.8, 0.001, 4),
+        (0.8, 0.0, 4),
+        (0.8, None, 4),
+        (30.0, 0.001, 6),
+        (1e-4, 0.5, 3),
+        (0.8, 1e-11, 8),
+    ],
+)
+def test_the_axis_of_an_error_has_the_tolerance_on_it(
+    largest: float, tolerance: float | None, decades: int
+) -> None:
+    assert _error_decades(np.array([[0.0], [largest]]), tolerance) == decades
+
+
+def test_a_logarithmic_axis_ends_at_the_power_of_ten_above_the_largest_value() -> None:
+    assert log_range(np.array([[0.02], [np.nan], [3.0]]), 2) == pytest.approx((0.1, 10.0))
+    assert log_range(np.zeros((2, 1)), 3) == pytest.approx((1e-18, 1e-15))
+
+
+def test_charts_have_limits_on_logarithmic_axes_where_these_have_them(hands: FlightReport) -> None:
+    signal = hands.link_errors[LEFT].distance
+    group = TraceGroup(
+        signal, ["d"], "distance", "m", ["#000000"], limits=[(0, 0.01), (0, 1e-5)], decades=4
+    )
+    assert _chart_data(group)["limits"] == [[0, pytest.approx(-2.0)]]
+    linear = replace(group, decades=0, limits=[(0, 0.01), (0, 99.0)])
+    assert _chart_data(linear)["limits"] == [[0, 0.01]]
+
+
+def test_angles_of_rotations_keep_their_digits() -> None:
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    angles = np.array([0.0, 1e-9, 0.3, 2.0, np.pi])
+    R = Rotation.from_rotvec(angles[:, np.newaxis] * axis).as_matrix()
+    np.testing.assert_allclose(rotation_angles(R), angles, rtol=1e-7, atol=1e-15)
+    assert rotation_angles(R[2]) == pytest.approx(0.3)
+
+
+def test_a_status_names_goals_of_links_and_of_the_base() -> None:
+    pose = (1.0, 2.0, 3.0, *TURNED)
+    base = Goal.checked(pose[:3], TURNED)
+    sent = [SentGoal(0.5, base, "1.5")]
+
+    def status(state: PlannerState = PlannerState.EXECUTING, **said: Any) -> PlannerStatus:
+        return PlannerStatus(state, **said)
+
+    links = {LEFT: (4.0, 5.0, 6.0), RIGHT: pose}
+    free = reported_goal(status(end_effector_goals=links), sent)
+    assert free is not None
+    assert free.base == frozenset()
+    assert [(each.link, each.values) for each in free.end_effectors] == [
+        (LEFT, (4.0, 5.0, 6.0)), (RIGHT, pytest.approx(pose)),
+    ]  # fmt: skip
+    both = reported_goal(status(goal_id="1.5", end_effector_goals=links), sent)
+    assert both is not None
+    assert both.base == POSE
+    assert both.end_effectors[0].link == LEFT
+    assert reported_goal(status(goal_id="1.5"), sent) is base
+    assert reported_goal(status(end_effector_goals={LEFT: (1.0,)}), sent) is None
+    # A goal that was refused counts where no other was flown or sent.
+    refused = status(PlannerState.REFUSED, end_effector_goals=links)
+    last = goal_at_end([refused, status(PlannerState.IDLE)], [])
+    assert last is not None
+    assert len(last.end_effectors) == 2
+    assert goal_at_end([refused], sent) is base
+    assert goal_at_end([status(PlannerState.IDLE)], []) is None
+
+
+def test_obstacles_stand_in_the_3d_view_where_the_world_has_them(strut: FlightReport) -> None:
+    scene = scene_of(strut)
+    assert isinstance(scene, Scene)
+    path = f"{WORLD}/obstacle 0 strut"
+    (placed,) = [c for c in scene.commands if c["type"] == "set_transform" and c["path"] == path]
+    matrix = np.reshape(placed["matrix"], (4, 4)).T
+    np.testing.assert_allclose(matrix[:3, 3], [1.6, 0.1, 0.0])
+    turned = Rotation.from_euler("xyz", [1.2, 0.3, 0.1]).as_matrix()
+    np.testing.assert_allclose(matrix[:3, :3], turned, atol=1e-8)
+    (drawn,) = [c for c in scene.commands if c.get("path") == f"{path}/solid" and "object" in c]
+    (cylinder,) = drawn["object"]["geometries"]
+    assert (cylinder["radiusTop"], cylinder["height"]) == (0.06, 0.8)
+    assert drawn["object"]["materials"][0]["color"] == 0x9999A6, "the color of its shape"
+    assert "obstacles have the shapes by which distances are measured" in scene.caption
+
+
+def test_a_flight_without_obstacles_says_nothing_of_them(hands: FlightReport) -> None:
+    scene = scene_of(hands)
+    assert isinstance(scene, Scene)
+    assert "obstacle" not in scene.caption
+    assert not any("/obstacle" in command.get("path", "") for command in scene.commands)
+    # The goals of links have marks, and axes where the attitude counts.
+    marks = {f"{WORLD}/goal of {link}": link for link in (LEFT, RIGHT)}
+    placed = {c["path"]: c["matrix"] for c in scene.commands if c["type"] == "set_transform"}
+    for path, link in marks.items():
+        assert placed[path][12:15] == pytest.approx(hands.link_goals[link].position)
+    drawn = {command.get("path") for command in scene.commands}
+    assert f"{WORLD}/goal of {LEFT}/x" in drawn
+    assert f"{WORLD}/goal of {RIGHT}/x" not in drawn
+    # The plant names the left hand its end-effector, whose path has a name of its own.
+    assert f"{WORLD}/path of the end-effector" in drawn
+    assert f"{WORLD}/path of {RIGHT}" in drawn
+    assert f"{WORLD}/path of {LEFT}" not in drawn
+    assert "of the end-effectors (orange)" in scene.caption
+
+
+def test_pictures_of_configurations_have_the_obstacles(strut: FlightReport) -> None:
+    assert strut.drawn is not None
+    around = strut.drawn.surroundings
+    center = around.points().mean(axis=0)
+    np.testing.assert_allclose(center, [1.6, 0.1, 0.0], atol=1e-9)
+    fills = np.array([face.fill for face in around.faces])
+    np.testing.assert_allclose(fills - [0.6, 0.6, 0.65], 0.0, atol=0.003)
+    robot = strut.drawn.at(strut.joints[0], strut.base_at(0))
+    whole = robot + around
+    assert len(whole.faces) == len(robot.faces) + len(around.faces)
+    assert len(whole.edges) == len(robot.edges) + len(around.edges)
+    figure = configurations_figure(strut)
+    assert isinstance(figure, ReportFigure)
+    assert "Obstacles have the shapes by which distances are measured." in figure.caption
+
+
+def test_meshes_of_obstacles_are_those_that_a_bag_carries(strut: FlightReport) -> None:
+    world = parse_world(
+        '<robot name="w"><link name="w"/><link name="rock"><collision><geometry>'
+        '<mesh filename="file:///nowhere/rock.stl"/></geometry></collision></link>'
+        '<joint name="j" type="fixed"><origin xyz="1 2 3"/><parent link="w"/><child link="rock"/>'
+        "</joint></robot>"
+    )
+    rock = TriangleMesh(np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 1, 2]]))
+    ((visual, pose),) = obstacle_visuals(world, lambda shape: rock)
+    assert visual.link == "rock"
+    np.testing.assert_array_equal(pose.r, [1.0, 2.0, 3.0])
+    assert len(visual.mesh.faces) == 4, "the hull"
+
+    def lost(shape: Shape) -> TriangleMesh:
+        raise MeshError(shape.resource)
+
+    assert obstacle_visuals(world, lost) == ()
+    assert obstacle_visuals(None) == ()
+    assert strut.robot is not None
+    flight = replace(strut.flight, robot=replace(strut.robot, world=world))
+    blind = replace(strut, flight=flight)
+    assert blind.obstacles == ()
+    assert blind.missing_meshes == " Meshes are not drawn. The bag does not carry them."
+    (carried,) = replace(blind, meshes={world.links[1].collisions[0].resource: rock}).obstacles
+    assert len(carried[0].mesh.faces) == 4
