@@ -23,12 +23,14 @@ from unittest.mock import patch
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.collections import Collection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.text import Text
+from matplotlib.text import Annotation, Text
 from scipy.spatial.transform import Rotation
 from support.made_flights import made_flight
 
@@ -312,6 +314,8 @@ def prints_of(figure: Figure) -> dict[str, str]:
             "lines": map(_line, axes.lines),
             "areas": [*map(_area, axes.collections), *map(_patch, axes.patches)],
             "texts": map(_text, _texts(axes)),
+            "ticks": map(_ticks, (axes.xaxis, axes.yaxis)),
+            "legend": [] if (legend := axes.get_legend()) is None else _legend(legend),
         }
         found |= {f"{number} {kind}": _digest(parts) for kind, parts in kinds.items()}
     return found
@@ -339,7 +343,43 @@ def _frame(axes: Axes) -> str:
         axes.get_ylabel(),
         *(axes.get_title(each) for each in ("left", "center", "right")),
     ]
-    return f"{bounds} {axes.get_xscale()} {axes.get_yscale()} {axes.get_aspect()} {labels}"
+    spines = [
+        f"{side} {spine.get_visible()} {_numbers(spine.get_edgecolor())}"
+        for side, spine in axes.spines.items()
+    ]
+    looks = f"{_numbers(axes.get_facecolor())} {axes.axison} {axes.get_visible()} {spines}"
+    scales = f"{axes.get_xscale()} {axes.get_yscale()} {axes.get_aspect()} {axes.get_box_aspect()}"
+    return f"{bounds} {scales} {labels} {looks}"
+
+
+def _ticks(axis: Axis) -> str:
+    """Return where the ticks of an axis are, as far as they are chosen, and their looks."""
+    locator: Any = axis.get_major_locator()
+    chosen = getattr(locator, "locs", ())
+    looks: Any = axis._major_tick_kw  # type: ignore[attr-defined]
+    keys = ("gridOn", "tick1On", "label1On", "size", "labelsize")
+    return (
+        f"{type(locator).__name__} {getattr(locator, '_nbins', '')} "
+        f"{_numbers(getattr(locator, '_steps', ()))} {_numbers(chosen)} "
+        f"{[str(looks.get(key)) for key in keys]} {len(axis.get_minorticklocs()) > 0}"
+    )
+
+
+def _legend(legend: Legend) -> list[str]:
+    """Return where a legend is, its distances, and its entries."""
+    anchor = legend.get_bbox_to_anchor().transformed(legend.axes.transAxes.inverted())
+    distances = (
+        legend.borderaxespad,
+        legend.handlelength,
+        legend.handletextpad,
+        legend.columnspacing,
+    )
+    place = f"{legend._loc} {_numbers(anchor.get_points())} {legend._ncols}"  # type: ignore[attr-defined]
+    handles = [
+        _line(handle) if isinstance(handle, Line2D) else _look(handle)
+        for handle in legend.get_patches() + legend.get_lines()
+    ]
+    return [f"{place} {_numbers(distances)}", *handles]
 
 
 def _line(line: Line2D) -> str:
@@ -372,4 +412,7 @@ def _text(text: Text) -> str:
     style += (
         f" {text.get_horizontalalignment()} {text.get_verticalalignment()} {text.get_rotation():g}"
     )
+    if isinstance(text, Annotation):
+        arrow = text.arrowprops or {}
+        style += f" {_numbers(text.xy)} {text.xycoords} {sorted(arrow.items())}"
     return f"{text.get_text()} {place} {style} {_look(text)}"
