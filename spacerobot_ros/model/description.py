@@ -109,7 +109,8 @@ class Mimic:
 class Joint:
     """A joint between two links; ``origin``: the child's pose at zero, ``axis``: a unit vector.
 
-    A joint with ``mimic`` follows an independent joint: it is no coordinate of its own.
+    A joint with ``mimic`` follows an independent joint: it is no coordinate of its own. The child
+    of a joint with ``wheel`` is a reaction wheel.
     """
 
     name: str
@@ -120,6 +121,7 @@ class Joint:
     axis: Array
     limits: JointLimits
     mimic: Mimic | None = None
+    wheel: bool = False
 
     @property
     def unit(self) -> str:
@@ -137,6 +139,7 @@ class Joint:
             origin=self.origin @ moved,
             limits=JointLimits(),
             mimic=None,
+            wheel=False,
         )
 
 
@@ -211,6 +214,11 @@ class RobotDescription:
     def joint_names(self) -> tuple[str, ...]:
         """Names of the coordinates q."""
         return tuple(joint.name for joint in self.movable_joints)
+
+    @property
+    def wheel_names(self) -> tuple[str, ...]:
+        """Names of the joints that carry reaction wheels, in the order of the coordinates q."""
+        return tuple(joint.name for joint in self.movable_joints if joint.wheel)
 
     @property
     def total_mass(self) -> float:

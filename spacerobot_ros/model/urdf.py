@@ -41,6 +41,7 @@ from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
 from spacerobot_ros.model.meshes import mesh_beside, with_mesh_files
 from spacerobot_ros.model.rotations import matrix_from_rpy
 from spacerobot_ros.model.srdf import disabled_pairs, with_srdf
+from spacerobot_ros.model.wheels import require_reaction_wheels
 from spacerobot_ros.resources import suggestion
 
 _MAX_NUMBER = 1e12
@@ -168,6 +169,7 @@ def parse_robot(text: str) -> RobotDescription:
             )
     _require_mass(description)
     _require_common_range(description)
+    require_reaction_wheels(description)
     return description
 
 
@@ -390,6 +392,7 @@ def _read_joint(joint: Element, links: dict[str, Link]) -> Joint:
         axis,
         _read_limits(joint.find("limit"), kind, where),
         _read_mimic(joint.find("mimic"), where),
+        joint.find("wheel") is not None,
     )
 
 
@@ -515,7 +518,7 @@ _OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": 
 _ELEMENTS_READ = {
     "robot": ("link", "joint", "material", "disable_collisions", "world"),
     "link": ("inertial", "visual", "collision"),
-    "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
+    "joint": ("origin", "parent", "child", "axis", "limit", "mimic", "wheel"),
     "material": ("color",),
 }
 """Tags of the elements to read, by the tag of their parent; other elements are ignored."""
@@ -618,7 +621,7 @@ def _checked_root(text: str) -> Element:
             if kind == "joint":
                 _require_type(element, where)
                 if element.get("type") == "fixed":
-                    _remove_children(element, ("axis", "limit", "mimic"))
+                    _remove_children(element, ("axis", "limit", "mimic", "wheel"))
             _require_element(element, where)
     for material in root.findall("material"):
         _require_element(material, f"material '{material.get('name', '')}'")

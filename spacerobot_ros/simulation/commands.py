@@ -25,6 +25,7 @@ from spacerobot_ros.control.state import ControlState, JointReference, Reference
 from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.times import SECOND
@@ -473,23 +474,36 @@ def _parse_latching_reasons(words: str) -> frozenset[Reason]:
 
 
 class _JointBrakes:
-    """Efforts that brake the joints of a plant: internal forces, which keep its momenta."""
+    """Efforts that brake the joints of a plant: internal forces, which keep its momenta.
+
+    Reaction wheels go on spinning, because braking them would turn the base.
+    """
 
     def __init__(self, plant: Plant, control_period: float) -> None:
         robot: SpaceRobot = plant.robot
         rate = min(_BRAKING_RATE, _MAX_RATE_PER_TICK / control_period)
+        self._braked: slice | npt.NDArray[np.int64] = slice(None)
+        self._efforts = np.zeros(robot.n)
+        if robot.description.wheel_names:
+            wheels = ReactionWheels.of(robot.description)
+            robot, self._braked = SpaceRobot(wheels.gyrostat), wheels.other
         outputs = ComputedTorqueLaw.default_outputs(robot, "")
         # The reference is always the present shape, so only the damping acts.
-        self._law = ComputedTorqueLaw(robot, outputs, Gains.uniform(1.0, rate))
+        self._law = ComputedTorqueLaw(robot, outputs, Gains.uniform(1.0, rate)) if robot.n else None
         self._plant = plant
 
     def efforts(self) -> Array:
         """Return the efforts (n,) of the next tick, N or N m, before limits."""
         plant = self._plant
+        if self._law is None:
+            return self._efforts
+        q, qdot = plant.q[self._braked], plant.qdot[self._braked]
         state = ControlState(
-            plant.pose[:3], plant.pose[3:], plant.twist[:3], plant.twist[3:], plant.q, plant.qdot
+            plant.pose[:3], plant.pose[3:], plant.twist[:3], plant.twist[3:], q, qdot
         )
-        return self._law.command(state, Reference(joints=JointReference.at_rest(plant.q))).tau
+        tau = self._law.command(state, Reference(joints=JointReference.at_rest(q))).tau
+        self._efforts[self._braked] = tau
+        return self._efforts
 
 
 _MIN_MISSING_NUMBER = 2**63

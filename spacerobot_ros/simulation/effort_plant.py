@@ -381,7 +381,8 @@ def tick_function(
     parts = state_slices(n)
     state, command = ca.MX.sym("state", parts[-1].stop), ca.MX.sym("command", n + 6)
     h = ca.MX.sym("h")
-    effort = ca.fmin(ca.fmax(command[:n], -robot.effort_limit), robot.effort_limit)
+    lowest, highest = _effort_bounds(robot, state[parts[2]])
+    effort = ca.fmin(ca.fmax(command[:n], lowest), highest)
     realised = ca.vertcat(effort, command[n:])
     march = repeat_step(_step_counting_stops(robot, model, loaded=loaded), substeps)
     p, touching = list(model.inputs.values()), _count_touching_joints(robot, state)
@@ -420,6 +421,19 @@ def tick_function(
             ca.densify(ca.vertcat(ca.sum1(clipped) + touched, clipped, touched)),
         ],
     )
+
+
+def _effort_bounds(robot: SpaceRobot, qdot: ca.MX) -> tuple[ca.MX | Array, ca.MX | Array]:
+    """Return the least and the largest efforts (n,) of the motors.
+
+    The motor of a reaction wheel that turns at its largest rate makes it no faster.
+    """
+    limit, wheels = robot.effort_limit, robot.description.wheel_names
+    if not wheels:
+        return -limit, limit
+    is_wheel = np.array([name in wheels for name in robot.joint_names])
+    rate = np.where(is_wheel, robot.velocity_limit, np.inf)
+    return ca.if_else(qdot <= -rate, 0.0, -limit), ca.if_else(qdot >= rate, 0.0, limit)
 
 
 def _step_counting_stops(

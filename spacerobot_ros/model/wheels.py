@@ -1,0 +1,177 @@
+"""Reaction wheels: bodies of revolution on the base that turn about their axes.
+
+A wheel is the child of a continuous joint with the element ``<wheel/>``, whose ``<limit>`` has its
+largest rate and torque. Since it is a body of revolution, its angle changes nothing; only its spin
+matters. With ``A`` (3, k) the axes in base components, ``J`` (k,) the moments of inertia about them
+and the spins ``h = J (A' omega + qdot_w)`` (k,), the momenta of the wheels about their axes in
+inertial space, base and arm obey the equations of a robot without wheels (a gyrostat)
+
+    M(q) z0ddot + C(q, z0dot) = Q,    base torque n = n_thrusters - A tau_w - omega x (A h),    (1)
+    hdot = tau_w,                                                                              (2)
+
+where M has the wheels' masses but not their moments J about their axes (Hughes, Spacecraft Attitude
+Dynamics, chapter 3). So a law for base and arm serves a robot with wheels as it is: the wheels
+realise a part of its base torque.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.model.description import Array, Body, JointKind, RobotDescription
+
+_MAX_OFFSET = 1e-4
+"""Largest distance of a wheel's centre of mass from its axis, m."""
+
+_MAX_ASYMMETRY = 1e-3
+"""Largest difference of a wheel's inertia from that of a body of revolution, relative."""
+
+
+@dataclass(frozen=True)
+class ReactionWheels:
+    """The k wheels of a robot, in the order of its coordinates q.
+
+    Attributes
+    ----------
+    description
+        The robot.
+    names
+        Names of their joints.
+    index
+        (k,) their coordinates in q.
+    other
+        (n - k,) the coordinates of the other joints.
+    axes_B
+        (3, k) unit vectors of their axes, base components.
+    inertia
+        (k,) moments of inertia about them, kg m^2.
+    rate, torque
+        (k,) largest rates relative to the base, rad/s, and torques of their motors, N m.
+    """
+
+    description: RobotDescription
+    names: tuple[str, ...]
+    index: npt.NDArray[np.int64]
+    other: npt.NDArray[np.int64]
+    axes_B: Array
+    inertia: Array
+    rate: Array
+    torque: Array
+
+    @classmethod
+    def of(cls, description: RobotDescription) -> ReactionWheels:
+        """Return the wheels of a robot; it may have none."""
+        names = description.wheel_names
+        joints = list(description.joint_names)
+        index = np.array([joints.index(name) for name in names], dtype=np.int64)
+        bodies = [_body_of(description, name) for name in names]
+        return cls(
+            description,
+            names,
+            index,
+            np.setdiff1d(np.arange(len(joints)), index),
+            np.array([_axis_B(body) for body in bodies]).reshape(-1, 3).T,
+            np.array([_spin_inertia(body) for body in bodies]),
+            description.limits("velocity")[index],
+            description.limits("effort")[index],
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def spins(self, omega_WB_B: Array, rates: Array) -> Array:
+        """Return the momenta h (k,) about the axes, kg m^2/s, at relative rates (k,), rad/s."""
+        return np.asarray(self.inertia * (self.axes_B.T @ omega_WB_B + rates))
+
+    @cached_property
+    def gyrostat(self) -> RobotDescription:
+        """The robot of eq. (1): its joints are the others, and the wheels are parts of the base
+        without moments of inertia about their axes.
+        """
+        links = {link.name: link for link in self.description.links}
+        for name, moment in zip(self.names, self.inertia, strict=True):
+            body = _body_of(self.description, name)
+            assert body.joint is not None
+            link, axis = links[body.name], body.joint.axis
+            about = link.inertia.about_com - moment * np.outer(axis, axis)
+            links[body.name] = replace(link, inertia=replace(link.inertia, about_com=about))
+        return self.description.with_links(tuple(links.values())).with_locked(
+            dict.fromkeys(self.names, 0.0)
+        )
+
+
+def require_reaction_wheels(robot: RobotDescription) -> None:
+    """Refuse wheels that are not bodies of revolution on the base with limits.
+
+    Raises
+    ------
+    RobotDescriptionError
+        One is not; the message names its joint.
+    """
+    followed = {joint.mimic.joint for joint in robot.moving_joints if joint.mimic is not None}
+    parents = {body.parent for body in robot.bodies}
+    for number, body in enumerate(robot.bodies):
+        joint = body.joint
+        if joint is None or not joint.wheel:
+            continue
+        flaw = ""
+        if joint.kind is not JointKind.CONTINUOUS:
+            flaw = f'is {joint.kind.value}: give it type="continuous"'
+        elif joint.mimic is not None or joint.name in followed:
+            flaw = "is coupled to another joint by <mimic>: a wheel turns by itself"
+        elif body.parent != 0:
+            flaw = (
+                f"is on link '{robot.bodies[body.parent].name}', which joints move: a reaction "
+                "wheel is on the base; leave <wheel> out, and it is a joint like others"
+            )
+        elif number in parents:
+            flaw = "carries a joint: nothing moves on a reaction wheel"
+        elif not (0 < joint.limits.velocity < np.inf and 0 < joint.limits.effort < np.inf):
+            flaw = (
+                "has no limits of rate and torque: give it "
+                '<limit velocity="..." effort="..."/> in rad/s and N m'
+            )
+        else:
+            flaw = _imbalance(body)
+        if flaw:
+            raise RobotDescriptionError(f"The wheel '{joint.name}' {flaw}.")
+
+
+def _imbalance(body: Body) -> str:
+    """Return a clause on a wheel that is no body of revolution; empty: it is one."""
+    assert body.joint is not None
+    axis, inertia = body.joint.axis, body.inertia
+    offset = float(np.linalg.norm(np.cross(axis, inertia.com)))
+    if offset > _MAX_OFFSET:
+        return (
+            f"is not balanced: its centre of mass is {offset:.3g} m beside its axis; "
+            "move the origin of its <inertial>"
+        )
+    spin = _spin_inertia(body)
+    across = (float(np.trace(inertia.about_com)) - spin) / 2
+    symmetric = across * np.eye(3) + (spin - across) * np.outer(axis, axis)
+    if np.abs(inertia.about_com - symmetric).max() > _MAX_ASYMMETRY * max(spin, across):
+        return (
+            "is not balanced: its inertia is not that of a body of revolution about its axis; "
+            "give it equal moments across the axis, and no products"
+        )
+    return ""
+
+
+def _body_of(robot: RobotDescription, joint: str) -> Body:
+    return next(b for b in robot.bodies if b.joint is not None and b.joint.name == joint)
+
+
+def _axis_B(body: Body) -> Array:
+    assert body.joint is not None
+    return np.asarray(body.origin.R @ body.joint.axis)
+
+
+def _spin_inertia(body: Body) -> float:
+    assert body.joint is not None
+    return float(body.joint.axis @ body.inertia.about_com @ body.joint.axis)
