@@ -52,6 +52,9 @@ class Parameter:
         semicolons, is accepted as well.
     of_joints
         Whether the array has an entry for each joint of the robot, or the text names joints.
+    by_name
+        Whether entries of such an array may be given for some joints alone, by their names: as a
+        mapping, or as texts ``NAME:VALUE``, which the value then has.
     """
 
     name: str
@@ -65,6 +68,7 @@ class Parameter:
     read_only: bool = True
     texts: bool = False
     of_joints: bool = False
+    by_name: bool = False
 
     def checked(self, value: Any) -> Value:
         """Return a value converted to the parameter's type.
@@ -102,11 +106,16 @@ class Parameter:
             raise self._refusal(value, f"a number{self._range_text()}")
         return int(value) if whole else float(value)
 
-    def _check_numbers(self, value: Any) -> tuple[float, ...]:
+    def _check_numbers(self, value: Any) -> tuple[float, ...] | tuple[str, ...]:
+        named = _named_entries(value) if self.by_name else None
+        if named is not None:
+            numbers = replace(self, by_name=False)._check_numbers(named.values())
+            return tuple(f"{name}:{x!r}" for name, x in zip(named, numbers, strict=True))
         try:
             numbers = tuple(float(x) for x in value)
         except (TypeError, ValueError, OverflowError):
-            raise self._refusal(value, "a list of numbers") from None
+            by_name = ", or of texts NAME:VALUE with names of joints" if self.by_name else ""
+            raise self._refusal(value, f"a list of numbers{by_name}") from None
         if self.length is not None and len(numbers) not in (0, self.length):
             raise self._refusal(value, f"a list of {self.length} numbers")
         if not all(math.isfinite(x) and self.minimum <= x <= self.maximum for x in numbers):
@@ -129,6 +138,21 @@ class Parameter:
         unit = f" ({self.unit})" if self.unit else ""
         shown = value if not isinstance(value, str) else f"'{value[:60]}'"
         return ParameterError(f"Parameter '{self.name}' is {shown}; it must be {expected}{unit}.")
+
+
+def _named_entries(value: Any) -> dict[str, Any] | None:
+    """Return the values of a mapping or of texts ``NAME:VALUE`` by name; None for anything else."""
+    if isinstance(value, Mapping):
+        return {str(name): entry for name, entry in value.items()}
+    if isinstance(value, str):
+        value = value.replace(";", " ").split()
+    if not isinstance(value, Sequence) or not value:
+        return None
+    if not all(isinstance(entry, str) and ":" in entry for entry in value):
+        return None
+    pairs = [entry.rpartition(":") for entry in value]
+    named = {name.strip(): number for name, _, number in pairs}
+    return named if len(named) == len(pairs) else None
 
 
 def parameter(default: Value, description: str, **attributes: Any) -> Any:

@@ -257,6 +257,10 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
     """Return the numbers of a list parameter; an empty list for joints is zeros."""
     values = values_of(scenario.config(node))[declaration.name]
     assert isinstance(values, tuple)
+    if any(isinstance(each, str) for each in values):
+        raise ParameterError(
+            f"'{name}': the list has texts NAME:VALUE: give a number for each joint under 'set'."
+        )
     if values:
         return [float(x) for x in values]
     if node == "plant" and declaration.length is None:

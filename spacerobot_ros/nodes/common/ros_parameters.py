@@ -187,7 +187,7 @@ def typed(
 def _ros_parameter(parameter: Parameter, value: Value) -> RosParameter:
     kind = RosParameter.Type
     if isinstance(value, tuple):
-        of_texts = parameter.texts
+        of_texts = parameter.texts or any(isinstance(each, str) for each in value)
         return RosParameter(
             parameter.name, kind.STRING_ARRAY if of_texts else kind.DOUBLE_ARRAY, list(value)
         )

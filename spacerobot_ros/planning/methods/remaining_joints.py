@@ -194,6 +194,10 @@ def _options_of_remaining(options: Any, stuck: npt.NDArray[np.bool_], names: Seq
             continue
         if isinstance(value, str):
             kept[option.name] = "" if gone & set(value.split()) else value
+        elif isinstance(value, tuple) and any(isinstance(each, str) for each in value):
+            kept[option.name] = tuple(
+                each for each in value if str(each).rpartition(":")[0] not in gone
+            )
         elif isinstance(value, tuple) and len(value) == len(names):
             kept[option.name] = tuple(
                 x for x, is_stuck in zip(value, stuck, strict=True) if not is_stuck

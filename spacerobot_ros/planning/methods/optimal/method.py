@@ -151,7 +151,7 @@ class OptimalGait(GaitMethod):
         self._limits = MotionLimits.of(robot, chosen)
         self._margin = np.zeros(robot.n)
         if chosen.joint_margin:
-            self._margin = per_joint(robot, "joint_margin", chosen.joint_margin)
+            self._margin = per_joint(robot, "joint_margin", chosen.joint_margin, np.zeros(robot.n))
         self._constraints = PathConstraints.of(robot, chosen)
         self._efforts = LimitedEfforts.of(robot, chosen, self.control_period)
         self._model = ManoeuvreModel(

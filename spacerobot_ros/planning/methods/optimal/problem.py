@@ -15,6 +15,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.goal import RobotState
+from spacerobot_ros.resources import suggestion
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class MotionOptions:
         minimum=0.0,
         maximum=1e9,
         of_joints=True,
+        by_name=True,
     )
     max_acceleration: tuple[float, ...] = parameter(
         (),
@@ -36,6 +38,7 @@ class MotionOptions:
         minimum=0.0,
         maximum=1e9,
         of_joints=True,
+        by_name=True,
     )
     ramp_time: float = parameter(
         0.5,
@@ -72,6 +75,7 @@ class OptimalOptions(MotionOptions):
         minimum=0.0,
         maximum=1e12,
         of_joints=True,
+        by_name=True,
     )
     effort_reserve: float = parameter(
         0.15,
@@ -86,6 +90,7 @@ class OptimalOptions(MotionOptions):
         minimum=0.0,
         maximum=1e9,
         of_joints=True,
+        by_name=True,
     )
     base_position: int = parameter(
         0, "0: reached if sliders can, 1: reached, 2: ignored", minimum=0, maximum=2
@@ -243,13 +248,12 @@ class MotionLimits:
         """
         velocity = robot.velocity_limit.copy()
         if options.max_velocity:
-            fastest = per_joint(robot, "max_velocity", options.max_velocity, method)
+            fastest = per_joint(robot, "max_velocity", options.max_velocity, velocity, method)
             velocity = np.minimum(velocity, fastest)
+        acceleration = velocity / options.ramp_time
         if options.max_acceleration:
             given = options.max_acceleration
-            acceleration = per_joint(robot, "max_acceleration", given, method)
-        else:
-            acceleration = velocity / options.ramp_time
+            acceleration = per_joint(robot, "max_acceleration", given, acceleration, method)
         for name, v, a in zip(robot.joint_names, velocity, acceleration, strict=True):
             if not (v > 0 and np.isfinite(a) and a > 0):
                 raise ParameterError(
@@ -514,18 +518,36 @@ def _largest_base_rate(quaternions: Array, period: float) -> float:
 
 
 def per_joint(
-    robot: SpaceRobot, option: str, values: Sequence[float], method: str = "optimal"
+    robot: SpaceRobot,
+    option: str,
+    values: Sequence[float] | Sequence[str],
+    default: Array,
+    method: str = "optimal",
 ) -> Array:
     """Return the list of a method's option as (n,) numbers.
+
+    ``default`` (n,) are the values of joints that a list of texts ``NAME:VALUE`` does not name.
 
     Raises
     ------
     ParameterError
-        It has another length.
+        A list of numbers has another length, or a name is that of no joint.
     """
+    names = robot.joint_names
+    if any(isinstance(each, str) for each in values):
+        given = default.copy()
+        for name, _, number in (str(each).rpartition(":") for each in values):
+            if name not in names:
+                raise ParameterError(
+                    f"{method}.{option} names '{name}', which is no joint of robot "
+                    f"'{robot.description.name}'; its joints are {', '.join(names)}."
+                    f"{suggestion(name, names)}"
+                )
+            given[names.index(name)] = float(number)
+        return given
     if len(values) != robot.n:
         raise ParameterError(
             f"{method}.{option} has {len(values)} number(s); robot '{robot.description.name}' has "
-            f"{robot.n} joints ({', '.join(robot.joint_names)})."
+            f"{robot.n} joints ({', '.join(names)})."
         )
     return np.asarray(values, dtype=float)
