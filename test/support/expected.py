@@ -16,6 +16,7 @@ import numpy as np
 from support.figure_prints import MADE_PARTS, PICTURES, analysis_prints, made_prints, report_prints
 from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
+from support.search_prints import SEARCHES
 from support.viewer_prints import SITUATIONS, viewer_prints
 
 from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
@@ -42,6 +43,7 @@ FOLDER = Path(__file__).parents[1] / "expected"
 PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"
 REPORTS, CAMPAIGN_PAGES = FOLDER / "reports.json", FOLDER / "campaigns.json"
 VIEWER, MADE_REPORTS = FOLDER / "viewer.json", FOLDER / "made_reports.json"
+SEARCH = FOLDER / "search.json"
 BAGS = ("arm_attitude", "planar_chain", "servicer_thrusters", "sliding_masses")
 ANALYSED = ("planar_chain", "three_joint_arm")
 
@@ -138,6 +140,23 @@ _PLANS: dict[str, dict[str, Any]] = {
         "t2": 5.0,
         "t3": 13.0,
         "t4": 17.0,
+    },
+    "along lines": {
+        "robot": "three_joint_arm",
+        "method": "resolved_rate",
+        "start": (0.4, -0.9, 1.1),
+        "end_effector_position": (1.3, 0.9, 0.8),
+        "waypoints": (1.4, 0.8, 1.2),
+        "max_velocity": (0.5, 0.3, 0.4),
+    },
+    "as far as possible": {
+        "robot": "planar_manipulator",
+        "method": "resolved_rate",
+        "start": (0.9, 0.7),
+        "end_effector_position": (1.5, 1.5, 0.0),
+        "as_far_as_possible": 1,
+        "max_velocity": (2.0, 2.0),
+        "max_acceleration": (4.0, 3.0),
     },
     "three of six joints": {
         "robot": "servicer",
@@ -277,6 +296,7 @@ def main() -> None:
         (REPORTS, reports),
         (CAMPAIGN_PAGES, pages),
         (MADE_REPORTS, {name: made_prints(name) for name in MADE_PARTS}),
+        (SEARCH, {name: print_of() for name, print_of in SEARCHES.items()}),
         (VIEWER, {name: viewer_prints(name) for name in SITUATIONS}),
     ):
         path.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
