@@ -274,7 +274,8 @@ _TOPIC_TABLE = (
         _STATUS_TYPE,
         _PUBLISHED_BY_PLANT,
         "smallest distance between two links, every `clearance_period`: `time` (s), `distance` "
-        "(m; negative: the depth of a contact), and the links `first` and `second`",
+        "(m; negative: the depth of a contact), and the links `first` and `second`; `second_is` is "
+        "`obstacle` where the second is one",
         when="links of the robot could touch",
     ),
     Topic(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,13 @@ from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
 from spacerobot_ros.campaign.rows import LANES, Row
-from spacerobot_ros.campaign.workers import THIS_PROCESS, Cluster, TaskDistributor, open_workers
+from spacerobot_ros.campaign.workers import (
+    THIS_PROCESS,
+    Cluster,
+    TaskDistributor,
+    Workers,
+    open_workers,
+)
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
@@ -82,25 +89,31 @@ def run_campaign(
     """
     draws, dataset = Draws(campaign), Dataset(folder)
     chosen = select_engine(campaign, campaign.engine if engine == "auto" else engine)
-    done = dataset.begin(campaign)
-    numbers = [number for number in range(len(draws)) if number not in done]
-    began, before = time.monotonic(), len(draws) - len(numbers)
+    with ExitStack() as opened:
+        workers = None
+        if cluster.scheduler and len(dataset.flown_numbers()) < len(draws):
+            # Before the folder is made, so that a scheduler that is not there leaves nothing.
+            workers = opened.enter_context(open_workers(cluster, len(draws)))
+        done = dataset.begin(campaign)
+        numbers = [number for number in range(len(draws)) if number not in done]
+        began, before = time.monotonic(), len(draws) - len(numbers)
 
-    def progress(flown: int) -> Progress:
-        seconds = time.monotonic() - began
-        rate = flown / seconds if seconds > 0 else 0.0
-        return Progress(before + flown, len(draws), rate, seconds)
+        def progress(flown: int) -> Progress:
+            seconds = time.monotonic() - began
+            rate = flown / seconds if seconds > 0 else 0.0
+            return Progress(before + flown, len(draws), rate, seconds)
 
-    flown = 0
-    rows = _fly_rows(campaign, draws, numbers, chosen.name, cluster, stopped)
-    try:
-        for batch in rows:
-            dataset.add(batch)
-            flown += len(batch)
-            show(progress(flown))
-    finally:
-        dataset.close()
-    return progress(flown)
+        flown = 0
+        try:
+            if workers is None and cluster.workers and numbers:
+                workers = opened.enter_context(open_workers(cluster, len(numbers)))
+            for batch in _fly_rows(campaign, draws, numbers, chosen.name, workers, stopped):
+                dataset.add(batch)
+                flown += len(batch)
+                show(progress(flown))
+        finally:
+            dataset.close()
+        return progress(flown)
 
 
 def _fly_rows(
@@ -108,19 +121,18 @@ def _fly_rows(
     draws: Draws,
     numbers: list[int],
     engine: str,
-    cluster: Cluster,
+    workers: Workers | None,
     stopped: Callable[[], bool],
 ) -> Iterator[list[Row]]:
     """Yield the rows of draws as they are flown, and empty lists while workers fly."""
     if not numbers:
         return
-    if not cluster.workers and not cluster.scheduler:
+    if workers is None:
         selected = (draws[number] for number in numbers)  # Each draw is made when it is flown.
         for row in fly_all(engine_by_name(engine), campaign, selected, stopped):
             yield [row]
         return
-    with open_workers(cluster, len(numbers)) as workers:
-        yield from TaskDistributor(workers, campaign, draws, engine, stopped).rows(numbers)
+    yield from TaskDistributor(workers, campaign, draws, engine, stopped).rows(numbers)
 
 
 RERUN_TOLERANCE = 1e-9

@@ -10,7 +10,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair
+from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair, ObstaclePair
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -18,6 +18,9 @@ from spacerobot_ros.model.description import Array, RobotDescription
 _LOG = logging.getLogger(__name__)
 
 _OK, _ERROR = 0, 2
+
+_OBSTACLE = "obstacle"
+"""Value of the key ``second_is`` where the second of a pair is an obstacle."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +55,15 @@ class ClearanceStatus:
 
     def to_values(self) -> dict[str, str]:
         """Return the status as key-value pairs of a DiagnosticStatus."""
-        return {
+        values = {
             "time": f"{self.time_s:.9f}",
             "distance": f"{self.distance:.9g}",
             "first": self.links.first,
             "second": self.links.second,
         }
+        if isinstance(self.links, ObstaclePair):
+            values["second_is"] = _OBSTACLE
+        return values
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> ClearanceStatus:
@@ -69,7 +75,8 @@ class ClearanceStatus:
             They are not those of a clearance.
         """
         try:
-            links = LinkPair(values["first"], values["second"])
+            kind = ObstaclePair if values.get("second_is") == _OBSTACLE else LinkPair
+            links = kind(values["first"], values["second"])
             return cls(float(values["distance"]), links, float(values["time"]))
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"The values are not a clearance: {error}.") from error

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from spacerobot_ros.campaign.running import (
     rerun_flight,
     run_campaign,
 )
+from spacerobot_ros.campaign.workers import Cluster
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.resources import robot_file
@@ -71,6 +74,32 @@ def test_a_campaign_that_is_ended_goes_on_where_it_was(tmp_path: Path) -> None:
     assert (fewer.done, fewer.total) == (2, 2)
     results = Results.of(tmp_path / "cut")
     assert (len(results), results.total) == (6, 6)
+
+
+def test_a_scheduler_that_is_not_there_is_refused_before_a_folder_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, int]] = []
+
+    @contextmanager
+    def refuse(cluster: Cluster, flights: int) -> Iterator[Any]:
+        asked.append((cluster.scheduler, flights))
+        raise SpaceRobotError("There is no scheduler.")
+        yield
+
+    monkeypatch.setattr(running, "open_workers", refuse)
+    nowhere, folder = Cluster(scheduler="nowhere:1"), tmp_path / "out" / "made"
+    with pytest.raises(SpaceRobotError, match="no scheduler"):
+        run_campaign(small(flights=2), folder, cluster=nowhere)
+    assert asked == [("nowhere:1", 2)]
+    assert not (tmp_path / "out").exists()
+    # A campaign that is flown already asks for no scheduler.
+    run_campaign(small(flights=2), folder)
+    assert run_campaign(small(flights=2), folder, cluster=nowhere).done == 2
+    assert len(asked) == 1
+    with pytest.raises(SpaceRobotError, match="no scheduler"):
+        run_campaign(small(flights=3), folder, cluster=nowhere)
+    assert run_campaign(small(flights=3), folder).done == 3, "the folder is free"
 
 
 def test_the_numbers_of_a_row_are_those_of_its_flight(tmp_path: Path) -> None:

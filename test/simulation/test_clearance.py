@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.crossing import URDF, distance
 
-from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair
+from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair, ObstaclePair
 from spacerobot_ros.collision import distances as distances_module
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
@@ -56,6 +56,13 @@ def test_a_plant_goes_on_through_a_contact_and_says_so() -> None:
 def test_a_clearance_is_read_again_from_its_message() -> None:
     status = ClearanceStatus(-0.0125, LinkPair("a", "b"), 12.75)
     assert ClearanceStatus.from_values(status.to_values()) == status
+    assert type(ClearanceStatus.from_values(status.to_values()).links) is LinkPair
+    assert set(status.to_values()) == {"time", "distance", "first", "second"}
+    beside = ClearanceStatus(0.25, ObstaclePair("a", "b"), 12.75)
+    assert beside.to_values()["second_is"] == "obstacle"
+    again = ClearanceStatus.from_values(beside.to_values())
+    assert again.message == "Link 'a' and obstacle 'b' are 0.25 m apart."
+    assert type(again.links) is ObstaclePair
     for flaw in ({"distance": "near"}, {"first": None}):
         values = {k: v for k, v in (status.to_values() | flaw).items() if v is not None}
         with pytest.raises(SpaceRobotError, match="are not a clearance"):
