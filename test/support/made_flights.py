@@ -17,6 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from support.flight_bags import cyclic_shapes, urdf_of
 
+from spacerobot_ros.collision.geometry import LinkPair
+from spacerobot_ros.collision.path_check import Approach
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.flight import Flight, SentGoal, Signal
@@ -61,12 +63,12 @@ def _report(
     namespace: str = "",
     others: Sequence[str] = (),
     planned: Sequence[Array] = (),
-    clearance: bool = False,
+    clearance: Array | None = None,
 ) -> FlightReport:
     """Return the report of a flight whose arrays have a row every ``period`` s.
 
     Arrays of fewer rows than the first one are of its last rows. ``topics`` are what else the bag
-    holds: ``base_wrench``, ``joint_commands``.
+    holds: ``base_wrench``, ``joint_commands``. ``clearance`` are smallest distances between links.
     """
     count = len(next(iter(series.values())))
 
@@ -117,11 +119,22 @@ def _report(
         end_effector_goal=tool_sent[-1].goal if tool_sent else None,
         goals=sent,
         end_effector_goals=tool_sent,
-        measures_clearance=clearance,
     )
     pose = flight.signal("pose")
     position = Signal(pose.time - BEGAN, pose.values[:, :3])
-    return FlightReport(bag, flight, position, pose.values[:, 3:], list(events))
+    report = FlightReport(bag, flight, position, pose.values[:, 3:], list(events))
+    least = np.inf if clearance is None else float(clearance.min())
+    vars(report)["clearance"] = (
+        clearance
+        if clearance is None
+        else SimpleNamespace(
+            geometry=SimpleNamespace(exact=least > 0),
+            nearest=Approach(LinkPair("link_0", "link_1"), 0, least, 20.0, np.zeros(3)),
+            nearest_time=1.25,
+            over_time=lambda most: (position.time[:most], clearance[:most]),
+        )
+    )
+    return report
 
 
 def _event(time: float, kind: EventKind, **about: str) -> FlightEvent:
@@ -199,7 +212,7 @@ def _cycles() -> FlightReport:
         description="Loops & <more>.",
         published=(Published("zf", [1.25, -2.0], "a note"), Published("nothing", [1e-7])),
         planned=[pose[::20, :3] + [0.0, 0.03125, 0.0], pose[100::40, :3]],
-        clearance=True,
+        clearance=0.5 * np.cos(0.25 * np.arange(count)),
     )
 
 
@@ -299,7 +312,7 @@ def _controlled() -> FlightReport:
         namespace="/left",
         others=("/right", ""),
         events=[_event(2.5, EventKind.LATCHED), _event(3.5, EventKind.REARMED)],
-        clearance=True,
+        clearance=0.5 + 0.25 * np.cos(0.25 * np.arange(count)),
     )
 
 
