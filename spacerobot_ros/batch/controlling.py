@@ -186,6 +186,14 @@ class BatchController:
         ParameterError
             The command of the law is more than one function.
         """
+        if any(
+            gains.integral_diagonal(self.law.outputs.selection).any()
+            for gains in (*self.program.gains, self._config.gains)
+        ):
+            raise ParameterError(
+                "Controllers with integral gains (ki) are not flown in lanes; engine 'flights' "
+                "flies them."
+            )
         n, law, size = self._n, self.law, profile_size(*self._groups)
         fixed = law.fixed_inputs
         if fixed is None:

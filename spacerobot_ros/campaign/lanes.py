@@ -355,6 +355,11 @@ class _ControlledLanes:
             law = build_controller(nominal_robots(scenario).controller, scenario.controller).law
         except SpaceRobotError as error:
             return str(error)
+        if law.integrates or any(
+            each.name.startswith(_GAIN_PREFIX) and each.name.endswith(".ki")
+            for each in campaign.dispersions
+        ):
+            return "its controller has integral gains, which engine 'flights' flies"
         if law.fixed_inputs is None:
             return f"the law '{law.name}' with these options is more than one function"
         for key, goal in _goals_by_frame(scenario).items():

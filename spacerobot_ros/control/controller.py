@@ -96,6 +96,7 @@ class CoordinatedController:
 
     def reset(self) -> None:
         """Drop goals and measurements; the next state counts as the first."""
+        self.law.reset_integral()
         self.profile, self._followed = None, Reference()
         self.coming_to_rest = False
         self._sent = self._estimator = self._brake = None
@@ -116,8 +117,10 @@ class CoordinatedController:
     ) -> None:
         """Start towards new goals; a group without a new goal keeps its earlier goal.
 
-        A robot that was brought to rest has no earlier goals: such a group stays where it is.
+        A robot that was brought to rest has no earlier goals: such a group stays where it is. The
+        integral of the errors begins anew.
         """
+        self.law.reset_integral()
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
         start = self._present_reference(time, state)
@@ -185,7 +188,10 @@ class CoordinatedController:
             if self.coming_to_rest:
                 commanded = self.joint_rate_limits.to_rest(state)
         if state is not None:
-            result = self.apply_limits(state, commanded, self._periods_held(time))
+            periods = self._periods_held(time)
+            result = self.apply_limits(state, commanded, periods)
+            if self.law.integrates and not self.coming_to_rest:
+                self.law.integrate_error(periods * self._control_period, limited=result.limited)
         else:
             result = self._limits.apply(commanded)
         self._sent = result.realised

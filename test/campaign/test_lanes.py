@@ -219,6 +219,12 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     assert select_engine(pushed, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="it has disturbances, which engine 'flights' flies"):
         select_engine(pushed, "lanes")
+    normal = {"uniform": [0.0, 0.5]}
+    steady = {"coordinated_control.gains.base_position.ki": 0.5}
+    for made in (controlled(set=steady), controlled(disperse=dict.fromkeys(steady, normal))):
+        assert select_engine(made, "auto").name == "flights"
+        with pytest.raises(SpaceRobotError, match="integral gains, which engine 'flights' flies"):
+            select_engine(made, "lanes")
     near = campaign(criteria={"clearance_m": {"min": 0.0}})
     assert select_engine(near, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="lanes measure no distances between links"):

@@ -53,6 +53,7 @@ class ComputedTorqueLaw(ControlLaw):
         H = z1.model("inertia_matrix", z1.q)
         C = z1.model("bias", z1.q, z1.v_cm, z1.omega, z1.qdot)
         u = z1.acceleration + symbols["kd"] * z1.error_rate + symbols["kp"] * z1.error
+        u += symbols["integral"]
         D, D_q, D_qq = H[3:6, 3:6], H[3:6, 6:], H[6:, 6:]
         omega_dot = -solve_positive_definite(D, D_q @ u + C[3:6])
         tau = D_qq @ u + D_q.T @ omega_dot + C[6:]

@@ -23,11 +23,14 @@ from spacerobot_ros.parameters import configured, group, parameter, values_of
 
 @dataclass(frozen=True)
 class GainPair:
-    """Proportional and derivative gain of each output of a group, a diagonal of Kp and Kd.
+    """Proportional, derivative and integral gain of each output of a group, in Kp, Kd and Ki.
 
     Their units are the law's (:attr:`ControlLaw.gain_units`): a force or torque per error and per
     error rate with ``transposed_jacobian``, an acceleration per error and per error rate with the
-    laws that know the inertia.
+    laws that know the inertia. The unit of Ki is that of Kp over seconds.
+
+    The integral gain removes the steady-state error under constant disturbances. With the laws
+    that know the inertia, each error is stable for ``ki < kp kd``; take much less.
 
     Commands are held for a control period. A derivative gain that takes more than its velocity
     within one makes the loop unstable: Kd times the period must stay well below 2 (with
@@ -53,16 +56,25 @@ class GainPair:
         maximum=1e9,
         read_only=False,
     )
+    ki: float = parameter(
+        0.0,
+        "integral gain, against constant disturbances; 0: none. N/(m s) or N m/(rad s) with laws "
+        "that command forces, 1/s^3 with laws that command accelerations",
+        unit="by law",
+        minimum=0.0,
+        maximum=1e9,
+        read_only=False,
+    )
 
 
 @dataclass(frozen=True)
 class Gains:
-    """The diagonals of Kp and Kd (paper 4, eqs 27 and 29), positive definite.
+    """The diagonals of Kp and Kd (paper 4, eqs 27 and 29), positive definite, and of Ki.
 
     Raises
     ------
     ParameterError
-        A gain is not positive and finite; the message names it.
+        A gain is not positive and finite, or an integral gain negative; the message names it.
     """
 
     base_position: GainPair = group(GainPair(30.0, 60.0))
@@ -79,15 +91,27 @@ class Gains:
                     raise ParameterError(
                         f"The gain {each.name}.{name} is {value}; it must be positive and finite."
                     )
+            if not (math.isfinite(pair.ki) and pair.ki >= 0):
+                raise ParameterError(
+                    f"The gain {each.name}.ki is {pair.ki}; it must be finite and not negative."
+                )
 
     @classmethod
-    def uniform(cls, kp: float, kd: float) -> Gains:
+    def uniform(cls, kp: float, kd: float, ki: float = 0.0) -> Gains:
         """Return the same gains for every group."""
-        return cls(*(GainPair(kp, kd) for _ in fields(cls)))
+        return cls(*(GainPair(kp, kd, ki) for _ in fields(cls)))
 
     def diagonals(self, selection: OutputSelection) -> tuple[Array, Array]:
         """Return the diagonals of Kp and Kd (m,) of the selected outputs."""
-        pairs = [
+        pairs = self._pairs(selection)
+        return np.array([pair.kp for pair in pairs]), np.array([pair.kd for pair in pairs])
+
+    def integral_diagonal(self, selection: OutputSelection) -> Array:
+        """Return the diagonal of Ki (m,) of the selected outputs."""
+        return np.array([pair.ki for pair in self._pairs(selection)])
+
+    def _pairs(self, selection: OutputSelection) -> list[GainPair]:
+        return [
             *(_axis_gains(axis, self.base_position, self.base_attitude) for axis in selection.base),
             *(
                 _axis_gains(axis, self.end_effector_position, self.end_effector_attitude)
@@ -95,7 +119,6 @@ class Gains:
             ),
             *(self.joints for _ in selection.joints),
         ]
-        return np.array([pair.kp for pair in pairs]), np.array([pair.kd for pair in pairs])
 
 
 @dataclass(frozen=True)
@@ -172,6 +195,7 @@ class ControlLaw(ABC):
             "reference": self.outputs.reference,
             "kp": ca.SX.sym("kp", self.outputs.m),
             "kd": ca.SX.sym("kd", self.outputs.m),
+            "integral": ca.SX.sym("integral", self.outputs.m),
             **{name: ca.SX.sym(name, np.size(value)) for name, value in inputs.items()},
         }
         weights = self.outputs.model.inputs
@@ -181,8 +205,11 @@ class ControlLaw(ABC):
             "J_z": self.outputs.J_z,
             **self._results(symbols),
         }
+        self._has_integral = ca.depends_on(results["actuation"], symbols["integral"])
+        self._integral = np.zeros(self.outputs.m)
+        """Integral of the errors (m,), m s or rad s."""
         self.function = dense_function(f"law_{self.name}", symbols | weights, results)
-        """The law as expressions: of state, reference, kp, kd and its own inputs, by name."""
+        """The law as expressions: of state, reference, kp, kd, integral and its own inputs."""
         self._function = robot.view(self.function)
         self._in = dict(zip(symbols, self._function.inputs, strict=True))
         self._out = dict(zip(results, self._function.outputs, strict=True))
@@ -207,13 +234,51 @@ class ControlLaw(ABC):
         return outputs
 
     def set_gains(self, gains: Gains) -> None:
-        """Change the gains from the next command on."""
-        self._in["kp"][:], self._in["kd"][:] = gains.diagonals(self.outputs.selection)
+        """Change the gains from the next command on.
+
+        Raises
+        ------
+        ParameterError
+            An integral gain is not zero, and the law has no integral term.
+        """
+        selection = self.outputs.selection
+        self._ki = gains.integral_diagonal(selection)
+        self.integrates = bool(self._ki.any())
+        """Whether an integral gain is not zero."""
+        if self.integrates and not self._has_integral:
+            raise ParameterError(
+                f"The law '{self.name}' has no integral term: its gains ki must be 0."
+            )
+        self._in["kp"][:], self._in["kd"][:] = gains.diagonals(selection)
+        self._integral[self._ki == 0.0] = 0.0
+        self._in["integral"][:] = self._ki * self._integral
+
+    def integrate_error(self, duration: float, *, limited: bool = False) -> None:
+        """Add the error of the last command, which is held for ``duration`` (s), to the integral.
+
+        Where the command was ``limited``, an integral may only shrink (anti-windup).
+        """
+        if not self.integrates:
+            return
+        error = self._out["error"]
+        grows = error * self._integral >= 0.0
+        added = np.where((self._ki == 0.0) | (grows & limited), 0.0, duration * error)
+        self._integral += added
+        self._in["integral"][:] = self._ki * self._integral
+
+    def reset_integral(self) -> None:
+        """Set the integral of the error to zero."""
+        self._integral[:] = self._in["integral"][:] = 0.0
 
     @property
     def gain_diagonals(self) -> tuple[Array, Array]:
         """The diagonals of Kp and Kd (m,), in the order of ``outputs.labels``."""
         return self._in["kp"].copy(), self._in["kd"].copy()
+
+    @property
+    def integral_gains(self) -> Array:
+        """The diagonal of Ki (m,), in the order of ``outputs.labels``."""
+        return self._ki.copy()
 
     def command(self, state: ControlState, reference: Reference) -> Actuation:
         """Return the wrench of the thrusters and the joint efforts, not limited.
@@ -230,6 +295,23 @@ class ControlLaw(ABC):
         self.outputs.pack_state(state, self._in["state"])
         self.outputs.pack_reference(reference, self._in["reference"])
         return self._actuation(reference)
+
+    def command_per_error(self, state: ControlState) -> Array:
+        """Return the command (6 + n, m) at rest per unit of ``Kp e``, in the shape of a state."""
+        state = ControlState.at_rest(state.r_WB, state.quaternion_WB, state.q)
+        selection = self.outputs.selection
+        reference = Reference.present(self.robot, state, selection.end_effector_link)
+        given = {name: memory.copy() for name, memory in self._in.items()}
+        self.outputs.pack_state(state, given["state"])
+        self.outputs.pack_reference(reference, given["reference"])
+        columns = []
+        for unit in np.vstack([np.zeros(self.outputs.m), np.eye(self.outputs.m)]):
+            given["integral"] = unit
+            results = self.function(*given.values(), *self.robot.mass_arguments.values())
+            actuation = dict(zip(self.function.name_out(), results, strict=True))["actuation"]
+            columns.append(np.array(actuation).ravel())
+        at_rest, *each = columns
+        return np.array(each).T - at_rest[:, np.newaxis]
 
     @property
     def state(self) -> ControlState:
@@ -273,7 +355,8 @@ class ControlLaw(ABC):
         """Arguments of :attr:`function` beside state, reference and gains that are the same in
         every flight; None: some depend on the flight.
         """
-        return {**self._inputs(), **self.robot.mass_arguments}
+        integral = {"integral": np.zeros(self.outputs.m)}
+        return {**integral, **self._inputs(), **self.robot.mass_arguments}
 
     def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:
         """Return whether the results of :attr:`function` are the command as they are."""
@@ -285,8 +368,9 @@ class ControlLaw(ABC):
 
         ``actuation`` (6 + n,) is the command: force (N) and torque (N m) at the origin of the base
         link in base components, then the joint efforts; other results are the law's own.
-        ``symbols`` has ``kp`` and ``kd`` (m,) and one for each name of :meth:`_inputs`; all else is
-        in ``self.outputs``.
+        ``symbols`` has ``kp`` and ``kd`` (m,), ``integral`` (m,), to be added to ``kp`` times the
+        error, and one for each name of :meth:`_inputs`; all else is in ``self.outputs``. A law
+        whose ``actuation`` does not depend on ``integral`` refuses integral gains.
         """
 
     def _actuation(self, reference: Reference) -> Actuation:

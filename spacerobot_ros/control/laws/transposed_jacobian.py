@@ -52,6 +52,6 @@ class TransposedJacobianLaw(ControlLaw):
 
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         z1 = self.outputs
-        effort = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate
+        effort = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate + symbols["integral"]
         friction = ca.vertcat(ca.SX(6, 1), symbols["joint_damping"] * z1.qdot)
         return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ effort - friction}
