@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
+from support.command_prints import command_prints, topic_prints
 from support.expected import (
     ANALYSED,
     BAGS,
     CAMPAIGN_PAGES,
+    COMMAND_TABLE,
     MADE_REPORTS,
     PARAMETERS,
     PLANS,
     REPORTS,
     SEARCH,
+    TOPIC_TABLE,
     VIEWER,
     differences,
     parameters,
@@ -64,6 +68,27 @@ def test_every_parameter_is_kept() -> None:
     kept = json.loads(PARAMETERS.read_text("utf-8"))
     new = {node: sorted(set(found) - set(kept[node])) for node, found in parameters().items()}
     assert not any(new.values()), f"New parameters have no expectation. {WRITE}"
+
+
+def known_to(kept: Any, found: Any) -> Any:
+    """Return what is found without what is new, which is no difference for anybody."""
+    if not (isinstance(kept, dict) and isinstance(found, dict)):
+        return found
+    return {key: known_to(kept[key], value) for key, value in found.items() if key in kept}
+
+
+@pytest.mark.parametrize(
+    ("file", "prints"),
+    [(COMMAND_TABLE, command_prints), (TOPIC_TABLE, topic_prints)],
+    ids=["options", "topics"],
+)
+def test_commands_and_topics_stay_as_they_are(
+    file: Path, prints: Callable[[], dict[str, Any]]
+) -> None:
+    kept = json.loads(file.read_text("utf-8"))
+    found = known_to(kept, as_kept(prints()))
+    assert not differences(found, kept), WRITE
+    assert list(found) == list(kept), "the plant publishes in this order"
 
 
 def test_plans_stay_as_they_are() -> None:

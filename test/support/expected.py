@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from support.command_prints import command_prints, topic_prints
 from support.figure_prints import MADE_PARTS, PICTURES, analysis_prints, made_prints, report_prints
 from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
@@ -44,6 +45,7 @@ PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"
 REPORTS, CAMPAIGN_PAGES = FOLDER / "reports.json", FOLDER / "campaigns.json"
 VIEWER, MADE_REPORTS = FOLDER / "viewer.json", FOLDER / "made_reports.json"
 SEARCH = FOLDER / "search.json"
+COMMAND_TABLE, TOPIC_TABLE = FOLDER / "commands.json", FOLDER / "topics.json"
 BAGS = ("arm_attitude", "planar_chain", "servicer_thrusters", "sliding_masses")
 ANALYSED = ("planar_chain", "three_joint_arm")
 
@@ -291,6 +293,8 @@ def main() -> None:
     reports |= {f"picture: {name}": print_of() for name, print_of in PICTURES.items()}
     pages = {name: print_of() for name, print_of in CAMPAIGNS.items()}
     for path, content in (
+        (COMMAND_TABLE, command_prints()),
+        (TOPIC_TABLE, topic_prints()),
         (PARAMETERS, parameters()),
         (PLANS, plans()),
         (REPORTS, reports),

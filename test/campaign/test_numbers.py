@@ -1,0 +1,770 @@
+"""Statistics, reruns and files of campaigns, each against numbers by hand or from scipy."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from support.campaigns import campaign
+
+import spacerobot_ros.session.run as session
+from spacerobot_ros.campaign import dataset as datasets
+from spacerobot_ros.campaign import draws as sampling
+from spacerobot_ros.campaign import report as reports
+from spacerobot_ros.campaign import running as reruns
+from spacerobot_ros.campaign.config import Criterion, Distribution, load_campaign, meets_criterion
+from spacerobot_ros.campaign.dataset import Dataset, self_contained
+from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, sobol_problem
+from spacerobot_ros.campaign.report import Results, figure_with_axes
+from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation, run_campaign
+from spacerobot_ros.campaign.statistics import (
+    Influence,
+    PairedDifference,
+    influences,
+    paired_difference,
+    paired_success,
+    percentiles,
+    share,
+    sobol_indices,
+)
+from spacerobot_ros.campaign.targets import DrawnFlight
+from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.measures import Outcome
+
+running: Any = reruns
+MADE = campaign(flights=6, disperse={"mass.mass_1": {"uniform": [0.5, 1.0]}})
+
+# -- statistics -----------------------------------------------------------------------------------
+
+
+def wilson(count: int, total: int) -> tuple[float, float]:
+    z = stats.norm.ppf(0.975)
+    p, n = count / total, total
+    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
+    return middle - half, middle + half
+
+
+@pytest.mark.parametrize(("count", "total"), [(3, 11), (11, 11), (0, 7), (40, 41)])
+def test_shares_have_intervals(count: int, total: int) -> None:
+    found = share(count, total)
+    assert found.value == count / total
+    assert (found.interval_low, found.interval_high) == pytest.approx(
+        wilson(count, total), abs=1e-12
+    )
+    low = stats.beta.ppf(0.025, count, total - count + 1) if count else 0.0
+    high = stats.beta.ppf(0.975, count + 1, total - count) if count < total else 1.0
+    assert found.exact == pytest.approx((low, high), abs=1e-9)
+    assert str(found) == (
+        f"{100 * count / total:.4g} % ({count} of {total}; 95 % interval "
+        f"{100 * found.interval_low:.4g} to {100 * found.interval_high:.4g} %)"
+    )
+
+
+def test_a_share_of_nothing_is_between_none_and_all() -> None:
+    nothing = share(0, 0)
+    assert (nothing.interval_low, nothing.interval_high, nothing.exact) == (0.0, 1.0, (0.0, 1.0))
+    assert math.isnan(nothing.value)
+
+
+def test_percentiles_are_of_finite_values() -> None:
+    values = np.array([math.nan, *range(101), math.inf])
+    assert percentiles(values) == [5.0, 50.0, 95.0, 99.0]
+    assert all(math.isnan(x) for x in percentiles(np.array([math.nan])))
+
+
+def test_what_is_said_of_an_influence() -> None:
+    plain = Influence("mass", "error_m", -0.456, 0.01, 0.4, 0.02)
+    assert str(plain) == "mass of error_m: -0.46"
+    assert plain.strength == 0.456
+    away = replace(plain, departure=-0.5)
+    assert str(away) == "mass of error_m: -0.50 with its distance from the median"
+    assert away.strength == 0.5
+    whole = replace(away, first=(0.125, 0.01), total=(0.375, 0.02))
+    assert str(whole) == "mass of error_m: total Sobol index 0.38"
+    assert whole.strength == 0.375
+    bare = Influence("a", "b", 0.25, 0.5)
+    assert (bare.departure, bare.p_departure, bare.first, bare.total) == (0.0, 1.0, None, None)
+
+
+def test_influences_are_rank_correlations_of_finite_values() -> None:
+    rng = np.random.default_rng(4)
+    x, y = rng.normal(size=40), rng.exponential(size=40)
+    metric = x**3 + 0.5 * rng.normal(size=40)
+    metric[[3, 9]] = math.nan
+    there = np.isfinite(metric)
+    causes = {"x": x, "y": y, "same": np.ones(40)}
+    metrics = {"m": metric, "constant": np.ones(40), "two": np.r_[1.0, 2.0, [math.nan] * 38]}
+    found = influences(causes, metrics)
+    assert [(each.cause, each.metric) for each in found] == [("x", "m"), ("y", "m")]
+    for each, values in zip(found, (x, y), strict=True):
+        expected = stats.spearmanr(values[there], metric[there])
+        away = np.abs(values[there] - np.median(values[there]))
+        departure = stats.spearmanr(away, metric[there])
+        assert (each.correlation, each.p) == pytest.approx(tuple(expected))
+        assert (each.departure, each.p_departure) == pytest.approx(tuple(departure))
+    three = {"m": np.array([1.0, 3.0, 2.0])}
+    (only,) = influences({"x": np.array([1.0, 2.0, 3.0])}, three)
+    assert only.correlation == pytest.approx(0.5)
+    # Two values are as far from their median: that distance says nothing.
+    (sides,) = influences({"x": np.array([1.0, 2.0, 1.0, 2.0])}, {"m": np.arange(4.0)})
+    assert (sides.departure, sides.p_departure) == (0.0, 1.0)
+
+
+def test_indices_need_whole_samples() -> None:
+    assert sobol_indices(["a"], np.array([1.0, math.nan, 2.0, 3.0])) == {}
+    assert sobol_indices(["a"], np.ones(8)) == {}
+    problem = sobol_problem(["a", "b"])
+    assert (problem["num_vars"], problem["bounds"]) == (2, [[0, 1], [0, 1]])
+    assert problem["names"].tolist() == ["a", "b"]
+
+
+def test_paired_differences_are_those_of_student() -> None:
+    first = np.array([1.0, 2.0, 4.0, math.nan, 5.0])
+    second = np.array([1.5, 2.25, 5.5, 1.0, math.nan])
+    found = paired_difference("m", first, second)
+    assert found is not None
+    expected = stats.ttest_rel(second[:3], first[:3])
+    interval = expected.confidence_interval(0.95)
+    assert (found.metric, found.count) == ("m", 3)
+    assert (found.first, found.second) == pytest.approx((7 / 3, 9.25 / 3))
+    assert found.difference == pytest.approx(0.75)
+    assert (found.interval_low, found.interval_high) == pytest.approx(tuple(interval))
+    assert not found.certain
+    two = paired_difference("m", first[:2], second[:2])
+    assert two is not None
+    assert two.count == 2
+    assert paired_difference("m", first[:1], second[:1]) is None
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "certain"),
+    [(0.1, 0.2, True), (-0.2, -0.1, True), (-0.1, 0.1, False), (0.0, 1.0, False), (-1, 0.0, False)],
+)
+def test_an_interval_that_excludes_zero_is_certain(low: float, high: float, certain: bool) -> None:
+    assert PairedDifference("m", 3, 0.0, 0.0, 0.0, low, high).certain is certain
+
+
+def test_paired_success_is_mcnemars() -> None:
+    first = np.array([1, 1, 1, 1, 1, 0, 0, 1], bool)
+    second = np.array([1, 0, 0, 0, 0, 1, 0, 1], bool)
+    assert paired_success(first, second) == pytest.approx((4, 1, 2 * 6 / 32))
+    assert paired_success(first, first) == (0, 0, 1.0)
+
+
+# -- criteria and distributions -------------------------------------------------------------------
+
+
+def test_criteria_include_their_bounds() -> None:
+    criterion = Criterion("duration_s", 1.5, 2.5)
+    for value, met in ((1.5, True), (2.5, True), (1.49, False), (2.51, False), (math.nan, False)):
+        assert meets_criterion(criterion, {"duration_s": value}) is met
+    assert not meets_criterion(criterion, {})
+
+
+def test_choices_are_equally_likely() -> None:
+    three = Distribution("choice", {}, ("a", "b", "c"))
+    shares = np.array([0.0, 0.333, 0.334, 0.666, 0.667, 1.0])
+    assert three.quantiles(shares) == ["a", "a", "b", "b", "c", "c"]
+    assert str(three) == "one of a, b, c"
+    assert str(Distribution("norm", {"loc": 1.0, "scale": 0.05})) == "norm (loc 1, scale 0.05)"
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"scenario": None}, "'scenario' must be the name or the file of a scenario."),
+        (
+            {"disperse": {"mass.mass_1": {"norm": {}}, "mass.*": {"norm": {}}}},
+            "'mass.mass_1' is dispersed twice.",
+        ),
+        (
+            {"disperse": {"mass": {"choice": []}}},
+            "'mass' must have a list of values to choose from.",
+        ),
+        (
+            {"disperse": {"mass": {"choice": 3}}},
+            "'mass' must have a list of values to choose from.",
+        ),
+        (
+            {"disperse": {"mass": {"norm": 3}}},
+            "'mass': norm must have its arguments: loc, scale.",
+        ),
+        ({"disperse": {"mass": {"poisson": [1, 2, 3]}}}, "'mass': poisson takes mu, loc, not 3"),
+        ({"longest": -1}, "'longest' is -1; it must be a finite number of at least 0."),
+        (
+            {"longest": True},
+            "'longest' is True; it must be a finite number of at least 0.",
+        ),
+        ({"flights": 10_000_001}, "'flights' is 10000001; it must be a whole number from 1 to 1"),
+        ({"flights": 2.0}, "'flights' is 2.0; it must be a whole number from 1 to 10000000."),
+        ({"seed": 2**63}, "'seed' is 9223372036854775808; it must be a whole number from 0 to 9"),
+        (
+            {"criteria": {"duration_s": {"min": "a"}}},
+            "'duration_s: min' is 'a'; it must be a finite number.",
+        ),
+    ],
+)
+def test_what_is_refused_of_a_campaign(given: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError) as refused:
+        campaign(**given)
+    assert str(refused.value).startswith(sentence)
+
+
+def test_a_campaign_has_defaults() -> None:
+    made = campaign()
+    assert (made.flights, made.seed, made.sampler, made.longest) == (100, 0, "random", 100_000.0)
+    assert (made.engine, made.description, made.dispersions, made.criteria) == ("auto", "", (), ())
+    assert campaign(flights=10_000_000, seed=2**63 - 1, longest=0).longest == 0.0
+    (criterion,) = campaign(criteria={"duration_s": {"max": 2}}).criteria
+    assert (criterion.minimum, criterion.maximum) == (-math.inf, 2.0)
+    assert not made.measures_clearance
+    assert campaign(criteria={"clearance_m": {"min": 0}}).measures_clearance
+
+
+def test_a_file_that_is_refused_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    file.write_text("campaign: {scenario: 3}")
+    with pytest.raises(ParameterError) as refused:
+        load_campaign(file)
+    assert str(refused.value) == (
+        f"The campaign file {file} is refused: 'scenario' must be the name or the file of a "
+        "scenario."
+    )
+
+
+# -- draws ----------------------------------------------------------------------------------------
+
+
+def test_seeds_and_values_of_draws() -> None:
+    """Of the campaign's seed and the number of the draw, as numpy makes them."""
+    made = campaign(flights=3, seed=7, disperse={"mass": {"uniform": [1.0, 2.0]}})
+    draws = Draws(made)
+    assert len(draws) == 3
+    for number, draw in enumerate(draws):
+        own = np.random.SeedSequence(7, spawn_key=(number,))
+        assert (draw.number, draw.seed) == (number, int(own.generate_state(1)[0]) // 2)
+        u = np.random.default_rng(own.spawn(1)[0]).random(1)[0]
+        assert draw.values == {"mass": pytest.approx(1.0 + 2.0 * u)}
+    for number in (-1, 3):
+        with pytest.raises(IndexError) as refused:
+            draws[number]
+        assert str(refused.value) == f"There is no draw {number} of 3."
+
+
+@pytest.mark.parametrize("sampler", ["sobol", "halton", "latin_hypercube"])
+def test_samplers_are_those_of_scipy(sampler: str) -> None:
+    values = {"mass.mass_1": {"uniform": [1.0, 2.0]}, "mass.mass_2": {"uniform": [0.0, 1.0]}}
+    made = campaign(flights=6, seed=7, sampler=sampler, disperse=values)
+    kind = {"sobol": "Sobol", "halton": "Halton", "latin_hypercube": "LatinHypercube"}[sampler]
+    rng = np.random.default_rng(np.random.SeedSequence(7))
+    engine = getattr(stats.qmc, kind)(d=2, seed=rng)
+    expected = engine.random_base2(3)[:6] if sampler == "sobol" else engine.random(6)
+    found = [list(draw.values.values()) for draw in Draws(made)]
+    np.testing.assert_allclose(found, expected * [2.0, 1.0] + [1.0, 0.0], atol=1e-11)
+
+
+def test_saltelli_samples_have_the_seed_of_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+
+    def sample(problem: Any, base: int, **given: Any) -> Any:
+        asked.append((problem["num_vars"], base, given))
+        return np.full((12, 2), 0.5)
+
+    monkeypatch.setattr(sampling, "import_salib", lambda name: SimpleNamespace(sample=sample))
+    values = {f"mass.mass_{k}": {"uniform": [1.0, 2.0]} for k in (1, 2)}
+    seed = int(np.random.SeedSequence(7).generate_state(1)[0]) // 2
+    for flights, base in ((8, 2), (15, 2), (16, 4), (31, 4), (35, 8)):
+        made = campaign(flights=flights, seed=7, sampler="saltelli", disperse=values)
+        assert len(Draws(made)) == 12
+        assert asked[-1] == (2, base, {"calc_second_order": False, "seed": seed})
+    with pytest.raises(ParameterError) as refused:
+        Draws(campaign(flights=7, sampler="saltelli", disperse=values))
+    assert str(refused.value) == (
+        "the sampler 'saltelli' needs at least 8 flights for 2 dispersion(s)."
+    )
+
+
+def test_a_draw_changes_its_flight() -> None:
+    flight = drawn_flight(MADE, Draw(3, 17, {"mass.mass_1": 1.25}))
+    assert flight.scenario.plant.sensors.seed == 17
+    assert flight.mass.tolist() == [1.0, 1.25, 1.0, 1.0]
+    with pytest.raises(ParameterError) as refused:
+        drawn_flight(MADE, Draw(3, 17, {"mass.mass_1": math.inf}))
+    assert str(refused.value) == "The value drawn for 'mass.mass_1' is inf."
+    common = DrawnFlight.of(MADE.scenario)
+    assert drawn_flight(MADE, Draw(3, 17, {"mass.mass_1": 1.5}), common).nominal is common.nominal
+
+
+def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(SpaceRobotError) as refused:
+        sampling.require_module("pyarrow.parquet")
+    assert str(refused.value) == (
+        "Campaigns need pyarrow, which is not installed: pip install 'spacerobot_ros[campaign]'."
+    )
+
+
+# -- running --------------------------------------------------------------------------------------
+
+
+def test_progress_has_a_time_left() -> None:
+    assert Progress(30, 100, 3.5, 10.0).seconds_left == 20.0
+    assert Progress(30, 100, 0.0, 10.0).seconds_left == math.inf
+
+
+def test_a_campaign_is_flown_by_the_engine_and_the_workers_that_it_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+
+    def select(made: Any, name: str) -> Any:
+        asked.append(name)
+        return SimpleNamespace(name="lanes")
+
+    class Opened:
+        def __init__(self, cluster: Any, flights: int) -> None:
+            self.given = cluster.workers, cluster.scheduler, flights
+
+        def __enter__(self) -> Any:
+            return self.given
+
+        def __exit__(self, *of: object) -> None:
+            asked.append("closed")
+
+    def fly(made: Any, draws: Any, numbers: Any, engine: str, workers: Any, stopped: Any) -> Any:
+        asked.append((list(numbers), engine, workers))
+        yield []
+        for first in (0, 3):
+            yield [Row(draws[n], "reached", ".") for n in numbers[first : first + 3]]
+
+    now = iter([100.0, 101.0, 102.0, 104.0, 104.0])
+    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: next(now)))
+    monkeypatch.setattr(running, "select_engine", select)
+    monkeypatch.setattr(running, "open_workers", Opened)
+    monkeypatch.setattr(running, "_fly_rows", fly)
+    dataset = Dataset(tmp_path)
+    dataset.begin(MADE)
+    dataset.add([Row(Draws(MADE)[1], "reached", ".")])
+    dataset.close()
+    seen: list[Progress] = []
+    cluster = running.Cluster(workers=3)
+    end = run_campaign(MADE, tmp_path, cluster=cluster, show=seen.append)
+    assert asked == ["auto", ([0, 2, 3, 4, 5], "lanes", (3, "", 5)), "closed"]
+    assert [(each.done, each.total, each.rate, each.seconds) for each in [*seen, end]] == [
+        (1, 6, 0.0, 1.0),
+        (4, 6, 1.5, 2.0),
+        (6, 6, 1.25, 4.0),
+        (6, 6, 1.25, 4.0),
+    ]
+    assert Dataset(tmp_path).flown_numbers() == set(range(6))
+    # What is flown takes no workers, and this process needs none.
+    now = iter([1.0] * 99)
+    asked.clear()
+    named = replace(MADE, engine="flights")
+    for options in ({}, {"engine": "ros"}, {"cluster": running.Cluster(scheduler="tcp://x")}):
+        run_campaign(named, tmp_path, **options)
+    assert asked[::2] == ["flights", "ros", "flights"]
+    assert {workers for _, _, workers in asked[1::2]} == {None}
+    asked.clear()
+    run_campaign(replace(named, flights=9), tmp_path / "b", cluster=running.Cluster(0, "tcp://x"))
+    assert asked[1][2] == (0, "tcp://x", 9)
+
+
+@pytest.mark.parametrize(("workers", "numbers"), [(None, [1, 2]), ("workers", [1, 2]), (None, [])])
+def test_rows_are_flown_here_or_by_workers(
+    workers: Any, numbers: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draws = Draws(MADE)
+
+    class Distributor:
+        def __init__(self, *given: Any) -> None:
+            assert given[:4] == ("workers", MADE, draws, "lanes")
+
+        def rows(self, of: list[int]) -> Any:
+            yield [], of
+
+    def fly(engine: Any, made: Any, given: Any, stopped: Any) -> Any:
+        assert engine == "engine lanes"
+        for draw in given:
+            yield draw.number
+
+    monkeypatch.setattr(running, "TaskDistributor", Distributor)
+    monkeypatch.setattr(running, "engine_by_name", lambda name: f"engine {name}")
+    monkeypatch.setattr(running, "fly_all", fly)
+    found: Any = list(running._fly_rows(MADE, draws, numbers, "lanes", workers, bool))
+    expected: Any = [([], numbers)] if workers else [[number] for number in numbers]
+    assert found == expected
+
+
+DRAWN = Draw(7, 123, {"mass": 1.23456789, "planner.method": "optimal"})
+
+
+def rerun(**given: Any) -> Rerun:
+    row = Row(DRAWN, "reached", "There.")
+    wanted = {"deviation": 1e-9, "worst_metric": "a_m", "outcome": "reached", "bag": Path("b.mcap")}
+    return Rerun(row, **{**wanted, **given})
+
+
+@pytest.mark.parametrize(
+    ("given", "agrees", "last"),
+    [
+        ({}, True, "dataset     reached; largest deviation 1e-09 (a_m)"),
+        ({"deviation": 1.1e-9}, False, "dataset     reached; largest deviation 1.1e-09 (a_m)"),
+        ({"outcome": "failed"}, False, "dataset     failed; largest deviation 1e-09 (a_m)"),
+        (
+            {"deviation": 0.0, "worst_metric": ""},
+            True,
+            "dataset     reached; largest deviation 0",
+        ),
+        ({"deviation": None, "outcome": ""}, True, "dataset     has no such flight yet"),
+        ({"deviation": 5.0, "note": "Because."}, True, "Because."),
+    ],
+)
+def test_what_is_said_of_a_rerun(given: dict[str, Any], agrees: bool, last: str) -> None:
+    found = rerun(**given)
+    assert found.agrees is agrees
+    assert found.lines[:3] == [
+        "flight 7: reached. There.",
+        "drawn       mass 1.23457, planner.method optimal; seed 123",
+        "bag         b.mcap",
+    ]
+    assert found.lines[-1] == last
+    assert len(found.lines) == (5 if "note" in given else 4)
+
+
+def test_a_rerun_without_dispersions() -> None:
+    row = Row(Draw(0, 5, {}), "failed", "Off.")
+    assert Rerun(row, None, "", "", Path("b")).lines[1] == "drawn       nothing; seed 5"
+
+
+@pytest.mark.parametrize(
+    ("engine", "outcome", "thrusters", "note"),
+    [
+        ("lanes", "reached", "urdf", "It was flown in lanes: thrusters that are on or off multip"),
+        ("flights", "reached", "urdf", ""),
+        ("lanes", "reached", "", ""),
+        (
+            *("flights", "interrupted", ""),
+            "It was interrupted: the stack flies on for up to a fifth of a second of wall time.",
+        ),
+    ],
+)
+def test_a_flight_is_compared_with_its_row(
+    engine: str,
+    outcome: str,
+    thrusters: str,
+    note: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plant = SimpleNamespace(thrusters=thrusters)
+    made: Any = SimpleNamespace(
+        longest=7.5, measures_clearance="clearance", scenario=SimpleNamespace(plant=plant)
+    )
+    asked: list[Any] = []
+
+    def noted(what: Any, answer: Any = None) -> Any:
+        asked.append(what)
+        return answer
+
+    row = Row(DRAWN, "reached", "There.", {"a_m": 1.5, "b_s": 3.0})
+    flight = SimpleNamespace(with_masses_in_urdf=lambda: SimpleNamespace(scenario="scenario"))
+    dataset = SimpleNamespace(campaign=lambda: made)
+    stored: list[Any] = [(outcome, engine, {"a_m": 1.25, "b_s": 3.0})]
+
+    def measured(clearance: Any) -> str:
+        asked.append(clearance)
+        return "measures"
+
+    monkeypatch.setattr(running, "Dataset", lambda folder: dataset)
+    monkeypatch.setattr(running, "Draws", lambda given: ["draw 0", "draw 1"])
+    monkeypatch.setattr(running, "drawn_flight", lambda given, draw: noted(draw, flight))
+    monkeypatch.setattr(session, "run_scenario", lambda *given, **more: asked.append((given, more)))
+    monkeypatch.setattr(running, "read_run", lambda bag: SimpleNamespace(measured=measured))
+    monkeypatch.setattr(running, "Row", SimpleNamespace(of=lambda *given: noted(given[1:], row)))
+    monkeypatch.setattr(running, "stored_flight", lambda of, number: stored[0])
+    bag = tmp_path / "a.mcap"
+    found = running.rerun_flight(tmp_path, 1, bag)
+    assert asked == [
+        "draw 1",
+        (("scenario", bag), {"longest": 7.5}),
+        "clearance",
+        ("draw 1", "measures", "ros"),
+    ]
+    assert (found.deviation, found.worst_metric, found.outcome) == (0.2, "a_m", outcome)
+    assert found.note.startswith(note)
+    assert bool(found.note) is bool(note)
+    stored[0] = None
+    assert running.rerun_flight(tmp_path, 0, bag) == Rerun(row, None, "", "", bag)
+    with pytest.raises(ParameterError) as refused:
+        running.rerun_flight(tmp_path, 2, bag)
+    assert str(refused.value) == (
+        f"The campaign in {tmp_path} has 2 flights, 0 to 1, and no flight 2."
+    )
+
+
+def test_deviations_are_relative_above_one() -> None:
+    nan = math.nan
+    assert largest_deviation({"a": 0.5, "b": 4.0}, {"a": 0.25, "b": 5.0}) == (0.25, "a")
+    assert largest_deviation({"a": 0.5, "b": -8.0}, {"a": 0.25, "b": -12.0}) == (0.5, "b")
+    assert largest_deviation({"a": nan}, {"a": nan}) == (0.0, "")
+    assert largest_deviation({"a": nan}, {}) == (0.0, "")
+    assert largest_deviation({"a": nan}, {"a": 1.0}) == (math.inf, "a")
+    assert largest_deviation({"a": 1.0}, {}) == (math.inf, "a")
+    assert largest_deviation({"a": math.inf}, {"a": math.inf}) == (0.0, "")
+
+
+def test_a_stored_flight_has_its_metrics(tmp_path: Path) -> None:
+    dataset = Dataset(tmp_path)
+    dataset.begin(MADE)
+    draws = Draws(MADE)
+    metrics = {"position_error_m": 0.25, "duration_s": 3.0}
+    dataset.add(
+        [Row(draws[n], "reached", ".", metrics, True, "lanes", "", 1.0, 2.0) for n in (2, 4)]
+    )
+    dataset.close()
+    assert running.stored_flight(dataset, 3) is None
+    assert running.stored_flight(dataset, 4) == ("reached", "lanes", metrics)
+
+
+# -- datasets -------------------------------------------------------------------------------------
+
+
+def test_rows_are_written_after_two_thousand_or_five_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [50.0]
+    monkeypatch.setattr(datasets.time, "monotonic", lambda: now[0])  # type: ignore[attr-defined]
+    dataset = Dataset(tmp_path)
+    dataset.begin(MADE)
+    row = Row(Draws(MADE)[0], "reached", ".")
+
+    def files() -> int:
+        return len(list((tmp_path / "flights").glob("part-*.parquet")))
+
+    dataset.add([row])
+    now[0] = 55.0
+    dataset.add([])
+    assert files() == 0
+    now[0] = 55.5
+    dataset.add([])
+    assert files() == 1
+    now[0] = 60.5
+    dataset.add([row] * 1999)
+    assert files() == 1
+    dataset.add([row])
+    assert files() == 2
+    now[0] = 70.0
+    dataset.add([])
+    assert files() == 2
+    dataset.add([row])
+    assert files() == 3
+    dataset.close()
+    names = sorted(path.name for path in (tmp_path / "flights").iterdir())
+    assert names == [f"part-{k:06d}.parquet" for k in range(3)]
+
+
+def test_the_files_of_a_dataset(tmp_path: Path) -> None:
+    dataset = Dataset(tmp_path)
+    assert dataset.begin(replace(MADE, description="D")) == set()
+    facts = json.loads((tmp_path / "about.json").read_text("utf-8"))
+    assert (facts["name"], facts["scenario"]) == ("short", "stuck_slider")
+    assert sorted(json.loads(facts["versions"])) == ["numpy", "python", "spacerobot_ros"]
+    assert len(facts["fingerprint"]) == 64
+    text = (tmp_path / "campaign.yaml").read_text("utf-8")
+    assert "scenario: scenario.yaml" in text
+    assert "flights: 6" in text
+    assert "set:" not in text
+    draws = Draws(MADE)
+    dataset.add([Row(draws[5], "reached", ".")])
+    dataset.close()
+    # Fewer flights than there are do not change the largest number.
+    assert dataset.begin(replace(MADE, flights=2, section={**MADE.section, "flights": 2})) == {5}
+    dataset.close()
+    assert "flights: 6" in (tmp_path / "campaign.yaml").read_text("utf-8")
+    assert dataset.begin(replace(MADE, flights=9)) == {5}
+    dataset.close()
+    assert "flights: 9" in (tmp_path / "campaign.yaml").read_text("utf-8")
+
+
+def test_a_folder_without_a_campaign_or_flights_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError) as refused:
+        Dataset(tmp_path / "none").campaign()
+    assert str(refused.value) == (
+        f"The folder {tmp_path / 'none'} holds no campaign: about.json: No such file or directory."
+    )
+    dataset = Dataset(tmp_path / "new")
+    dataset.begin(MADE)
+    with pytest.raises(ParameterError) as refused:
+        dataset.table()
+    assert str(refused.value) == f"The folder {tmp_path / 'new'} has no flights yet."
+    dataset.close()
+    (tmp_path / "new" / "campaign.yaml").write_text("campaign: {flights: 0}")
+    with pytest.raises(ParameterError) as refused:
+        dataset.campaign()
+    assert str(refused.value).startswith(
+        f"The campaign in {tmp_path / 'new'} is refused: 'flights' is 0;"
+    )
+
+
+def test_robots_that_are_files_travel_with_a_campaign(tmp_path: Path) -> None:
+    from spacerobot_ros.resources import robot_file
+
+    file = tmp_path / "own.urdf"
+    text = robot_file("sliding_masses").read_text("utf-8")
+    file.write_text(text)
+    assert self_contained(MADE).scenario.plant.robot == "sliding_masses"
+    own = campaign(set={"plant.robot": str(file), "planner.robot": ""})
+    sent = self_contained(own).scenario
+    assert (sent.plant.robot, sent.plant.world) == ("", "")
+    assert "slider_1" in sent.plant.robot_description
+    assert (sent.planner.robot, sent.planner.robot_description) == ("", "")
+    both = campaign(set={"plant.robot": str(file), "planner.robot": str(file)})
+    assert self_contained(both).scenario.planner.robot_description == sent.plant.robot_description
+
+
+# -- reports --------------------------------------------------------------------------------------
+
+
+def results(outcomes: list[str], **columns: Any) -> Results:
+    count = len(outcomes)
+    usual = {name: np.full(count, math.nan) for name in reports._MAIN_METRICS}
+    found = {"outcome": outcomes, "passed": np.ones(count), **usual, **columns}
+    return Results(MADE, Path("folder"), np.arange(float(count)), found, 9)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "sentence"),
+    [
+        ([0, 1, 2], ""),
+        ([0, 2], "1 draw is not flown yet although later ones are, mostly because they take"),
+        ([1, 4], "3 draws are not flown yet although later ones are, mostly because they take"),
+        ([], ""),
+    ],
+)
+def test_missing_flights_are_counted(numbers: list[int], sentence: str) -> None:
+    found = replace(results(["reached"]), numbers=np.array(numbers, float))
+    assert found.bias.startswith(sentence)
+    assert bool(found.bias) is bool(sentence)
+
+
+def test_the_worst_flights_are_ten() -> None:
+    """Those that failed, then those that did not pass, then by the distance from a bound."""
+    errors = np.array([0.5, 0.1, 0.9, 0.3, math.nan, 0.2, 0.7, 0.4, 0.6, 0.8, 0.05, 0.15])
+    outcomes = ["reached"] * 12
+    outcomes[1] = "failed"
+    passed = np.ones(12)
+    passed[[1, 3]] = 0.0
+    found = results(outcomes, passed=passed, position_error_m=errors)
+    # Without criteria by the position error.
+    assert found.worst_rows() == [1, 3, 2, 9, 6, 8, 0, 7, 5, 11]
+    bound = Criterion("position_error_m", 0.08, 1.0)
+    made = replace(MADE, criteria=(bound,))
+    assert replace(found, campaign=made).worst_rows()[:5] == [1, 3, 4, 10, 11]
+    # The spread is that of the values: two criteria are weighed by it.
+    both = replace(
+        MADE, criteria=(Criterion("position_error_m", maximum=1.0), Criterion("x_m", maximum=30.0))
+    )
+    wide = replace(found, campaign=both, columns={**found.columns, "x_m": 100.0 * errors[::-1]})
+    assert wide.worst_rows()[:3] == [1, 3, 4]
+    equal = replace(
+        found, campaign=made, columns={**found.columns, "position_error_m": np.ones(12)}
+    )
+    assert equal.worst_rows()[:4] == [1, 3, 0, 2]
+
+
+def test_shown_metrics_are_those_with_criteria_and_the_main_ones() -> None:
+    found = results(
+        ["reached"] * 2,
+        duration_s=np.array([1.0, math.nan]),
+        attitude_error_rad=np.array([0.5, 0.25]),
+        position_error_m=np.array([math.nan, 0.125]),
+    )
+    criteria = (Criterion("duration_s"), Criterion("attitude_error_rad", maximum=0.3))
+    found = replace(found, campaign=replace(MADE, criteria=criteria))
+    assert found.shown_metrics == ["duration_s", "attitude_error_rad", "position_error_m"]
+    assert list(found.metrics()) == found.shown_metrics
+    met = found.requirement_share(criteria[1])
+    assert (met.count, met.total) == (1, 2)
+    assert found.success.count == 2
+
+
+@pytest.mark.parametrize(
+    ("count", "across", "rows", "hidden"), [(1, 3, 1, 2), (3, 3, 1, 0), (4, 3, 2, 2), (5, 2, 3, 1)]
+)
+def test_figures_have_as_many_axes_as_are_wanted(
+    count: int, across: int, rows: int, hidden: int
+) -> None:
+    figure, axes = figure_with_axes(count, across, 2.5)
+    assert figure.get_size_inches().tolist() == pytest.approx([9.6, 2.5 * rows + 0.2])
+    assert len(axes) == count
+    assert [each.get_visible() for each in figure.axes] == [True] * count + [False] * hidden
+    assert figure_with_axes(1, 1)[0].get_size_inches()[1] == pytest.approx(2.4)
+
+
+def test_sobol_indices_stand_in_the_table_of_drivers() -> None:
+    found = [
+        Influence("a", "m", 0.5, 0.01, 0.25, 0.02, (0.125, 0.03), (0.375, 0.04)),
+        Influence("b", "m", -0.25, 0.5),
+    ]
+    text = reports._sensitivity_section(results(["reached"]), found)
+    assert "<td>0.125 ± 0.030</td><td>0.375 ± 0.040</td></tr>" in text
+    assert text.count("<td></td><td></td></tr>") == 1
+    assert "Sobol, first order" in text
+    assert "The sampler 'saltelli' adds" not in text
+    plain = reports._sensitivity_section(results(["reached"]), found[1:] * 16)
+    assert "Sobol, first order" not in plain
+    assert "The sampler &#x27;saltelli&#x27; adds Sobol indices." in plain
+    assert plain.count("<tr>") == 16
+    assert "No drawn number varies" in reports._sensitivity_section(results(["reached"]), [])
+
+
+def test_indices_are_computed_of_whole_saltelli_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = replace(
+        results(["reached"] * 9, position_error_m=np.arange(9.0)),
+        columns={
+            **results(["reached"] * 9, position_error_m=np.arange(9.0) ** 2).columns,
+            "draw.mass.mass_1": np.arange(9.0),
+        },
+    )
+    monkeypatch.setattr(
+        reports, "sobol_indices", lambda names, x: dict.fromkeys(names, (0.1, 0.2, 0.3, 0.4))
+    )
+    assert [each.total for each in found.influences()] == [None]
+    whole = replace(found, campaign=replace(MADE, sampler="saltelli"))
+    (each,) = whole.influences()
+    assert (each.first, each.total) == ((0.1, 0.2), (0.3, 0.4))
+    assert [each.total for each in replace(whole, total=10).influences()] == [None]
+
+
+def test_a_campaign_without_dispersions_says_so() -> None:
+    assert reports._dispersions_section(replace(MADE, dispersions=())) == (
+        '<p class="missing">No dispersions: flights differ in their noise only.</p>'
+    )
+
+
+def test_a_row_of_an_error() -> None:
+    draw = Draw(1, 2, {})
+    refused = Row.of_error(draw, SpaceRobotError("No\n robot."), "ros")
+    assert (refused.outcome, refused.reason, refused.engine) == (
+        "error",
+        str(SpaceRobotError("No\n robot.")),
+        "ros",
+    )
+    other = Row.of_error(draw, KeyError("a\n  b"), "ros")
+    assert other.reason.startswith("KeyError: ")
+    assert (other.passed, other.metrics, other.fallback) == (False, {}, "")
+    assert math.isnan(other.wall_time)
+    assert math.isnan(other.plan_time)
+    assert isinstance(RecordingError("a"), SpaceRobotError)
+    assert Outcome.REACHED.value == "reached"

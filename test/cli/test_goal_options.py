@@ -1,0 +1,240 @@
+"""Goals as the command line gives them, and what is said of them."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import click
+import pytest
+
+import spacerobot_ros.cli as cli
+from spacerobot_ros.cli import errors
+from spacerobot_ros.cli.errors import sentences
+from spacerobot_ros.cli.options import (
+    EndEffectorOptions,
+    GoalOptions,
+    Registered,
+    note_large_angles,
+    viewing_if,
+)
+from spacerobot_ros.errors import GoalError
+from spacerobot_ros.termination import Terminated
+
+POSE = (1.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8)
+HAND = (4.0, 5.0, 6.0)
+
+
+class Asked:
+    """A scenario that keeps the goals that it is asked for."""
+
+    def __init__(self) -> None:
+        self.goals: list[Any] = []
+
+    def with_goal(self, *goal: Any) -> Asked:
+        self.goals.append(goal)
+        return self
+
+    def with_end_effectors(self, hands: Any, base: Any) -> Asked:
+        self.goals.append(([hand.link for hand in hands], sorted(base)))
+        return self
+
+
+@pytest.mark.parametrize(
+    ("pose", "rotvec", "rpy_deg", "base"),
+    [
+        (None, None, None, []),
+        (POSE, None, None, ["attitude", "position"]),
+        (POSE, (0.0, 0.0, 1.0), None, ["attitude", "position"]),
+        (None, (0.0, 0.0, 1.0), None, ["attitude"]),
+        (None, None, (0.0, 0.0, 1.0), ["attitude"]),
+    ],
+)
+def test_beside_goals_of_end_effectors_the_base_has_what_is_asked(
+    pose: Any, rotvec: Any, rpy_deg: Any, base: list[str]
+) -> None:
+    asked: Any = Asked()
+    hands = EndEffectorOptions((), (HAND,), ("left",))
+    GoalOptions(pose, rotvec, rpy_deg, hands).apply_to(asked)
+    assert asked.goals == [(pose, rotvec, rpy_deg), (["left"], base)]
+    alone: Any = Asked()
+    GoalOptions(pose, rotvec, rpy_deg).apply_to(alone)
+    assert alone.goals == [(pose, rotvec, rpy_deg)]
+
+
+def test_end_effectors_have_names_in_the_order_of_poses_then_positions() -> None:
+    found = EndEffectorOptions((POSE,), (HAND,), ("left", "right")).goals()
+    assert [(each.link, tuple(each.position)) for each in found] == [
+        ("left", POSE[:3]),
+        ("right", HAND),
+    ]
+    assert [each.quaternion is None for each in found] == [False, True]
+    (found_one,) = EndEffectorOptions((), (HAND,)).goals()
+    assert found_one.link == ""
+    assert EndEffectorOptions().goals() == []
+
+
+@pytest.mark.parametrize(
+    ("poses", "positions", "links", "counts"),
+    [
+        ((POSE,), (HAND,), ("left",), "2 goal(s) of end-effectors and 1 name(s)"),
+        ((POSE,), (), ("left", "right"), "1 goal(s) of end-effectors and 2 name(s)"),
+        ((), (), ("left",), "0 goal(s) of end-effectors and 1 name(s)"),
+        ((POSE, POSE), (), (), "2 goal(s) of end-effectors and 0 name(s)"),
+    ],
+)
+def test_end_effectors_with_more_or_fewer_names_are_refused(
+    poses: Any, positions: Any, links: Any, counts: str
+) -> None:
+    with pytest.raises(click.UsageError) as refused:
+        EndEffectorOptions(poses, positions, links).goals()
+    assert refused.value.message == (
+        f"{counts}: give one --end-effector for each --end-effector-goal, then for each "
+        "--end-effector-position."
+    )
+
+
+@pytest.mark.parametrize(
+    ("rotvec", "said"),
+    [
+        ((0.0, 0.0, 2 * math.pi), ""),
+        ((0.0, 0.0, math.inf), ""),
+        ((math.nan, 0.0, 0.0), ""),
+        (
+            (0.0, -30.0, 40.0),
+            "The goal turns by 50 rad, which is 7.96 turns: only the attitude at their end "
+            "counts. For degrees there is --here.\n",
+        ),
+        (
+            (6.5, 0.0, 0.0),
+            "The goal turns by 6.5 rad, which is 1.03 turns: only the attitude at their end "
+            "counts. For degrees there is --here.\n",
+        ),
+    ],
+)
+def test_a_rotation_of_more_than_a_turn_is_noted(
+    rotvec: tuple[float, float, float], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    note_large_angles(rotvec, "--here")
+    assert capsys.readouterr() == ("", said)
+    asked: Any = Asked()
+    GoalOptions(None, rotvec, None).apply_to(asked)
+    assert capsys.readouterr().err == said.replace("--here", "--goal-rpy-deg")
+
+
+def test_a_choice_of_names_in_registries_is_sorted(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = SimpleNamespace(A={"two": 1, "one": 2}, B={"three": 3, "one": 4})
+    monkeypatch.setitem(sys.modules, "some_registry", module)
+    choice = Registered("some_registry:A", "some_registry:B")
+    assert tuple(choice.choices) == ("one", "three", "two")
+
+
+def test_a_viewer_runs_beside_a_command_that_wants_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import spacerobot_ros.session.viewing as module
+
+    class Viewing:
+        def __init__(self, parameters: Any, show: Any, namespace: str) -> None:
+            show(f"{parameters} {namespace!r}")
+
+        def __enter__(self) -> None:
+            pass
+
+        def __exit__(self, *of: object) -> None:
+            pass
+
+    monkeypatch.setattr(module, "viewing", Viewing)
+    with viewing_if(False, {"port": 1}):
+        pass
+    assert capsys.readouterr() == ("", "")
+    with viewing_if(True, {"port": 1}):
+        pass
+    with viewing_if(True, {}, "left"):
+        pass
+    assert capsys.readouterr() == ("", "{'port': 1} ''\n{} 'left'\n")
+
+
+# -- how commands end -----------------------------------------------------------------------------
+
+
+def test_a_signal_ends_a_command_with_its_code_whatever_a_library_makes_of_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ending = Terminated(signal.SIGTERM)
+    monkeypatch.setattr(errors, "termination", lambda: ending)
+    with pytest.raises(SystemExit) as ended, sentences():
+        raise RuntimeError("The solver was interrupted.")
+    assert ended.value.code == 143
+    with pytest.raises(SystemExit) as ended, sentences():
+        raise Terminated(signal.SIGINT)
+    assert ended.value.code == 130
+    with pytest.raises(SystemExit) as ended:
+        errors.end_if_requested()
+    assert ended.value.code == 143
+    assert capsys.readouterr() == ("", "Terminated.\nInterrupted.\nTerminated.\n")
+    monkeypatch.setattr(errors, "termination", lambda: None)
+    errors.end_if_requested()
+    with pytest.raises(RuntimeError, match="itself"), sentences():
+        raise RuntimeError("itself")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (GoalError("No goal."), 2, "No goal.\n"),
+        (
+            ModuleNotFoundError("No module named 'rclpy'", name="rclpy.node"),
+            2,
+            "ROS 2 was not found (No module named 'rclpy'); source its setup file, or install "
+            "spacerobot_ros with its extra [jazzy].\n",
+        ),
+    ],
+)
+def test_a_refusal_is_a_sentence(
+    error: Exception, code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended, sentences():
+        raise error
+    assert ended.value.code == code
+    assert capsys.readouterr().err == said
+    for other in (ImportError("no", name="casadi"), ImportError("no")):
+        with pytest.raises(ImportError), sentences():
+            raise other
+
+
+def test_the_command_starts_and_ends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import spacerobot_ros.cli.main as module
+
+    asked: list[Any] = []
+    monkeypatch.setattr(module, "main", lambda **given: asked.append(given))
+    with pytest.raises(SystemExit) as ended:
+        cli.start()
+    assert ended.value.code is None
+    with pytest.raises(SystemExit):
+        cli.start("another")
+    assert asked == [{"prog_name": "spacerobot"}, {"prog_name": "another"}]
+
+    def interrupted(**given: Any) -> None:
+        raise Terminated(signal.SIGHUP)
+
+    monkeypatch.setattr(module, "main", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        cli.start()
+    assert ended.value.code == 129
+    assert capsys.readouterr().err == "Hung up.\n"
+
+
+def test_a_path_of_bytes_that_are_no_text_is_refused() -> None:
+    from spacerobot_ros.cli.options import PATH
+
+    assert PATH.convert("a", None, None) == Path("a")
+    with pytest.raises(click.BadParameter) as refused:
+        PATH.convert("a\udcff", None, None)
+    assert refused.value.message == "the name 'a\\udcff' has bytes that are not UTF-8."
