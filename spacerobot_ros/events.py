@@ -37,6 +37,10 @@ class EventKind(str, Enum):
     CONTACT = "contact"
     """Two links of the robot touch; the simulation goes on through the contact."""
     CONTACT_ENDED = "contact_ended"
+    CAPTURED = "captured"
+    """The robot has captured the target: from now on it is another robot."""
+    RELEASED = "released"
+    """The robot has released the target."""
 
     GOAL_ACCEPTED = "goal_accepted"
     GOAL_REFUSED = "goal_refused"

@@ -514,7 +514,7 @@ def _with_files_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
     """Return the parameters of a scenario file; robots and worlds beside it have their paths."""
     beside = {
         name: str((path.parent / file).resolve())
-        for name in ("robot", "world")
+        for name in ("robot", "world", "target.robot")
         if isinstance(file := values.get(name), str)
         and is_path(file)
         and (path.parent / file).is_file()

@@ -172,9 +172,19 @@ _TOPIC_TABLE = (
         "momentum_expected",
         _ARRAY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "expected momenta: those of the beginning plus the impulses of thrusters and disturbances",
-        when="actuation is effort, or a disturbance acts",
+        "expected momenta: those of the beginning plus the impulses of thrusters, disturbances "
+        "and captures",
+        when="actuation is effort, a disturbance acts, or there is a target",
         state=(StateField("data", "expected_momenta", entries=_MOMENTUM_LABELS),),
+    ),
+    Topic(
+        "target/odom",
+        _ODOMETRY_TYPE,
+        _PUBLISHED_BY_PLANT,
+        "pose of the target's root link in the world, and its twist in its own frame: the truth, "
+        "whether it floats or is held",
+        when="`target.robot` is set",
+        state=_odometry("target"),
     ),
     Topic(
         "odom_true",
@@ -257,10 +267,18 @@ _TOPIC_TABLE = (
         latched=True,
     ),
     Topic(
+        "target/robot_description",
+        _STRING_TYPE,
+        _PUBLISHED_BY_PLANT,
+        "the URDF of the target",
+        when="`target.robot` is set",
+        latched=True,
+    ),
+    Topic(
         "markers",
         "visualization_msgs/msg/MarkerArray",
         ("plant", "planner"),
-        "links, goal and planned path, for viewers",
+        "links, target, goal and planned path, for viewers",
     ),
     Topic(
         "/diagnostics",
@@ -351,8 +369,9 @@ _TOPIC_TABLE = (
         "plant/status",
         _STATUS_TYPE,
         ("plant",),
-        "state of the plant, why, and the injected faults that are active: at once on every "
-        "change; `state` is inactive, running, resting, paused, latched or failed",
+        "state of the plant, why, the injected faults that are active, and the `payload` that the "
+        "robot holds: at once on every change; `state` is inactive, running, resting, paused, "
+        "latched or failed",
         latched=True,
     ),
     Topic(

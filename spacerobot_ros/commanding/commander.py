@@ -24,10 +24,11 @@ from spacerobot_ros.commanding.plant_state import (
 )
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.executive import ControlExecutive
-from spacerobot_ros.errors import CommandError, PlanningError
+from spacerobot_ros.errors import CommandError, PlanningError, RobotDescriptionError
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
@@ -183,6 +184,9 @@ class Commander(ABC):
         self.states = StateSynchroniser(pose_required=pose_required)
         self.plant = PlantListener()
         self._decoder: StateDecoder | None = None
+        self._described: SpaceRobot | None = None
+        """The robot as it is described, without a body that it holds."""
+        self._payload = ""
         self._goal_file = GoalFile(config.resume_file, goal_keys)
         self._goal_ids = GoalIds()
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
@@ -207,6 +211,8 @@ class Commander(ABC):
         SpaceRobotError
             The configuration does not go with the robot.
         """
+        self._described, self._payload = robot, self.plant.payload
+        robot = self._with_payload(robot)
         self._build_executive(robot, decoder)
         self.robot, self._decoder = robot, decoder
         self._tell_plant_state()
@@ -219,7 +225,7 @@ class Commander(ABC):
         if self.executive is not None:
             self._give_up_goals(PlantStopped(why))
             self._stop_executive()
-        self.robot = self.executive = self._decoder = None
+        self.robot = self.executive = self._decoder = self._described = None
 
     def activate(self) -> None:
         """Answer states from now on; resume the goals that an earlier process left undecided.
@@ -424,6 +430,19 @@ class Commander(ABC):
             if self.executive is not None:
                 self._react_to_change(change)
         self._tell_plant_state()
+        if self.plant.payload != self._payload:
+            self._payload = self.plant.payload
+            if self._described is not None:
+                self.robot = self._with_payload(self._described)
+                self._change_masses(self.robot)
+
+    def _with_payload(self, robot: SpaceRobot) -> SpaceRobot:
+        """Return the robot with the body that it holds according to the plant's status."""
+        try:
+            return Payload.from_text(self._payload).attached_to(robot) if self._payload else robot
+        except RobotDescriptionError as error:
+            self.host.log("error", f"plant/status: {error}")
+            return robot
 
     def plant_silent(self, message: str) -> None:
         """Give up the goals: nothing comes from the plant any more."""
@@ -447,6 +466,10 @@ class Commander(ABC):
     @abstractmethod
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         """Build the executive."""
+
+    @abstractmethod
+    def _change_masses(self, robot: SpaceRobot) -> None:
+        """Have the executive command a robot of the same joints and other masses."""
 
     @abstractmethod
     def _stop_executive(self) -> None:

@@ -93,6 +93,10 @@ class ControllerCommander(Commander):
         self.effort = np.zeros(robot.n)
         self._held_velocities = HeldVelocityReference(self.config.control_period)
 
+    def _change_masses(self, robot: SpaceRobot) -> None:
+        assert self.executive is not None
+        self.executive.use_controller(build_controller(robot, self.config))
+
     def _stop_executive(self) -> None:
         assert self.executive is not None
         self.executive.reset()

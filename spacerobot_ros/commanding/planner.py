@@ -120,6 +120,15 @@ class PlannerCommander(Commander):
         self.executive = Executive(robot, self.config, worker, self._goal_file)
         self._measured = _MeasuredState(decoder)
 
+    def _change_masses(self, robot: SpaceRobot) -> None:
+        assert self.executive is not None
+        # A given method is one for the robot without what it holds.
+        method = self._method if robot is self._described else None
+        with self._long_work():
+            worker = PlanningWorker(robot, self.config, method, self._long_work)
+        self.executive.use_robot(robot, worker)
+        self._pass_on_outputs()
+
     def _stop_executive(self) -> None:
         assert self.executive is not None
         commands = self.statistics.commands_published

@@ -396,6 +396,11 @@ class PlantListener:
         return status is not None and (status.state is PlantState.RESTING or bool(self.blocked))
 
     @property
+    def payload(self) -> str:
+        """The body that the robot holds, as the text of a :class:`.Payload`; empty: none."""
+        return "" if self._status is None else self._status.payload
+
+    @property
     def paused(self) -> bool:
         """Whether the plant's time stands still."""
         return self._status is not None and self._status.state is PlantState.PAUSED

@@ -102,6 +102,11 @@ class CoordinatedController:
         self._sent = self._estimator = self._brake = None
         self.mode = Mode.MEASURED
 
+    def continue_for(self, other: CoordinatedController) -> None:
+        """Pursue the goals of another controller from now on."""
+        self.profile, self._began = other.profile, other._began
+        self._followed, self.coming_to_rest = other._followed, other.coming_to_rest
+
     def set_gains(self, gains: Gains) -> None:
         """Change the gains from the next command on."""
         self.law.set_gains(gains)

@@ -220,6 +220,16 @@ class ControlExecutive:
         else:
             self._hold_here = True
 
+    def use_controller(self, controller: CoordinatedController) -> None:
+        """Control by another controller of the same outputs: the robot's masses have changed.
+
+        The goal begins anew at the next measured state; without a goal the robot holds where it
+        held.
+        """
+        controller.continue_for(self.controller)
+        self.controller = controller
+        self._begin_anew = self._goal_state is ControllerState.TRACKING
+
     def _give_up(self, message: str) -> None:
         """Drop every goal and its file; the message is that of the status from now on."""
         pursued = self._pending or self._goal_state is ControllerState.TRACKING

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import PlanningError, RecordingError
-from spacerobot_ros.events import Event
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.measures import (
     Measures,
@@ -40,6 +40,7 @@ from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
+from spacerobot_ros.simulation.capture import capture_values, load_target
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.times import SECOND
@@ -57,8 +58,8 @@ _TRUE_QUANTITIES = ("pose", "twist", "q", "qdot", "effort", "momentum")
 """Quantities that are attributes of a flight."""
 
 _QUANTITY_SIZES = {
-    **dict.fromkeys(("pose", "momentum", "measured_pose", "end_effector_pose"), 7),
-    **dict.fromkeys(("twist", "measured_twist", "expected_momenta"), 6),
+    **dict.fromkeys(("pose", "momentum", "measured_pose", "end_effector_pose", "target_pose"), 7),
+    **dict.fromkeys(("twist", "measured_twist", "expected_momenta", "target_twist"), 6),
 }
 """Numbers per sample by quantity; other quantities have one number per joint."""
 
@@ -249,6 +250,22 @@ class Flight:
                 f"The flight of '{self.scenario.name}' has no description of its robot."
             )
         return self.robot
+
+    @cached_property
+    def target(self) -> RobotDescription | None:
+        """The body that floats beside the robot; None: there is none."""
+        return load_target(self.scenario.plant.target)
+
+    @cached_property
+    def capture(self) -> dict[str, Any]:
+        """The first capture of the target, by the keys of ``spacerobot run --json``.
+
+        Without a capture, ``captured`` is false; empty where there is no target.
+        """
+        for event in self.events:
+            if event.kind is EventKind.CAPTURED:
+                return {"time_s": event.time_s, **capture_values(event.about)}
+        return {} if self.target is None else {"captured": False}
 
     @property
     def control_period(self) -> float:
@@ -453,6 +470,8 @@ class Flight:
             summary["end_effector_position_error_m"] = measures.end_effector_error.distance
             if _turns_end_effector(self.status):
                 summary["end_effector_attitude_error_rad"] = measures.end_effector_error.angle
+        if self.capture:
+            summary["capture"] = self.capture
         if self.propellant is not None:
             summary["propellant_kg"] = self.propellant
         if self.clearance is not None:

@@ -206,7 +206,7 @@ class FlightBag:
                     makers[f"measured_{quantity}"] = partial(self.measured_signal, name, number)
         for name in (
             *("momentum", "end_effector_pose", "momentum_expected"),
-            *("base_wrench_realised", "thrusters"),
+            *("base_wrench_realised", "thrusters", "target/odom"),
         ):
             for field in TOPICS[name].state if self.series_of(name) else ():
                 makers[field.quantity] = partial(self.quantity, name, field)
@@ -334,12 +334,14 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
 
 
 def namespaces(bag: Bag) -> list[str]:
-    """Return the namespaces that a bag has an ``odom`` in, in alphabetical order."""
-    return sorted(
+    """Return the namespaces of robots that a bag has an ``odom`` in, in alphabetical order."""
+    found = {
         topic.rpartition("/")[0]
         for topic, kind in bag.topics.items()
         if topic.endswith("/odom") and kind == TOPICS["odom"].type
-    )
+    }
+    # The target of a robot has an odometry, too.
+    return sorted(found - {f"{name}/target" for name in found})
 
 
 def _bag_files(path: Path) -> list[Path]:
@@ -465,6 +467,9 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
     for node, parameter in _ABSENT_MEANS_ZERO:
         if node in nodes:
             nodes[node].setdefault(parameter, 0.0)
+    target = recorded_target(bag.parts[0])
+    if target and "plant" in nodes:
+        nodes["plant"]["target.robot_description"] = target
     urdf, own = bag.parts[0].urdf, nodes.get("plant", {}).get("robot", "")
     for values in nodes.values():
         if urdf is not None and values.get("robot") in ("", own):
@@ -504,6 +509,12 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
         overrides={},
         has_goal=goal is not None,
     )
+
+
+def recorded_target(robot: RecordedRobot) -> str:
+    """Return the URDF text of the target of a robot in a bag; empty: it has none."""
+    series = robot.get("target/robot_description")
+    return "" if series is None else str(next(series.messages())[1].data)
 
 
 def _parse_json(text: str) -> Any:

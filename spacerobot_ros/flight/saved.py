@@ -94,7 +94,8 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
             continue
         names = thrusters if topic.entries_of == "thrusters" else flight.joint_names
         base = config.frame_prefix + robot.base_link
-        message = state_message(topic, names, config.world_frame, base)
+        target = "" if flight.target is None else flight.target.base_link
+        message = state_message(topic, names, config.world_frame, base, target)
         columns = {
             field.columns[0]: quantities[field.quantity]
             for field in topic.state
@@ -142,6 +143,9 @@ def _other_streams(flight: Flight) -> Iterator[_Stream]:
     world = scenario.plant.world_frame
     described = encode("std_msgs/msg/String", {"data": flight.required_robot().urdf})
     yield _Stream(TOPICS["robot_description"], zero, [described])
+    if flight.target is not None:
+        described = encode("std_msgs/msg/String", {"data": flight.target.urdf})
+        yield _Stream(TOPICS["target/robot_description"], zero, [described])
     shape = scenario.goal.joint_positions
     if shape is not None:
         topic = TOPICS["goal_joint_states"]

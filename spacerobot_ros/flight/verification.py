@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
-from spacerobot_ros.flight.reading import namespaces
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.flight.reading import namespaces, recorded_target
 from spacerobot_ros.flight.second_opinion import EngineFlight, SecondOpinion
 from spacerobot_ros.messages.readers import CommandReader, UnreadableError
+from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import build_plant
+from spacerobot_ros.simulation.capture import capture_values
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
@@ -175,12 +178,15 @@ class _RecordedPlant:
         The model.
     injections
         The faults that were injected in each tick, and the disturbances.
+    grasps
+        What was requested in each tick: captures (true) and releases (false).
     """
 
     recorded: RecordedRobot
     config: PlantConfig
     robot: SpaceRobot
     injections: tuple[dict[int, list[str]], dict[int, list[str]]]
+    grasps: dict[int, list[bool]]
 
     @classmethod
     def of(cls, bag: Bag) -> _RecordedPlant:
@@ -203,7 +209,8 @@ class _RecordedPlant:
                 f"{', '.join(description.joint_names)}."
             )
         robot = SpaceRobot(config.assumed_robot(description))
-        return cls(recorded, config, robot, (faults, disturbances))
+        grasps = _requested_grasps(recorded, config)
+        return cls(recorded, config, robot, (faults, disturbances), grasps)
 
     def commands(self, source: CommandSource) -> dict[int, RecordedCommand]:
         """Return the first command of each tick; later ones and those between ticks are stale."""
@@ -237,6 +244,26 @@ def _injections(recorded: RecordedRobot, topic: str, period_ns: int) -> dict[int
     return by_tick
 
 
+def _requested_grasps(recorded: RecordedRobot, config: PlantConfig) -> dict[int, list[bool]]:
+    """Return the captures (true) and releases (false) that were requested in each tick."""
+    grasps: dict[int, list[bool]] = {}
+    series = recorded.get("events")
+    for _, message in series.messages() if series is not None else ():
+        record = read_status(message)
+        try:
+            event = Event.from_values(record.values)
+        except SpaceRobotError:
+            continue  # Of a later version.
+        captured = event.kind is EventKind.CAPTURED
+        if event.time_s is None or not (captured or event.kind is EventKind.RELEASED):
+            continue
+        # The plant itself finds the captures that were automatic.
+        if not captured or capture_values(event.about).get("requested"):
+            tick = round(event.time_s * SECOND / config.period_ns)
+            grasps.setdefault(tick, []).append(captured)
+    return grasps
+
+
 def _recorded_robot(bag: Bag) -> RecordedRobot:
     """Return the one robot of which the bag holds odom and joint_states."""
     candidates = [RecordedRobot(bag, name) for name in namespaces(bag)]
@@ -259,7 +286,10 @@ def _plant_config(recorded: RecordedRobot) -> PlantConfig:
             "the plant's parameters."
         )
     try:
-        config = configured(PlantConfig, {name: json.loads(text) for name, text in texts.items()})
+        values = {name: json.loads(text) for name, text in texts.items()}
+        if target := recorded_target(recorded):
+            values["target.robot_description"] = target
+        config = configured(PlantConfig, values)
     except (ValueError, RecursionError, ParameterError) as error:
         reason = str(error).removesuffix(".")
         raise RecordingError(
@@ -469,6 +499,11 @@ def _resimulate(
             f"The bag {flight.path} begins in mid-flight, where the noise of its sensors is "
             "not known."
         )
+    if first and plant.capturing is not None:
+        raise RecordingError(
+            f"The bag {flight.path} begins in mid-flight, where it is not known whether the target "
+            "is held."
+        )
     plant.tick = first
     if flight.config.actuation == "velocity":
         # The efforts of servos follow from the change of the velocities.
@@ -476,6 +511,11 @@ def _resimulate(
     recorded = [flight.commands(source) for source in commands.sources]
     states: dict[str, Floats] = {}
     done = _Resimulation(first, last, states, frozenset(recorded[0]))
+    if mujoco and plant.capturing is not None:
+        raise SpaceRobotError(
+            f"The bag {flight.path} has a target, which MuJoCo does not capture: verify it without "
+            "the second engine."
+        )
     if mujoco:
         done.engine = EngineFlight(plant, flight.config.period_ns / SECOND)
     for tick in range(first, last + 1):
@@ -491,6 +531,10 @@ def _resimulate(
             for text in by_tick.get(tick, ()):
                 with suppress(ParameterError):
                     inject(text)  # A refused line changes nothing.
+        if plant.capturing is not None:
+            for captures in flight.grasps.get(tick, ()):
+                with suppress(CommandError):  # The states show a capture that differs.
+                    (plant.capturing.capture if captures else plant.capturing.release)()
         now = tick * flight.config.period_ns
         for source, commanded in zip(commands.sources, recorded, strict=True):
             if tick in commanded:

@@ -159,7 +159,9 @@ def robot_frames(description: RobotDescription, state: StateFrames) -> dict[str,
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 
 
-def state_message(topic: Topic, names: Sequence[str], world: str, base: str) -> bytes:
+def state_message(
+    topic: Topic, names: Sequence[str], world: str, base: str, target: str = ""
+) -> bytes:
     """Return the message of a state topic with all numbers zero.
 
     Parameters
@@ -170,6 +172,8 @@ def state_message(topic: Topic, names: Sequence[str], world: str, base: str) -> 
         Joints or thrusters that its arrays have entries for.
     world, base
         Names of the inertial frame and of that of the base link.
+    target
+        Name of the frame of the target's root link.
     """
     values: dict[str, Any] = {}
     if topic.type == "std_msgs/msg/Float64MultiArray":
@@ -179,7 +183,7 @@ def state_message(topic: Topic, names: Sequence[str], world: str, base: str) -> 
     elif topic.state:
         values["header"] = {"frame_id": base if topic.frame == "base" else world}
     if topic.type == "nav_msgs/msg/Odometry":
-        values["child_frame_id"] = base
+        values["child_frame_id"] = target if topic.name.startswith("target/") else base
     if topic.type == "sensor_msgs/msg/JointState":
         values["name"] = names
     for field in topic.state:

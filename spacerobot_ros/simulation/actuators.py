@@ -1,8 +1,8 @@
 """Actuators of a plant: thrusters and actuator faults around the rigid-body dynamics; disturbances.
 
 :func:`build_plant` makes the plant of a configuration: :class:`.VelocityPlant` or
-:class:`.EffortPlant`, within a :class:`ThrusterPlant` if thrusters are modelled, within a
-:class:`FaultyPlant`.
+:class:`.EffortPlant`, within a :class:`.CapturePlant` if there is a target, within a
+:class:`ThrusterPlant` if thrusters are modelled, within a :class:`FaultyPlant`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.model import SpaceRobot, integration
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.simulation import effort_plant
+from spacerobot_ros.simulation.capture import CapturePlant, Target, capture_in, load_target
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.disturbances import Disturbance, disturbance_timeline
 from spacerobot_ros.simulation.effort_plant import EffortPlant
@@ -237,6 +238,8 @@ class FaultyPlant(WrappedPlant):
     ) -> None:
         super().__init__(plant)
         self._thrusters = thrusters_in(plant)
+        self.capturing = capture_in(plant)
+        """The target, and what captures it; None: there is no target."""
         nozzles = self._thrusters.table.names if self._thrusters is not None else ()
         self.timeline = FaultTimeline(faults, Targets(plant.robot.joint_names, wrench, nozzles))
         self.takes_wrench = wrench
@@ -445,8 +448,8 @@ def build_plant(
     Raises
     ------
     ParameterError
-        The integration step is too short, or the initial state, a thruster, a fault or a
-        disturbance is refused.
+        The integration step is too short, or the initial state, the target, a thruster, a fault or
+        a disturbance is refused.
     """
     kind, step = PLANTS[config.actuation], config.integration_step
     control_period = config.control_period
@@ -468,7 +471,17 @@ def build_plant(
             "choose longer steps or shorter ticks."
         )
     start = InitialState.of(config) if initial is None else initial
-    plant = kind.plant(robot, control_period, start, step or kind.integration_step)
+    step = step or kind.integration_step
+
+    def dynamics(of: SpaceRobot, at: InitialState) -> Plant:
+        return kind.plant(of, control_period, at, step)
+
+    description = load_target(config.target)
+    if description is None:
+        plant = dynamics(robot, start)
+    else:
+        target = Target(description, config.target, control_period, step)
+        plant = CapturePlant(dynamics, robot, start, target, config)
     plant = with_thrusters(plant, control_period, config.thrusters, config.thrusters_excluded)
     return FaultyPlant(
         plant,

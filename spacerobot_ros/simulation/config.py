@@ -74,6 +74,76 @@ class SensorConfig:
 
 
 @dataclass(frozen=True)
+class TargetConfig:
+    """A body that floats beside the robot: its URDF, its grapple frame and its initial state."""
+
+    robot: str = parameter("", "URDF file of the target, one rigid body; '': no target")
+    robot_description: str = parameter(
+        "", "URDF text of the target; takes precedence over 'target.robot'"
+    )
+    grapple_frame: str = parameter("grapple", "link of the target at which it is captured")
+    position: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        "root link of the target in the world at the beginning",
+        unit="m",
+        minimum=-_MAX_INITIAL_VALUE,
+        maximum=_MAX_INITIAL_VALUE,
+        length=3,
+    )
+    orientation: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0, 1.0), "likewise, quaternion x, y, z, w", length=4
+    )
+    velocity: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        "of the origin of its root link, in world",
+        unit="m/s",
+        minimum=-_MAX_INITIAL_VALUE,
+        maximum=_MAX_INITIAL_VALUE,
+        length=3,
+    )
+    angular_velocity: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        "in world",
+        unit="rad/s",
+        minimum=-_MAX_INITIAL_VALUE,
+        maximum=_MAX_INITIAL_VALUE,
+        length=3,
+    )
+
+
+@dataclass(frozen=True)
+class CaptureConfig:
+    """When the target is captured: on request or automatically, within these bounds."""
+
+    mode: str = parameter(
+        "manual",
+        "whether the service ~/capture captures the target, or the plant by itself as soon as it "
+        "can",
+        choices=("manual", "automatic"),
+    )
+    end_effector: str = parameter(
+        "", "link that captures; '': end_effector_frame, or 'end_effector'"
+    )
+    distance: float = parameter(
+        0.05, "largest distance of the grapple frame from the link", unit="m", minimum=0.0
+    )
+    angle: float = parameter(0.2, "largest angle between the two frames", unit="rad", minimum=0.0)
+    speed: float = parameter(
+        0.1, "largest speed of the grapple frame relative to the link", unit="m/s", minimum=0.0
+    )
+    rate: float = parameter(
+        0.1, "largest rate of rotation of one relative to the other", unit="rad/s", minimum=0.0
+    )
+    joint_impulse_limit: float = parameter(
+        0.0,
+        "impulse of the capture along a joint's coordinate beyond which its event is a warning; 0: "
+        "none",
+        unit="N m s or N s",
+        minimum=0.0,
+    )
+
+
+@dataclass(frozen=True)
 class PlantConfig(WatchdogConfig, RobotConfig):
     """Parameters of a plant: actuation, time, limits, initial state, faults, sensors."""
 
@@ -235,6 +305,8 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         texts=True,
     )
     sensors: SensorConfig = group(SensorConfig())
+    target: TargetConfig = group(TargetConfig())
+    capture: CaptureConfig = group(CaptureConfig())
 
     @property
     def period_ns(self) -> int:

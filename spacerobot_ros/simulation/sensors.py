@@ -184,6 +184,9 @@ class ReportedState:
         self._poses_of_links = [np.zeros(7) for _ in self._links]
         self._link_poses = plant.robot.buffered("link_poses") if self._links else None
         self._thrusters = thrusters_in(plant)
+        capturing = plant.capturing
+        self.target = None if capturing is None else capturing.target.description
+        """The target; None: there is none."""
         self._sensors_used, self._loaded = self.sensors.used, plant.loads is not None
         self.quantities = self._quantities()
 
@@ -242,7 +245,11 @@ class ReportedState:
             quantities["end_effector_pose"] = self._end_effector_pose
         for name, pose in zip(self._end_effectors, self._poses_of_links, strict=True):
             quantities[pose_topic(name).state[0].quantity] = pose
-        if plant.takes_wrench or self._loaded:
+        capturing = plant.capturing
+        if capturing is not None:
+            quantities["target_pose"] = capturing.target_pose
+            quantities["target_twist"] = capturing.target_twist
+        if plant.takes_wrench or self._loaded or capturing is not None:
             quantities["expected_momenta"] = plant.expected_momenta
         if self._sensors_used:
             quantities |= {

@@ -9,6 +9,7 @@ from enum import Enum
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.simulation.actuators import FaultyPlant
+from spacerobot_ros.simulation.capture import CaptureReport, ReleaseReport
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
@@ -57,6 +58,9 @@ class PlantStatus:
         Lines of the active injected faults.
     disturbances
         Lines of the active disturbances.
+    payload
+        The body that the robot holds, as the text of a :class:`.Payload`; empty: none. With it the
+        robot has another mass, inertia and momentum.
     timeouts
         Number of times that the joints were brought to rest because no command came in time.
     last_command_s
@@ -74,6 +78,7 @@ class PlantStatus:
     disturbances: tuple[str, ...] = ()
     timeouts: int = 0
     last_command_s: float | None = None
+    payload: str = ""
 
     @property
     def level(self) -> int:
@@ -98,6 +103,8 @@ class PlantStatus:
         values["faults"] = _SEPARATOR.join(self.faults)
         if self.disturbances:
             values["disturbances"] = _SEPARATOR.join(self.disturbances)
+        if self.payload:
+            values["payload"] = self.payload
         return values
 
     @classmethod
@@ -124,6 +131,7 @@ class PlantStatus:
                 last_command_s=None if last is None else float(last),
                 faults=tuple(faults.split(_SEPARATOR)) if faults else (),
                 disturbances=tuple(disturbances.split(_SEPARATOR)) if disturbances else (),
+                payload=values.get("payload", ""),
             )
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"The values are not a status of a plant: {error}.") from error
@@ -164,7 +172,7 @@ class PlantMonitor:
         list[Event]
             Events since the last update; empty: the status is the same.
         """
-        before = self.status
+        before, reports = self.status, self._take_reports()
         now = replace(
             self._status(activity),
             time_s=before.time_s,
@@ -176,11 +184,26 @@ class PlantMonitor:
             ),
             faults=tuple(str(fault) for fault in self._plant.active),
             disturbances=tuple(str(each) for each in self._plant.disturbances),
+            payload=self._payload(),
         )
+        captures = [report.event(time_s) for report in reports]
         if now == before:
-            return []
+            return captures
         self.status = replace(now, time_s=time_s)
-        return _events_between(before, self.status)
+        return [*captures, *_events_between(before, self.status)]
+
+    def _take_reports(self) -> list[CaptureReport | ReleaseReport]:
+        """Return the captures and releases since the last update."""
+        capturing = self._plant.capturing
+        if capturing is None:
+            return []
+        reports, capturing.reports = capturing.reports, []
+        return reports
+
+    def _payload(self) -> str:
+        capturing = self._plant.capturing
+        payload = None if capturing is None else capturing.payload
+        return "" if payload is None else payload.to_text()
 
     def _status(self, activity: PlantState) -> PlantStatus:
         """Return the present status, with state, message and reason."""

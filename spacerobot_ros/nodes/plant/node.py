@@ -17,7 +17,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.bag.salvage import last_state
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.messages.readers import CommandReader
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
@@ -36,6 +36,7 @@ from spacerobot_ros.nodes.plant.publisher import (
 )
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import build_plant
+from spacerobot_ros.simulation.capture import CapturePlant, CaptureReport, ReleaseReport
 from spacerobot_ros.simulation.commands import CommandValidator, PublisherTracker
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
@@ -179,6 +180,9 @@ class PlantNode(FlightNode):
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/abort", self._on_abort)
         self.create_service(Trigger, "~/rearm", self._on_rearm)
+        self.create_service(Trigger, "~/capture", self._on_capture)
+        self.create_service(Trigger, "~/release", self._on_release)
+        self._capturing = self.plant.capturing
         self._injected_seen = self.plant.injected
         self._publish_status(self._monitor.status)
 
@@ -288,6 +292,12 @@ class PlantNode(FlightNode):
         path = self.config.resume_bag
         if not path:
             return None, 0
+        target = self.config.target
+        if target.robot or target.robot_description:
+            raise ParameterError(
+                "A plant with a target does not go on from a bag: leave out 'resume_bag' or "
+                "'target.robot'."
+            )
         state = last_state(path, self.get_namespace().rstrip("/"))
         if state.joint_names != list(robot.joint_names):
             raise ParameterError(
@@ -316,6 +326,9 @@ class PlantNode(FlightNode):
             raise SpaceRobotError(f"The plant stops at {time:g} s: {error}") from error
         if limited:
             self._report.limited()
+        if self._capturing is not None and self._capturing.reports:
+            # Commanders must know of the other robot before they answer a state of it.
+            self._look_at_status()
         self._tick += 1
         self._publish()
         if self._lockstep is not None and self._tick % _MAX_UNCONFIRMED_TICKS == 0:
@@ -470,6 +483,35 @@ class PlantNode(FlightNode):
         response.message = (
             f"Commands pass again after: {fault}." if fault else "No fault was latched."
         )
+        return response
+
+    def _on_capture(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._grasp(response, lambda capturing: capturing.capture())
+
+    def _on_release(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._grasp(response, lambda capturing: capturing.release())
+
+    def _grasp(
+        self,
+        response: Trigger.Response,
+        act: Callable[[CapturePlant], CaptureReport | ReleaseReport],
+    ) -> Trigger.Response:
+        """Capture or release the target; it takes effect in the next tick."""
+        try:
+            if self._capturing is None:
+                raise CommandError("There is no target: set parameter 'target.robot' to its URDF.")
+            if not self._steps_or_pauses:
+                raise CommandError(f"The plant is {self._active.value}: nothing moves.")
+            if self._commands.fault:
+                raise CommandError(
+                    f"A fault is latched: {self._commands.fault}; call '~/rearm' first."
+                )
+            report = act(self._capturing)
+        except CommandError as error:
+            response.success, response.message = False, str(error)
+            return response
+        response.success, response.message = True, report.event(self.time_ns / SECOND).message
+        self._look_at_status()
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

@@ -318,6 +318,11 @@ class StatePublisher:
         self._readers: frozenset[bytes] = frozenset()
         self._matched = 0
         self._description = node.create_publisher(String, "robot_description", LATCHED)
+        self._target_description: Any = None
+        if state.target is not None:
+            self._target_description = node.create_publisher(
+                String, "target/robot_description", LATCHED
+            )
         self.rebuild()
 
     def rebuild(self) -> None:
@@ -335,8 +340,10 @@ class StatePublisher:
         self._of_measured_pose = [template for topic, _, template in streams if topic.name in poses]
 
     def publish_description(self) -> None:
-        """Publish the URDF on robot_description."""
+        """Publish the URDFs of robot and target."""
         self._description.publish(String(data=self._robot.description.urdf))
+        if self._state.target is not None:
+            self._target_description.publish(String(data=self._state.target.urdf))
 
     def publish(self, time_ns: int, *, all_topics: bool) -> None:
         """Publish the state, stamped ``time_ns``.
@@ -382,7 +389,10 @@ class StatePublisher:
     def _template(self, topic: Topic) -> MessageTemplate:
         """Return the message of a topic, fed with the quantities that it carries."""
         names = self._state.names(topic)
-        prototype = state_message(topic, names, self._world, self._base)
+        target = self._state.target
+        prototype = state_message(
+            topic, names, self._world, self._base, "" if target is None else target.base_link
+        )
         template = MessageTemplate(topic.type, prototype)
         if topic.name == "odom" and self._state.sensors.used:
             template.feed("pose.covariance", self._state.sensors.pose_covariance)
@@ -469,12 +479,12 @@ class ClearancePublisher:
 
 
 class LinkMarkers:
-    """Publishes all visuals of a robot as one marker array in the world frame.
+    """Publishes all visuals of a robot and of its target as one marker array in the world frame.
 
     With poses in the world frame a viewer needs no transforms.
     """
 
-    def __init__(self, node: FlightNode, plant: Plant, world_frame: str) -> None:
+    def __init__(self, node: FlightNode, plant: FaultyPlant, world_frame: str) -> None:
         self._plant = plant
         self._poses: list[tuple[int, Pose]] = []
         markers: list[Marker] = []
@@ -482,6 +492,14 @@ class LinkMarkers:
             for shape in link.shapes:
                 markers.append(shape_marker(shape, world_frame, link.name, len(markers)))
                 self._poses.append((index, shape.pose))
+        self._of_target: list[Pose] = []
+        """Poses of the visuals of the target in the frame of its root link."""
+        if plant.capturing is not None:
+            target = plant.capturing.target.description
+            for link in target.links:
+                for shape in link.shapes:
+                    markers.append(shape_marker(shape, world_frame, link.name, len(markers)))
+                    self._of_target.append(target.frames[link.name][1] @ shape.pose)
         if (world := plant.robot.description.world) is not None:
             for link in world.links:
                 for shape in link.shapes or link.collisions:
@@ -495,7 +513,7 @@ class LinkMarkers:
         )
         self._targets = [
             self._template.floats(f"markers[{i}].pose.position.x", 7)
-            for i in range(len(self._poses))
+            for i in range(len(self._poses) + len(self._of_target))
         ]
 
     def publish(self, time_ns: int) -> None:
@@ -504,8 +522,15 @@ class LinkMarkers:
             return
         plant = self._plant
         R_WB, r_WB = matrix_from_quaternion(plant.pose[3:]), plant.pose[:3]
-        for (index, pose), target in zip(self._poses, self._targets, strict=True):
+        count = len(self._poses)
+        for (index, pose), target in zip(self._poses, self._targets[:count], strict=True):
             R_BL = plant.link_R[:, 3 * index : 3 * index + 3]
             target[:3] = r_WB + R_WB @ (plant.link_r[:, index] + R_BL @ pose.r)
             target[3:] = quaternion_from_matrix(R_WB @ R_BL @ pose.R)
+        if plant.capturing is not None:
+            of_target = plant.capturing.target_pose
+            at = Pose(matrix_from_quaternion(of_target[3:]), of_target[:3])
+            for pose, target in zip(self._of_target, self._targets[count:], strict=True):
+                placed = at @ pose
+                target[:3], target[3:] = placed.r, quaternion_from_matrix(placed.R)
         self._publisher.publish(self._template.serialised(stamp_bytes(time_ns)))

@@ -98,7 +98,7 @@ class Event(Enum):
     FAILED = "failed"  # All corrections are used, or the measured state is not finite.
     ABORTED = "aborted"  # The goal is given up on request.
     PLANT_STOPPED = "plant stopped"  # The plant does not obey commands: the goal is given up.
-    PLANT_RESET = "plant reset"  # The plant was reset to another state.
+    PLANT_RESET = "plant reset"  # The plant was reset, or its robot has captured or released.
     DEACTIVATED = "deactivated"
 
 
@@ -352,6 +352,25 @@ class Executive:
     def plant_reset(self) -> None:
         """Plan again for the present goal, if any: the robot is in another state than
         before."""
+        self._plan_again("The plant was reset: the motion is planned again.")
+
+    def use_robot(self, robot: SpaceRobot, worker: PlanningWorker) -> None:
+        """Plan again for the present goal, if any: the robot has captured or released a body.
+
+        Parameters
+        ----------
+        robot
+            The robot with its present mass properties.
+        worker
+            Makes the plans from now on.
+        """
+        self._plan_again("The robot has another mass now: the motion is planned again.")
+        self._worker.close()
+        self._robot, self._worker = robot, worker
+        self._average = StateAverage(robot, self.config.averaging, self.config.rest_tolerance)
+        self._tracker.use_robot(robot)
+
+    def _plan_again(self, message: str) -> None:
         self._average.forget()
         # The held shape and the schedule belong to the time before the reset.
         self._tracker.stop()
@@ -361,7 +380,7 @@ class Executive:
             return
         self._drop_plan()
         self._change_phase(Event.PLANT_RESET, self._phase_at_rest())
-        self._add_notice(Severity.WARNING, "The plant was reset: the motion is planned again.")
+        self._add_notice(Severity.WARNING, message)
 
     def cancel_plan(self) -> None:
         """Cancel the plan that the worker computes; any thread may call this."""

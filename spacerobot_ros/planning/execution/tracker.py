@@ -211,19 +211,24 @@ class TrajectoryTracker:
         self.setpoint = Setpoint(np.zeros(robot.n), np.zeros(robot.n))
         self.stuck: list[int] = []
         """Stuck joints; their commands are zero."""
-        self._robot, self._config = robot, config
+        self._config = config
         # No feedback here: a controller closes its own loop around the reference.
         self._commands_plant = config.output == "commands"
         self._follower: ScheduleFollower | BrakingFollower | None = None
         self._holds_position = False
         """Whether the position of the setpoint is the shape to hold."""
-        self._sensitivity = PathSensitivity(robot) if config.replanning > 0 else None
-        self._mass_estimate = MassEstimate(
-            0 if self._sensitivity is None else self._sensitivity.count
-        )
+        self.use_robot(robot)
         band = 2 * config.shape_deadband
         self._stuck_watch = StuckJointWatch(
             robot.n, config.stuck_ticks, config.control_period, band
+        )
+
+    def use_robot(self, robot: SpaceRobot) -> None:
+        """Track the later schedules with a robot of the same joints and other masses."""
+        self._robot = robot
+        self._sensitivity = PathSensitivity(robot) if self._config.replanning > 0 else None
+        self._mass_estimate = MassEstimate(
+            0 if self._sensitivity is None else self._sensitivity.count
         )
 
     @property

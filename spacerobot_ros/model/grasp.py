@@ -1,0 +1,294 @@
+"""The grasp of a floating body by a floating robot: an inelastic impact.
+
+With ``z = [v_WB_B; omega_WB_B; qdot]`` (6 + n,) of the robot, ``nu`` (6,) of the body (velocity of
+its centre of mass and angular velocity) and ``L`` (6,) the impulse of the grasp on the robot, force
+over torque at the point of the grasp, all along the axes of the base B,
+
+    H (z+ - z) = J' L,    M (nu+ - nu) = -G' L,    J z+ = G nu+,
+
+where H is the robot's inertia matrix, M the spatial inertia of the body, J the Jacobian of the
+end-effector and G the map of the body's twist to the same point. The joints are free: no motor or
+brake gives an impulse. So
+
+    L = (J H^-1 J' + G M^-1 G')^-1 (G nu - J z),
+
+and half of ``(G nu - J z)' L`` of the energy is lost (Carnot). Momentum is conserved, because L
+acts on both with opposite signs. The formulation is that of Yoshida and Nenchev and of Dimitrov and
+Yoshida; see the page on the theory of captures.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.model.description import Array, Inertia, Pose
+from spacerobot_ros.model.rotations import hat, matrix_from_quaternion
+from spacerobot_ros.model.space_robot import SpaceRobot
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A body that a link of a robot holds.
+
+    Attributes
+    ----------
+    link
+        Name of the link.
+    inertia
+        Mass properties of the body in the frame of the link.
+    """
+
+    link: str
+    inertia: Inertia
+
+    def attached_to(self, robot: SpaceRobot) -> SpaceRobot:
+        """Return the robot that holds the body: its joints, links and limits are the same.
+
+        Raises
+        ------
+        RobotDescriptionError
+            The robot has no such link, or the inertia is that of no body.
+        """
+        frames = robot.description.frames
+        if self.link not in frames:
+            raise RobotDescriptionError(
+                f"A body is held by the link '{self.link}', but robot '{robot.description.name}' "
+                f"has no such link; it has {', '.join(robot.link_names)}."
+            )
+        body, pose = frames[self.link]
+        return robot.with_inertial(robot.inertial.with_payload(body, self.inertia.moved(pose)))
+
+    def to_text(self) -> str:
+        """Return the payload as JSON: ``link``, ``mass`` (kg), ``com`` (m), ``inertia`` (kg m^2),
+        the six entries xx, yy, zz, xy, xz, yz about the centre of mass.
+        """
+        about = self.inertia.about_com
+        return json.dumps(
+            {
+                "link": self.link,
+                "mass": self.inertia.mass,
+                "com": self.inertia.com.tolist(),
+                "inertia": [float(about[i, j]) for i, j in _ENTRIES],
+            }
+        )
+
+    @classmethod
+    def from_text(cls, text: str) -> Payload:
+        """Return the payload of :meth:`to_text`.
+
+        Raises
+        ------
+        RobotDescriptionError
+            The text is no payload.
+        """
+        try:
+            values = json.loads(text)
+            about = np.zeros((3, 3))
+            for (i, j), value in zip(_ENTRIES, values["inertia"], strict=True):
+                about[i, j] = about[j, i] = float(value)
+            com = np.array([float(x) for x in values["com"]])
+            if com.shape != (3,):
+                raise ValueError(f"its centre of mass has {com.size} numbers")
+            return cls(str(values["link"]), Inertia(float(values["mass"]), com, about))
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise RobotDescriptionError(f"The text describes no held body: {error}.") from error
+
+
+_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+@dataclass(frozen=True)
+class RobotMotion:
+    """A state of motion of a robot.
+
+    Attributes
+    ----------
+    pose
+        (7,) position ``r_WB`` in m and quaternion ``R_WB`` (x, y, z, w) of the base link.
+    twist
+        (6,) ``v_WB_B`` in m/s and ``omega_WB_B`` in rad/s.
+    q, qdot
+        (n,) joint positions (m or rad) and velocities (a second).
+    """
+
+    pose: Array
+    twist: Array
+    q: Array
+    qdot: Array
+
+    @property
+    def R_WB(self) -> Array:
+        """Attitude of the base link (3, 3)."""
+        return matrix_from_quaternion(self.pose[3:])
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """A state of motion of a rigid body, in W.
+
+    Attributes
+    ----------
+    R_WT, r_WT
+        Attitude (3, 3) and position (3,), m, of its frame T.
+    v, omega
+        Velocity of the origin of T (3,), m/s, and angular velocity (3,), rad/s.
+    """
+
+    R_WT: Array
+    r_WT: Array
+    v: Array
+    omega: Array
+
+    def at(self, frame: Pose) -> BodyMotion:
+        """Return the motion of a frame that is fixed to the body, with this pose in T."""
+        arm = self.R_WT @ frame.r
+        return BodyMotion(
+            self.R_WT @ frame.R, self.r_WT + arm, self.v + np.cross(self.omega, arm), self.omega
+        )
+
+    def momenta(self, inertia: Inertia) -> tuple[Array, Array]:
+        """Return linear momentum (kg m/s), and angular momentum (kg m^2/s) about the body's centre
+        of mass, in W. ``inertia`` is given in T.
+        """
+        moving = self.at(Pose(r=inertia.com))
+        return inertia.mass * moving.v, self.R_WT @ inertia.about_com @ self.R_WT.T @ self.omega
+
+
+@dataclass(frozen=True)
+class Impact:
+    """The result of a grasp.
+
+    Attributes
+    ----------
+    twist, qdot
+        Twist of the base (6,) and joint rates (n,) after it, as in :class:`RobotMotion`.
+    impulse
+        (6,) on the robot at the origin of the end-effector: N s over N m s, in W.
+    joint_impulses
+        (n,) of the grasp along the joints' coordinates, ``J_q' L``: those that motors or brakes
+        would have to give in order to hold the joints in their motion; N s or N m s.
+    energy_before, energy_lost
+        Kinetic energy of both bodies before it, and its loss, J.
+    """
+
+    twist: Array
+    qdot: Array
+    impulse: Array
+    joint_impulses: Array
+    energy_before: float
+    energy_lost: float
+
+
+def frame_motion(robot: SpaceRobot, link: str, motion: RobotMotion) -> BodyMotion:
+    """Return the motion of a link's frame."""
+    R_BL, r_BL = robot.link_pose(link, motion.q)
+    R_WB = motion.R_WB
+    twist = _jacobian_of_base_twist(robot, link, motion.q) @ _velocities(motion)
+    return BodyMotion(
+        R_WB @ R_BL, motion.pose[:3] + R_WB @ r_BL, R_WB @ twist[:3], R_WB @ twist[3:]
+    )
+
+
+def grasp_impact(
+    robot: SpaceRobot, link: str, motion: RobotMotion, body: BodyMotion, inertia: Inertia
+) -> Impact:
+    """Return the impact by which a link grasps a floating body where both are.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    link
+        The end-effector; the impulse is given at the origin of its frame.
+    motion, body
+        The motions before it.
+    inertia
+        Mass properties of the body in its frame T.
+    """
+    q, n, R_WB = motion.q, robot.n, motion.R_WB
+    to_cm = _to_velocity_of_cm(robot, q)
+    H = to_cm.T @ robot.inertia_matrix(q) @ to_cm
+    J, z = _jacobian_of_base_twist(robot, link, q), _velocities(motion)
+    center, R_BT = body.at(Pose(r=inertia.com)), R_WB.T @ body.R_WT
+    nu = np.concatenate([R_WB.T @ center.v, R_WB.T @ center.omega])
+    M = np.zeros((6, 6))
+    M[:3, :3] = inertia.mass * np.eye(3)
+    M[3:, 3:] = R_BT @ inertia.about_com @ R_BT.T
+    point = motion.pose[:3] + R_WB @ robot.link_pose(link, q)[1]
+    G = np.eye(6)
+    G[:3, 3:] = -hat(R_WB.T @ (point - center.r_WT))
+    by_robot, by_body = np.linalg.solve(H, J.T), np.linalg.solve(M, G.T)
+    approach = G @ nu - J @ z
+    L = np.linalg.solve(J @ by_robot + G @ by_body, approach)
+    after = z + by_robot @ L
+    return Impact(
+        twist=after[:6],
+        qdot=after[6:],
+        impulse=np.concatenate([R_WB @ L[:3], R_WB @ L[3:]]),
+        joint_impulses=J[:, 6 : 6 + n].T @ L,
+        energy_before=float(z @ H @ z + nu @ M @ nu) / 2,
+        energy_lost=float(approach @ L) / 2,
+    )
+
+
+def joined_momenta(
+    masses: tuple[float, float], centers: tuple[Array, Array], momenta: tuple[Array, Array]
+) -> Array:
+    """Return the momenta (6,) of two systems together.
+
+    Parameters
+    ----------
+    masses
+        Of the two, kg.
+    centers
+        Their centres of mass in W (3,), m.
+    momenta
+        Linear over angular momentum (6,) of each about its own centre of mass, in W; those of the
+        result are about the common one.
+    """
+    first, second = momenta
+    arm = centers[1] - centers[0]
+    # About the common centre of mass only the motion of one relative to the other counts.
+    share = masses[0] / (masses[0] + masses[1])
+    relative = share * second[:3] - (1.0 - share) * first[:3]
+    return np.concatenate(
+        [first[:3] + second[:3], first[3:] + second[3:] + np.cross(arm, relative)]
+    )
+
+
+def parted_momenta(
+    masses: tuple[float, float], centers: tuple[Array, Array], together: Array, second: Array
+) -> Array:
+    """Return the momenta (6,) of the first of two systems, from those of both and of the second.
+
+    The arguments are those of :func:`joined_momenta`, which this inverts.
+    """
+    share = masses[0] / (masses[0] + masses[1])
+    linear = together[:3] - second[:3]
+    relative = share * second[:3] - (1.0 - share) * linear
+    arm = centers[1] - centers[0]
+    return np.concatenate([linear, together[3:] - second[3:] - np.cross(arm, relative)])
+
+
+def _velocities(motion: RobotMotion) -> Array:
+    return np.concatenate([motion.twist, motion.qdot])
+
+
+def _to_velocity_of_cm(robot: SpaceRobot, q: npt.ArrayLike) -> Array:
+    """Return the map (6 + n, 6 + n) of ``[v_WB_B; omega; qdot]`` to ``[v_cm; omega; qdot]``.
+
+    The functions of the model take the velocity of the robot's centre of mass. The Jacobian of the
+    base link's origin is the inverse map.
+    """
+    to_cm = np.eye(6 + robot.n)
+    to_cm[:3, 3:] = -robot.jacobian(robot.base_link, q)[:3, 3:]
+    return to_cm
+
+
+def _jacobian_of_base_twist(robot: SpaceRobot, link: str, q: npt.ArrayLike) -> Array:
+    return np.asarray(robot.jacobian(link, q) @ _to_velocity_of_cm(robot, q))

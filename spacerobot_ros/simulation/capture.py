@@ -1,0 +1,605 @@
+"""A target that floats beside the robot, and its capture: an inelastic impact, then one body.
+
+Until the capture robot and target move by themselves, each with its own constant momenta. The
+capture (:mod:`spacerobot_ros.model.grasp`) takes place between two ticks. After it the plant
+integrates the joined robot, whose momenta are the sum of both: no rounding of the impact changes
+them. A release parts them where they are, each with the velocity that it has.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from spacerobot_ros.errors import CommandError, ParameterError, RobotDescriptionError
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.model.description import Array, Pose, RobotDescription
+from spacerobot_ros.model.grasp import (
+    BodyMotion,
+    Impact,
+    Payload,
+    RobotMotion,
+    frame_motion,
+    grasp_impact,
+    joined_momenta,
+    parted_momenta,
+)
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotvec_from_quaternion,
+    unit_quaternion,
+)
+from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.config import CaptureConfig, PlantConfig, TargetConfig
+from spacerobot_ros.simulation.loads import PlantLoads
+from spacerobot_ros.simulation.plant import Counts, Flags, InitialState, Plant, WrappedPlant
+from spacerobot_ros.simulation.velocity_plant import VelocityPlant
+
+_ANY_POSE = Pose(matrix_from_quaternion(unit_quaternion([0.1, 0.2, 0.3, 0.9])), np.ones(3))
+"""A pose in which no entry of the inertia of a held body is zero."""
+
+
+def load_target(config: TargetConfig) -> RobotDescription | None:
+    """Return the target of a configuration; None: it names none.
+
+    Raises
+    ------
+    ParameterError
+        There is no such file; the target is refused, or its joints move.
+    """
+    if not config.robot and not config.robot_description:
+        return None
+    try:
+        if config.robot_description:
+            target = parse_robot(config.robot_description)
+        else:
+            target = load_robot(robot_file(config.robot))
+    except (ParameterError, RobotDescriptionError) as error:
+        raise ParameterError(f"The target is refused: {error}") from error
+    if target.joint_names:
+        raise ParameterError(
+            f"The target '{target.name}' has joints that move ({', '.join(target.joint_names)}); a "
+            "target is one rigid body: make them fixed."
+        )
+    if config.grapple_frame not in target.frames:
+        raise ParameterError(
+            f"The target '{target.name}' has no link '{config.grapple_frame}' to be grasped at; it "
+            f"has {', '.join(target.frames)}: set parameter 'target.grapple_frame', or add the "
+            "link."
+        )
+    return target
+
+
+class Target:
+    """A free rigid body: torque-free motion at constant momenta.
+
+    Attributes
+    ----------
+    description
+        The body.
+    inertia
+        Its mass properties in the frame T of its root link.
+    grapple
+        Pose of the grapple frame in T.
+    """
+
+    def __init__(
+        self, description: RobotDescription, config: TargetConfig, period: float, step: float
+    ) -> None:
+        self.description = description
+        self.inertia = description.bodies[0].inertia
+        self.grapple = description.frames[config.grapple_frame][1]
+        try:
+            self._model = SpaceRobot(description)
+            quaternion = unit_quaternion(config.orientation or (0.0, 0.0, 0.0, 1.0))
+        except RobotDescriptionError as error:
+            raise ParameterError(f"The target is refused: {error}") from error
+        except ValueError as error:
+            raise ParameterError(f"Parameter 'target.orientation' is refused: {error}.") from None
+        self._initial = BodyMotion(
+            matrix_from_quaternion(quaternion),
+            *(
+                np.array(values or (0.0, 0.0, 0.0))
+                for values in (config.position, config.velocity, config.angular_velocity)
+            ),
+        )
+        self._plant = VelocityPlant(self._model, period, self._start(self._initial), step)
+        self.pose, self.twist = self._plant.pose, self._plant.twist
+
+    @property
+    def motion(self) -> BodyMotion:
+        """Its present motion."""
+        R = matrix_from_quaternion(self.pose[3:])
+        return BodyMotion(R, self.pose[:3].copy(), R @ self.twist[:3], R @ self.twist[3:])
+
+    @property
+    def momenta(self) -> Array:
+        """Linear over angular momentum (6,) about its centre of mass, in W."""
+        return self._plant.expected_momenta
+
+    def reset(self) -> None:
+        """Return to the initial state."""
+        self.release(self._initial)
+
+    def release(self, motion: BodyMotion) -> None:
+        """Float freely from this motion on."""
+        self._plant.initial = self._start(motion)
+        self._plant.reset()
+
+    def step(self) -> None:
+        """Advance a tick."""
+        self._plant.step(np.zeros(0))
+
+    def _start(self, motion: BodyMotion) -> InitialState:
+        p, L = motion.momenta(self.inertia)
+        return InitialState(
+            position=motion.r_WT,
+            quaternion=quaternion_from_matrix(motion.R_WT),
+            linear_momentum=p,
+            angular_momentum=L,
+        )
+
+
+@dataclass(frozen=True)
+class Approach:
+    """The motion of the grapple frame relative to the end-effector.
+
+    Attributes
+    ----------
+    distance, angle
+        Between the origins (m) and the attitudes (rad) of the two frames.
+    speed, rate
+        Of the origin of one relative to that of the other (m/s), and of their rotation (rad/s).
+    """
+
+    distance: float
+    angle: float
+    speed: float
+    rate: float
+
+    @classmethod
+    def between(cls, end_effector: BodyMotion, grapple: BodyMotion) -> Approach:
+        """Return the approach of two frames."""
+        turn = quaternion_from_matrix(end_effector.R_WT.T @ grapple.R_WT)
+        return cls(
+            float(np.linalg.norm(grapple.r_WT - end_effector.r_WT)),
+            float(np.linalg.norm(rotvec_from_quaternion(turn))),
+            float(np.linalg.norm(grapple.v - end_effector.v)),
+            float(np.linalg.norm(grapple.omega - end_effector.omega)),
+        )
+
+    def misses(self, limits: CaptureConfig) -> list[str]:
+        """Return a clause for each quantity beyond its limit; empty: a capture is possible."""
+        return [
+            f"{name} is {value:.4g} {unit}, {value - limit:.4g} {unit} more than "
+            f"'capture.{name}', {limit:g}"
+            for name, unit, value, limit in (
+                ("distance", "m", self.distance, limits.distance),
+                ("angle", "rad", self.angle, limits.angle),
+                ("speed", "m/s", self.speed, limits.speed),
+                ("rate", "rad/s", self.rate, limits.rate),
+            )
+            if not value <= limit
+        ]
+
+
+@dataclass(frozen=True)
+class CaptureReport:
+    """A capture: the impact, and the momenta and the motion after it.
+
+    Attributes
+    ----------
+    impact
+        The impact.
+    R_WB
+        Attitude of the base link (3, 3).
+    momenta
+        Linear over angular momentum (6,) of robot and target, about their common centre of mass,
+        in W.
+    residual
+        Relative difference between these momenta and those summed over the joined bodies after
+        the impact.
+    requested
+        Whether it was requested, not automatic.
+    joint_names, joint_impulse_limit
+        The joints, and the largest joint impulse that they stand, N m s or N s; 0: any.
+    """
+
+    impact: Impact
+    R_WB: Array
+    momenta: Array
+    residual: float
+    requested: bool
+    joint_names: tuple[str, ...] = ()
+    joint_impulse_limit: float = 0.0
+
+    def to_values(self) -> dict[str, Any]:
+        """Return the object ``capture`` of ``spacerobot run --json``; vectors are in W."""
+        impact = self.impact
+        return {
+            "captured": True,
+            "requested": self.requested,
+            "base_velocity_mps": (self.R_WB @ impact.twist[:3]).tolist(),
+            "base_rate_radps": (self.R_WB @ impact.twist[3:]).tolist(),
+            "joint_rates_radps": impact.qdot.tolist(),
+            "impulse_Ns": impact.impulse.tolist(),
+            "joint_impulses_Nms": impact.joint_impulses.tolist(),
+            "joint_impulse_limit_Nms": self.joint_impulse_limit,
+            "energy_before_J": impact.energy_before,
+            "energy_lost_J": impact.energy_lost,
+            "linear_momentum_kgmps": self.momenta[:3].tolist(),
+            "angular_momentum_Nms": self.momenta[3:].tolist(),
+            "total_momentum_residual": self.residual,
+        }
+
+    def event(self, time_s: float) -> Event:
+        """Return the event of the capture; a warning where a joint impulse is beyond its limit."""
+        impact, limit = self.impact, self.joint_impulse_limit
+        force, moment = np.linalg.norm(impact.impulse[:3]), np.linalg.norm(impact.impulse[3:])
+        message = (
+            f"The target is captured by an impulse of {force:.4g} N s and {moment:.4g} N m s; "
+            f"{impact.energy_lost:.4g} J of {impact.energy_before:.4g} J are lost"
+        )
+        worst = int(np.argmax(np.abs(impact.joint_impulses))) if self.joint_names else -1
+        exceeded = worst >= 0 and 0.0 < limit < abs(impact.joint_impulses[worst])
+        if exceeded:
+            message += (
+                f", and joint '{self.joint_names[worst]}' takes "
+                f"{abs(impact.joint_impulses[worst]):.4g} N m s, more than "
+                f"'capture.joint_impulse_limit', {limit:g}"
+            )
+        about = {name: json.dumps(value) for name, value in self.to_values().items()}
+        return Event(EventKind.CAPTURED, f"{message}.", int(exceeded), time_s, about=about)
+
+
+@dataclass(frozen=True)
+class ReleaseReport:
+    """A release: the target's velocity (3,), m/s, and rate (3,), rad/s, in W."""
+
+    velocity: Array
+    rate: Array
+
+    def event(self, time_s: float) -> Event:
+        """Return the event of the release."""
+        about = {
+            "velocity_mps": json.dumps(self.velocity.tolist()),
+            "rate_radps": json.dumps(self.rate.tolist()),
+        }
+        speed, rate = np.linalg.norm(self.velocity), np.linalg.norm(self.rate)
+        message = f"The target is released; it moves at {speed:.4g} m/s and {rate:.4g} rad/s."
+        return Event(EventKind.RELEASED, message, 0, time_s, about=about)
+
+
+def capture_values(about: Mapping[str, str]) -> dict[str, Any]:
+    """Return :meth:`CaptureReport.to_values` from the facts of its event; empty: they are others.
+
+    Numbers survive to the last bit.
+    """
+    try:
+        return {name: json.loads(text) for name, text in about.items()}
+    except (ValueError, RecursionError):
+        return {}
+
+
+class CapturePlant(WrappedPlant):
+    """A plant beside a target, which it can capture and release.
+
+    The state arrays are its own: those of the robot, alone or joined with the target, are copied
+    into them after each tick. Links, joints and commands stay the same.
+
+    Attributes
+    ----------
+    target
+        The target.
+    target_pose
+        (7,) position (m) and quaternion (x, y, z, w) of its root link in W.
+    target_twist
+        (6,) its velocity (m/s) and angular velocity (rad/s), in its own frame.
+    payload
+        The held target; None: it floats freely.
+    reports
+        Captures and releases since the owner emptied the list.
+
+    Parameters
+    ----------
+    build
+        Builds the dynamics of a robot in an initial state.
+    robot, initial
+        The robot alone, and its initial state.
+    target
+        The target.
+    config
+        Parameters of the plant.
+
+    Raises
+    ------
+    ParameterError
+        The robot has no end-effector, or the initial state is refused.
+    """
+
+    def __init__(
+        self,
+        build: Callable[[SpaceRobot, InitialState], Plant],
+        robot: SpaceRobot,
+        initial: InitialState,
+        target: Target,
+        config: PlantConfig,
+    ) -> None:
+        self._alone = build(robot, initial)
+        super().__init__(self._alone)
+        self.target, self._build, self._config = target, build, config.capture
+        self._moving_start = config.actuation == "effort"
+        self.link = _end_effector_of(robot.description, config)
+        self._link_index = robot.link_names.index(self.link)
+        self.pose, self.twist = self.pose.copy(), self.twist.copy()
+        self.q, self.qdot = self.q.copy(), self.qdot.copy()
+        self.effort, self.momentum = self.effort.copy(), self.momentum.copy()
+        self.link_R, self.link_r = self.link_R.copy(), self.link_r.copy()
+        self._momenta = self.plant.expected_momenta.copy()
+        self.target_pose, self.target_twist = target.pose.copy(), target.twist.copy()
+        self.payload: Payload | None = None
+        self.reports: list[CaptureReport | ReleaseReport] = []
+        self._held_joints: Flags = np.zeros(robot.n, dtype=np.bool_)
+        self._loads: PlantLoads | None = None
+        self._counts: dict[str, Counts] = {}
+        self._changed: RobotMotion | None = None
+        """The motion after a capture or a release, until the next tick."""
+        self._ready = True
+        """Whether an automatic capture is due as soon as its conditions hold."""
+        self._compile(initial)
+
+    def _compile(self, initial: InitialState) -> None:
+        """Call all functions of a capture once: compiling them would delay the flight then."""
+        robot, motion, inertia = self.robot, self._motion(), self.target.inertia
+        grasp_impact(robot, self.link, motion, self._body(), inertia)
+        joined = Payload(self.link, inertia.moved(_ANY_POSE)).attached_to(robot)
+        _summed_momenta(joined, motion)
+        self._build(joined, InitialState(joint_positions=initial.shape(robot)))
+
+    # -- the plant ----------------------------------------------------------------------------
+
+    @property
+    def present_robot(self) -> SpaceRobot:
+        """The robot that is integrated: alone, or with the mass properties of the target."""
+        return self.plant.robot
+
+    @property
+    def limit_counts(self) -> Mapping[str, Counts]:
+        """Number of ticks in which each joint (n,) was limited, by kind of limit."""
+        counts = self.plant.limit_counts
+        return {kind: each + self._counts.get(kind, 0) for kind, each in counts.items()}
+
+    @property
+    def expected_momenta(self) -> Array:
+        """Linear over angular momentum (6,) in W: from the beginning, by thrust, loads and captures."""
+        return self._momenta
+
+    def hold(self, joints: Flags) -> None:
+        """Lock the marked joints (n,) at their positions, and release all other joints."""
+        self._held_joints = joints.copy()
+        self.plant.hold(joints)
+
+    def load(self, loads: PlantLoads) -> None:
+        """Step under external loads on the robot from now on, whether it holds the target or not;
+        their numbers may change before each step.
+        """
+        self._loads = loads
+        self._alone.load(loads)
+        if self.plant is not self._alone:
+            self.plant.load(loads)
+
+    def reset(self) -> None:
+        """Return robot and target to their initial states."""
+        self._use(self._alone)
+        self._alone.reset()
+        self.target.reset()
+        self.payload, self._changed, self._ready = None, None, True
+        self._update()
+
+    def step(self, *commands: Any) -> bool:
+        """Advance a tick under the commands of the robot; first capture the target where that is
+        automatic and possible. Returns whether a joint was limited.
+        """
+        if self._config.mode == "automatic" and self.payload is None:
+            far = self._distance() > self._config.distance
+            if far or self.approach().misses(self._config):
+                self._ready = True
+            elif self._ready:
+                self._capture(requested=False)
+        limited: bool = self.plant.step(*commands)
+        if self.payload is None:
+            self.target.step()
+        self._changed = None
+        self._update()
+        return limited
+
+    def _distance(self) -> float:
+        """Return the distance of the grapple frame from the end-effector, m."""
+        R_WB, R_WT = (matrix_from_quaternion(pose[3:]) for pose in (self.pose, self.target_pose))
+        grapple = self.target_pose[:3] + R_WT @ self.target.grapple.r
+        hand = self.pose[:3] + R_WB @ self.link_r[:, self._link_index]
+        return math.dist(grapple, hand)
+
+    # -- captures -----------------------------------------------------------------------------
+
+    def approach(self) -> Approach:
+        """Return the present motion of the grapple frame relative to the end-effector."""
+        end_effector = frame_motion(self.robot, self.link, self._motion())
+        return Approach.between(end_effector, self._body().at(self.target.grapple))
+
+    def capture(self) -> CaptureReport:
+        """Capture the target; the next tick begins with the motion after the impact.
+
+        Raises
+        ------
+        CommandError
+            It is held already, or too far away or too fast; the message says by how much.
+        """
+        if self.payload is not None:
+            raise CommandError(
+                f"'{self.link}' holds the target '{self.target.description.name}' already: call "
+                "'~/release' first."
+            )
+        misses = self.approach().misses(self._config)
+        if misses:
+            raise CommandError(f"The target is missed: its {'; its '.join(misses)}.")
+        return self._capture(requested=True)
+
+    def release(self) -> ReleaseReport:
+        """Release the target, which keeps its velocity.
+
+        Raises
+        ------
+        CommandError
+            Nothing is held.
+        """
+        if self.payload is None:
+            raise CommandError(f"'{self.link}' holds nothing that could be released.")
+        motion, body, robot = self._motion(), self._body(), self._alone.robot
+        # The target takes its share of the momenta along, the robot keeps the rest.
+        self.target.release(body)
+        momenta = parted_momenta(
+            (robot.total_mass, self.target.inertia.mass),
+            self._centers(motion, body),
+            self.plant.expected_momenta,
+            self.target.momenta,
+        )
+        self._continue(robot, motion, momenta)
+        # An automatic capture waits until the target has left.
+        self.payload, self._ready = None, False
+        report = ReleaseReport(body.v, body.omega)
+        self.reports.append(report)
+        return report
+
+    def _capture(self, *, requested: bool) -> CaptureReport:
+        robot, motion, body = self._alone.robot, self._motion(), self._body()
+        inertia = self.target.inertia
+        impact = grasp_impact(robot, self.link, motion, body, inertia)
+        momenta = joined_momenta(
+            (robot.total_mass, inertia.mass),
+            self._centers(motion, body),
+            (self.plant.expected_momenta, self.target.momenta),
+        )
+        grasp = _relative_pose(frame_motion(robot, self.link, motion), body)
+        payload = Payload(self.link, inertia.moved(grasp))
+        joined = payload.attached_to(robot)
+        after = RobotMotion(motion.pose, impact.twist, motion.q, impact.qdot)
+        self._continue(joined, after, momenta)
+        self.payload, self._grasp = payload, grasp
+        report = CaptureReport(
+            impact,
+            motion.R_WB,
+            momenta,
+            _relative_difference(_summed_momenta(joined, after), momenta),
+            requested,
+            tuple(robot.joint_names),
+            self._config.joint_impulse_limit,
+        )
+        self.reports.append(report)
+        return report
+
+    def _continue(self, robot: SpaceRobot, motion: RobotMotion, momenta: Array) -> None:
+        """Integrate another robot from this motion on."""
+        start = InitialState(
+            position=motion.pose[:3],
+            quaternion=motion.pose[3:],
+            joint_positions=np.clip(motion.q, robot.lower, robot.upper),
+            joint_velocities=motion.qdot if self._moving_start else None,
+            linear_momentum=momenta[:3],
+            angular_momentum=momenta[3:],
+        )
+        self._use(self._build(robot, start))
+        # Servos bring the joints from these rates to the commanded ones in the next tick.
+        self.plant.qdot[:] = motion.qdot
+        self._changed = motion
+
+    def _use(self, plant: Plant) -> None:
+        self._counts = dict(self.limit_counts)
+        if plant is self._alone:
+            self._counts = {
+                kind: total - self._alone.limit_counts[kind] for kind, total in self._counts.items()
+            }
+        elif self._loads is not None:
+            plant.load(self._loads)
+        self.plant = plant
+        plant.hold(self._held_joints)
+
+    def _motion(self) -> RobotMotion:
+        """Return the present motion of the robot."""
+        if self._changed is not None:
+            return self._changed
+        return RobotMotion(self.pose.copy(), self.twist.copy(), self.q.copy(), self.qdot.copy())
+
+    def _body(self) -> BodyMotion:
+        """Return the present motion of the target."""
+        if self.payload is None:
+            return self.target.motion
+        return frame_motion(self.robot, self.link, self._motion()).at(self._grasp)
+
+    def _centers(self, motion: RobotMotion, body: BodyMotion) -> tuple[Array, Array]:
+        """Return the centres of mass of robot and target in W, m."""
+        r_BC_B = self._alone.robot.center_of_mass(motion.q)
+        of_target = body.at(Pose(r=self.target.inertia.com))
+        return motion.pose[:3] + motion.R_WB @ r_BC_B, of_target.r_WT
+
+    def _update(self) -> None:
+        """Copy the state of the plant and the target."""
+        plant = self.plant
+        self.pose[:], self.twist[:] = plant.pose, plant.twist
+        self.q[:], self.qdot[:], self.effort[:] = plant.q, plant.qdot, plant.effort
+        self.momentum[:], self._momenta[:] = plant.momentum, plant.expected_momenta
+        self.link_R[:], self.link_r[:] = plant.link_R, plant.link_r
+        if self.payload is None:
+            self.target_pose[:], self.target_twist[:] = self.target.pose, self.target.twist
+            return
+        body = self._body()
+        self.target_pose[:3] = body.r_WT
+        self.target_pose[3:] = quaternion_from_matrix(body.R_WT)
+        self.target_twist[:3] = body.R_WT.T @ body.v
+        self.target_twist[3:] = body.R_WT.T @ body.omega
+
+
+def capture_in(plant: Plant) -> CapturePlant | None:
+    """Return the part of a plant that captures, looking through its wrappers; None: no target."""
+    while isinstance(plant, WrappedPlant) and not isinstance(plant, CapturePlant):
+        plant = plant.plant
+    return plant if isinstance(plant, CapturePlant) else None
+
+
+def _end_effector_of(robot: RobotDescription, config: PlantConfig) -> str:
+    link = robot.end_effector(config.capture.end_effector or config.end_effector_frame)
+    if link not in robot.frames:
+        missing = f"has no link '{link}'" if link else "has no link 'end_effector'"
+        raise ParameterError(
+            f"The robot '{robot.name}' {missing} to capture a target with; it has "
+            f"{', '.join(robot.frames)}: set parameter 'capture.end_effector'."
+        )
+    return link
+
+
+def _relative_pose(first: BodyMotion, second: BodyMotion) -> Pose:
+    return Pose(first.R_WT.T @ second.R_WT, first.R_WT.T @ (second.r_WT - first.r_WT))
+
+
+def _summed_momenta(robot: SpaceRobot, motion: RobotMotion) -> Array:
+    twist = motion.twist
+    p, L, _ = robot.momentum(motion.pose[3:], motion.q, twist[:3], twist[3:], motion.qdot)
+    return np.concatenate([p, L])
+
+
+def _relative_difference(actual: Array, expected: Array) -> float:
+    """Return the larger relative difference of linear and angular momentum."""
+    shares = [0.0]
+    for part in (slice(0, 3), slice(3, 6)):
+        change = float(np.linalg.norm(actual[part] - expected[part]))
+        size = float(np.linalg.norm(expected[part]))
+        shares.append(change / size if size else (math.inf if change else 0.0))
+    return max(shares)
