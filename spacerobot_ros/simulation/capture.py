@@ -333,12 +333,12 @@ class CapturePlant(WrappedPlant):
         target: Target,
         config: PlantConfig,
     ) -> None:
+        self.link = _end_effector_of(robot.description, config)
+        self._link_index = robot.link_names.index(self.link)
         self._alone = build(robot, initial)
         super().__init__(self._alone)
         self.target, self._build, self._config = target, build, config.capture
         self._moving_start = config.actuation == "effort"
-        self.link = _end_effector_of(robot.description, config)
-        self._link_index = robot.link_names.index(self.link)
         self.pose, self.twist = self.pose.copy(), self.twist.copy()
         self.q, self.qdot = self.q.copy(), self.qdot.copy()
         self.effort, self.momentum = self.effort.copy(), self.momentum.copy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Inertia
+from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.planning import Goal
@@ -440,3 +443,88 @@ def test_a_plant_that_is_reset_shows_another_pose_of_one_time(controller: Rig) -
     controller.odom(1)
     controller.odom(1)
     assert any("differ" in line for _, line in controller.host.lines)
+
+
+# -- a robot that captures a target -----------------------------------------------------------
+
+HELD = Payload("link_1", Inertia(4.0, np.array([0.1, -0.2, 0.3]), np.diag([0.2, 0.3, 0.4])))
+CAPTURED = PlantStatus(PlantState.RUNNING, "A command is in force.", payload=HELD.to_text())
+RELEASED = PlantStatus(PlantState.RUNNING, "A command is in force.")
+
+
+def test_a_controller_commands_the_robot_with_the_body_that_it_holds(
+    controller: Rig, arm: SpaceRobot
+) -> None:
+    commander = controller.commander
+    controller.goal()
+    controller.state(1)
+    before, effort, wrench = commander.executive.controller, commander.effort, commander.wrench
+    assert before.law.robot is arm
+    commander.receive_plant_status(CAPTURED)
+    assert commander.robot.total_mass == pytest.approx(arm.total_mass + 4.0)
+    after = commander.executive.controller
+    assert after.law.robot is commander.robot
+    # The goal goes on, in the arrays that the messages are fed with.
+    assert after.profile is before.profile
+    assert commander.effort is effort
+    assert commander.wrench is wrench
+    controller.state(2)
+    assert controller.host.states[-1] == "tracking"
+    np.testing.assert_array_equal(after.goal.base.position, GOAL.position)
+    assert after.profile is not before.profile
+    assert controller.host.commands == [1, 2]
+    commander.receive_plant_status(CAPTURED)
+    assert commander.executive.controller is after
+    commander.receive_plant_status(RELEASED)
+    assert commander.robot is arm
+
+
+def test_a_controller_without_a_goal_holds_where_it_held(controller: Rig) -> None:
+    controller.state(1)
+    commander = controller.commander
+    held = commander.executive.controller.profile
+    commander.receive_plant_status(CAPTURED)
+    controller.state(2)
+    assert commander.executive.controller.profile is held
+    assert controller.host.states[-1] == "holding"
+
+
+def test_a_planner_plans_again_for_the_robot_with_the_body_that_it_holds(
+    planner: Rig, robot: SpaceRobot
+) -> None:
+    held = Payload(robot.link_names[1], HELD.inertia)
+    planner.goal()
+    for tick in range(1, 5):
+        planner.state(tick)
+    assert planner.host.states[-1] == "executing"
+    setpoint = planner.commander.setpoint
+    assert setpoint.velocity.any()
+    executive = planner.commander.executive
+    planner.commander.receive_plant_status(replace(CAPTURED, payload=held.to_text()))
+    assert planner.commander.robot.total_mass == pytest.approx(robot.total_mass + 4.0)
+    assert planner.commander.executive is executive
+    assert planner.commander.setpoint is setpoint
+    warnings = [line for level, line in planner.host.lines if level == "warning"]
+    assert warnings == ["The robot has another mass now: the motion is planned again."]
+    plans = planner.commander.statistics.plans
+    for tick in range(5, 9):
+        planner.state(tick)
+    assert planner.commander.statistics.plans == plans + 1
+    assert planner.host.commands == list(range(1, 9))
+
+
+def test_a_commander_that_comes_after_a_capture_knows_of_it(
+    arm: SpaceRobot, robot: SpaceRobot
+) -> None:
+    rig = Rig(ControllerCommander, config(ControllerConfig), arm.n)
+    rig.commander.receive_plant_status(CAPTURED)
+    rig.use(arm)
+    assert rig.commander.robot.total_mass == pytest.approx(arm.total_mass + 4.0)
+    # Of a robot without that link nothing is believed.
+    other = Rig(PlannerCommander, config(PlannerConfig, **METHOD), robot.n)
+    other.commander.receive_plant_status(CAPTURED)
+    other.use(robot)
+    assert other.commander.robot is robot
+    ((level, line),) = other.host.lines
+    assert level == "error"
+    assert line.startswith("plant/status: A body is held by the link 'link_1', but robot ")

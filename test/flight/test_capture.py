@@ -1,0 +1,134 @@
+"""The scenario `capture`: a flight whose robot is another one after the first tick."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spacerobot_ros.bag import read_bag
+from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import EventKind
+from spacerobot_ros.flight.flight import Flight, Signal
+from spacerobot_ros.flight.lockstep import fly_scenario
+from spacerobot_ros.flight.reading import namespaces, read_run
+from spacerobot_ros.flight.verification import verify_bag
+from spacerobot_ros.scenario import load_scenario
+
+TOPICS = ("/target/odom", "/momentum_expected", "/odom", "/joint_states")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _interpreted() -> Iterator[None]:
+    """Simulate in CasADi's virtual machine: compiling would take longer than these flights."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SPACEROBOT_COMPILE", "0")
+        yield
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return fly_scenario(load_scenario("capture"))
+
+
+@pytest.fixture(scope="module")
+def bag(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("capture") / "capture.mcap"
+    flight.save(path)
+    return path
+
+
+def test_the_block_is_captured_at_once_and_brought_to_rest(flight: Flight) -> None:
+    """Figures by Pinocchio."""
+    assert flight.succeeded
+    assert [each.kind for each in flight.events if each.time_s == 0.0] == [
+        EventKind.RUNNING,
+        EventKind.GOAL_ACCEPTED,
+        EventKind.CAPTURED,
+    ]
+    capture = flight.summary()["capture"]
+    assert (capture["time_s"], capture["captured"], capture["requested"]) == (0.0, True, False)
+    np.testing.assert_allclose(capture["joint_rates_radps"], [-0.0362457, 0.0809148], atol=5e-8)
+    np.testing.assert_allclose(capture["impulse_Ns"][:2], [-0.110519, -0.065737], atol=5e-7)
+    assert capture["energy_lost_J"] == pytest.approx(0.0048564, abs=5e-8)
+    assert capture["total_momentum_residual"] < 1e-12
+    # Thrusters have taken the momentum of the block away.
+    assert np.abs(flight.momentum[1, :6]).max() > 0.2
+    assert np.abs(flight.momentum[-1, :6]).max() < 0.02
+    assert flight.momentum_drift.max() < 1e-14
+    assert flight.target is not None
+    assert flight.target.name == "block"
+
+
+def test_the_bag_of_a_capture_verifies_and_reads_as_it_was_flown(flight: Flight, bag: Path) -> None:
+    found = verify_bag(bag)
+    assert found.difference is None
+    assert found.largest == 0.0
+    assert set(TOPICS) <= set(found.topics)
+    assert namespaces(read_bag(bag)) == [""]
+    read = read_run(bag)
+    assert read.capture == flight.capture
+    np.testing.assert_array_equal(
+        read.signal("target_pose").values, flight.signal("target_pose").values
+    )
+    assert read.target is not None
+    assert read.target.base_link == "block"
+
+
+def test_a_bag_that_was_cut_after_the_capture_is_salvaged_and_verifies(bag: Path) -> None:
+    cut = bag.with_name("cut.mcap")
+    shutil.copy(bag, cut)
+    with cut.open("r+b") as file:
+        file.truncate(int(bag.stat().st_size * 0.9))
+    found = verify_bag(salvage_bag(cut).path)
+    assert found.difference is None
+    assert "/target/odom" in found.topics
+
+
+def test_a_target_that_moved_otherwise_is_found(flight: Flight, bag: Path) -> None:
+    pose = flight.signal("target_pose")
+    values = pose.values.copy()
+    values[100:, 1] += 1e-6
+    series = {**flight.series, "target_pose": Signal(pose.time, values)}
+    path = bag.with_name("moved.mcap")
+    replace(flight, series=series).save(path)
+    difference = verify_bag(path).difference
+    assert difference is not None
+    assert (difference.topic, difference.time) == ("/target/odom", 1.0)
+    assert difference.field == "pose.pose.position.y"
+
+
+def test_mujoco_does_not_capture(bag: Path) -> None:
+    with pytest.raises(SpaceRobotError) as error:
+        verify_bag(bag, mujoco=True)
+    assert str(error.value) == (
+        f"The bag {bag} has a target, which MuJoCo does not capture: verify it without the second "
+        "engine."
+    )
+
+
+def test_a_block_that_passes_is_missed() -> None:
+    flight = fly_scenario(load_scenario("faults/missed_capture"))
+    assert flight.summary()["capture"] == {"captured": False}
+    assert EventKind.CAPTURED not in {each.kind for each in flight.events}
+    # It drifts past the end-effector.
+    x = flight.signal("target_pose").values[:, 0]
+    hand = flight.signal("end_effector_pose").values[:, 0]
+    assert x[0] - 0.3 > hand[0]
+    assert x[-1] - 0.3 < hand[-1]
+    np.testing.assert_allclose(flight.momentum[:, :6], 0.0, atol=1e-6)
+
+
+def test_a_flight_without_a_target_has_no_capture() -> None:
+    scenario = load_scenario("coordinated_control").with_overrides(
+        "coordinated_control", {"time_limit": 0.05}
+    )
+    flight = fly_scenario(scenario)
+    assert flight.target is None
+    assert flight.capture == {}
+    assert "capture" not in flight.summary()

@@ -1,0 +1,133 @@
+"""The plant's services that capture and release a target, and the topics of the target."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
+from std_msgs.msg import Float64MultiArray, String
+from support.plant_rig import Rig
+from support.ros_harness import Harness
+from visualization_msgs.msg import MarkerArray
+
+from spacerobot_ros.resources import share_directory
+
+BLOCK = share_directory() / "config" / "targets" / "block.urdf"
+JOINTS = ["shoulder", "elbow"]
+PARAMETERS: dict[str, Any] = {
+    "robot": "planar_manipulator",
+    "initial_center_of_mass": [0.0, 0.0, 0.0],
+    "initial_orientation": [0.0, 0.0, 0.18223552549214747, 0.9832549075639546],
+    "initial_joint_positions": [-1.0122909661567112, 1.0524335389525807],
+    "marker_period": 0.05,
+    "target.robot": str(BLOCK),
+    "target.position": [2.3000768148, -0.0023734357, 0.0],
+    "target.velocity": [-0.05, 0.02, 0.0],
+    "target.angular_velocity": [0.0, 0.0, 0.1],
+    "capture.angle": 0.5,
+    "capture.rate": 0.2,
+}
+TARGET_TOPICS = {
+    "target/odom": Odometry,
+    "target/robot_description": String,
+    "momentum_expected": Float64MultiArray,
+    "plant/status": DiagnosticStatus,
+    "events": DiagnosticStatus,
+    "markers": MarkerArray,
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _interpreted() -> Iterator[None]:
+    """Simulate in CasADi's virtual machine: compiling would take longer than these flights."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SPACEROBOT_COMPILE", "0")
+        yield
+
+
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
+
+
+def events_of(rig: Rig) -> list[tuple[str, str]]:
+    found = [values_of(each) for each in rig.probe.messages["events"]]
+    return [
+        (each["event"], each["time"])
+        for each in found
+        if each["event"] in ("captured", "released", "reset")
+    ]
+
+
+def test_a_target_is_captured_and_released_on_request(harness: Harness) -> None:
+    rig = Rig(harness, PARAMETERS, topics=TARGET_TOPICS)
+    assert rig.wait("target/robot_description", 1).data == BLOCK.read_text(encoding="utf-8")
+    refused = rig.trigger("plant/release")
+    assert (refused.success, refused.message) == (
+        False,
+        "'end_effector' holds nothing that could be released.",
+    )
+    first = rig.wait("target/odom", 1)
+    assert (first.header.frame_id, first.child_frame_id) == ("world", "block")
+    assert first.pose.pose.position.x == pytest.approx(2.3000768148)
+    assert first.twist.twist.linear.y == pytest.approx(0.02)
+
+    captured = rig.trigger("plant/capture")
+    assert captured.success
+    assert captured.message.startswith("The target is captured by an impulse of 0.1286 N s and ")
+    again = rig.trigger("plant/capture")
+    assert not again.success
+    assert again.message.startswith("'end_effector' holds the target 'block' already")
+    rig.step([0.0, 0.0], JOINTS)
+    harness.spin_until(lambda: bool(events_of(rig)), "the event of the capture")
+    assert events_of(rig) == [("captured", "0.000000000")]
+    assert '"mass": 10.0' in values_of(rig.probe.last("plant/status"))["payload"]
+    momentum = rig.wait("momentum", 2).data
+    np.testing.assert_allclose(momentum[:6], [-0.5, 0.2, 0, 0, 0, 0.4783324], atol=1e-7)
+    expected = rig.wait("momentum_expected", 2).data
+    np.testing.assert_allclose(expected, momentum[:6], rtol=0, atol=1e-14)
+    assert rig.diagnosis("momentum").level == DiagnosticStatus.OK
+
+    assert rig.trigger("plant/release").success
+    rig.step([0.0, 0.0], JOINTS)
+    harness.spin_until(lambda: len(events_of(rig)) == 2, "the event of the release")
+    assert events_of(rig)[1] == ("released", "0.050000000")
+    assert "payload" not in values_of(rig.probe.last("plant/status"))
+    # The last visual of the robot is followed by the two of the target.
+    markers = rig.wait("markers", 3).markers
+    assert [each.ns for each in markers[-2:]] == ["block", "grapple"]
+    at = rig.wait("target/odom", 3).pose.pose.position
+    assert markers[-2].pose.position.x == pytest.approx(at.x)
+    assert markers[-2].pose.position.y == pytest.approx(at.y)
+
+
+def test_a_latched_paused_or_stopped_plant_captures_nothing_but_a_paused_one(
+    harness: Harness,
+) -> None:
+    rig = Rig(harness, PARAMETERS)
+    rig.trigger("plant/abort")
+    latched = rig.trigger("plant/capture")
+    assert (latched.success, latched.message) == (
+        False,
+        "A fault is latched: aborted on request; call '~/rearm' first.",
+    )
+    rig.trigger("plant/rearm")
+    rig.pause(True)
+    assert rig.trigger("plant/capture").success
+    assert rig.trigger("plant/reset").success
+    rig.plant.trigger_deactivate()
+    stopped = rig.trigger("plant/capture")
+    assert (stopped.success, stopped.message) == (False, "The plant is inactive: nothing moves.")
+
+
+def test_a_plant_without_a_target_captures_nothing(harness: Harness) -> None:
+    rig = Rig(harness)
+    for service in ("capture", "release"):
+        answer = rig.trigger(f"plant/{service}")
+        assert (answer.success, answer.message) == (
+            False,
+            "There is no target: set parameter 'target.robot' to its URDF.",
+        )

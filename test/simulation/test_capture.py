@@ -1,0 +1,456 @@
+"""Robot and target in the plant: free motion, capture, the motion of both as one, release."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+from support.oracles import Array
+
+from spacerobot_ros.errors import CommandError, ParameterError
+from spacerobot_ros.events import EventKind
+from spacerobot_ros.model import SpaceRobot, parse_robot
+from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.parameters import configured
+from spacerobot_ros.resources import robot_file, share_directory
+from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
+from spacerobot_ros.simulation.capture import Approach, CapturePlant, capture_values
+from spacerobot_ros.simulation.commands import CommandValidator
+from spacerobot_ros.simulation.config import CaptureConfig, PlantConfig
+from spacerobot_ros.simulation.sensors import ReportedState
+from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
+
+BLOCK = str(share_directory() / "config" / "targets" / "block.urdf")
+
+PAPER_ROBOT: dict[str, Any] = {
+    "robot": "planar_manipulator",
+    "tick_rate": 100.0,
+    "initial_center_of_mass": [0.0, 0.0, 0.0],
+    "initial_orientation": [0.0, 0.0, 0.18223552549214747, 0.9832549075639546],
+    "initial_joint_positions": [-1.0122909661567112, 1.0524335389525807],
+    "target.robot": BLOCK,
+    "target.position": [2.3000768148, -0.0023734357, 0.0],
+    "target.velocity": [-0.05, 0.02, 0.0],
+    "target.angular_velocity": [0.0, 0.0, 0.1],
+    "capture.distance": 0.01,
+    "capture.angle": 0.5,
+    "capture.rate": 0.2,
+}
+"""Papadopoulos and Dubowsky's robot at rest; the block's centre is 0.3 m beyond its hand."""
+
+TUMBLER = """<robot name="tumbler">
+  <link name="hull"><inertial><origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.4 0.9"/><mass value="21"/>
+    <inertia ixx="1.3" iyy="1.9" izz="2.6" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="ring"/><joint name="ring_mount" type="fixed"><parent link="hull"/>
+    <child link="ring"/><origin xyz="0.4 0.3 -0.1" rpy="0.5 0.2 -0.3"/></joint></robot>"""
+
+SPATIAL: dict[str, Any] = {
+    "robot": "three_joint_arm",
+    "tick_rate": 40.0,
+    "integration_step": 0.005,
+    "initial_position": [0.3, -0.2, 0.5],
+    "initial_orientation": [0.1, -0.3, 0.2, 0.9],
+    "initial_joint_positions": [0.3, -0.5, 0.4],
+    "linear_momentum": [3.0, -2.0, 1.0],
+    "angular_momentum": [1.0, 2.0, -1.5],
+    "target.robot_description": TUMBLER,
+    "target.grapple_frame": "ring",
+    "target.position": [1.0, 1.5, -0.7],
+    "target.orientation": [0.5, 0.1, -0.4, 0.7],
+    "target.velocity": [0.02, -0.03, 0.01],
+    "target.angular_velocity": [0.2, 0.3, -0.1],
+    "capture.end_effector": "link_3",
+    # Both are grasped where they are, however far apart.
+    **{f"capture.{name}": 100.0 for name in ("distance", "angle", "speed", "rate")},
+}
+
+
+def plant_of(values: dict[str, Any], **others: Any) -> FaultyPlant:
+    config = configured(PlantConfig, {**values, **others})
+    return build_plant(SpaceRobot.from_file(robot_file(config.robot)), config)
+
+
+def capturing_of(plant: FaultyPlant) -> CapturePlant:
+    assert plant.capturing is not None
+    return plant.capturing
+
+
+def commands_of(plant: FaultyPlant, rates: Any = 0.0) -> list[Array]:
+    joints = np.zeros(plant.robot.n) + rates
+    return [joints, np.zeros(6)] if plant.takes_wrench else [joints]
+
+
+def total_momentum(plant: FaultyPlant) -> Array:
+    """Linear momentum, and angular momentum about the origin of W, summed over all bodies."""
+    capturing = capturing_of(plant)
+    robot, pose = capturing.present_robot, plant.pose
+    R_WB = Rotation.from_quat(pose[3:]).as_matrix()
+    p = plant.momentum[:3].copy()
+    L = plant.momentum[3:6] + np.cross(pose[:3] + R_WB @ robot.center_of_mass(plant.q), p)
+    if capturing.payload is None:
+        inertia = capturing.target.inertia
+        R = Rotation.from_quat(capturing.target_pose[3:]).as_matrix()
+        omega = R @ capturing.target_twist[3:]
+        v = R @ capturing.target_twist[:3] + np.cross(omega, R @ inertia.com)
+        center = capturing.target_pose[:3] + R @ inertia.com
+        p = p + inertia.mass * v
+        L = L + R @ inertia.about_com @ R.T @ omega + np.cross(center, inertia.mass * v)
+    return np.concatenate([p, L])
+
+
+def relative_change(now: Array, before: Array) -> float:
+    return max(
+        float(np.linalg.norm((now - before)[part]) / np.linalg.norm(before[part]))
+        for part in (slice(0, 3), slice(3, 6))
+    )
+
+
+@pytest.mark.parametrize("actuation", ["velocity", "effort"])
+def test_the_papers_robot_captures_a_block(actuation: str) -> None:
+    """Figures by Pinocchio."""
+    mode = {"capture.mode": "automatic", "actuation": actuation}
+    plant = plant_of(PAPER_ROBOT, **mode)
+    capturing = capturing_of(plant)
+    plant.step(*commands_of(plant))
+    (report,) = capturing.reports
+    values = report.to_values()  # type: ignore[union-attr]
+    expected = {
+        "base_velocity_mps": [5.2523e-4, 3.1376e-4, 0.0],
+        "base_rate_radps": [0.0, 0.0, 3.1406e-4],
+        "joint_rates_radps": [-0.0362457, 0.0809148],
+        "impulse_Ns": [-0.110519, -0.065737, 0.0, 0.0, 0.0, 0.035296],
+        "energy_before_J": 0.0195,
+        "energy_lost_J": 0.0048564,
+        "linear_momentum_kgmps": [-0.5, 0.2, 0.0],
+        "angular_momentum_Nms": [0.0, 0.0, 0.4783324],
+    }
+    for name, figures in expected.items():
+        np.testing.assert_allclose(values[name], figures, rtol=2e-5, atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(values["angular_momentum_Nms"][2], 0.4783324, rtol=0, atol=5e-8)
+    assert values["total_momentum_residual"] < 1e-14
+    assert values["captured"] is True
+    assert values["requested"] is False
+    # Servos have brought the joints to rest by internal torques; motors leave them moving.
+    rates = [0.0, 0.0] if actuation == "velocity" else values["joint_rates_radps"]
+    np.testing.assert_allclose(plant.qdot, rates, rtol=0, atol=6e-5)
+    assert plant.effort.any() == (actuation == "velocity")
+    assert capturing.present_robot.total_mass == pytest.approx(57.0)
+    np.testing.assert_allclose(plant.momentum[:6], plant.expected_momenta, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("actuation", ["velocity", "effort"])
+def test_momentum_is_constant_through_approach_capture_and_release(actuation: str) -> None:
+    plant = plant_of(SPATIAL, actuation=actuation)
+    capturing = capturing_of(plant)
+    before = total_momentum(plant)
+    joints = commands_of(plant, [0.02, -0.01, 0.03])
+    poses = []
+    for tick in range(16):
+        if tick == 5:
+            report = capturing.capture()
+            assert report.requested
+            assert report.residual < 1e-13
+        if tick == 11:
+            capturing.release()
+        plant.step(*joints)
+        assert relative_change(total_momentum(plant), before) < 1e-12, tick
+        poses.append(capturing.target_pose.copy())
+    assert capturing.payload is None
+    assert capturing.present_robot is plant.robot
+    # The target moves on without a jump, and where its velocity says.
+    steps = np.diff([pose[:3] for pose in poses], axis=0)
+    assert np.abs(np.diff(steps, axis=0))[[0, 1, 6, 7, 8, 12, 13]].max() < 2e-3
+    R = Rotation.from_quat(poses[-1][3:]).as_matrix()
+    np.testing.assert_allclose(steps[-1] * 40.0, R @ capturing.target_twist[:3], rtol=0, atol=5e-3)
+
+
+def test_a_release_at_once_leaves_the_motion_after_the_impact() -> None:
+    plant = plant_of(SPATIAL, actuation="effort")
+    capturing = capturing_of(plant)
+    before, report = total_momentum(plant), capturing.capture()
+    released = capturing.release()
+    plant.step(*commands_of(plant))
+    assert relative_change(total_momentum(plant), before) < 1e-12
+    np.testing.assert_allclose(plant.qdot, report.impact.qdot, rtol=0, atol=0.05)
+    R = Rotation.from_quat(capturing.target_pose[3:]).as_matrix()
+    np.testing.assert_allclose(R @ capturing.target_twist[3:], released.rate, rtol=0, atol=0.01)
+    assert [type(each).__name__ for each in capturing.reports] == ["CaptureReport", "ReleaseReport"]
+
+
+def test_a_free_target_moves_by_eulers_equations() -> None:
+    plant = plant_of(SPATIAL)
+    capturing = capturing_of(plant)
+    inertia = capturing.target.inertia
+    R_0 = Rotation.from_quat(SPATIAL["target.orientation"]).as_matrix()
+    omega_W, v_W = (np.array(SPATIAL[f"target.{k}"]) for k in ("angular_velocity", "velocity"))
+
+    def rate(_: float, x: Array) -> Array:
+        omega = x[4:]
+        w, u = x[3], x[:3]
+        turn = np.concatenate([w * omega + np.cross(u, omega), [-u @ omega]]) / 2
+        J = inertia.about_com
+        return np.concatenate([turn, np.linalg.solve(J, np.cross(J @ omega, omega))])
+
+    start = np.concatenate([Rotation.from_matrix(R_0).as_quat(), R_0.T @ omega_W])
+    end = solve_ivp(rate, (0, 2.0), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    for _ in range(80):
+        plant.step(*commands_of(plant))
+    R = Rotation.from_quat(end[:4]).as_matrix()
+    center = np.array(SPATIAL["target.position"]) + R_0 @ inertia.com
+    center = center + 2.0 * (v_W + np.cross(omega_W, R_0 @ inertia.com))
+    np.testing.assert_allclose(capturing.target_pose[:3], center - R @ inertia.com, atol=1e-9)
+    actual = Rotation.from_quat(capturing.target_pose[3:])
+    assert (actual * Rotation.from_quat(end[:4]).inv()).magnitude() < 1e-9
+    np.testing.assert_allclose(capturing.target_twist[3:], end[4:], rtol=0, atol=1e-9)
+
+
+def test_a_held_target_moves_with_the_link() -> None:
+    plant = plant_of(SPATIAL, actuation="velocity")
+    capturing = capturing_of(plant)
+    capturing.capture()
+    index = plant.robot.link_names.index("link_3")
+
+    def grasp() -> Array:
+        R_WB = Rotation.from_quat(plant.pose[3:]).as_matrix()
+        R_WL = R_WB @ plant.link_R[:, 3 * index : 3 * index + 3]
+        arm = capturing.target_pose[:3] - plant.pose[:3] - R_WB @ plant.link_r[:, index]
+        R_WT = Rotation.from_quat(capturing.target_pose[3:]).as_matrix()
+        return np.column_stack([R_WL.T @ arm, R_WL.T @ R_WT])
+
+    plant.step(*commands_of(plant, 0.1))
+    first = grasp()
+    plant.step(*commands_of(plant, 0.1))
+    np.testing.assert_allclose(grasp(), first, rtol=0, atol=1e-13)
+
+
+def test_an_automatic_capture_waits_for_the_target_and_after_a_release_for_its_return() -> None:
+    """The block drifts towards the hand by 0.02 m a tick, from 0.06 m before it."""
+    position = [2.3000768148 + 0.06, -0.0023734357, 0.0]
+    plant = plant_of(
+        PAPER_ROBOT,
+        **{"capture.mode": "automatic", "target.position": position, "capture.distance": 0.025},
+        **{"target.velocity": [-2.0, 0.0, 0.0], "capture.speed": 3.0, "capture.angle": 0.41},
+        **{"target.angular_velocity": [0.0, 0.0, 0.0], "actuation": "effort"},
+    )
+    capturing = capturing_of(plant)
+    held = []
+    for _ in range(4):
+        plant.step(*commands_of(plant))
+        held.append(capturing.payload is not None)
+    assert held == [False, False, True, True]
+    capturing.release()
+    for _ in range(3):
+        plant.step(*commands_of(plant))
+        assert capturing.payload is None
+    # It has left and comes back.
+    capturing.target.release(
+        type(capturing.target.motion)(np.eye(3), np.full(3, 9.0), *np.eye(3)[:2])
+    )
+    plant.step(*commands_of(plant))
+    plant.reset()
+    np.testing.assert_allclose(capturing.target_pose[:3], position)
+    assert not capturing.payload
+
+
+def test_a_capture_needs_every_quantity_within_its_bound() -> None:
+    approach = Approach(distance=0.2, angle=0.3, speed=0.04, rate=0.5)
+    loose = CaptureConfig(distance=0.2, angle=0.3, speed=0.04, rate=0.5)
+    assert approach.misses(loose) == []
+    assert approach.misses(CaptureConfig(distance=0.05, angle=0.2, speed=0.03, rate=0.1)) == [
+        "distance is 0.2 m, 0.15 m more than 'capture.distance', 0.05",
+        "angle is 0.3 rad, 0.1 rad more than 'capture.angle', 0.2",
+        "speed is 0.04 m/s, 0.01 m/s more than 'capture.speed', 0.03",
+        "rate is 0.5 rad/s, 0.4 rad/s more than 'capture.rate', 0.1",
+    ]
+
+
+def test_the_approach_is_measured_between_the_two_frames() -> None:
+    approach = capturing_of(plant_of(PAPER_ROBOT)).approach()
+    assert approach.distance < 1e-8
+    assert approach.angle == pytest.approx(np.radians(23.3))
+    # Of the handle: -0.05 m/s along x, and 0.02 - 0.3 * 0.1 m/s along y.
+    assert approach.speed == pytest.approx(np.hypot(0.05, 0.01))
+    assert approach.rate == pytest.approx(0.1)
+
+
+def test_refusals() -> None:
+    capturing = capturing_of(plant_of(PAPER_ROBOT, **{"capture.angle": 0.1}))
+    with pytest.raises(CommandError) as error:
+        capturing.capture()
+    assert str(error.value) == (
+        "The target is missed: its angle is 0.4067 rad, 0.3067 rad more than 'capture.angle', 0.1."
+    )
+    with pytest.raises(CommandError, match=r"^'end_effector' holds nothing that could be released"):
+        capturing.release()
+    assert capturing.reports == []
+    capturing = capturing_of(plant_of(PAPER_ROBOT))
+    capturing.capture()
+    with pytest.raises(CommandError) as error:
+        capturing.capture()
+    assert str(error.value) == (
+        "'end_effector' holds the target 'block' already: call '~/release' first."
+    )
+
+
+def test_a_reset_puts_both_back() -> None:
+    plant = plant_of(PAPER_ROBOT, actuation="effort")
+    capturing = capturing_of(plant)
+    pose = plant.pose.copy()
+    capturing.capture()
+    plant.step(*commands_of(plant, 1.0))
+    plant.reset()
+    assert capturing.payload is None
+    assert capturing.present_robot is plant.robot
+    np.testing.assert_array_equal(plant.pose, pose)
+    np.testing.assert_allclose(capturing.target_pose[:3], PAPER_ROBOT["target.position"])
+    np.testing.assert_allclose(plant.momentum, 0.0, atol=1e-15)
+    np.testing.assert_allclose(capturing.target_twist, [-0.05, 0.02, 0, 0, 0, 0.1], atol=1e-15)
+
+
+def test_limits_and_locked_joints_outlast_a_capture() -> None:
+    plant = plant_of(
+        PAPER_ROBOT,
+        faults=["joint_stuck shoulder at 0"],
+        **{"capture.distance": 1.0, "capture.speed": 9.0, "capture.rate": 9.0},
+    )
+    capturing = capturing_of(plant)
+    fast = commands_of(plant, [0.1, 9.0])
+    plant.step(*fast)
+    capturing.capture()
+    plant.step(*fast)
+    assert plant.limit_counts["rate"].tolist() == [0, 2]
+    assert plant.qdot[0] == 0.0
+    assert plant.q[0] == pytest.approx(-1.0122909661567112, abs=1e-15)
+    plant.reset()
+    plant.step(*fast)
+    assert plant.limit_counts["rate"].tolist() == [0, 3]
+    plant.reset()
+    assert plant.limit_counts["rate"].tolist() == [0, 3]
+
+
+def test_joint_impulses_are_held_against_their_limit() -> None:
+    capturing = capturing_of(plant_of(PAPER_ROBOT, **{"capture.joint_impulse_limit": 0.09}))
+    report = capturing.capture()
+    np.testing.assert_allclose(report.impact.joint_impulses, [-0.100376, 0.0186352], atol=5e-7)
+    event = report.event(1.5)
+    assert (event.kind, event.level, event.time_s) == (EventKind.CAPTURED, 1, 1.5)
+    assert event.message == (
+        "The target is captured by an impulse of 0.1286 N s and 0.0353 N m s; 0.004856 J of "
+        "0.0195 J are lost, and joint 'shoulder' takes 0.1004 N m s, more than "
+        "'capture.joint_impulse_limit', 0.09."
+    )
+    assert capture_values(event.about) == report.to_values()
+    assert capture_values({"impulse_Ns": "[1"}) == {}
+    enough = capturing_of(plant_of(PAPER_ROBOT, **{"capture.joint_impulse_limit": 0.11})).capture()
+    assert enough.event(0.0).level == 0
+    assert enough.event(0.0).message.endswith("0.0195 J are lost.")
+
+
+def test_the_state_and_the_status_tell_of_a_capture() -> None:
+    config = configured(PlantConfig, PAPER_ROBOT)
+    plant = plant_of(PAPER_ROBOT)
+    capturing, reported = capturing_of(plant), ReportedState(plant, config)
+    assert reported.quantities["target_pose"] is capturing.target_pose
+    assert reported.quantities["target_twist"] is capturing.target_twist
+    assert reported.quantities["expected_momenta"] is plant.expected_momenta
+    assert reported.target is capturing.target.description
+    names = [topic.name for topic in reported.topics]
+    assert "target/odom" in names
+    assert "momentum_expected" in names
+
+    monitor = PlantMonitor(CommandValidator(plant, config), plant, lockstep=True)
+    assert [each.kind for each in monitor.update(PlantState.RUNNING, 0.0)] == [EventKind.RUNNING]
+    assert monitor.status.payload == ""
+    assert "payload" not in monitor.status.to_values()
+    capturing.capture()
+    (event,) = monitor.update(PlantState.RUNNING, 0.25)
+    assert (event.kind, event.time_s) == (EventKind.CAPTURED, 0.25)
+    held = Payload.from_text(monitor.status.payload)
+    assert held.link == "end_effector"
+    assert held.inertia.mass == 10.0
+    # The hand is turned by 23.3 deg, and the block's centre 0.3 m beyond it along x of the world.
+    turn = np.radians(-23.3)
+    expected = 0.3 * np.array([np.cos(turn), np.sin(turn), 0.0])
+    np.testing.assert_allclose(held.inertia.com, expected, rtol=0, atol=1e-8)
+    values = monitor.status.to_values()
+    assert json.loads(values["payload"])["mass"] == 10.0
+    assert PlantStatus.from_values(values).payload == monitor.status.payload
+    assert monitor.update(PlantState.RUNNING, 0.26) == []
+    capturing.release()
+    (event,) = monitor.update(PlantState.RUNNING, 0.5)
+    assert event.kind is EventKind.RELEASED
+    # It has lost the impulse of the capture: 10 kg move by (-0.389481, 0.265737) N s.
+    assert event.message == "The target is released; it moves at 0.04715 m/s and 0.04498 rad/s."
+    assert set(event.about) == {"velocity_mps", "rate_radps"}
+    assert monitor.status.payload == ""
+
+
+def test_a_plant_without_a_target_has_nothing_of_it() -> None:
+    values = {name: x for name, x in PAPER_ROBOT.items() if not name.startswith("target.")}
+    plant = plant_of(values)
+    assert plant.capturing is None
+    reported = ReportedState(plant, configured(PlantConfig, values))
+    assert reported.target is None
+    assert not {"target_pose", "target_twist", "expected_momenta"} & set(reported.quantities)
+
+
+JOINTED = TUMBLER.replace('type="fixed"', 'type="continuous"').replace(
+    '<link name="ring"/>',
+    '<link name="ring"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" '
+    'ixz="0" iyz="0"/></inertial></link>',
+)
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        (
+            {"target.grapple_frame": "handle"},
+            "The target 'block' has no link 'handle' to be grasped at; it has block, grapple: set "
+            "parameter 'target.grapple_frame', or add the link.",
+        ),
+        (
+            {"target.robot_description": JOINTED},
+            "The target 'tumbler' has joints that move (ring_mount); a target is one rigid body: "
+            "make them fixed.",
+        ),
+        (
+            {"target.robot_description": TUMBLER.replace('value="21"', 'value="0"')},
+            "The target is refused: The base link 'hull' has no mass;",
+        ),
+        ({"target.robot": "nowhere.urdf"}, "The target is refused: There is no robot 'nowhere"),
+        (
+            {"target.orientation": [0.0, 0.0, 0.0, 0.0]},
+            "Parameter 'target.orientation' is refused: ",
+        ),
+        (
+            {"capture.end_effector": "hand"},
+            "The robot 'planar_manipulator' has no link 'hand' to capture a target with; it has "
+            "base_link, link_1, link_2, end_effector: set parameter 'capture.end_effector'.",
+        ),
+    ],
+)
+def test_a_bad_target_is_refused(values: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError) as error:
+        plant_of(PAPER_ROBOT, **values)
+    assert str(error.value).startswith(sentence)
+
+
+def test_a_robot_without_an_end_effector_captures_nothing() -> None:
+    with pytest.raises(ParameterError) as error:
+        plant_of({"robot": "seven_joint_arm", "target.robot": BLOCK})
+    assert str(error.value).startswith(
+        "The robot 'seven_joint_arm' has no link 'end_effector' to capture a target with; it has "
+    )
+
+
+def test_the_block_is_as_its_file_says() -> None:
+    block = parse_robot(Path(BLOCK).read_text(encoding="utf-8"))
+    assert block.total_mass == 10.0
+    np.testing.assert_array_equal(block.bodies[0].inertia.about_com, np.eye(3))
+    np.testing.assert_array_equal(block.frames["grapple"][1].r, [-0.3, 0.0, 0.0])
