@@ -174,6 +174,7 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	$(FLY) reach
 	$(FLY) two_hands
 	$(FLY) strut
+	$(FLY) capture --set plant.target.robot=config/targets/block.urdf
 
 # What mkdocs prints of its theme's successor is no warning of the build.
 .PHONY: docs

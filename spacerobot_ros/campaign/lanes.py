@@ -142,6 +142,8 @@ class LanesEngine:
             return "it has faults"
         if plant.disturbances:
             return "it has disturbances, which engine 'flights' flies"
+        if plant.target.given:
+            return "it has a target"
         if campaign.measures_clearance:
             return "a criterion names clearance_m, and lanes measure no distances between links"
         match scenario.commanders, plant.actuation:

@@ -76,6 +76,8 @@ _MARKS = {
     EventKind.DISTURBANCE_ENDED: _Mark("disturbance over", "<", _WARN, 1, hollow=True),
     EventKind.CONTACT: _Mark("contact", "P", _BAD, 1),
     EventKind.CONTACT_ENDED: _Mark("contact over", "P", _BAD, 1, hollow=True),
+    EventKind.CAPTURED: _Mark("captured", "D", _GOOD, 1),
+    EventKind.RELEASED: _Mark("released", "D", _GOOD, 1, hollow=True),
     EventKind.LATCHED: _Mark("latched", "s", _BAD, 1),
     EventKind.REARMED: _Mark("rearmed", "s", _GOOD, 1, hollow=True),
     EventKind.STUCK_JOINT: _Mark("stuck joint", "D", _BAD, 1),

@@ -55,7 +55,7 @@ def load_target(config: TargetConfig) -> RobotDescription | None:
     ParameterError
         There is no such file; the target is refused, or its joints move.
     """
-    if not config.robot and not config.robot_description:
+    if not config.given:
         return None
     try:
         if config.robot_description:
@@ -379,7 +379,7 @@ class CapturePlant(WrappedPlant):
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: from the beginning, by thrust, loads and captures."""
+        """Linear over angular momentum (6,) in W: from the beginning, and by all impulses."""
         return self._momenta
 
     def hold(self, joints: Flags) -> None:

@@ -110,6 +110,11 @@ class TargetConfig:
         length=3,
     )
 
+    @property
+    def given(self) -> bool:
+        """Whether there is a target."""
+        return bool(self.robot or self.robot_description)
+
 
 @dataclass(frozen=True)
 class CaptureConfig:

@@ -225,6 +225,9 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
         assert select_engine(made, "auto").name == "flights"
         with pytest.raises(SpaceRobotError, match="integral gains, which engine 'flights' flies"):
             select_engine(made, "lanes")
+    beside = campaign(set={"plant.target.robot": "block.urdf"})
+    with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has a target"):
+        select_engine(beside, "lanes")
     near = campaign(criteria={"clearance_m": {"min": 0.0}})
     assert select_engine(near, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="lanes measure no distances between links"):

@@ -27,6 +27,7 @@ EXPECTED: dict[str, tuple[bool, float | None, float | None]] = {
     "weak_motors": (True, 2e-3, 2e-3),
     "late_poses": (True, 2e-3, 2e-3),
     "biased_pose": (True, 0.11, 2e-3),
+    "missed_capture": (True, 1e-6, 1e-6),
 }
 FAST = ("noisy_sensors", "late_poses")
 KILLED = "killed_nodes"

@@ -292,8 +292,7 @@ class PlantNode(FlightNode):
         path = self.config.resume_bag
         if not path:
             return None, 0
-        target = self.config.target
-        if target.robot or target.robot_description:
+        if self.config.target.given:
             raise ParameterError(
                 "A plant with a target does not go on from a bag: leave out 'resume_bag' or "
                 "'target.robot'."
