@@ -119,7 +119,7 @@ def test_the_papers_robot_captures_a_block(actuation: str) -> None:
     plant.step(*commands_of(plant))
     (report,) = capturing.reports
     values = report.to_values()  # type: ignore[union-attr]
-    expected = {
+    expected: dict[str, Any] = {
         "base_velocity_mps": [5.2523e-4, 3.1376e-4, 0.0],
         "base_rate_radps": [0.0, 0.0, 3.1406e-4],
         "joint_rates_radps": [-0.0362457, 0.0809148],
@@ -331,6 +331,25 @@ def test_limits_and_locked_joints_outlast_a_capture() -> None:
     assert plant.limit_counts["rate"].tolist() == [0, 3]
     plant.reset()
     assert plant.limit_counts["rate"].tolist() == [0, 3]
+
+
+@pytest.mark.parametrize("actuation", ["velocity", pytest.param("effort", marks=pytest.mark.slow)])
+def test_disturbances_push_the_robot_before_and_after_a_capture(actuation: str) -> None:
+    """0.3 N along x of the world from 0.02 s on: 0.003 N s in each tick of 0.01 s."""
+    push = ["base_link force 0.3 0 0 at 0.02"]
+    plant = plant_of(PAPER_ROBOT, actuation=actuation, disturbances=push)
+    capturing = capturing_of(plant)
+    along_x = []
+    for tick in range(9):
+        if tick == 4:
+            capturing.capture()
+        if tick == 7:
+            capturing.release()
+        plant.step(*commands_of(plant))
+        along_x.append(total_momentum(plant)[0])
+    expected = -0.5 + 0.003 * np.maximum(0.0, np.arange(1, 10) - 2)
+    np.testing.assert_allclose(along_x, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(plant.momentum[:6], plant.expected_momenta, rtol=0, atol=1e-13)
 
 
 def test_joint_impulses_are_held_against_their_limit() -> None:
