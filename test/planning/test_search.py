@@ -550,7 +550,9 @@ def test_commands_in_motion_take_a_few_ticks_more_where_they_must(model: Manoeuv
         [call.bounds.shortest / PERIOD for call in calls], [51, 51, 52, 52, 54, 54, 58, 58]
     )
     assert all(call.bounds.fixed for call in calls)
-    np.testing.assert_allclose([c.guess.step * 11 for c in calls], [c.bounds.shortest for c in calls])
+    np.testing.assert_allclose(
+        [c.guess.step * 11 for c in calls], [c.bounds.shortest for c in calls]
+    )
     shares = [float(call.limits.acceleration[0] / LIMITS.acceleration[0]) for call in calls]
     np.testing.assert_allclose(shares, [0.98, 1.0] * 4)
 

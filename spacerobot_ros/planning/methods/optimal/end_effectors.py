@@ -458,26 +458,37 @@ class EndEffectorSpecification:
             candidates = quaternions_from_rotvecs(
                 np.vstack([np.zeros((1, 3)), *(np.pi * k / 2 * self.rows.axes for k in (1, 2, 3))])
             )
-            least = np.inf
-            for candidate in candidates:
-                for _ in range(_ITERATIONS):
-                    values, by_rotation, _ = self.rows.evaluate(
-                        candidate[np.newaxis], shape[np.newaxis], parameters
-                    )
-                    J = by_rotation[0] @ self.rows.axes.T
-                    step = self.rows.axes.T @ np.linalg.lstsq(J, -values[0], rcond=1e-9)[0]
-                    candidate = quaternion_multiply(candidate, quaternion_from_rotvec(step))
-                if (miss := float(np.linalg.norm(values[0]))) < least:
-                    least, X = miss, candidate
+            found = [self._nearest_turn(each, shape, parameters) for each in candidates]
+            X = min(found, key=lambda each: each[1])[0]
         values, _, _ = self.rows.evaluate(X[np.newaxis], shape[np.newaxis], parameters)
-        if (miss := float(np.abs(values).max(initial=0.0))) > most:
+        if np.abs(values).max(initial=0.0) > most:
             raise UnreachableError(
                 f"With the joint positions of the goal no attitude of the base puts the "
-                f"end-effectors nearer than {miss:.3g} m or rad to their goals: the centre of mass "
-                "stays where it is. Leave the joint positions out.",
+                f"end-effectors nearer than {np.linalg.norm(values):.3g} m or rad to their goals: "
+                "the centre of mass stays where it is. Leave the joint positions out.",
                 Proof.MOMENTUM,
             )
         return X
+
+    def _nearest_turn(self, X: Array, shape: Array, parameters: Array) -> tuple[Array, float]:
+        """Return the turn (4,) near X at which the rows of a shape are least, and their norm."""
+
+        def at(turn: Array) -> tuple[Array, Array]:
+            values, by_rotation, _ = self.rows.evaluate(
+                turn[np.newaxis], shape[np.newaxis], parameters
+            )
+            return values[0], by_rotation[0] @ self.rows.axes.T
+
+        (values, J), size = at(X), 1.0
+        for _ in range(_ITERATIONS):
+            step = self.rows.axes.T @ np.linalg.lstsq(J, -values, rcond=1e-9)[0]
+            there = quaternion_multiply(X, quaternion_from_rotvec(size * step))
+            after, J_after = at(there)
+            # Far from a goal that no turn meets, whole steps go to and fro.
+            if nearer := np.linalg.norm(after) < np.linalg.norm(values):
+                X, values, J = there, after, J_after
+            size = min(1.0, 2 * size) if nearer else size / 2
+        return X, float(np.linalg.norm(values))
 
     def _possible_ends(
         self, start: Array, limits: MotionLimits, parameters: Array, turn: Array
