@@ -1,4 +1,4 @@
-"""Parts of goals of end-effectors: rows, radii, directions and ends, against numbers of their own."""
+"""Parts of goals of end-effectors, against other ways to get them: rows, radii, ends."""
 
 from __future__ import annotations
 
@@ -124,8 +124,8 @@ def test_derivatives_at_several_ends_are_those_of_each(rows: EndEffectorRows) ->
 def test_turns_on_direct_ways_are_those_of_many_small_steps(
     arm: SpaceRobot, rows: EndEffectorRows
 ) -> None:
-    found = rows.turns_on_direct_way(ARM, np.array([OTHER, ARM + [0.9, 0.3, -0.2]]))
-    for X, end in zip(found, (OTHER, ARM + [0.9, 0.3, -0.2]), strict=True):
+    ends = np.array([OTHER, [1.3, -0.6, 0.9]])
+    for X, end in zip(rows.turns_on_direct_way(ARM, ends), ends, strict=True):
         turned, step = Rotation.identity(), (end - ARM) / 600
         for k in range(600):
             A = arm.connection(ARM + (k + 0.5) * step)[3:]
