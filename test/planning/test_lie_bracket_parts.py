@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -250,9 +251,7 @@ def test_brackets_are_minus_the_curvature_of_pairs(method: Any) -> None:
     for column, (i, j) in enumerate(((0, 1), (1, 2), (0, 2))):
         u, v = side * np.eye(3)[i], side * np.eye(3)[j]
         corners = np.array([z, z + u, z + u + v, z + v, z]) - (u + v) / 2
-        fine = np.vstack(
-            [np.linspace(a, b, 41)[:-1] for a, b in zip(corners, corners[1:], strict=False)]
-        )
+        fine = np.vstack([np.linspace(a, b, 41)[:-1] for a, b in pairwise(corners)])
         fine = np.vstack([fine, corners[-1:]])
         turned = ROBOT.attitudes(fine, PERIOD, Rotation.identity())[-1].as_rotvec()
         np.testing.assert_allclose(-turned / side**2, brackets[:, column], atol=1e-4)
