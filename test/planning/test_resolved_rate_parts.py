@@ -47,7 +47,8 @@ def test_a_way_through_points_is_a_natural_spline_by_the_lengths_of_its_chords()
 def test_points_that_come_twice_are_no_way_and_two_are_a_straight_one() -> None:
     points = np.array([[0.0, 0, 0], [0.0, 0, 0], [0.6, 0.0, -0.8], [0.6, 0.0, -0.8]])
     way = _Way(points)
-    assert (way.is_straight, way.length) == (True, pytest.approx(1.0))
+    assert way.is_straight
+    assert way.length == pytest.approx(1.0)
     np.testing.assert_allclose(way.place(0.25), [0.15, 0.0, -0.2], atol=1e-15)
     np.testing.assert_allclose(way.rate(0.7), [0.6, 0.0, -0.8], atol=1e-14)
     none = _Way(points[:2])
@@ -185,7 +186,7 @@ def test_a_bent_path_is_slower_where_it_bends() -> None:
 
 
 def joint_path(length: float) -> JointPath:
-    s = np.linspace(0.0, length, 30)
+    s: Array = np.linspace(0.0, length, 30)
     return JointPath(
         s, np.column_stack([s, 0.5 * s]), np.tile(IDENTITY, (30, 1)), s / length, np.ones(30)
     )
