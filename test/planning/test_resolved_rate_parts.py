@@ -186,7 +186,7 @@ def test_a_bent_path_is_slower_where_it_bends() -> None:
 
 
 def joint_path(length: float) -> JointPath:
-    s = length * np.arange(30.0) / 29
+    s: Array = np.array([length * k / 29 for k in range(30)])
     return JointPath(
         s, np.column_stack([s, 0.5 * s]), np.tile(IDENTITY, (30, 1)), s / length, np.ones(30)
     )
@@ -235,7 +235,7 @@ def obstacle(
     K = len(progress)
     shares = np.linspace(0.0, 1.0 if complete else 0.8, K)
     path = JointPath(
-        np.arange(K) * 0.1,
+        np.array([0.1 * k for k in range(K)]),
         np.array(shapes),
         np.arange(4.0 * K).reshape(K, 4),
         shares,
