@@ -168,6 +168,22 @@ class Clearance:
             roomy[at] = geometry.distances(pair, (R[at], r[at])) >= room
         return roomy
 
+    def is_clear(self, shapes: Array, required: Array) -> bool:
+        """Whether links keep the ``required`` distances (P,), m, at all of some shapes (N, n).
+
+        Obstacles do not count.
+        """
+        geometry = self.geometry
+        if not len(geometry.pairs):
+            return True
+        R, r = geometry.poses(shapes)
+        near = geometry.lower_bounds((R, r)) < required
+        for pair in np.flatnonzero(near.any(axis=0)).tolist():
+            at = np.flatnonzero(near[:, pair])
+            if (geometry.distances(pair, (R[at], r[at])) < required[pair]).any():
+                return False
+        return True
+
     def approaches(
         self,
         positions: Array,

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -154,6 +155,8 @@ class AreaLoopGait(GaitMethod):
         if tolerance.admits(error, self.controls):
             return self._build_schedule(gait, request, notes, progress)
         chosen = self._nominal.at(state.q, None if progress is None else progress.nominal)
+        if progress is None:
+            chosen = self._with_room(request, final, chosen, cancellation)
         nominal = self._nominal.move_to_nearest_turn(chosen, state.q)
         flown = 0 if progress is None else progress.cycles
         gait = self._add_legs(gait, [(nominal.shape, self.options.edge_time)])
@@ -180,6 +183,65 @@ class AreaLoopGait(GaitMethod):
         progress = AreaLoopProgress(chosen, flown)
         return self._build_schedule(gait, request, notes, progress, remaining)
 
+    def _with_room(
+        self,
+        request: PlanRequest,
+        final: Array | None,
+        chosen: NominalShape,
+        cancellation: Cancellation,
+    ) -> NominalShape:
+        """Return the nominal shape for a goal: the chosen one if links keep clear on its way and
+        on its first loop, else the one, of others with room, from which the goal takes least time.
+        """
+        if self.clearance is None:
+            return chosen
+        least, whole = self._expected_time(request, final, chosen)
+        if whole:
+            return chosen
+        required = self.clearance.required(request.state.q)
+        keeps_clear = partial(self.clearance.is_clear, required=required)
+        for other in self._nominal.roomier(request.state.q, keeps_clear):
+            cancellation.raise_if_requested()
+            time, _ = self._expected_time(request, final, other)
+            if time < least:
+                least, chosen = time, other
+        return chosen
+
+    def _expected_time(
+        self, request: PlanRequest, final: Array | None, chosen: NominalShape
+    ) -> tuple[float, bool]:
+        """Return the time of the cycles for a goal round a nominal shape, s, infinite where links
+        come too near, and whether links keep clear without a smaller loop.
+        """
+        state = request.state
+        nominal = self._nominal.move_to_nearest_turn(chosen, state.q)
+        gait = _PlannedMotion(state.q[np.newaxis], state.quaternion[np.newaxis])
+        gait = self._add_legs(gait, [(nominal.shape, self.options.edge_time)])
+        aside = self._turn_to_final_shape(nominal, final)
+        target = quaternion_multiply(request.goal.quaternion, quaternion_inverse(aside))
+        left = attitude_error(gait.attitudes[-1], target)
+        missing, enough = float(np.linalg.norm(left)), request.tolerance.attitude
+        if missing <= enough:
+            return 0.0, True
+        if self._too_near(gait.positions, self._base_poses(state, gait.positions, gait.attitudes)):
+            return math.inf, False
+        S, share = self._first_areas(left, nominal)
+        try:
+            clear, _ = self._shrink_until_clear(state, gait, S, share, nominal)
+        except PlanningError:
+            return math.inf, False
+        loop = self._add_legs(gait, self._edge_ends(edge_path(clear * S, nominal.longest), nominal))
+        duration = (len(loop.positions) - len(gait.positions)) * self.control_period
+        return self._count_cycles_left(missing, clear, enough) * duration, clear == share
+
+    def _first_areas(self, left: Array, nominal: NominalShape) -> tuple[Array, float]:
+        """Return the areas (3,) for the share k of a turn (3,), rad, and the part of them that
+        loops with edges of at most the longest have.
+        """
+        S = self.options.k * np.linalg.solve(nominal.M, left).astype(float)
+        # Edges scale with the square root of areas.
+        return S, min(1.0, edge_path(S, nominal.longest).excess ** -2)
+
     def _add_cycle(
         self,
         state: RobotState,
@@ -197,18 +259,12 @@ class AreaLoopGait(GaitMethod):
         The gait begins in ``state``. Cycles go on until the attitude is off by ``enough`` (rad);
         ``flown`` are done.
         """
-        S = self.options.k * np.linalg.solve(nominal.M, left).astype(float)
-        # Edges scale with the square root of areas.
-        share = min(1.0, edge_path(S, nominal.longest).excess ** -2)
+        S, share = self._first_areas(left, nominal)
         missing = float(np.linalg.norm(left))
-        cycles = flown + self._count_cycles_left(missing, share, enough)
-        most = self.options.most_cycles
-        if cycles > most:
-            raise PlanningError(
-                f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
-                f"{flown} are flown."
-            )
-        share = self._shrink_until_clear(state, gait, S, share, nominal)
+        cycles = self._require_few_cycles(missing, share, enough, flown)
+        share, too_near = self._shrink_until_clear(state, gait, S, share, nominal)
+        if too_near:
+            cycles = self._require_few_cycles(missing, share, enough, flown, too_near)
         for _ in range(_MAX_CYCLE_TRIALS):
             path = edge_path(share * S, nominal.longest)
             after = self._add_legs(gait, self._edge_ends(path, nominal))
@@ -241,6 +297,26 @@ class AreaLoopGait(GaitMethod):
             cycles,
         )
 
+    def _require_few_cycles(
+        self, missing: float, share: float, enough: float, flown: int, too_near: str = ""
+    ) -> float:
+        """Return the expected number of cycles for the goal, with those that are ``flown``.
+
+        Raises
+        ------
+        PlanningError
+            It is above ``most_cycles``; the message has the clause ``too_near`` on larger loops.
+        """
+        cycles = flown + self._count_cycles_left(missing, share, enough)
+        most = self.options.most_cycles
+        if cycles > most:
+            why = f" In a loop twice as large {too_near}." if too_near else ""
+            raise PlanningError(
+                f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
+                f"{flown} are flown.{why}"
+            )
+        return cycles
+
     def _shrink_until_clear(
         self,
         state: RobotState,
@@ -248,28 +324,29 @@ class AreaLoopGait(GaitMethod):
         S: Array,
         share: float,
         nominal: NominalShape,
-    ) -> float:
+    ) -> tuple[float, str]:
         """Return a share of areas ``S`` (3,), up to a given one, on whose loop links keep clear.
 
-        ``state`` is the start of the gait.
+        ``state`` is the start of the gait. The second is the clause on the last loop that was too
+        large; empty where the first one is clear.
 
         Raises
         ------
         PlanningError
             Links come too near on small loops, too.
         """
-        if self.clearance is None:
-            return share
         too_near = ""
+        if self.clearance is None:
+            return share, too_near
         for _ in range(_MAX_SHRINKS):
             path = edge_path(share * S, nominal.longest)
             loop = self._add_legs(gait, self._edge_ends(path, nominal))
             added = slice(len(gait.positions) - 1, None)
             shapes, attitudes = loop.positions[added], loop.attitudes[added]
-            too_near = self._too_near(shapes, self._base_poses(state, shapes, attitudes))
-            if not too_near:
-                return share
-            share /= 2
+            found = self._too_near(shapes, self._base_poses(state, shapes, attitudes))
+            if not found:
+                return share, too_near
+            share, too_near = share / 2, found
         raise PlanningError(f"In the smallest of {_MAX_SHRINKS} loops {too_near}.")
 
     def _count_cycles_left(self, missing: float, share: float, enough: float) -> float:

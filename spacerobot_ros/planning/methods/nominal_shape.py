@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -48,6 +48,18 @@ _HELD_JOINT_TOLERANCE = 1e-3
 
 _NEIGHBOUR_OFFSETS = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)))
 
+
+_BOX_SHARES = (1.0, 0.5, 0.25, 0.125)
+"""Edges of the boxes in which links keep clear, as shares of the longest edges of loops."""
+
+_BOX_GRID_POINTS = 7
+"""Points per joint of the grid on which such boxes are looked for."""
+
+_MAX_BOXES = 300
+"""Boxes of one size that are looked at, the best first."""
+
+ClearTest = Callable[[Array], bool]
+"""Whether links keep clear at all of some shapes (N, n)."""
 
 RoomTest = Callable[[Array], npt.NDArray[np.bool_]]
 """Whether links have room to move (N,) at shapes (N, n)."""
@@ -150,6 +162,22 @@ class NominalShapeChooser:
             kept if kept is not None and self._still_applies(kept, q) else self._choose_nominal(q)
         )
 
+    def roomier(self, q: Array, is_clear: ClearTest) -> Iterator[NominalShape]:
+        """Yield other nominal shapes from shape ``q`` (n,), round which loops have room.
+
+        All shapes in a box round one keep clear, as ``is_clear`` says. The edges of the first box
+        are as long as edges of loops may be, those of the next half as long, and so on. None is
+        yielded where users have given the nominal shape.
+        """
+        if self._given_shape is not None:
+            return
+        for share in _BOX_SHARES:
+            found = roomy_nominal(
+                self._robot, q, self._triples, self._largest_edge, share, is_clear
+            )
+            if found is not None:
+                yield found
+
     def move_to_nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
         """Return the nominal shape with unlimited joints moved by full turns to near ``q``."""
         turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
@@ -225,6 +253,44 @@ def best_nominal(
         ),
         key=lambda nominal: float(_worst_axis_turn(nominal.M, nominal.longest)),
     )
+
+
+def roomy_nominal(
+    robot: SpaceRobot,
+    held: Array,
+    triples: Sequence[tuple[int, int, int]],
+    largest_edge: float,
+    share: float,
+    is_clear: ClearTest,
+) -> NominalShape | None:
+    """Return the best nominal shape of a grid round which links keep clear; None if none is found.
+
+    They keep clear in a box with a share of the longest edges; the edges of its loops are no
+    longer. Other joints than three stay as in ``held`` (n,).
+    """
+    ranked: list[tuple[float, NominalShape]] = []
+    for triple in _select_best_triples(robot, triples, largest_edge):
+        chosen = list(triple)
+        lower, upper = (bound[chosen] for bound in shape_box(robot))
+        axes = [np.linspace(a, b, _BOX_GRID_POINTS) for a, b in zip(lower, upper, strict=True)]
+        at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        matrices, longest = _matrices_and_edges(robot, held, chosen, at, largest_edge)
+        edges = share * longest
+        for place, M, box, turn in zip(
+            at, matrices, edges, _worst_axis_turn(matrices, edges), strict=True
+        ):
+            shape = held.copy()
+            shape[chosen] = place
+            ranked.append((float(turn), NominalShape(shape, triple, M, box)))
+    ranked.sort(key=lambda each: -each[0])
+    for turn, nominal in ranked[:_MAX_BOXES]:
+        if turn <= 0.0 or nominal.longest.min() < _MIN_EDGE or nominal.condition >= MAX_CONDITION:
+            continue
+        corners = np.tile(nominal.shape, (len(_NEIGHBOUR_OFFSETS), 1))
+        corners[:, list(nominal.joints)] += 0.5 * nominal.longest * _NEIGHBOUR_OFFSETS
+        if is_clear(corners):
+            return nominal
+    return None
 
 
 def _select_best_triples(
