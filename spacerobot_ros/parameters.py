@@ -96,6 +96,8 @@ class Parameter:
     def _check_number(self, value: Any, whole: bool) -> int | float:
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             raise self._refusal(value, "a number")
+        if isinstance(value, np.generic):
+            value = value.item()  # Numbers of 32 bits would overflow in the next line.
         if not -sys.float_info.max <= value <= sys.float_info.max:  # An int may be larger.
             raise self._refusal(value, "a finite number")
         if whole and value != int(value):

@@ -1,0 +1,862 @@
+"""The modules that all others use: files, errors, events, times, parameters, scenarios."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import signal
+import stat
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from spacerobot_ros import errors, files, measures, parameters, resources, termination, times
+from spacerobot_ros.errors import (
+    GoalError,
+    NotFoundError,
+    ParameterError,
+    PlanningError,
+    Proof,
+    SpaceRobotError,
+    UnreachableError,
+    printable,
+    refusal_of_all,
+    sentence_case,
+)
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.files import (
+    Cache,
+    UntrustedFileError,
+    load_yaml,
+    read_private,
+    write_output,
+    write_whole,
+)
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.parameters import (
+    Parameter,
+    configured,
+    declared,
+    group,
+    parameter,
+    reconfigured,
+    registered,
+    require_known,
+    values_of,
+)
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.scenario import (
+    Kill,
+    Scenario,
+    load_scenario,
+    number_in,
+    parse_kills,
+    parse_setting,
+    read_sections,
+    scenario_of,
+    scenario_or_robot,
+    scenario_text,
+)
+from spacerobot_ros.topics import TOPICS, goal_topic, pose_topic, topic_named
+
+# -- errors ---------------------------------------------------------------------------------------
+
+
+def test_messages_are_lines_of_at_most_two_thousand_characters() -> None:
+    assert str(SpaceRobotError("a\nb\x1bc")) == "a b\ufffdc"
+    assert str(SpaceRobotError()) == ""
+    assert str(SpaceRobotError("x" * 2000)) == "x" * 2000
+    long = "a" * 1000 + "!" + "b" * 1000
+    assert str(SpaceRobotError(long)) == "a" * 1000 + " ... " + "b" * 1000
+    assert (printable("a\n b"), sentence_case("no way"), sentence_case("")) == (
+        "a  b",
+        "No way",
+        "",
+    )
+
+
+def test_a_proof_by_one_method_holds_for_all() -> None:
+    proof = UnreachableError("far", Proof.MOMENTUM)
+    lost, other = NotFoundError("lost"), PlanningError("other")
+    found = refusal_of_all("All.", [other, lost, proof])
+    assert isinstance(found, UnreachableError)
+    assert (str(found), found.proof) == ("All.", Proof.MOMENTUM)
+    assert type(refusal_of_all("All.", iter([other, lost]))) is NotFoundError
+    assert type(refusal_of_all("All.", [other])) is PlanningError
+    assert errors.PlanningError is PlanningError
+
+
+# -- times and events -----------------------------------------------------------------------------
+
+
+def test_times_are_split_into_seconds_and_the_rest() -> None:
+    raw = bytes(4) + times.stamp_bytes(3_000_000_007) + b"rest"
+    assert times.first_time_ns(raw) == 3_000_000_007
+    assert times.stamp_bytes(-1) == b"\xff\xff\xff\xff\xff\xc9\x9a\x3b"
+    assert times.first_time_ns(bytes(4) + times.stamp_bytes(-1)) == 0
+    latest = 2**31 * 10**9 - 1
+    assert times.LATEST_NS == latest
+    assert times.first_time_ns(bytes(4) + times.stamp_bytes(latest)) == latest
+    beyond = bytes(4) + b"\xff\xff\xff\x7f\xff\xff\xff\xff"
+    assert times.first_time_ns(beyond) == latest
+    with pytest.raises(SpaceRobotError) as refused:
+        times.stamp_bytes(latest + 1)
+    assert str(refused.value) == ("Stamps carry times up to 2^31 s (68 years), not 2147483648 s.")
+    stamp = SimpleNamespace(sec=0, nanosec=0)
+    times.set_stamp(stamp, 5_000_000_001)
+    assert (stamp.sec, stamp.nanosec, times.stamp_to_ns(stamp)) == (5, 1, 5_000_000_001)
+    times.set_stamp(stamp, latest + 5)
+    assert (stamp.sec, stamp.nanosec) == (2**31 - 1, 999_999_999)
+
+
+def test_events_are_pairs_and_back() -> None:
+    event = Event(EventKind.LATCHED, "So.", 2, 1.5, "7.5", {"reason": "a"})
+    values = event.to_values(12.25)
+    assert values == {
+        "event": "latched",
+        "time": "1.500000000",
+        "wall_time": "12.250000",
+        "goal_id": "7.5",
+        "reason": "a",
+    }
+    read = Event.from_values(values, "So.", 2)
+    assert (read.kind, read.message, read.level) == (EventKind.LATCHED, "So.", 2)
+    assert (read.time_s, read.goal_id, read.about["reason"]) == (1.5, "7.5", "a")
+    bare = Event.from_values({"event": "reset"})
+    assert (bare.message, bare.level, bare.time_s, bare.goal_id, dict(bare.about)) == (
+        *("", 0, None, "", {}),
+    )
+    assert bare.to_values(None) == {"event": "reset"}
+    plain = Event(EventKind.RESET, "m")
+    assert (plain.level, plain.time_s, plain.goal_id, plain.about) == (0, None, "", {})
+    for wrong in ({}, {"event": "no"}, {"event": "reset", "time": "x"}):
+        with pytest.raises(SpaceRobotError):
+            Event.from_values(wrong)
+
+
+def test_topics_of_end_effectors() -> None:
+    assert goal_topic("left hand/1") == "left_hand_1/goal_pose"
+    pose = pose_topic("hand")
+    assert (pose.name, pose.state[0].quantity) == ("hand/pose", "pose_of_hand")
+    assert topic_named("a/goal_pose") == replace(
+        TOPICS["end_effector/goal_pose"], name="a/goal_pose"
+    )
+    assert topic_named("hand/pose") == pose
+    assert topic_named("odom") is TOPICS["odom"]
+    with pytest.raises(KeyError):
+        topic_named("nothing")
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("durable", "synced"), [(True, 2), (False, 0)])
+def test_files_that_last_are_synced_with_their_folder(
+    durable: bool, synced: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+    monkeypatch.setattr(os, "fsync", calls.append)
+    path = tmp_path / ("n" * 150)
+    write_whole(path, b"content", durable=durable)
+    assert path.read_bytes() == b"content"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert len(calls) == synced
+    assert os.listdir(tmp_path) == [path.name]
+    calls.clear()
+    write_whole(path, b"more")
+    assert len(calls) == 2
+    with pytest.raises(OSError, match="No such file"):
+        write_whole(tmp_path / "none" / "a", b"")
+
+
+def test_outputs_keep_the_permissions_of_older_files(tmp_path: Path) -> None:
+    umask = os.umask(0o022)
+    try:
+        path = tmp_path / "new" / "a.txt"
+        write_output(path, "ü")
+        assert path.read_bytes() == "ü".encode()
+        assert stat.S_IMODE(path.stat().st_mode) == 0o644
+        path.chmod(0o640)
+        write_output(path, b"b", mode=0o600)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o640
+        write_output(tmp_path / "b", b"b", mode=0o600)
+        assert stat.S_IMODE((tmp_path / "b").stat().st_mode) == 0o600
+    finally:
+        os.umask(umask)
+    bag = tmp_path / "c.mcap"
+    bag.write_bytes(b"\x89MCAP and more")
+    with pytest.raises(SpaceRobotError) as refused:
+        write_output(bag, b"x")
+    assert str(refused.value) == f"The file {bag} is a bag, which is not replaced: name another."
+    bag.write_bytes(b"\x89MCA")
+    write_output(bag, b"x")
+    below = tmp_path / "b" / "c"
+    with pytest.raises(SpaceRobotError) as refused:
+        write_output(below, b"x")
+    assert (
+        str(refused.value) == f"The file {below} cannot be written: {tmp_path / 'b'} is no folder."
+    )
+
+
+def nested(depth: int) -> str:
+    return "[" * depth + "1" + "]" * depth
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("a" * 1_000_001, "it has more than 1000000 characters"),
+        (nested(51), "it is nested too deeply"),
+        ("&a [*a]", "it refers to itself"),
+        ("a: [", "while parsing a flow node"),
+    ],
+)
+def test_yaml_of_unknown_origin_is_limited(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=r"\w") as refused:
+        load_yaml(text)
+    assert str(refused.value).startswith(reason)
+    assert "\n" not in str(refused.value)
+
+
+def test_yaml_up_to_its_limits_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert load_yaml("a" * 1_000_000) == "a" * 1_000_000
+    found = load_yaml(nested(49))
+    for _ in range(49):
+        (found,) = found
+    assert found == 1
+    with pytest.raises(ValueError, match="too deeply"):
+        load_yaml(nested(50))
+    assert load_yaml("") is None
+    assert load_yaml("[&a [1, 2], *a]") == [[1, 2], [1, 2]]
+    assert load_yaml("{a: 1, 2: b}") == {"a": 1, 2: "b"}
+    assert files._MAX_YAML_VALUES == 100_000
+    # Mappings count with their keys.
+    monkeypatch.setattr(files, "_MAX_YAML_VALUES", 10)
+    assert load_yaml("[1, {a: 2, b: 3}, &a [4, 5]]") == [1, {"a": 2, "b": 3}, [4, 5]]
+    for more in ("[1, {a: 2, b: 3}, &a [4, 5], 6]", "[1, 2, 3, &a [4, 5], *a, 6]"):
+        with pytest.raises(ValueError, match="its aliases stand for more than 10 values"):
+            load_yaml(more)
+
+
+def test_a_private_file_is_of_this_user_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"12345")
+    path.chmod(0o600)
+    assert read_private(path) == b"12345"
+    assert files._MAX_PRIVATE_FILE_SIZE == 268_435_456
+    monkeypatch.setattr(files, "_MAX_PRIVATE_FILE_SIZE", 5)
+    assert read_private(path) == b"12345"
+    monkeypatch.setattr(files, "_MAX_PRIVATE_FILE_SIZE", 4)
+    with pytest.raises(UntrustedFileError) as refused:
+        read_private(path)
+    assert str(refused.value) == f"'{path}' has 5 bytes; remove it."
+    for mode in (0o620, 0o602):
+        path.chmod(mode)
+        with pytest.raises(UntrustedFileError) as refused:
+            read_private(path)
+        assert str(refused.value) == (
+            f"others may write '{path}' (mode {mode:o}); make it yours alone with "
+            f"chmod go-w '{path}'."
+        )
+    path.chmod(0o644)
+    monkeypatch.setattr(os, "geteuid", lambda: 4_000_000)
+    facts = SimpleNamespace(st_uid=4_000_001, st_mode=0o600)
+    with pytest.raises(UntrustedFileError) as refused:
+        files._require_own_path(path, facts)  # type: ignore[arg-type]
+    assert str(refused.value) == f"'{path}' belongs to user 4000001; use one of your own."
+    assert files._user_name(0) == "user 0 (root)"
+    for owner in (0, 4_000_000):
+        files._require_own_path(path, SimpleNamespace(st_uid=owner, st_mode=0o600))  # type: ignore[arg-type]
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(UntrustedFileError, match="is not a regular file; remove it"):
+        read_private(pipe)
+
+
+def test_a_cache_gives_what_was_stored_under_a_key(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    cache = Cache(tmp_path / "a" / "b")
+    assert cache.load("x", "key") is None
+    path = cache.store("x", "key", b"content")
+    assert path == tmp_path / "a" / "b" / "x"
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o700
+    assert cache.load("x", "key") == (path, b"content")
+    assert path.read_bytes().splitlines()[-1].startswith(b"spacerobot_ros cache 2 key 7 ")
+    with caplog.at_level(logging.WARNING):
+        assert cache.load("x", "other") is None
+    assert not path.exists()
+    assert caplog.messages == [
+        f"'{path}' is deleted and computed again: it is damaged, or stored under another key."
+    ]
+    damaged = cache.store("y", "key", b"content")
+    assert damaged is not None
+    damaged.write_bytes(damaged.read_bytes().replace(b"content", b"contents"))
+    assert cache.load("y", "key") is None
+    empty = cache.store("z", "key", b"")
+    assert empty is not None
+    assert cache.load("z", "key") == (empty, b"")
+
+
+# -- parameters -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Options:
+    speed: float = parameter(2.0, "Speed.", unit="m/s", minimum=0.5, maximum=4.0)
+    count: int = parameter(3, "Count.", minimum=1)
+    on: bool = parameter(False, "On.")
+
+
+@dataclass(frozen=True)
+class Inner:
+    names: tuple[str, ...] = parameter((), "Names.", texts=True)
+    vector: tuple[float, ...] = parameter((), "Vector.", length=3, minimum=-1.0)
+
+
+REGISTRY = {"one": SimpleNamespace(Options=Options)}
+
+
+@dataclass(frozen=True)
+class Config:
+    mode: str = parameter("a", "Mode.", choices=("a", "b"), read_only=False)
+    inner: Inner = group(Inner())
+    methods: dict[str, Any] = registered(REGISTRY)  # noqa: RUF009
+
+
+def test_declarations_have_full_names_and_defaults() -> None:
+    found = {each.name: each for each in declared(Config)}
+    assert list(found) == [
+        *("mode", "inner.names", "inner.vector", "one.speed", "one.count", "one.on"),
+    ]
+    assert found["one.speed"] == Parameter(
+        "one.speed", 2.0, "m/s", "Speed.", 0.5, 4.0, read_only=True
+    )
+    plain = Parameter("a", 1.0)
+    assert (plain.unit, plain.description, plain.choices, plain.length) == ("", "", (), None)
+    assert (plain.minimum, plain.maximum) == (-math.inf, math.inf)
+    assert (plain.read_only, plain.texts, plain.of_joints) == (True, False, False)
+    assert found["mode"].read_only is False
+    changed = configured(Config, {"one.count": 5, "inner.vector": [1, 2, 3]})
+    assert values_of(changed) == {
+        "mode": "a",
+        "inner.names": (),
+        "inner.vector": (1.0, 2.0, 3.0),
+        "one.speed": 2.0,
+        "one.count": 5,
+        "one.on": False,
+    }
+    assert {each.name: each.default for each in declared(changed)} == values_of(changed)
+    again = reconfigured(changed, {"mode": "b"})
+    assert (again.mode, again.inner, again.methods) == ("b", changed.inner, changed.methods)
+    assert reconfigured(changed, {"nothing": 1}) is changed
+    other = reconfigured(changed, {"one.on": True})
+    assert values_of(other) == {**values_of(changed), "one.on": True}
+
+
+def test_unknown_names_are_refused_in_alphabetical_order() -> None:
+    require_known("it", Config, ["mode", "one.on"])
+    with pytest.raises(ParameterError) as refused:
+        require_known("method 'a'", Config, ["mode", "z", "b"])
+    assert str(refused.value) == "method 'a' has no option 'b'."
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "found"),
+    [
+        ("one.speed", 0.5, 0.5),
+        ("one.speed", 4, 4.0),
+        ("one.speed", np.float32(1.5), 1.5),
+        ("one.count", 1, 1),
+        ("one.count", 2.0, 2),
+        ("one.count", 2**63 - 1, 2**63 - 1),
+        ("one.on", True, True),
+        ("mode", "b", "b"),
+        ("inner.vector", (), ()),
+        ("inner.vector", [-1, 0, 1], (-1.0, 0.0, 1.0)),
+        ("inner.names", " a ; b\nc;", ("a", "b", "c")),
+        ("inner.names", ["a ", ""], ("a",)),
+    ],
+)
+def test_values_are_converted(name: str, value: Any, found: Any) -> None:
+    made = values_of(configured(Config, {name: value}))[name]
+    assert made == found
+    assert type(made) is type(found)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("one.speed", 0.49, "0.49; it must be a number from 0.5 to 4 (m/s)."),
+        ("one.speed", 4.01, "4.01; it must be a number from 0.5 to 4 (m/s)."),
+        ("one.speed", math.inf, "inf; it must be a finite number (m/s)."),
+        ("one.speed", True, "True; it must be a number (m/s)."),
+        ("one.speed", "fast", "'fast'; it must be a number (m/s)."),
+        ("one.count", 0, "0; it must be a number of at least 1."),
+        ("one.count", 1.5, "1.5; it must be a whole number."),
+        ("one.count", 2**63, "9.223372036854776e+18; it must be a whole number of 64 bits."),
+        ("one.on", 1, "1; it must be true or false."),
+        ("mode", "c", "'c'; it must be one of a, b."),
+        ("mode", "c" * 70, f"'{'c' * 60}'; it must be one of a, b."),
+        ("mode", 1, "1; it must be a text."),
+        ("inner.vector", [1, 2], "[1, 2]; it must be a list of 3 numbers."),
+        ("inner.vector", [1, 2, -1.5], "[1, 2, -1.5]; it must be finite numbers of at least -1."),
+        ("inner.vector", [1, 2, math.nan], "[1, 2, nan]; it must be finite numbers of at least -1"),
+        ("inner.vector", 3, "3; it must be a list of numbers."),
+        ("inner.names", [1], "[1]; it must be a list of texts."),
+        ("inner.names", 3, "3; it must be a list of texts."),
+    ],
+)
+def test_values_that_are_refused(name: str, value: Any, expected: str) -> None:
+    with pytest.raises(ParameterError) as refused:
+        configured(Config, {name: value})
+    assert str(refused.value).startswith(f"Parameter '{name}' is {expected}")
+
+
+# -- resources ------------------------------------------------------------------------------------
+
+
+def test_names_of_robots_and_paths() -> None:
+    paths = {"a": False, "a.urdf": True, "b/a": True, "a.xacro": True, "a.yaml": False}
+    assert {name: resources.is_path(name) for name in paths} == paths
+    assert resources.suggestion("servicr", ["servicer", "service"]) == " Did you mean 'servicer'?"
+    assert resources.suggestion("zzz", ["servicer"]) == ""
+
+
+def test_robots_that_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.urdf").mkdir()
+    (tmp_path / "robot.urdf").write_text("x")
+    (tmp_path / "beside").mkdir()
+    (tmp_path / "beside" / "robot.urdf").write_text("y")
+    assert resources.robot_file("robot.urdf") == Path("robot.urdf")
+    beside = tmp_path / "beside"
+    assert resources.robot_file("robot.urdf", beside) == beside / "robot.urdf"
+    os.mkfifo(tmp_path / "pipe.urdf")
+    for name, sentence in (
+        ("folder.urdf", "'folder.urdf' is a folder; name the URDF file in it."),
+        ("pipe.urdf", "'pipe.urdf' is no regular file; name a URDF file."),
+        (
+            "robt.urdf",
+            "There is no robot 'robt.urdf': there is no such URDF file. Did you mean 'robot.urdf'?",
+        ),
+    ):
+        with pytest.raises(ParameterError) as refused:
+            resources.robot_file(name)
+        assert str(refused.value) == sentence
+    with pytest.raises(ParameterError) as refused:
+        resources.robot_file("servicr")
+    assert str(refused.value).startswith(
+        "There is no robot 'servicr': there is no such URDF file, nor a robot of that name (known: "
+    )
+    assert str(refused.value).endswith("Did you mean 'servicer'?")
+
+
+def test_data_files_are_in_the_checkout_or_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = resources.share_directory.__wrapped__
+    checkout, prefix = tmp_path / "checkout", tmp_path / "prefix"
+    (checkout / "package").mkdir(parents=True)
+    (checkout / "urdf").mkdir()
+    monkeypatch.setattr(resources, "__file__", str(checkout / "package" / "resources.py"))
+    monkeypatch.setattr(sys, "prefix", str(prefix))
+    monkeypatch.setitem(sys.modules, "ament_index_python.packages", None)
+    with pytest.raises(SpaceRobotError) as refused:
+        find()
+    share = prefix / "share" / "spacerobot_ros"
+    assert str(refused.value) == (
+        f"The data files of spacerobot_ros (urdf, config) were not found in {share}; install the "
+        "package with pip or colcon."
+    )
+    (share / "urdf").mkdir(parents=True)
+    assert find() == share
+    index: Any = SimpleNamespace(get_package_share_directory=lambda name: str(tmp_path / name))
+    monkeypatch.setitem(sys.modules, "ament_index_python.packages", index)
+    assert find() == share
+    (tmp_path / "spacerobot_ros" / "urdf").mkdir(parents=True)
+    assert find() == tmp_path / "spacerobot_ros"
+    (checkout / "package.xml").touch()
+    assert find() == checkout
+
+
+# -- measures -------------------------------------------------------------------------------------
+
+
+def test_momenta_of_a_flight() -> None:
+    momenta = np.zeros((4, 7))
+    momenta[:, 0], momenta[:, 1], momenta[:, 5] = [1, 4, 1, 1], [1, 5, 1, 1], [0, 0, -2, 1]
+    momenta[:, 6] = 99.0
+    np.testing.assert_allclose(measures.momentum_drift(momenta), [5.0, 2.0])
+    expected = np.zeros((4, 6))
+    expected[:, 0] = [7, 10, 7, 7]
+    np.testing.assert_allclose(measures.momentum_drift(momenta, expected), [4.0, 2.0])
+    np.testing.assert_allclose(measures.momentum_drift(momenta, expected[:3]), [5.0, 2.0])
+    momenta[0, 3] = math.nan
+    np.testing.assert_allclose(measures.momentum_drift(momenta), [5.0, 2.0])
+    assert np.isnan(measures.momentum_drift(momenta[:1])).tolist() == [True, True]
+    np.testing.assert_array_equal(measures.peak(np.array([[1.0, -3.0], [-2.0, 0.0]])), [2.0, 3.0])
+    np.testing.assert_array_equal(measures.peak(np.empty((0, 2))), [0.0, 0.0])
+    wrenches = np.array([[3.0, 0, 4, 0, 0, 1], [0, 0, 0, 0, -5, 12]])
+    np.testing.assert_allclose(measures.peak_wrench(wrenches), [5.0, 13.0])
+
+
+# -- scenarios ------------------------------------------------------------------------------------
+
+
+def text_of(*goal: str, **nodes: Any) -> str:
+    """Return a scenario file of lines of its goal and parameters by node."""
+    plant = {"robot": "sliding_masses", **nodes.pop("plant", {})}
+    content = {"plant": {"ros__parameters": plant}, **nodes}
+    lines = "".join(f"    {line}\n" for line in goal or ("goal_position: [1, 2, 3]",))
+    return f"scenario:\n  ros__parameters:\n{lines}{yaml.safe_dump(content)}"
+
+
+def written(folder: Path, text: str) -> Scenario:
+    path = folder / "own.yaml"
+    path.write_text(text)
+    return load_scenario(str(path))
+
+
+@pytest.mark.parametrize(
+    ("line", "kills"),
+    [
+        ("planner at 1", (Kill("planner", 1.0, math.inf),)),
+        ("plant  at 0 until 2.5", (Kill("plant", 0.0, 2.5),)),
+    ],
+)
+def test_kills_of_nodes(line: str, kills: tuple[Kill, ...]) -> None:
+    assert parse_kills([line], "here") == kills
+
+
+@pytest.mark.parametrize(
+    ("lines", "sentence"),
+    [
+        ("planner at 1", "'kills' in here is 'planner at 1', not a list of lines NODE at SECONDS."),
+        (["planner"], "The kill 'planner' in here is not NODE at SECONDS [until SECONDS]."),
+        (
+            ["viewer at 1"],
+            "The kill 'viewer at 1' in here names 'viewer'; it may name plant, planner, "
+            "coordinated_control.",
+        ),
+        *(
+            ([line], f"The kill '{line}' in here needs times in s, the second after the first.")
+            for line in (
+                *("plant at x", "plant at -1", "plant at 2 until 2", "plant at 2 until 1"),
+                *("plant at inf", "plant at nan"),
+            )
+        ),
+    ],
+)
+def test_kills_that_are_refused(lines: Any, sentence: str) -> None:
+    with pytest.raises(ParameterError) as refused:
+        parse_kills(lines, "here")
+    assert str(refused.value) == sentence
+
+
+def test_kills_are_sorted_by_time() -> None:
+    found = parse_kills(["plant at 3", "planner at 0.5 until 1"], "here")
+    assert [kill.at for kill in found] == [0.5, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("plant.tick_rate=1e-3", ("plant", "tick_rate", 1e-3)),
+        (" planner.method =optimal", ("planner", "method ", "optimal")),
+        ("plant.a.b=[1, 2]", ("plant", "a.b", [1, 2])),
+        ("plant.a=b=c", ("plant", "a", "b=c")),
+    ],
+)
+def test_settings(text: str, found: tuple[str, str, Any]) -> None:
+    node, name, value = parse_setting(text)
+    assert (node, name.strip(), value) == (found[0], found[1].strip(), found[2])
+
+
+@pytest.mark.parametrize("text", ["plant.a", "plant=1", "nobody.a=1", "plant.=1", "=1"])
+def test_settings_that_are_none(text: str) -> None:
+    with pytest.raises(ParameterError) as refused:
+        parse_setting(text)
+    assert str(refused.value) == (
+        f"'{text}' is not node.parameter=value with one of the nodes plant, planner, "
+        "coordinated_control, recorder, viewer."
+    )
+    with pytest.raises(ParameterError) as refused:
+        parse_setting("plant.a=[")
+    assert str(refused.value) == "The value in 'plant.a=[' cannot be read."
+    assert (number_in("1e3"), number_in("a")) == (1000.0, "a")
+
+
+def test_sections_of_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(
+        "/**:\n  ros__parameters: {tick_rate: 5.0, method: optimal}\n"
+        "/**/plant:\n  ros__parameters: {sensors: {seed: 3}, tick_rate: 7.0}\n"
+        "/robot_1/plant:\n  ros__parameters: {actuation: effort}\n"
+        "planner:\n"
+        "else:\n  ros__parameters: {a: 1}\n"
+    )
+    assert read_sections(path) == {
+        "plant": {"tick_rate": 7.0, "sensors.seed": 3, "actuation": "effort"},
+        "planner": {"tick_rate": 5.0, "method": "optimal"},
+    }
+    for content in ("plant: [1]", "plant: {ros__parameters: 3}"):
+        path.write_text(content)
+        with pytest.raises(ParameterError) as refused:
+            read_sections(path)
+        assert str(refused.value) == (
+            f"The section 'plant' of the scenario file {path} is not 'ros__parameters:' with the "
+            "parameters under it."
+        )
+    path.write_text("[1]")
+    assert read_sections(path) == {}
+    with pytest.raises(ParameterError, match="cannot be read"):
+        read_sections(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("goal", "sentence"),
+    [
+        (("goal_positon: [1, 2, 3]",), "has an unknown key 'goal_positon' in its scenario section"),
+        (("goal_position: [1, 2]",), "The goal of the scenario file"),
+        (("goal_rotvec: [1, 2]",), "The goal of the scenario file"),
+        (
+            ("published: {a: 3}",),
+            "The section 'published' of the scenario file FILE is not quantity: {printed: "
+            "[numbers], note: text}: ",
+        ),
+        (("kills: 3",), "'kills' in the file FILE is 3, not a list of lines NODE at SECONDS."),
+        (("world: none.urdf",), "The world of the scenario file FILE is refused: "),
+        (("end_effector_goals: 3",), "The goal of the scenario file FILE is refused: "),
+    ],
+)
+def test_scenarios_that_are_refused(goal: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(ParameterError) as refused:
+        written(tmp_path, text_of(*goal))
+    assert sentence.replace("FILE", str(tmp_path / "own.yaml")) in str(refused.value)
+
+
+def test_a_scenario_without_a_section_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError) as refused:
+        written(tmp_path, "plant: {ros__parameters: {}}")
+    assert str(refused.value) == (
+        f"The scenario file {tmp_path / 'own.yaml'} has no 'scenario: ros__parameters:' section "
+        "with a goal."
+    )
+
+
+def test_a_scenario_is_read_and_written(tmp_path: Path) -> None:
+    found = written(
+        tmp_path,
+        text_of(
+            *("description: It is", "goal_position: [1, 2, 3]", "goal_rotvec: [0, 0, 0.5]"),
+            *("goal_joint_positions: [0.1, 0.2, 0.3]", "published_method: optimal"),
+            *("published: {a: {printed: [1, 2.5], note: so}, b: {printed: [3]}}",),
+            planner={"ros__parameters": {"method": "lie_bracket"}},
+        ),
+    )
+    assert (found.name, found.description, found.commanders) == ("own", "It is", ("planner",))
+    assert found.path == (tmp_path / "own.yaml").resolve()
+    assert found.goal.position.tolist() == [1.0, 2.0, 3.0]
+    assert found.goal.quaternion == pytest.approx([0, 0, math.sin(0.25), math.cos(0.25)])
+    assert found.goal.joint_positions is not None
+    first, second = found.published
+    assert (first.quantity, first.printed, first.note) == ("a", [1.0, 2.5], "so")
+    assert (second.quantity, second.printed, second.note) == ("b", [3.0], "")
+    assert found.comparable == ()
+    assert found.with_method("optimal").comparable == found.published
+    assert replace(found, published_method="").comparable == found.published
+    assert (found.end_effector_goal, found.kills, found.has_goal) == (None, (), True)
+    text = scenario_text(found.with_overrides("planner", {"averaging": 3}))
+    content = yaml.safe_load(text)
+    assert list(content) == ["scenario", "/**/plant", "/**/planner"]
+    about = content["scenario"]["ros__parameters"]
+    assert about["description"] == "It is"
+    assert about["goal_position"] == [1.0, 2.0, 3.0]
+    assert about["goal_joint_positions"] == [0.1, 0.2, 0.3]
+    planner = content["/**/planner"]["ros__parameters"]
+    assert planner == {"method": "lie_bracket", "averaging": 3}
+    recorded = scenario_text(found.with_overrides("recorder", {"tf_period": 0.5}))
+    assert list(yaml.safe_load(recorded)) == [
+        *("scenario", "/**/plant", "/**/planner", "/**/recorder"),
+    ]
+    again = written(tmp_path, text)
+    assert again.goal.joint_positions is not None
+    assert again.planner.averaging == 3
+
+
+def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
+    found = written(tmp_path, text_of(planner={"ros__parameters": {}}))
+    with pytest.raises(ParameterError) as refused:
+        found.with_method("transposed_jacobian")
+    assert str(refused.value) == (
+        "'transposed_jacobian' is a control law, and the scenario 'own' has no section "
+        "'coordinated_control' that could use it: it flies with planner."
+    )
+    with pytest.raises(GoalError) as twice:
+        found.with_goal(None, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
+    assert str(twice.value) == "The attitude of the goal is given twice, in radians and in degrees."
+    assert found.with_goal() is found
+    bare = written(tmp_path, text_of(plant={"robot": ""}, planner={"ros__parameters": {}}))
+    with pytest.raises(ParameterError) as refused:
+        bare.problem()
+    assert str(refused.value) == "The scenario 'own' names no robot; see plant.robot."
+    with pytest.raises(ParameterError) as refused:
+        found.with_overrides("plant", {"tick_rat": 1}).config("plant")
+    assert str(refused.value) == "Node 'plant' has no parameter 'tick_rat'."
+    with pytest.raises(ParameterError) as refused:
+        found.with_overrides("plant", {"tick_rate": -1}).config("plant")
+    assert str(refused.value).startswith("Node 'plant': Parameter 'tick_rate' is -1")
+    robot = scenario_or_robot("planar_manipulator")
+    if not robot.has_goal:
+        with pytest.raises(ParameterError) as refused:
+            robot.require_goal()
+        assert str(refused.value) == (
+            "'planar_manipulator' is a robot and has no goal: give one, for instance "
+            "--goal-rpy-deg 0 0 10, or make a scenario of it with `spacerobot new`."
+        )
+
+
+def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
+    description = SpaceRobot.from_file(resources.robot_file("sliding_masses")).description
+    found = scenario_of(description)
+    assert (found.name, found.has_goal, found.path) == (description.name, False, Path())
+    assert found.plant.robot_description == found.planner.robot_description == description.urdf
+    shape = Goal.checked([0, 0, 0], [0, 0, 0, 1], [0.0])
+    with pytest.raises(GoalError) as refused:
+        replace(found, goal=shape).require_shape_of(SpaceRobot(description))
+    assert str(refused.value) == (
+        f"The goal shape has 1 joint position(s); robot '{description.name}' has 3 joints."
+    )
+
+
+def test_parameters_of_a_scenario_have_their_types(tmp_path: Path) -> None:
+    found = written(
+        tmp_path,
+        text_of(
+            planner={"ros__parameters": {"averaging": "3", "use_sim_time": 1, "method": "auto"}}
+        ),
+    )
+    assert found.parameters("planner") == {"averaging": 3, "method": "auto", "use_sim_time": True}
+    assert found.planner.averaging == 3
+    assert found.lockstep
+    fast = found.in_real_time(0.25)
+    assert (fast.plant.time_mode, fast.plant.real_time_factor) == ("realtime", 0.25)
+    assert fast.planner.plan_in_background
+    recorder = fast.config("recorder")
+    assert recorder.diagnostics_period == 1.0
+    assert recorder.tf_period == pytest.approx(min(found.config("recorder").tf_period, 0.025))
+    silent = found.with_overrides("recorder", {"tf_period": 0.0}).in_real_time(2.0)
+    assert silent.config("recorder").tf_period == 0.0
+    assert not fast.lockstep
+    assert isinstance(fast.planner, PlannerConfig)
+
+
+# -- termination ----------------------------------------------------------------------------------
+
+
+class Child:
+    """A process that ends by one of its signals."""
+
+    def __init__(self, ends_by: int | None) -> None:
+        self.ends_by, self.sent = ends_by, list[tuple[int, float]]()
+        self.pid, self.code = 4711, None if ends_by is None else 7
+        self.ended = False
+        self.stdin = SimpleNamespace(close=lambda: self.sent.append((0, -1.0)))
+        self.stdout = None
+
+    def send_signal(self, number: int) -> None:
+        self.number = number
+
+    def wait(self, patience: float | None = None) -> int:
+        if patience is None:
+            return 9
+        self.sent.append((self.number, patience))
+        if self.number != self.ends_by:
+            raise subprocess.TimeoutExpired("it", patience)
+        self.ended = True
+        return 7
+
+    def poll(self) -> int | None:
+        return self.code if self.ended else None
+
+
+@pytest.mark.parametrize(
+    ("ends_by", "sent", "killed"),
+    [
+        (signal.SIGINT, [(signal.SIGINT, 1.5)], False),
+        (signal.SIGTERM, [(signal.SIGINT, 1.5), (signal.SIGTERM, 0.5)], False),
+        (None, [(signal.SIGINT, 1.5), (signal.SIGTERM, 0.5)], True),
+    ],
+)
+def test_a_child_is_ended_by_one_signal_after_the_other(
+    ends_by: int | None,
+    sent: list[tuple[int, float]],
+    killed: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    killings: list[Any] = []
+    monkeypatch.setattr(os, "killpg", lambda *given: killings.append(given))
+    child: Any = Child(ends_by)
+    assert termination.end_child(child, {signal.SIGINT: 1.5, signal.SIGTERM: 0.5}) == 9
+    assert child.sent == [*sent, (0, -1.0)]
+    assert killings == ([(4711, signal.SIGKILL)] if killed else [])
+
+
+def test_children_hold_a_pipe_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[Any] = []
+    monkeypatch.setattr(termination, "_lifeline_read_end", lambda: 5)
+    monkeypatch.setattr(subprocess, "Popen", lambda *given, **more: started.append((given, more)))
+    monkeypatch.setattr(subprocess, "run", lambda *given, **more: started.append((given, more)))
+    lifeline = f"5:{os.getpid()}"
+    assert termination.child_options({"A": "b"}) == {
+        "env": {"A": "b", "SPACEROBOT_LIFELINE": lifeline},
+        "pass_fds": (5,),
+    }
+    assert termination.child_options()["env"] == {**os.environ, "SPACEROBOT_LIFELINE": lifeline}
+    own = termination.child_options({})
+    termination.start_child(["-m", "x"], {}, stdout=3)
+    termination.run_child(["-c", "y"], {}, timeout=4)
+    assert started == [
+        (([sys.executable, "-m", "x"],), {"start_new_session": True, **own, "stdout": 3}),
+        (
+            ([sys.executable, "-c", "y"],),
+            {"capture_output": True, "text": True, "check": False, **own, "timeout": 4},
+        ),
+    ]
+
+
+def test_a_lifeline_is_that_of_the_parent(monkeypatch: pytest.MonkeyPatch) -> None:
+    changed: list[Any] = []
+    monkeypatch.setattr(os, "set_inheritable", lambda *given: changed.append(given))
+    monkeypatch.delenv("SPACEROBOT_LIFELINE", raising=False)
+    assert termination._parent_lifeline() == (None, 0)
+    monkeypatch.setenv("SPACEROBOT_LIFELINE", "12:345")
+    assert termination._parent_lifeline() == (12, 345)
+    assert changed == [(12, False)]
+    assert "SPACEROBOT_LIFELINE" not in os.environ
+
+
+def test_what_is_said_of_a_signal() -> None:
+    words = {
+        signal.SIGINT: "Interrupted.",
+        signal.SIGTERM: "Terminated.",
+        signal.SIGHUP: "Hung up.",
+    }
+    for number, text in words.items():
+        ending = termination.Terminated(number)
+        assert (str(ending), ending.number, ending.exit_code) == (text, number, 128 + number)
+    assert str(termination.Terminated(signal.SIGUSR1)) == "Terminated."
+    assert termination.termination() is None
+    assert parameters.Value is not None
