@@ -150,7 +150,7 @@ def test_laws_of_lanes_are_one_function_and_control_the_goals(
     fixed: int | None, selection: dict[str, bool], reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     outputs = SimpleNamespace(selection=SimpleNamespace(**selection))
-    law = SimpleNamespace(name="own", fixed_inputs=fixed, outputs=outputs)
+    law = SimpleNamespace(name="own", fixed_inputs=fixed, outputs=outputs, integrates=False)
     monkeypatch.setattr(lanes, "build_controller", lambda *_: SimpleNamespace(law=law))
     monkeypatch.setattr(lanes, "nominal_robots", lambda _: SimpleNamespace(controller=None))
     assert _ControlledLanes().refusal(CONTROLLED, asked=False) == reason
