@@ -33,6 +33,7 @@ def checked_path(ticks: int = 20, goal: Goal | None = None, **config: Any) -> Pa
     places = np.linspace(0.0, 1.0, len(time))[:, np.newaxis] * PLACE
     path = BasePath(time, places, np.tile(END.as_quat(), (len(time), 1)))
     shapes = np.tile(SHAPE, (ticks + 1, 1))
+    shapes[:2] += 0.2
     goal = goal or Goal(PLACE, END.as_quat())
     schedule = GaitSchedule("stub", ARM.joint_names, TICK, shapes, path, goal)
     return PathCheck(ARM, schedule, BEGIN_NS, PlannerConfig(**config), average=1)
