@@ -67,7 +67,7 @@ def test_numbers_by_name_keep_their_range(value: float) -> None:
 
 def test_lists_without_names_of_joints_take_numbers_alone() -> None:
     assert not option("keep_out").by_name
-    with pytest.raises(ParameterError, match=r"it must be a list of numbers\."):
+    with pytest.raises(ParameterError, match=r"it must be a list of numbers \(m or rad\)\.$"):
         option("keep_out").checked({"a": 1.0})
 
 
