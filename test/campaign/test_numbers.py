@@ -306,7 +306,8 @@ def test_a_draw_changes_its_flight() -> None:
 
 
 def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    for name in ("pyarrow", "pyarrow.parquet"):
+        monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(SpaceRobotError) as refused:
         sampling.require_module("pyarrow.parquet")
     assert str(refused.value) == (
