@@ -53,6 +53,8 @@ class EventKind(str, Enum):
     """A plan takes over from another one while the joints move."""
     PLAN_LATE = "plan_late"
     """A plan was not ready at the start time of its schedule."""
+    PLAN_DISTURBED = "plan_disturbed"
+    """A wrench from outside changes the momenta that a plan takes as constant."""
     CORRECTION = "correction"
     STUCK_JOINT = "stuck_joint"
 

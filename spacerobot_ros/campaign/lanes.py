@@ -46,6 +46,7 @@ from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerStatus, describe_remaining_error
 from spacerobot_ros.scenario import Scenario
+from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
@@ -61,6 +62,9 @@ campaign loses no more."""
 
 _END_POSITION_TOLERANCE = 1e-6
 """Largest distance of a joint from its last position at the end of a schedule, m or rad."""
+
+_LOADS = "plant.disturbances", "plant.orbit.", "plant.table."
+"""Prefixes of the parameters of loads from outside."""
 
 _GAIN_PREFIX = "coordinated_control.gains."
 """Prefix of the controller's parameters that may differ from lane to lane."""
@@ -140,10 +144,12 @@ class LanesEngine:
         plant = scenario.plant
         if plant.faults or any(each.name.startswith("faults") for each in campaign.dispersions):
             return "it has faults"
-        if plant.disturbances:
-            return "it has disturbances, which engine 'flights' flies"
         if plant.target.given:
             return "it has a target"
+        loads = plant.disturbances, plant.orbit, plant.table
+        dispersed = any(each.name.startswith(_LOADS) for each in campaign.dispersions)
+        if dispersed or loads != ((), OrbitConfig(), TableConfig()):
+            return "it has disturbances, an orbit or a table, which engine 'flights' flies"
         if campaign.measures_clearance:
             return "a criterion names clearance_m, and lanes measure no distances between links"
         match scenario.commanders, plant.actuation:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
 from spacerobot_ros.commanding.plant_state import Pairing, PlantChange
 from spacerobot_ros.errors import CommandError, PlanningError
-from spacerobot_ros.events import Event
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.method import GaitMethod
@@ -30,6 +30,7 @@ from spacerobot_ros.planning.execution.status import (
 )
 from spacerobot_ros.planning.execution.tracker import Setpoint
 from spacerobot_ros.planning.execution.worker import PlanningWorker
+from spacerobot_ros.simulation.status import PlantStatus
 
 # Constants save the slow look-up of enum members for every state.
 _ACTIVE = Activity.ACTIVE
@@ -89,6 +90,10 @@ class PlannerCommander(Commander):
         self._method, self._long_work = method, long_work
         self._last_goal: IdentifiedGoal | None = None
         """The goal that was accepted last."""
+        self._status: PlannerStatus | None = None
+        """The status that the executive has reported last."""
+        self._disturbances: tuple[str, ...] = ()
+        """Lines of the active disturbances of the plant."""
 
     def _make_status(self, state: str, message: str, goal_id: str) -> PlannerStatus:
         return PlannerStatus(PlannerState(state), message, goal_id)
@@ -180,6 +185,24 @@ class PlannerCommander(Commander):
             self.executive.plant_reset()
             self._pass_on_outputs()
 
+    def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
+        """React to a status of the named plant."""
+        super().receive_plant_status(status, name)
+        begun = [each for each in status.disturbances if each not in self._disturbances]
+        self._disturbances = status.disturbances
+        if self._status is not None and self._status.state is PlannerState.EXECUTING:
+            self._warn_of_disturbances(begun)
+
+    def _warn_of_disturbances(self, lines: Sequence[str]) -> None:
+        """Report disturbances that a schedule does not know; a controller holds against them."""
+        if lines and self._status is not None and self.config.output == "commands":
+            message = (
+                "The plan assumes constant momenta, which a disturbance changes: "
+                f"{'; '.join(lines)}."
+            )
+            goal_id = self._status.goal_id
+            self.host.report_event(Event(EventKind.PLAN_DISTURBED, message, 1, goal_id=goal_id))
+
     def _tell_plant_state(self) -> None:
         if self.executive is not None:
             self.executive.plant_rests = self.plant.rests
@@ -225,9 +248,11 @@ class PlannerCommander(Commander):
         while outputs:
             match outputs.popleft():
                 case PlannerStatus() as status:
+                    self._status = status
                     self._publish_decision(status)
                 case ScheduleStart() as start:
                     host.announce(start)
+                    self._warn_of_disturbances(self._disturbances)
                 case Event() as event:
                     host.report_event(event)
                 case Notice(severity, message):

@@ -13,6 +13,9 @@ its centre ::
 
 Their sum over the bodies is the moment ``3 n^2 o x D o`` about the system's centre of mass, with
 the locked inertia D, and the force ``M n^2 (3 o o' - 1) r_C`` on that centre.
+
+On an air table every body is accelerated alike, and friction on it is proportional to its momentum:
+``f_k = -d m_k v_k``, ``n_k = -d I_k omega_k``.
 """
 
 from __future__ import annotations

@@ -65,6 +65,7 @@ _MARKS = {
     EventKind.PLAN_READY: _Mark("plan", "o", _PLAIN, 0),
     EventKind.PLAN_TAKEN_OVER: _Mark("takeover", ">", _PLAIN, 0),
     EventKind.PLAN_LATE: _Mark("plan late", ">", _WARN, 0, hollow=True),
+    EventKind.PLAN_DISTURBED: _Mark("plan disturbed", "<", _WARN, 0, hollow=True),
     EventKind.CORRECTION: _Mark("correction", "s", _PLAIN, 0, hollow=True),
     EventKind.GOAL_REACHED: _Mark("goal reached", "*", _GOOD, 0),
     EventKind.GOAL_FAILED: _Mark("goal failed", "X", _BAD, 0),

@@ -24,7 +24,7 @@ from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.disturbances import Disturbance, disturbance_timeline
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.simulation.faults import FAULT_KINDS, WRENCH_AXES, Fault, FaultTimeline, Targets
-from spacerobot_ros.simulation.loads import PlantLoads
+from spacerobot_ros.simulation.loads import PlantLoads, Surroundings
 from spacerobot_ros.simulation.plant import InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
@@ -219,6 +219,8 @@ class FaultyPlant(WrappedPlant):
         Seed of the actuators' noise.
     disturbances
         The disturbances, one per line (:func:`.parse_disturbance`).
+    surroundings
+        Loads that act in the whole flight, of an orbit or a table; None: none.
 
     Raises
     ------
@@ -235,6 +237,7 @@ class FaultyPlant(WrappedPlant):
         wrench: bool,
         seed: int = 0,
         disturbances: Iterable[str] = (),
+        surroundings: Surroundings | None = None,
     ) -> None:
         super().__init__(plant)
         self._thrusters = thrusters_in(plant)
@@ -263,7 +266,8 @@ class FaultyPlant(WrappedPlant):
         self.loads: PlantLoads | None = None
         """External loads; None: there never were any."""
         self._disturbances = disturbance_timeline(disturbances, self.robot.link_names)
-        if self._disturbances.entries:
+        self._surroundings = surroundings or Surroundings()
+        if self._disturbances.entries or self._surroundings.act:
             self._begin_loads()
         self.apply_active_faults()
         self._apply_active_disturbances()
@@ -342,7 +346,7 @@ class FaultyPlant(WrappedPlant):
         self._actuators_sound = all(FAULT_KINDS[f.kind].sensor for f in active)
 
     def _begin_loads(self) -> None:
-        self.loads = PlantLoads(self.robot)
+        self.loads = PlantLoads(self.robot, self._surroundings)
         self.plant.load(self.loads)
         self.step = self._loaded_step
 
@@ -471,6 +475,13 @@ def build_plant(
             "choose longer steps or shorter ticks."
         )
     start = InitialState.of(config) if initial is None else initial
+    surroundings = Surroundings.of(config.orbit, config.table)
+    surroundings.require_suitable(robot, start.attitude())
+    if surroundings.act and config.target.given:
+        raise ParameterError(
+            "Parameters 'target.*' are set beside 'orbit.*' or 'table.*': targets feel neither the "
+            "gravity gradient nor a table; leave one of them out."
+        )
     step = step or kind.integration_step
 
     def dynamics(of: SpaceRobot, at: InitialState) -> Plant:
@@ -490,4 +501,5 @@ def build_plant(
         wrench=kind.wrench,
         seed=config.sensors.seed,
         disturbances=config.disturbances,
+        surroundings=surroundings,
     )

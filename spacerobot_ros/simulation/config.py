@@ -149,6 +149,54 @@ class CaptureConfig:
 
 
 @dataclass(frozen=True)
+class OrbitConfig:
+    """A circular orbit, on which the origin of the world frame falls freely."""
+
+    altitude: float = parameter(
+        0.0,
+        "height above the Earth's equatorial radius; 0: no orbit, unless mean_motion is set",
+        unit="m",
+        minimum=0.0,
+        maximum=_MAX_INITIAL_VALUE,
+    )
+    mean_motion: float = parameter(
+        0.0, "of the orbit, instead of altitude", unit="rad/s", minimum=0.0, maximum=100.0
+    )
+    orientation: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0, 1.0),
+        "of the orbital frame in the world at time zero (x outward along the radius, z along the "
+        "orbit's normal), a quaternion x, y, z, w",
+        length=4,
+    )
+
+
+@dataclass(frozen=True)
+class TableConfig:
+    """A table with air bearings, in the x-y plane of the world, for planar robots."""
+
+    tilt: float = parameter(
+        0.0, "angle by which the table is off level", unit="rad", minimum=0.0, maximum=1.5707963
+    )
+    direction: float = parameter(
+        0.0,
+        "direction downhill in the x-y plane, from x",
+        unit="rad",
+        minimum=-6.2831854,
+        maximum=6.2831854,
+    )
+    gravity: float = parameter(
+        9.80665, "acceleration of gravity", unit="m/s^2", minimum=0.0, maximum=1000.0
+    )
+    friction: float = parameter(
+        0.0,
+        "viscous friction of the bearings: force on every body over its momentum",
+        unit="1/s",
+        minimum=0.0,
+        maximum=1000.0,
+    )
+
+
+@dataclass(frozen=True)
 class PlantConfig(WatchdogConfig, RobotConfig):
     """Parameters of a plant: actuation, time, limits, initial state, faults, sensors."""
 
@@ -309,6 +357,8 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "docs/disturbances.md",
         texts=True,
     )
+    orbit: OrbitConfig = group(OrbitConfig())
+    table: TableConfig = group(TableConfig())
     sensors: SensorConfig = group(SensorConfig())
     target: TargetConfig = group(TargetConfig())
     capture: CaptureConfig = group(CaptureConfig())

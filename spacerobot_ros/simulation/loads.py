@@ -2,23 +2,124 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from spacerobot_ros.control.outputs import plane_normal
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.external_loads import LoadLayout
+from spacerobot_ros.model.orbit import mean_motion_at
+from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
+from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
+
+_PLANE_TOLERANCE = 1e-9
+"""Largest component of a planar robot's normal along the table."""
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Loads of the place that a robot is in, which do not change in a flight.
+
+    Attributes
+    ----------
+    mean_motion
+        Of the circular orbit, rad/s; zero: none.
+    quaternion_WO
+        (4,) attitude (x, y, z, w) of the orbital frame in W at time zero.
+    gravity_W
+        (3,) uniform acceleration, m/s^2.
+    friction
+        Viscous friction of every body over its momentum, 1/s.
+    """
+
+    mean_motion: float = 0.0
+    quaternion_WO: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    gravity_W: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    friction: float = 0.0
+
+    @classmethod
+    def of(cls, orbit: OrbitConfig, table: TableConfig) -> Surroundings:
+        """Return the surroundings of a configuration.
+
+        Raises
+        ------
+        ParameterError
+            The orbit is given twice, or its orientation is no quaternion, or there is a table in an
+            orbit.
+        """
+        if orbit.altitude and orbit.mean_motion:
+            raise ParameterError(
+                f"Parameters 'orbit.altitude' ({orbit.altitude:g} m) and 'orbit.mean_motion' "
+                f"({orbit.mean_motion:g} rad/s) both give the orbit: leave one of them 0."
+            )
+        try:
+            orientation = unit_quaternion(np.array(orbit.orientation))
+        except ValueError as error:
+            raise ParameterError(f"Parameter 'orbit.orientation' is refused: {error}.") from None
+        slope = table.gravity * math.sin(table.tilt)
+        found = cls(
+            mean_motion_at(orbit.altitude) if orbit.altitude else orbit.mean_motion,
+            tuple(orientation.tolist()),
+            (slope * math.cos(table.direction), slope * math.sin(table.direction), 0.0),
+            table.friction,
+        )
+        if found.mean_motion and found.on_table:
+            raise ParameterError(
+                "Parameters 'table.*' and 'orbit.*' are both set: a robot is on a table or in "
+                "an orbit."
+            )
+        return found
+
+    @property
+    def on_table(self) -> bool:
+        """Whether a table acts: slope or friction."""
+        return bool(any(self.gravity_W) or self.friction)
+
+    @property
+    def act(self) -> bool:
+        """Whether there is any load."""
+        return bool(self.mean_motion or self.on_table)
+
+    def require_suitable(self, robot: SpaceRobot, quaternion_WB: Array) -> None:
+        """Refuse a robot that does not stand on the table.
+
+        Raises
+        ------
+        ParameterError
+            The robot is not planar, or its plane is not that of the table at its attitude
+            ``quaternion_WB`` (4,).
+        """
+        if not self.on_table:
+            return
+        normal = plane_normal(robot.description)
+        if normal is None:
+            raise ParameterError(
+                f"Parameters 'table.*' are set, but robot '{robot.description.name}' is not "
+                "planar: on a table with air bearings all joints move in its plane."
+            )
+        normal_W = matrix_from_quaternion(quaternion_WB) @ normal
+        if np.abs(normal_W[:2]).max() > _PLANE_TOLERANCE:
+            raise ParameterError(
+                f"Parameters 'table.*' are set, but the plane of robot '{robot.description.name}' "
+                "is not the x-y plane of the world: turn 'initial_orientation'."
+            )
 
 
 class PlantLoads:
-    """The loads on a robot, which change in place; at first there are none.
+    """The loads on a robot, which change in place; at first there are no wrenches.
 
     Parameters
     ----------
     robot
         The model.
+    surroundings
+        Loads that do not change; None: none.
 
     Attributes
     ----------
@@ -29,7 +130,7 @@ class PlantLoads:
         ``robot.link_names``: in components of the link, and in those of W.
     """
 
-    def __init__(self, robot: SpaceRobot) -> None:
+    def __init__(self, robot: SpaceRobot, surroundings: Surroundings | None = None) -> None:
         count = len(robot.link_names)
         layout = LoadLayout(count)
         self.vector = np.zeros(layout.size)
@@ -46,7 +147,11 @@ class PlantLoads:
             )
         ]
         self._time = self.vector[layout.time]
-        self.vector[layout.quaternion_WO] = 0.0, 0.0, 0.0, 1.0
+        given = surroundings or Surroundings()
+        self.vector[layout.mean_motion] = given.mean_motion
+        self.vector[layout.quaternion_WO] = given.quaternion_WO
+        self.vector[layout.gravity_W] = given.gravity_W
+        self.vector[layout.friction] = given.friction
 
     @property
     def act(self) -> bool:

@@ -215,10 +215,15 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     assert select_engine(stuck, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has faults"):
         select_engine(stuck, "lanes")
-    pushed = campaign(set={"plant.disturbances": ["mass_1 force 1 0 0 at 1"]})
-    assert select_engine(pushed, "auto").name == "flights"
-    with pytest.raises(SpaceRobotError, match="it has disturbances, which engine 'flights' flies"):
-        select_engine(pushed, "lanes")
+    why = "it has disturbances, an orbit or a table, which engine 'flights' flies"
+    for made in (
+        campaign(set={"plant.disturbances": ["mass_1 force 1 0 0 at 1"]}),
+        campaign(set={"plant.orbit.altitude": 4e5}),
+        campaign(disperse={"plant.table.friction": {"uniform": [0.0, 0.1]}}),
+    ):
+        assert select_engine(made, "auto").name == "flights"
+        with pytest.raises(SpaceRobotError, match=why):
+            select_engine(made, "lanes")
     normal = {"uniform": [0.0, 0.5]}
     steady = {"coordinated_control.gains.base_position.ki": 0.5}
     for made in (controlled(set=steady), controlled(disperse=dict.fromkeys(steady, normal))):

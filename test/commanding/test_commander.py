@@ -528,3 +528,41 @@ def test_a_commander_that_comes_after_a_capture_knows_of_it(
     ((level, line),) = other.host.lines
     assert level == "error"
     assert line.startswith("plant/status: A body is held by the link 'link_1', but robot ")
+
+
+# -- disturbances -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("output", ["commands", "reference"])
+def test_a_plan_that_a_disturbance_pushes_is_reported_with_a_warning(
+    robot: SpaceRobot, output: str
+) -> None:
+    """Of a free-floating robot: a controller that tracks a reference has thrusters."""
+    rig = Rig(PlannerCommander, config(PlannerConfig, output=output, **METHOD), robot.n)
+    rig.use(robot)
+    rig.commander.activate()
+
+    def pushed(*lines: str) -> None:
+        rig.commander.receive_plant_status(
+            PlantStatus(PlantState.RUNNING, "It runs.", disturbances=lines)
+        )
+
+    pushed("mass_1 force 1 0 0 in world at 0")
+    assert not any(each.kind is EventKind.PLAN_DISTURBED for each in rig.host.events)
+    rig.goal()
+    for tick in range(1, 4):
+        rig.state(tick)
+    assert "executing" in rig.host.states
+    pushed("mass_1 force 1 0 0 in world at 0", "mass_2 torque 0 0 1 in link at 0.2")
+    pushed("mass_2 torque 0 0 1 in link at 0.2")
+    pushed()
+    found = [each for each in rig.host.events if each.kind is EventKind.PLAN_DISTURBED]
+    if output == "reference":
+        assert found == []
+        return
+    assert [each.message for each in found] == [
+        f"The plan assumes constant momenta, which a disturbance changes: {line}."
+        for line in ("mass_1 force 1 0 0 in world at 0", "mass_2 torque 0 0 1 in link at 0.2")
+    ]
+    assert {(each.level, each.goal_id) for each in found} == {(1, rig.host.statuses[-1].goal_id)}
+    assert found[0].goal_id

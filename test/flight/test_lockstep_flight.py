@@ -78,6 +78,8 @@ BROKEN = ["plant.tick_rate=50", "coordinated_control.tick_rate=50"]
 NOISY = ["plant.sensors.position_noise=0.001", "plant.sensors.joint_rate_noise=0.002"]
 """Faults of actuators and half a second without pose, which controllers and plant wait for."""
 
+PUSHED = ["plant.disturbances=mass_2 force 0.1 0 -0.2 torque 0 0.01 0 in link at 3.1 until 3.3"]
+
 BY_ROS = [
     pytest.param("faults/stuck_slider", [], Outcome.FAILED),
     pytest.param(
@@ -91,6 +93,8 @@ BY_ROS = [
     pytest.param("planar_chain", [], Outcome.REACHED, marks=pytest.mark.slow),
     pytest.param("servicer", [], Outcome.REACHED, marks=pytest.mark.slow),
     pytest.param("servicer_thrusters", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("gravity_gradient", [], Outcome.REACHED, marks=pytest.mark.slow),
+    pytest.param("sliding_masses", PUSHED, Outcome.FAILED, marks=pytest.mark.slow),
 ]
 
 

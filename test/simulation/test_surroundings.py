@@ -1,0 +1,312 @@
+"""Robots in an orbit and on an air table: closed forms, and point masses in their fields."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+from support.effort_flights import random_urdf, robot_of, tumbling
+from support.oracles import Array, PinocchioOracle, assert_agrees, random_motion
+
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.orbit import EARTH_GRAVITATION, relative_motion
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
+from spacerobot_ros.simulation.actuators import build_plant
+from spacerobot_ros.simulation.config import OrbitConfig, PlantConfig, TableConfig, TargetConfig
+from spacerobot_ros.simulation.loads import PlantLoads, Surroundings
+
+DUMBBELL = (
+    '<robot name="dumbbell"><link name="bar"><inertial><mass value="2.0"/><inertia ixx="0.3" '
+    'iyy="1.2" izz="1.1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
+)
+N = 0.0011
+
+
+def point_masses(oracle: PinocchioOracle) -> tuple[Array, Array]:
+    """Return masses (k,) and places in W (k, 3) that have the inertia of every body."""
+    masses, places = [], []
+    for index in range(1, oracle.model.njoints):
+        body, joint = oracle.model.inertias[index], oracle.data.oMi[index]
+        moment = np.trace(body.inertia) / 2 * np.eye(3) - body.inertia
+        values, vectors = np.linalg.eigh(moment)
+        for value, axis in zip(values, vectors.T, strict=True):
+            for sign in (-1.0, 1.0):
+                arm = sign * math.sqrt(3 * max(value, 0.0) / body.mass) * axis
+                masses.append(body.mass / 6)
+                places.append(joint.act(body.lever + arm))
+    return np.array(masses), np.array(places)
+
+
+def potential(oracle: PinocchioOracle, q: Array, n: float, o: Array) -> float:
+    """Return the energy of a robot of point masses in the tide of an orbit, J."""
+    pin.forwardKinematics(oracle.model, oracle.data, q)
+    masses, r = point_masses(oracle)
+    return float(-(n**2) / 2 * masses @ (3 * (r @ o) ** 2 - np.sum(r * r, axis=1)))
+
+
+def tide(oracle: PinocchioOracle, n: float, o: Array) -> Array:
+    """Return its forces (6 + n,) along the engine's velocities, by central differences."""
+    q, forces = oracle.q.copy(), []
+    for direction in 1e-5 * np.eye(oracle.model.nv):
+        ends = [pin.integrate(oracle.model, q, sign * direction) for sign in (-1.0, 1.0)]
+        below, above = (potential(oracle, end, n, o) for end in ends)
+        forces.append((below - above) / 2e-5)
+    return np.array(forces)
+
+
+@pytest.mark.parametrize("seed", [1, 6])
+def test_the_tide_is_that_of_point_masses(seed: int) -> None:
+    """Joints and base accelerate by the gradient of the potential, with Pinocchio's masses."""
+    rng, urdf = np.random.default_rng(seed), random_urdf(seed)
+    robot, n, time = robot_of(urdf), 1.3, 0.7
+    oracle = PinocchioOracle(urdf, robot.joint_names)
+    motion, R_WO = random_motion(rng, robot.n), Rotation.from_rotvec(rng.normal(size=3))
+    loads = PlantLoads(robot, Surroundings(n, tuple(R_WO.as_quat())))
+    tau, wrench = rng.uniform(-1.0, 1.0, robot.n), rng.uniform(-1.0, 1.0, 6)
+    bare = oracle.forward_dynamics(motion, wrench, tau)
+    (p_W, L_W, _), center = oracle.momentum_W(), oracle.center_of_mass_W()
+    to_z0dot, M = oracle.to_z0dot(), oracle.own_mass_matrix()
+    o = R_WO.apply([math.cos(n * time), math.sin(n * time), 0.0])
+    forces = tide(oracle, n, o)
+    expected = bare + to_z0dot @ np.linalg.solve(M, forces)
+    state = [motion.q, motion.quaternion_WB, motion.qdot, p_W, L_W, center]
+    x, command = np.append(np.concatenate(state), time), np.concatenate([tau, wrench, loads.vector])
+    K, Q = robot.buffered("loaded_shape_equations")(x, command)
+    assert_agrees(np.linalg.solve(K.reshape(robot.n, -1), Q), expected[6:], 1e-7)
+    # The momenta change by the force on the centre of mass and the moment 3 n^2 o x D o.
+    step = robot.buffered("loaded_flight_step")
+    command[: robot.n + 6] = 0.0
+    after, before = step(x, command, 1e-6)[0], step(x, command, 0.0)[0]
+    gained = (after - before)[2 * robot.n + 4 : 2 * robot.n + 10] / 1e-6
+    force = robot.total_mass * n**2 * (3 * (o @ center) * o - center)
+    oracle.set_configuration(motion.q, motion.quaternion_WB, motion.r_WB_W)
+    R_WB = oracle.R_WB
+    D_W = R_WB @ robot.inertia_matrix(motion.q)[3:6, 3:6] @ R_WB.T
+    assert_agrees(gained, np.append(force, 3 * n**2 * np.cross(o, D_W @ o)), 1e-5)
+
+
+def test_the_moment_is_that_of_an_inverse_square_field() -> None:
+    """Six point masses, 6,700 km from the centre of the Earth."""
+    radius = 6.7e6
+    o = np.array([0.6, -0.48, 0.64])
+    arms = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 2.0, 0], [0, -2.0, 0], [0, 0, 3.0], [0, 0, -3]])
+    places = radius * o + arms
+    fields = -EARTH_GRAVITATION * places / np.linalg.norm(places, axis=1)[:, None] ** 3
+    moment = np.cross(arms, 5.0 * fields).sum(axis=0)
+    inertia = 10.0 * np.diag([4.0 + 9.0, 1.0 + 9.0, 1.0 + 4.0])
+    urdf = DUMBBELL.replace('"2.0"', '"30.0"')
+    for name, value in zip(("ixx", "iyy", "izz"), np.diag(inertia), strict=True):
+        old = {"ixx": "0.3", "iyy": "1.2", "izz": "1.1"}[name]
+        urdf = urdf.replace(f'{name}="{old}"', f'{name}="{value}"')
+    n = math.sqrt(EARTH_GRAVITATION / radius**3)
+    turn, _ = Rotation.align_vectors([o], [[1.0, 0.0, 0.0]])
+    plant = VelocityPlant(SpaceRobot.from_urdf(urdf), 1e-3)
+    plant.load(PlantLoads(plant.robot, Surroundings(n, tuple(turn.as_quat()))))
+    plant.step(np.zeros(0))
+    np.testing.assert_allclose(plant.expected_momenta[3:] / 1e-3, moment, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", [EffortPlant, VelocityPlant])
+def test_a_dumbbell_swings_like_a_pendulum_and_drifts_as_clohessy_and_wiltshire_say(
+    kind: Any,
+) -> None:
+    """Libration in the plane of the orbit: ``theta'' = -3/2 n^2 (Iy - Ix)/Iz sin 2 theta``."""
+    angle, r0, v0 = 0.4, np.array([10.0, -20.0, 5.0]), np.array([0.01, 0.02, -0.01])
+    start = InitialState(
+        position=r0,
+        quaternion=Rotation.from_rotvec([0.0, 0.0, angle]).as_quat(),
+        linear_momentum=2.0 * v0,
+        angular_momentum=np.array([0.0, 0.0, 1.1 * N]),
+    )
+    robot = robot_of(DUMBBELL)
+    plant, loads = kind(robot, 20.0, start, 20.0), PlantLoads(robot, Surroundings(N))
+    plant.load(loads)
+    times = np.arange(0.0, 2001.0, 20.0)
+    angles = []
+    for time in times:
+        turn = 2 * math.atan2(plant.pose[5], plant.pose[6]) - N * time
+        angles.append(math.remainder(turn, 2 * math.pi))
+        loads.time = time
+        plant.step(np.zeros(0))
+    swing = solve_ivp(
+        lambda _, y: [y[1], -1.5 * N**2 * 0.9 / 1.1 * math.sin(2 * y[0])],
+        (0.0, times[-1]),
+        [angle, 0.0],
+        t_eval=times,
+        rtol=1e-11,
+        atol=1e-13,
+    ).y[0]
+    np.testing.assert_allclose(angles, swing, atol=1e-8)
+    assert min(angles) < -0.39
+    end = times[-1] + 20.0
+    r_O, _ = relative_motion(N, r0, v0 - np.cross([0.0, 0.0, N], r0), end)
+    turned = Rotation.from_rotvec([0.0, 0.0, N * end])
+    np.testing.assert_allclose(plant.pose[:3], turned.apply(r_O), atol=1e-5)
+
+
+def test_small_librations_have_the_period_of_the_textbook() -> None:
+    """``2 pi / (n sqrt(3 (Iy - Ix) / Iz))``, by the zeros of the angle."""
+    start = InitialState(
+        quaternion=Rotation.from_rotvec([0.0, 0.0, 0.01]).as_quat(),
+        angular_momentum=np.array([0.0, 0.0, 1.1 * N]),
+    )
+    plant = EffortPlant(robot_of(DUMBBELL), 20.0, start, 20.0)
+    loads = PlantLoads(plant.robot, Surroundings(N))
+    plant.load(loads)
+    zeros, before = [], 0.01
+    for tick in range(1, 180):
+        loads.time = 20.0 * (tick - 1)
+        plant.step(np.zeros(0))
+        angle = math.remainder(
+            2 * math.atan2(plant.pose[5], plant.pose[6]) - 20 * N * tick, 2 * math.pi
+        )
+        if before * angle < 0:
+            zeros.append(20.0 * (tick - 1 + before / (before - angle)))
+        before = angle
+    period = 2 * math.pi / (N * math.sqrt(3 * 0.9 / 1.1))
+    assert len(zeros) == 2
+    assert 2 * (zeros[1] - zeros[0]) == pytest.approx(period, rel=1e-4)
+
+
+# -- the table --------------------------------------------------------------------------------
+
+
+def test_friction_slows_every_motion_down_alike() -> None:
+    """Friction on every body by its momentum: the free motion, in the time (1 - exp(-d t))/d."""
+    friction, t = 0.8, 0.9
+    robot = robot_of(random_urdf(3))
+    start = tumbling(robot, np.random.default_rng(7))
+    slow = (1 - math.exp(-friction * t)) / friction
+    rubbed, free = (EffortPlant(robot, whole / 9, start, 0.01) for whole in (t, slow))
+    rubbed.load(PlantLoads(robot, Surroundings(friction=friction)))
+    for _ in range(9):
+        rubbed.step(np.zeros(robot.n))
+        free.step(np.zeros(robot.n))
+    scale = math.exp(-friction * t)
+    np.testing.assert_allclose(rubbed.pose, free.pose, atol=1e-9)
+    np.testing.assert_allclose(rubbed.q, free.q, atol=1e-9)
+    np.testing.assert_allclose(rubbed.qdot, scale * free.qdot, atol=1e-9)
+    np.testing.assert_allclose(rubbed.momentum[:6], scale * free.momentum[:6], atol=1e-9)
+    assert np.abs(free.pose[:3] - start.position).max() > 0.01
+
+
+def test_a_robot_slides_down_a_table_with_friction() -> None:
+    """``v = g/d (1 - exp(-d t))`` downhill, under efforts and velocities; joints do not feel it."""
+    table = TableConfig(tilt=0.02, direction=2.0, gravity=9.0, friction=0.5)
+    for actuation in ("effort", "velocity"):
+        config = PlantConfig(
+            actuation=actuation, tick_rate=10.0, table=table, initial_joint_positions=(0.3, -0.7)
+        )
+        plant = build_plant(SpaceRobot.from_file(robot_file("planar_manipulator")), config)
+        commands = (np.zeros(2), np.zeros(6)) if plant.takes_wrench else (np.zeros(2),)
+        for _ in range(20):
+            plant.step(*commands)
+        speed = 9.0 * math.sin(0.02) / 0.5 * (1 - math.exp(-1.0))
+        velocity = plant.momentum[:3] / plant.robot.total_mass
+        expected = [speed * math.cos(2.0), speed * math.sin(2.0), 0.0]
+        np.testing.assert_allclose(velocity, expected, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(plant.q, [0.3, -0.7], atol=1e-12)
+        np.testing.assert_allclose(plant.effort, 0.0, atol=1e-9)
+        np.testing.assert_allclose(plant.twist[3:], 0.0, atol=1e-12)
+
+
+def test_servos_work_against_friction() -> None:
+    """Held rates at zero momentum: the efforts' power is friction times twice the energy."""
+    robot = robot_of(random_urdf(2))
+    plant = VelocityPlant(robot, 1e-6)
+    plant.load(PlantLoads(robot, Surroundings(friction=0.7)))
+    rates = np.linspace(0.2, -0.3, robot.n)
+    plant.step(rates)
+    before = plant.momentum[6]
+    plant.step(rates)
+    power = plant.effort @ rates - (plant.momentum[6] - before) / 1e-6
+    assert power == pytest.approx(0.7 * 2 * plant.momentum[6], rel=1e-3)
+
+
+# -- parameters -------------------------------------------------------------------------------
+
+
+def test_an_altitude_is_a_mean_motion() -> None:
+    found = Surroundings.of(OrbitConfig(altitude=400e3, orientation=(0, 0, 3, 4)), TableConfig())
+    assert 2 * math.pi / found.mean_motion == pytest.approx(5553.6, abs=0.1)
+    assert found.quaternion_WO == pytest.approx((0.0, 0.0, 0.6, 0.8))
+    assert found.act
+    assert not found.on_table
+    assert Surroundings.of(OrbitConfig(mean_motion=0.5), TableConfig()).mean_motion == 0.5
+    assert not Surroundings.of(OrbitConfig(), TableConfig()).act
+    assert Surroundings.of(OrbitConfig(), TableConfig(friction=0.1)).on_table
+    steep = Surroundings.of(OrbitConfig(), TableConfig(tilt=0.1, direction=0.5, gravity=2.0))
+    expected = 2 * math.sin(0.1) * np.array([math.cos(0.5), math.sin(0.5), 0.0])
+    np.testing.assert_allclose(steep.gravity_W, expected)
+
+
+TABLE = TableConfig(tilt=0.01)
+
+
+@pytest.mark.parametrize(
+    ("robot", "parameters", "message"),
+    [
+        (
+            "servicer",
+            {"orbit": OrbitConfig(altitude=4e5, mean_motion=0.001)},
+            "Parameters 'orbit.altitude' (400000 m) and 'orbit.mean_motion' (0.001 rad/s) both "
+            "give the orbit: leave one of them 0.",
+        ),
+        (
+            "servicer",
+            {"orbit": OrbitConfig(mean_motion=0.001, orientation=(0, 0, 0, 0))},
+            "Parameter 'orbit.orientation' is refused: ",
+        ),
+        (
+            "planar_manipulator",
+            {"orbit": OrbitConfig(mean_motion=0.001), "table": TABLE},
+            "Parameters 'table.*' and 'orbit.*' are both set: a robot is on a table or in an "
+            "orbit.",
+        ),
+        (
+            "servicer",
+            {"table": TABLE},
+            "Parameters 'table.*' are set, but robot 'servicer' is not planar: on a table with air "
+            "bearings all joints move in its plane.",
+        ),
+        (
+            "servicer",
+            {"orbit": OrbitConfig(altitude=4e5), "target": TargetConfig(robot="any.urdf")},
+            "Parameters 'target.*' are set beside 'orbit.*' or 'table.*': targets feel neither the "
+            "gravity gradient nor a table; leave one of them out.",
+        ),
+        (
+            "planar_manipulator",
+            {"table": TableConfig(friction=0.1), "initial_orientation": (0.1, 0.0, 0.0, 0.99)},
+            "Parameters 'table.*' are set, but the plane of robot 'planar_manipulator' is not the "
+            "x-y plane of the world: turn 'initial_orientation'.",
+        ),
+    ],
+)
+def test_surroundings_that_do_not_suit_are_refused(
+    robot: str, parameters: dict[str, Any], message: str
+) -> None:
+    model = SpaceRobot.from_file(robot_file(robot))
+    with pytest.raises(ParameterError) as refused:
+        build_plant(model, PlantConfig(actuation="effort", **parameters))
+    assert str(refused.value).startswith(message)
+
+
+def test_loads_that_act_are_told_from_those_that_do_not() -> None:
+    robot = robot_of(DUMBBELL)
+    loads = PlantLoads(robot)
+    loads.time = 3.5
+    assert not loads.act
+    assert loads.time == 3.5
+    loads.in_link[0, 5] = 1.0
+    assert loads.act
+    given = [{"mean_motion": 0.1}, {"gravity_W": (0.0, 0.1, 0.0)}, {"friction": 0.1}]
+    for each in given:
+        assert PlantLoads(robot, Surroundings(**each)).act
