@@ -108,6 +108,11 @@ CLEAR_GOALS ?= 50
 clear-plans: $(STAMP)/test ## plan CLEAR_GOALS random goals each of six robots with and without clearance, and list distances
 	SPACEROBOT_CLEAR_GOALS=$(CLEAR_GOALS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_clear_plans.py
 
+DRIFTING_CASES ?= 7
+.PHONY: drifting-plans
+drifting-plans: $(STAMP)/test ## plan DRIFTING_CASES random cases each of three robots and three drifts, flown by Pinocchio, and list durations
+	SPACEROBOT_DRIFTING_CASES=$(DRIFTING_CASES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_drifting_plans.py
+
 CLEAR_FLIGHTS ?= 100
 .PHONY: clear-flights
 clear-flights: $(STAMP)/test ## fly CLEAR_FLIGHTS draws each of four robots with noise, wrong masses and corrections, and list the smallest distances

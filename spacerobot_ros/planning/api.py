@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ def plan(
     end_effector_pose: EndEffectorValues | None = None,
     end_effector: str = "",
     start: RobotState | npt.ArrayLike | None = None,
+    linear_momentum: npt.ArrayLike | None = None,
+    angular_momentum: npt.ArrayLike | None = None,
     method: str = "optimal",
     control_period: float = 0.05,
     tolerance: Tolerance = _DEFAULT_TOLERANCE,
@@ -65,6 +68,9 @@ def plan(
     start
         The start: a state, or the shape (n,) alone with the base at the origin of W; None is the
         shape zero, or as near to it as the joint limits allow.
+    linear_momentum, angular_momentum
+        (3,) each in W, kg m/s and kg m^2/s, the second about the centre of mass; None: those of the
+        start. ``optimal`` plans for robots that drift.
     method
         Name of a gait method; ``options`` are its own.
     control_period, tolerance, integration_step
@@ -82,7 +88,7 @@ def plan(
     PlanningError
         The goal is refused or cannot be reached; the message says why.
     ParameterError
-        There is no such robot, method or option, or one is refused.
+        There is no such robot, method or option, or one of them or a momentum is refused.
     RobotDescriptionError
         The robot or the world is refused.
     """
@@ -111,7 +117,21 @@ def plan(
         options_of_method,
         Clearance.wanted(_among_obstacles(robot, world), clearance),
     )
-    return planner.plan(PlanRequest(_start_state(robot, start), goal, tolerance))
+    state = _start_state(robot, start)
+    for name, given in (
+        ("linear_momentum", linear_momentum),
+        ("angular_momentum", angular_momentum),
+    ):
+        if given is not None:
+            state = replace(state, **{name: _momentum(name, given)})
+    return planner.plan(PlanRequest(state, goal, tolerance))
+
+
+def _momentum(name: str, given: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    momentum = np.asarray(given, dtype=float)
+    if momentum.shape != (3,) or not np.all(np.isfinite(momentum)):
+        raise ParameterError(f"The {name} is {momentum.tolist()}; it must be three finite numbers.")
+    return momentum
 
 
 def _among_obstacles(

@@ -98,6 +98,8 @@ def test_the_next_solution_is_refined_where_it_may_be_the_better_one(
             position: bool,
             tolerance: float = TOLERANCE,
             pairs: tuple[int, ...] = (),
+            *,
+            drifting: bool = False,
         ) -> Scripted:
             return solvers[intervals]
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import GaitSchedule, RobotState, plan
+from spacerobot_ros.planning import GaitSchedule, plan
 from spacerobot_ros.planning.methods.optimal import multiple_shooting, search
 from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions, PathConstraints
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
@@ -225,14 +225,6 @@ def test_two_links_turn_but_not_in_place() -> None:
         plan(robot, rotvec=[0, 0, 0.3], final_shape=1, **QUICK)
     with pytest.raises(PlanningError, match="no joints"):
         plan(SpaceRobot.from_urdf(chain(1)), rotvec=[0, 0, 0.3], **QUICK)
-
-
-def test_a_drifting_robot_is_refused(arm: SpaceRobot) -> None:
-    spin = RobotState(
-        np.zeros(3), np.array([0.0, 0, 0, 1]), ARM_START, angular_momentum=np.array([0, 0, 1.0])
-    )
-    with pytest.raises(PlanningError, match="drifts"):
-        plan(arm, rotvec=[0, 0, 0.1], start=spin, **QUICK)
 
 
 def test_a_goal_that_takes_too_long_is_refused(arm: SpaceRobot) -> None:

@@ -48,7 +48,7 @@ def method(**options: Any) -> Any:
         near="",
         excess=0.0,
     )
-    made._efforts = SimpleNamespace(excess=lambda *_: made.excess)
+    made._efforts = SimpleNamespace(excess=lambda *_, **__: made.excess)
 
     def attitudes(positions: Array, quaternion: Array, _: Array) -> Array:
         end = Rotation.from_quat(quaternion) * TURN * Rotation.from_rotvec(made.off)
@@ -161,7 +161,7 @@ def planned(velocity: list[float], previous: object = None, **options: Any) -> A
     held = SimpleNamespace(positions=shapes(3))
     found = SimpleNamespace(starts=4, solutions=[5.0, 6.0], held=held)
 
-    def within(kind: object, search: Any, velocity: Array) -> Any:
+    def within(kind: object, search: Any, velocity: Array, boundary: object) -> Any:
         def given_to(*given: Any) -> Any:
             asked.append(given)
             return found
@@ -249,7 +249,7 @@ def test_limits_of_efforts_are_searched_for_where_they_are_exceeded() -> None:
     ):
         is_hard[0] = hard
         made: Any = SimpleNamespace(options=replace(OptimalOptions(), **chosen))
-        made._keeps_efforts = lambda found, velocity, excess=excess: excess <= 1.0
+        made._keeps_efforts = lambda found, velocity, boundary, excess=excess: excess <= 1.0
         if found is None:
             with pytest.raises(NotFoundError):
                 OptimalGait._within_efforts(made, kind, search)

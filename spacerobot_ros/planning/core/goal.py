@@ -264,6 +264,11 @@ class Goal:
         shape = self.joint_positions if other.joint_positions is None else other.joint_positions
         return replace(of_base, joint_positions=shape, end_effectors=tuple(links.values()))
 
+    def displaced(self, by: Array) -> Goal:
+        """Return the goal with all its places (3,) displaced in W, m."""
+        hands = tuple(replace(each, position=each.position + by) for each in self.end_effectors)
+        return replace(self, position=self.position + by, end_effectors=hands)
+
     def equals(self, other: Goal) -> bool:
         """Whether another goal has exactly the same poses and shape."""
         mine, others = self.joint_positions, other.joint_positions

@@ -1,9 +1,11 @@
-"""Joint efforts of held commands at zero momentum, beside their limits."""
+"""Joint efforts of held commands, beside their limits."""
 
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
@@ -40,23 +42,32 @@ class JointEfforts:
         self._joints = robot.description.movable_joints
         self.limit = limit
         self._function = robot.function("joint_efforts", compile=False)
+        self._robot = robot
 
-    def shares(self, positions: Array, velocity: Array | float = 0.0) -> Array:
+    def shares(
+        self, positions: Array, velocity: Array | float = 0.0, L_B: Array | None = None
+    ) -> Array:
         """Return the efforts of held commands over their limits (N + 1, n), at the ticks.
 
         ``positions`` (N + 1, n) are the shapes at the ticks, at rest after; ``velocity`` (n,) is
-        held before.
+        held before. ``L_B`` (N + 1, 3) is the angular momentum about the centre of mass in the
+        base, kg m^2/s; None: zero.
         """
-        return self._effort_shares(positions, *self._rates(positions, velocity))
+        return self._effort_shares(positions, *self._rates(positions, velocity), L_B)
 
-    def excess(self, positions: Array, velocity: Array | float = 0.0) -> float:
+    def excess(
+        self, positions: Array, velocity: Array | float = 0.0, L_B: Array | None = None
+    ) -> float:
         """Return the factor by which held commands must be slower; at most 1: they need not be.
 
-        Arguments are those of :meth:`shares`.
+        Arguments are those of :meth:`shares`. Of a robot that drifts it is an estimate, as its
+        efforts are not quadratic in the speed.
         """
-        return math.sqrt(float(np.abs(self.shares(positions, velocity)).max(initial=0.0)))
+        return math.sqrt(float(np.abs(self.shares(positions, velocity, L_B)).max(initial=0.0)))
 
-    def beyond_limits(self, positions: Array, velocity: Array | float = 0.0) -> str:
+    def beyond_limits(
+        self, positions: Array, velocity: Array | float = 0.0, L_B: Array | None = None
+    ) -> str:
         """Return the clause that says which joints take more than their limits; empty: none.
 
         Arguments are those of :meth:`shares`. Of many ticks, those are compared at which the joints
@@ -69,7 +80,8 @@ class JointEfforts:
             between = np.linspace(0, len(positions) - 1, _ALL_TICKS // 2).astype(int)
             chosen = np.union1d(most, between)
             positions, rates, changes = positions[chosen], rates[chosen], changes[chosen]
-        peaks = np.abs(self._effort_shares(positions, rates, changes)).max(axis=0)
+            L_B = None if L_B is None else L_B[chosen]
+        peaks = np.abs(self._effort_shares(positions, rates, changes, L_B)).max(axis=0)
         clauses = []
         for joint, share, limit in zip(self._joints, peaks, self.limit, strict=True):
             if share > 1 + _BEYOND:
@@ -88,10 +100,29 @@ class JointEfforts:
         return (before + after) / 2, (after - before) / self._period
 
     def _effort_shares(
-        self, q: npt.NDArray[np.float64], qdot: Array, qddot: Array
+        self,
+        q: npt.NDArray[np.float64],
+        qdot: Array,
+        qddot: Array,
+        L_B: Array | None = None,
     ) -> npt.NDArray[np.float64]:
-        tau = self._function(q.T, qdot.T, qddot.T).full().T
+        if L_B is None:
+            tau = self._function(q.T, qdot.T, qddot.T).full().T
+        else:
+            tau = self._drifting_function(q.T, qdot.T, qddot.T, L_B.T).full().T
         return np.asarray(tau / self.limit)
+
+    @cached_property
+    def _drifting_function(self) -> ca.Function:
+        """The efforts by shape, velocities, accelerations, and angular momentum in the base."""
+        n = self._robot.n
+        q, qdot, qddot, L_B = (
+            ca.SX.sym(name, k) for name, k in zip("qvaL", (n, n, n, 3), strict=True)
+        )
+        servo_efforts = self._robot.function("servo_efforts", compile=False)
+        base = ca.DM([0.0, 0.0, 0.0, 1.0])
+        tau = servo_efforts(base, q, qdot - qddot / 2, qdot + qddot / 2, L_B, 1.0)
+        return ca.Function("drifting_efforts", [q, qdot, qddot, L_B], [tau])
 
 
 def given_effort_limits(robot: SpaceRobot) -> Array | None:

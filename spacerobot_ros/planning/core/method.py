@@ -207,10 +207,12 @@ class GaitMethod(ABC):
         progress: object = None,
         is_clear: bool = False,
         velocity: Array | float = 0.0,
+        L_B: Array | None = None,
     ) -> GaitSchedule:
         """Return shapes (N + 1, n) at the ticks as a schedule of this method.
 
-        ``velocity`` (n,) is held before. Of efforts beyond the limits of the URDF there is a note.
+        ``velocity`` (n,) is held before. Of efforts beyond the limits of the URDF there is a note;
+        ``L_B`` (N + 1, 3) is the angular momentum in the base for them (:class:`JointEfforts`).
 
         Raises
         ------
@@ -223,7 +225,7 @@ class GaitMethod(ABC):
             start = RobotState(path.position[0], path.quaternion[0], positions[0])
             self._require_clear(positions, self._base_poses(start, positions))
         if self._joint_efforts is not None:
-            beyond = self._joint_efforts.beyond_limits(positions, velocity)
+            beyond = self._joint_efforts.beyond_limits(positions, velocity, L_B)
             notes = {**notes, BEYOND_EFFORT_LIMITS: beyond} if beyond else notes
         return GaitSchedule(
             method=self.name,
@@ -316,14 +318,24 @@ class GaitMethod(ABC):
         period = self.control_period if at_ticks else None
         return self.clearance.clause(found[0], period) if found else ""
 
-    def _require_rest(self, state: RobotState) -> None:
-        """Refuse an unsuitable robot, and a robot whose total momentum is not zero."""
+    def _require_suitable_setup(self) -> None:
+        """Refuse a robot that was found unsuitable."""
         if self._setup_refusal is not None:
             raise PlanningError(str(self._setup_refusal))
+
+    def _require_rest(self, state: RobotState) -> None:
+        """Refuse an unsuitable robot, and a robot whose total momentum is not zero."""
+        self._require_suitable_setup()
         p, L = np.linalg.norm(state.linear_momentum), np.linalg.norm(state.angular_momentum)
         if max(p, L) > _REST_MOMENTUM * self.robot.total_mass:
             raise PlanningError(
                 "The robot drifts: its total momentum is not zero "
                 f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), and {self.name} plans for zero momentum; "
-                "shape changes cannot remove it."
+                "shape changes cannot remove it, and optimal plans for robots that drift."
             )
+
+    def _significant(self, momentum: Array) -> Array:
+        """Return a total momentum (3,), kg m/s or kg m^2/s; zero where it counts as zero."""
+        if np.linalg.norm(momentum) > _REST_MOMENTUM * self.robot.total_mass:
+            return momentum
+        return np.zeros(3)

@@ -411,6 +411,7 @@ class EndEffectorSpecification:
         turn = quaternion_multiply(quaternion_inverse(state.quaternion), goal.quaternion)
         if self.attitude:
             self.base.require_suitable(robot)
+            self.base.require_turning_with_drift(robot, state)
             self.base.require_reachable_turn(robot, turn, tolerance.attitude)
         goals = list(goal.end_effectors)
         if self.position:

@@ -39,7 +39,7 @@ from spacerobot_ros.planning.core.controllability import (
     slot_matrix,
     tilted_goal_error,
 )
-from spacerobot_ros.planning.core.goal import POSITION_SLACK, Controlled
+from spacerobot_ros.planning.core.goal import POSITION_SLACK, Controlled, RobotState
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -54,6 +54,9 @@ _SAMPLED_SHAPE_COUNT = 12
 
 _SINGULAR_VALUE_TOLERANCE = 1e-7
 """Singular values below this share of the largest count as zero."""
+
+_AXIS_TOLERANCE = 1e-6
+"""Sine of the angle between two directions below which they are the same."""
 
 _MIN_BASE_TURN = 1e-12
 """Turn of the base per metre or radian of the joints that counts as zero, rad."""
@@ -173,6 +176,7 @@ class GoalSpecification:
         if shape is None and self.same_shape:
             shape = state.q
         if self.attitude:
+            self.require_turning_with_drift(robot, state)
             self.require_reachable_turn(robot, turn, tolerance.attitude)
             if robot.n == 1 and len(self.turning.axes):
                 _require_within_one_joint(
@@ -213,6 +217,37 @@ class GoalSpecification:
         if robot.n <= 3:
             return BoundaryConditions(state.q, turn, likely, likely, None, direction)
         return BoundaryConditions(state.q, turn, likely, None, center, direction)
+
+    def require_turning_with_drift(self, robot: SpaceRobot, state: RobotState) -> None:
+        """Refuse robots that drift, and whose joints turn the base about no or another axis.
+
+        Raises
+        ------
+        PlanningError
+            The robot is such a robot.
+        """
+        L_W, name = state.angular_momentum, robot.description.name
+        if not L_W.any():
+            return
+        size = float(np.linalg.norm(L_W))
+        drifts = f"Robot '{name}' drifts, with an angular momentum of {size:.3g} kg m^2/s"
+        if not self.turning.loops:
+            raise PlanningError(
+                f"{drifts}, and loops of its joints do not turn its base: optimal plans for robots "
+                "that drift only where they do. With optimal.base_attitude 0 the attitude of the "
+                "goal is ignored."
+            )
+        if len(self.turning.axes) == 1:
+            axis = self.turning.axes[0]
+            D = robot.function("locked_inertia", compile=False)(state.q)[0].full()
+            turned = matrix_from_quaternion(state.quaternion).T @ L_W / size
+            off = max(np.linalg.norm(np.cross(axis, x)) for x in (turned, D @ axis / D.max()))
+            if off > _AXIS_TOLERANCE:
+                raise PlanningError(
+                    f"{drifts}, which turns its base about another axis than the only one about "
+                    "which its joints turn it: no motion of them stops that. With "
+                    "optimal.base_attitude 0 the attitude of the goal is ignored."
+                )
 
     def require_reachable_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
         """Refuse attitudes that the joints cannot reach."""

@@ -8,7 +8,8 @@ the plant's own prediction ends on the goal. The first variation of the final at
 
 ``eta = R_f' sum_k R_k K(q_k)(dq_k, q_k' dt)``,  K the curvature of the connection,
 
-for a change ``dq`` that vanishes at both ends. Where that needs more speed or acceleration than
+for a change ``dq`` that vanishes at both ends, and more terms where the robot drifts
+(:class:`DriftVariation`). Where that needs more speed or acceleration than
 the limits allow, the manoeuvre takes a few ticks longer.
 
 Where that fails and the last shape is free, it is changed as well: loops of some robots do not turn
@@ -19,13 +20,21 @@ more; one of two or three may have too few corners to end on the goal, and takes
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
+import casadi as ca
 import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import attitude_error, matrix_from_quaternion
+from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    matrix_from_quaternion,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+)
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
@@ -174,7 +183,8 @@ class CommandHolder:
                         continue
                     needed, overrun = limits.excess(held.positions, self._period, before)
                 if self._efforts is not None:
-                    needed = max(needed, self._efforts.excess(held.positions, before))
+                    L_B = boundary.momenta_in_base(held.quaternions)
+                    needed = max(needed, self._efforts.excess(held.positions, before, L_B))
                 if overrun <= _LIMIT_ROUNDING:
                     if needed <= 1 + _LIMIT_ROUNDING:
                         return held
@@ -190,6 +200,19 @@ class CommandHolder:
             if ticks > most:
                 return None
         return None
+
+    def corrected_aim(
+        self, trajectory: Trajectory, boundary: BoundaryConditions, ticks: int
+    ) -> BoundaryConditions:
+        """Return boundary conditions whose solution ends at the goal as commands of ``ticks``.
+
+        The goal attitude is turned by the difference between the end of a trajectory and that of
+        its commands. Where the robot drifts, the solver's attitude is of order two only.
+        """
+        start, L_0 = np.array([0.0, 0.0, 0.0, 1.0]), boundary.angular_momentum
+        reached = self._prediction.attitudes(trajectory.at_ticks(ticks), start, L_0)[-1]
+        error = quaternion_from_rotvec(attitude_error(reached, trajectory.quaternions[-1]))
+        return replace(boundary, turn=quaternion_multiply(boundary.turn, error))
 
     def _adjust_to_goal(
         self,
@@ -216,7 +239,7 @@ class CommandHolder:
             waves = np.hstack([waves, self._build_ramps(s, limits)])
         for _ in range(_MAX_NEWTON_STEPS):
             quaternions = self._prediction.attitudes(
-                positions, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
+                positions, np.array([0.0, 0.0, 0.0, 1.0]), boundary.angular_momentum
             )
             error = self._axes @ attitude_error(quaternions[-1], boundary.turn)
             if self._end_effectors is not None:
@@ -232,7 +255,7 @@ class CommandHolder:
             if miss > 2 * best:
                 return None
             best = min(best, miss)
-            turn = self._first_variation(positions, quaternions, waves)
+            turn = self._first_variation(positions, quaternions, waves, boundary)
             J = self._axes @ turn
             if self._end_effectors is not None:
                 J = np.vstack([J, by_turn[0] @ turn + by_shape[0] @ waves[-1].T])
@@ -281,7 +304,9 @@ class CommandHolder:
         half = limits.span(q)[1]
         return np.where(np.isfinite(limits.velocity), limits.velocity, half), half
 
-    def _first_variation(self, positions: Array, quaternions: Array, waves: Array) -> Array:
+    def _first_variation(
+        self, positions: Array, quaternions: Array, waves: Array, boundary: BoundaryConditions
+    ) -> Array:
         """Return the turns (3, w) of the final attitude by waves (N + 1, w, n), base components."""
         # A few hundred points of a smooth integrand are plenty for Newton's direction.
         stride = max(1, len(positions) // 200)
@@ -295,4 +320,59 @@ class CommandHolder:
         R_f = matrix_from_quaternion(quaternions[-1])
         # The last step of a change that does not vanish at the end turns the base directly.
         direct = self._connection(positions[-1])[3:] @ waves[-1].T
-        return np.asarray(R_f.T @ np.einsum("kab,kbw->aw", R, twists) - direct)
+        L_B = boundary.momenta_in_base(quaternions[chosen])
+        if L_B is None:
+            return np.asarray(R_f.T @ np.einsum("kab,kbw->aw", R, twists) - direct)
+        moves, duration = waves[chosen].transpose(0, 2, 1), stride * self._period
+        accumulated = self._drift.accumulated(shapes, L_B, R, R @ twists, moves, duration)
+        return np.asarray(R_f.T @ accumulated - direct)
+
+    @cached_property
+    def _drift(self) -> DriftVariation:
+        return DriftVariation(self._robot)
+
+
+class DriftVariation:
+    """The first variation of the attitude of a robot whose angular momentum is not zero.
+
+    With ``w = D^-1 (L_B - D_q q')``, ``L_B = R' L``, ``A = D^-1 D_q`` and ``xi = R (eta + A dq)``,
+
+    ``xi' = R (K(dq, q') + G dq + D^-1 (L_B x R' xi))``,
+    ``G dq = d(D^-1 L_B)/dq dq + (D^-1 L_B) x A dq - D^-1 (L_B x A dq)``,
+
+    where K is the curvature, as it is at zero momentum.
+    """
+
+    def __init__(self, robot: SpaceRobot) -> None:
+        q, L_B = ca.SX.sym("q", robot.n), ca.SX.sym("L_B", 3)
+        D, D_q = robot.function("locked_inertia", compile=False)(q)
+        inverse, drift = solve_positive_definite(D, ca.SX.eye(3)), solve_positive_definite(D, L_B)
+        A = inverse @ D_q
+        G = ca.jacobian(drift, q) + ca.skew(drift) @ A - inverse @ ca.skew(L_B) @ A
+        outputs = [ca.densify(ca.vec(G)), ca.densify(ca.vec(inverse @ ca.skew(L_B)))]
+        self._function = ca.Function("drift_variation", [q, L_B], ca.cse(outputs))
+        self._n = robot.n
+
+    def accumulated(
+        self,
+        shapes: Array,
+        L_B: Array,
+        R: Array,
+        turned: Array,
+        moves: Array,
+        duration: float,
+    ) -> Array:
+        """Return xi (3, w) at the end of K steps of a duration, s.
+
+        ``shapes`` (K, n), ``L_B`` (K, 3) and ``R`` (K, 3, 3) are those of the steps, ``turned``
+        (K, 3, w) what curvature adds to xi in each, and ``moves`` (K, n, w) the changes dq.
+        """
+        columns = (each.full().T for each in self._function(shapes.T, L_B.T))
+        G, M = (each.reshape(len(shapes), -1, 3).transpose(0, 2, 1) for each in columns)
+        added = turned + duration * (R @ G @ moves)
+        carried = duration * (R @ M @ R.transpose(0, 2, 1))
+        # The implicit midpoint rule of xi' = M xi + b.
+        half, xi = np.eye(3), np.zeros(turned.shape[1:])
+        for step, change in zip(carried, added, strict=True):
+            xi = np.linalg.solve(half - step / 2, (half + step / 2) @ xi + change)
+        return xi

@@ -27,6 +27,7 @@ from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     attitude_error,
+    matrices_from_quaternions,
     quaternion_multiply,
     quaternions_from_rotvecs,
 )
@@ -52,6 +53,9 @@ _LEAST_SIZE = 0.1
 _MAX_RANGE_SHARE = 0.85
 """Largest share of half the joints' ranges that a guess uses."""
 
+_MAX_COASTING_SHARE = 0.6
+"""Largest share of a guess in which the joints rest first while the base drifts."""
+
 _BRAKING_TIME_FACTOR = 4.0
 """A joint that moves at the start is back on the way of its guess after this many times the time
 that it takes to brake."""
@@ -66,14 +70,23 @@ class InitialGuesses:
     Parameters
     ----------
     turn
-        Function ``(q, u, u+) -> Omega`` of a step (:func:`turn_function`).
+        Function of a step (:func:`turn_function`), drifting if there is an angular momentum.
     curvature
         Function ``q -> K`` of the model.
+    angular_momentum
+        (3,) total, in the base at the start, kg m^2/s; None: zero.
     """
 
-    def __init__(self, turn: ca.Function, curvature: ca.Function, intervals: int) -> None:
+    def __init__(
+        self,
+        turn: ca.Function,
+        curvature: ca.Function,
+        intervals: int,
+        angular_momentum: Array | None = None,
+    ) -> None:
         self._turn, self._curvature = turn, curvature
         self._instants = np.linspace(0.0, 1.0, intervals + 1)
+        self._angular_momentum = angular_momentum
 
     def generate(
         self, boundary: BoundaryConditions, limits: MotionLimits, final: Array
@@ -100,10 +113,23 @@ class InitialGuesses:
                 for _ in range(_CANDIDATES_PER_GUESS)
             ]
             shapes = self._add_loops(np.array(rounds), boundary.start, final, limits)
+            if self._angular_momentum is not None and around % 3 == 1:
+                shapes = self._after_coasting(shapes, rng)
             candidates = self._build_trajectories(shapes, limits)
             # The cosine of half the remaining angle.
             near = np.abs([each.quaternions[-1] @ turn for each in candidates])
             yield candidates[int(near.argmax())]
+
+    def _after_coasting(self, shapes: Array, rng: np.random.Generator) -> Array:
+        """Return paths (K, N + 1, n) that begin later: meanwhile the base drifts on."""
+        s = self._instants
+        shares = rng.uniform(0.0, _MAX_COASTING_SHARE, len(shapes))
+        return np.array(
+            [
+                _interpolate(np.clip((s - share) / (1 - share), 0.0, 1.0), s, path)
+                for share, path in zip(shares, shapes, strict=True)
+            ]
+        )
 
     def _direct_path(self, start: Array, final: Array) -> Array:
         s = self._instants
@@ -135,13 +161,18 @@ class InitialGuesses:
         return [
             Trajectory(float(h), q, step / h, X)
             for h, q, step, X in zip(
-                steps, shapes, u, self._integrate_attitudes(shapes, u), strict=True
+                steps, shapes, u, self._integrate_attitudes(shapes, u, steps), strict=True
             )
         ]
 
-    def _integrate_attitudes(self, shapes: Array, steps: Array) -> Array:
-        """Return the attitudes (..., N + 1, 4) that shapes and steps (..., N + 1, n) lead to."""
+    def _integrate_attitudes(self, shapes: Array, steps: Array, durations: Array | float) -> Array:
+        """Return the attitudes (..., N + 1, 4) that shapes and steps (..., N + 1, n) lead to.
+
+        ``durations`` (...) are those of a step, s.
+        """
         parts = shapes[..., :-1, :], steps[..., :-1, :], steps[..., 1:, :]
+        if self._angular_momentum is not None:
+            return self._integrate_drift(*parts, np.asarray(durations), self._angular_momentum)
         Omega = self._turn(*(x.reshape(-1, x.shape[-1]).T for x in parts)).full().T
         rotations = quaternions_from_rotvecs(Omega).reshape(*parts[0].shape[:-1], 4)
         quaternions = np.empty((*shapes.shape[:-1], 4))
@@ -152,6 +183,27 @@ class InitialGuesses:
             )
         return quaternions
 
+    def _integrate_drift(
+        self, q: Array, u: Array, u_next: Array, durations: Array, L_0: Array
+    ) -> Array:
+        """Return the attitudes (..., N + 1, 4), each from the one before, at an angular momentum.
+
+        ``q``, ``u`` and ``u_next`` (..., N, n) are those of the steps.
+        """
+        N, n = q.shape[-2:]
+        parts = [each.reshape(-1, N, n) for each in (q, u, u_next)]
+        h = np.broadcast_to(durations, q.shape[:-2]).reshape(-1, 1)
+        X = np.tile([0.0, 0.0, 0.0, 1.0], (len(h), N + 1, 1))
+        Omega = np.zeros((len(h), 3))
+        for k in range(N):
+            # Half-way, about: where the turn before leads in half a step.
+            ahead = quaternion_multiply(X[:, k], quaternions_from_rotvecs(Omega / 2))
+            impulse = h * (L_0 @ matrices_from_quaternions(ahead))
+            arguments = (*(each[:, k] for each in parts), impulse)
+            Omega = self._turn(*(each.T for each in arguments)).full().T
+            X[:, k + 1] = quaternion_multiply(X[:, k], quaternions_from_rotvecs(Omega))
+        return np.asarray(X.reshape(*q.shape[:-2], N + 1, 4))
+
     def resample(self, solution: Trajectory) -> Trajectory:
         """Return a solution on another grid."""
         intervals = len(self._instants) - 1
@@ -160,7 +212,7 @@ class InitialGuesses:
         velocities = _interpolate(self._instants, coarse, solution.velocities)
         step = solution.duration / intervals
         return Trajectory(
-            step, shapes, velocities, self._integrate_attitudes(shapes, step * velocities)
+            step, shapes, velocities, self._integrate_attitudes(shapes, step * velocities, step)
         )
 
     def from_shapes(self, shapes: Array, limits: MotionLimits) -> Trajectory:
@@ -180,7 +232,7 @@ class InitialGuesses:
             _interpolate(self._instants, ticks, values) for values in (positions, rates)
         )
         return Trajectory(
-            step, shapes, velocities, self._integrate_attitudes(shapes, step * velocities)
+            step, shapes, velocities, self._integrate_attitudes(shapes, step * velocities, step)
         )
 
     def with_initial_velocity(
@@ -195,7 +247,7 @@ class InitialGuesses:
         shapes = guess.shapes + back * x * (1 - x) ** 2 * velocity
         velocities = guess.velocities + (1 - x) * (1 - 3 * x) * velocity
         shapes = np.clip(shapes, limits.lower, limits.upper)
-        quaternions = self._integrate_attitudes(shapes, guess.step * velocities)
+        quaternions = self._integrate_attitudes(shapes, guess.step * velocities, guess.step)
         return Trajectory(guess.step, shapes, velocities, quaternions)
 
 

@@ -1,9 +1,9 @@
-"""Joint efforts of a motion at zero momentum, and their limits.
+"""Joint efforts of a motion, and their limits.
 
 The efforts of held commands (:class:`.JointEfforts`) are those of servos that follow them; where
-the plant is driven by efforts, they are a controller's command beside its feedback. Efforts are
-quadratic in the speed: so a motion whose efforts are f^2 times their limits keeps these in f times
-its time.
+the plant is driven by efforts, they are a controller's command beside its feedback. At zero
+momentum efforts are quadratic in the speed: so a motion whose efforts are f^2 times their limits
+keeps these in f times its time.
 """
 
 from __future__ import annotations
@@ -78,30 +78,40 @@ class LimitedEfforts(JointEfforts):
             limit *= 1 - options.effort_reserve
         return cls(robot, limit, control_period) if np.any(np.isfinite(limit)) else None
 
-    def peak(self, trajectory: Trajectory) -> float:
-        """Return the largest ratio of efforts on a trajectory to those that solutions may use."""
+    def peak(self, trajectory: Trajectory, boundary: BoundaryConditions | None = None) -> float:
+        """Return the largest ratio of efforts on a trajectory to those that solutions may use.
+
+        The angular momentum is that of the ``boundary`` conditions; None: zero.
+        """
         q, v = trajectory.shapes, trajectory.velocities
         a = np.diff(v, axis=0) / trajectory.step
+        L_B = None if boundary is None else boundary.momenta_in_base(trajectory.quaternions)
+        before, after = (None, None) if L_B is None else (L_B[:-1], L_B[1:])
         ends = np.vstack(
-            [self._effort_shares(q[:-1], v[:-1], a), self._effort_shares(q[1:], v[1:], a)]
+            [
+                self._effort_shares(q[:-1], v[:-1], a, before),
+                self._effort_shares(q[1:], v[1:], a, after),
+            ]
         )
         return float(np.abs(ends).max()) / _PLANNED_EFFORT_SHARE
 
-    def slowed(self, trajectory: Trajectory) -> Trajectory:
+    def slowed(
+        self, trajectory: Trajectory, boundary: BoundaryConditions | None = None
+    ) -> Trajectory:
         """Return the trajectory, slowed along its path until its efforts keep the limits."""
-        peak = self.peak(trajectory)
+        peak = self.peak(trajectory, boundary)
         return trajectory if peak <= 1 else trajectory.retimed(math.sqrt(peak))
 
-    @property
-    def inequality(self) -> PathInequality:
-        """The limits as a path constraint at both ends of every interval."""
+    def inequality(self, *, drifting: bool = False) -> PathInequality:
+        """Return the limits as a path constraint at both ends of every interval."""
         n = len(self.limit)
         q, qdot, qddot = (ca.SX.sym(name, n) for name in ("q", "qdot", "qddot"))
+        arguments = [q, qdot, qddot, ca.SX.sym("L_B", 3)] if drifting else [q, qdot, qddot]
         limited = np.flatnonzero(np.isfinite(self.limit))
-        tau = self._function(q, qdot, qddot)[limited.tolist()]
+        efforts = self._drifting_function if drifting else self._function
+        tau = efforts(*arguments)[limited.tolist()]
         share = tau / (_PLANNED_EFFORT_SHARE * self.limit[limited])
-        function = ca.Function("efforts", [q, qdot, qddot], [ca.vertcat(1 - share, 1 + share)])
-        return PathInequality(function)
+        return PathInequality(ca.Function("efforts", arguments, [ca.vertcat(1 - share, 1 + share)]))
 
 
 class EffortLimitedShooting(MultipleShooting):
@@ -120,6 +130,8 @@ class EffortLimitedShooting(MultipleShooting):
         The limits.
     tolerance
         That of :class:`MultipleShooting`.
+    drifting
+        Whether the angular momentum is a parameter of the stages.
     """
 
     def __init__(
@@ -128,8 +140,11 @@ class EffortLimitedShooting(MultipleShooting):
         intervals: int,
         efforts: LimitedEfforts,
         tolerance: float = TOLERANCE,
+        *,
+        drifting: bool = False,
     ) -> None:
         super().__init__(stages(()), intervals, tolerance)
+        self._with_drift = drifting
         self._stages, self._efforts, self._tolerance = stages, efforts, tolerance
         self._limited: MultipleShooting | None = None
 
@@ -143,13 +158,14 @@ class EffortLimitedShooting(MultipleShooting):
     ) -> Trajectory | None:
         """Solve as :class:`MultipleShooting` does, with joint efforts within limits."""
         # A guess whose efforts just reach their limits was made for these limits.
-        if not _AT_LIMITS_FROM <= self._efforts.peak(guess) <= 1 + _AT_LIMITS_BEYOND:
+        peak = self._efforts.peak(guess, boundary)
+        if not _AT_LIMITS_FROM <= peak <= 1 + _AT_LIMITS_BEYOND:
             solution = super().solve(boundary, limits, guess, stop, duration)
-            if solution is None or self._efforts.peak(solution) <= 1:
+            if solution is None or self._efforts.peak(solution, boundary) <= 1:
                 return solution
-            guess = solution if duration.fixed else self._efforts.slowed(solution)
+            guess = solution if duration.fixed else self._efforts.slowed(solution, boundary)
         if self._limited is None:
-            stages = self._stages((self._efforts.inequality,))
+            stages = self._stages((self._efforts.inequality(drifting=self._with_drift),))
             self._limited = MultipleShooting(stages, self.intervals, self._tolerance)
         solution = self._limited.solve(boundary, limits, guess, stop, duration)
         self.iterations, self.converged = self._limited.iterations, self._limited.converged

@@ -27,6 +27,8 @@ from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     attitude_error,
+    matrices_from_quaternions,
+    matrix_from_quaternion,
     quaternion_inverse,
     quaternion_multiply,
 )
@@ -87,6 +89,13 @@ _MAX_CACHED_END_ERROR = 1e-7
 
 _ACTIVE_LIMIT_SHARE = 0.95
 """Share of a limit beyond which a manoeuvre counts as limited by it."""
+
+_MAX_MOVING_AIMS = 4
+"""Largest number of fastest manoeuvres to where a goal is at the end of the one before, seen from a
+centre of mass that coasts."""
+
+_MOVING_AIM_FACTORS = (1.05, 1.2, 1.5)
+"""Factors of the duration of the last one, in which a manoeuvre is planned if they do not agree."""
 
 _LONGEST_FACTOR, _LONGEST_ADDITIONAL_TICKS = 1.25, 20
 """Longest duration of held commands: a factor of optimal.longest, and additional ticks."""
@@ -228,14 +237,91 @@ class OptimalGait(GaitMethod):
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan within the search budget; see :meth:`GaitMethod.plan`.
 
-        A correction takes the smallest way instead of the fastest, and may use the margins.
+        A correction takes the smallest way instead of the fastest, and may use the margins. Where
+        the centre of mass coasts, goals that are places are planned for in its frame, in which
+        they move: where they are when the manoeuvre ends depends on its duration.
         """
-        self._require_rest(request.state)
+        self._require_suitable_setup()
         # Measured shapes may be a little beyond the joint limits.
         q = np.clip(request.state.q, self.robot.lower, self.robot.upper)
-        goal, correction = request.goal.for_robot(self.robot.description), request.correction
-        state = replace(request.state, q=q)
+        goal = request.goal.for_robot(self.robot.description)
+        state = replace(
+            request.state,
+            q=q,
+            linear_momentum=self._significant(request.state.linear_momentum),
+            angular_momentum=self._significant(request.state.angular_momentum),
+        )
         request = replace(request, state=state, goal=goal)
+        if not state.linear_momentum.any():
+            return self._plan_about_center(request, cancellation)
+        schedule = self._plan_while_coasting(request, cancellation)
+        velocity = 0.0 if request.motion is None else request.motion.velocity
+        return self._build_schedule(state, goal, schedule.positions, {**schedule.notes}, velocity)
+
+    def _plan_while_coasting(
+        self, request: PlanRequest, cancellation: Cancellation
+    ) -> GaitSchedule:
+        """Return the schedule of a robot whose centre of mass coasts, in the frame of that.
+
+        Raises
+        ------
+        PlanningError
+            There are obstacles, or no manoeuvre ends when the goal is where it leads.
+        """
+        state, goal = request.state, request.goal
+        velocity = state.linear_momentum / self.robot.total_mass
+        if self._has_obstacles:
+            raise PlanningError(
+                f"The robot drifts: its centre of mass moves at {np.linalg.norm(velocity):.3g} "
+                "m/s, and among obstacles optimal plans only where it rests."
+            )
+        in_frame = replace(request, state=replace(state, linear_momentum=np.zeros(3)))
+        if not goal.end_effectors and "position" not in self._specification.controls:
+            return self._plan_about_center(in_frame, cancellation)
+        if goal.joint_positions is not None and not goal.end_effectors:
+            raise PlanningError(
+                "The robot drifts: its centre of mass moves at "
+                f"{np.linalg.norm(velocity):.3g} m/s, so attitude and shape of the goal put the "
+                "base to its position at one instant at most. Leave the shape out, or ignore the "
+                "position with optimal.base_position 2."
+            )
+
+        def plan_for_end(end: float, duration: float | None) -> GaitSchedule:
+            moved = goal.displaced(-velocity * end)
+            aimed = replace(in_frame, goal=moved)
+            return self._plan_about_center(aimed, cancellation, duration)
+
+        if self.options.duration > 0:
+            ticks = max(round(self.options.duration / self.control_period), 1)
+            return plan_for_end(ticks * self.control_period, None)
+        refusal, end = "", 0.0
+        try:
+            for _ in range(_MAX_MOVING_AIMS):
+                schedule = plan_for_end(end, None)
+                if schedule.duration == end:
+                    return schedule
+                end = schedule.duration
+        except PlanningError as reason:
+            refusal = str(reason)
+        # The fastest manoeuvre ends too early or too late: one of a given duration does not.
+        for factor in _MOVING_AIM_FACTORS:
+            ticks = math.ceil(max(end * factor, 1.0) / self.control_period)
+            try:
+                duration = ticks * self.control_period
+                return plan_for_end(duration, duration)
+            except PlanningError as reason:
+                refusal = str(reason)
+        raise NotFoundError(
+            "The robot drifts, and no manoeuvre was found that ends when the goal is where it "
+            f"leads, seen from the centre of mass: {refusal}"
+        )
+
+    def _plan_about_center(
+        self, request: PlanRequest, cancellation: Cancellation, duration: float | None = None
+    ) -> GaitSchedule:
+        """Plan where the centre of mass rests; in a ``duration``, s, or that of the options."""
+        state, goal, correction = request.state, request.goal, request.correction
+        q = state.q
         margin = np.zeros(self.robot.n) if correction else self._margin
         shape, kind = self._goal_shape(goal), self._kind_of(goal)
         same_shape = self._specification.same_shape and not goal.end_effectors
@@ -249,11 +335,14 @@ class OptimalGait(GaitMethod):
             self._limits,
             self._constraints.direction_W,
         )
-        boundary = replace(boundary, state=state)
+        L_0 = matrix_from_quaternion(state.quaternion).T @ state.angular_momentum
+        boundary = replace(boundary, state=state, angular_momentum=L_0)
         # A manoeuvre ends within the margin if its goal does.
         limits = self._limits.within(margin, q, boundary.likely)
         if request.motion is not None:
-            return self._plan_in_motion(request, request.motion, boundary, limits, cancellation)
+            return self._plan_in_motion(
+                request, request.motion, boundary, limits, cancellation, duration
+            )
         if self._is_reached(state, goal):
             return self._build_schedule(state, goal, q[np.newaxis], {"starts": 0.0})
         attitude = state.quaternion[np.newaxis]
@@ -262,13 +351,15 @@ class OptimalGait(GaitMethod):
         except CandidateError as reason:
             raise PlanningError(f"The start violates a path constraint: {reason}.") from None
         key = None
-        if self._cache is not None and not correction:
+        if self._cache is not None and not correction and duration is None:
             key = self._request_key(request)
             if kept := self._load_cached_plan(self._cache, key, request, boundary, limits):
                 return kept
         # Libraries have manoeuvres to attitudes of the base.
         library = None if correction or goal.end_effectors else self._library
         chosen = replace(self.options, duration=0.0, answers=1) if correction else self.options
+        if duration is not None:
+            chosen = replace(chosen, duration=duration)
         found = self._within_efforts(
             kind,
             lambda searches: searches.from_rest.search(
@@ -279,8 +370,10 @@ class OptimalGait(GaitMethod):
                 chosen,
                 cancellation,
                 library=library,
-                gentle=correction,
+                # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
+                gentle=correction and not boundary.drifts,
             ),
+            boundary=boundary,
         )
         notes: Notes = {
             "starts": float(found.starts),
@@ -298,7 +391,7 @@ class OptimalGait(GaitMethod):
             self._cache is not None
             and key is not None
             and not found.cut_short
-            and self._keeps_efforts(found)
+            and self._keeps_efforts(found, boundary=boundary)
         ):
             kept_plan = _CachedPlan(schedule.positions, notes)
             self._cache.store(archive_name(key), key, kept_plan.to_bytes())
@@ -311,6 +404,7 @@ class OptimalGait(GaitMethod):
         boundary: BoundaryConditions,
         limits: MotionLimits,
         cancellation: Cancellation,
+        given: float | None = None,
     ) -> GaitSchedule:
         """Plan from moving joints; the remaining previous motion is the first guess."""
         too_fast = np.abs(motion.velocity) > limits.velocity * (1 + _LIMIT_ROUNDING)
@@ -318,8 +412,8 @@ class OptimalGait(GaitMethod):
             names = ", ".join(np.array(self.robot.joint_names)[too_fast])
             raise PlanningError(f"Joints move faster than the velocity limits of optimal: {names}.")
         chosen, again = self.options, request.previous is not None
-        duration = chosen.duration
-        if again and duration > 0:
+        duration = chosen.duration if given is None else given
+        if given is None and again and duration > 0:
             # The previous manoeuvre continues, and keeps its end time.
             duration = (len(motion.remaining) - 1) * self.control_period
         budget = replace(
@@ -340,6 +434,7 @@ class OptimalGait(GaitMethod):
                 cancellation,
             ),
             motion.velocity,
+            boundary,
         )
         notes: Notes = {"starts": float(found.starts), "durations": list(found.solutions)}
         return self._build_schedule(
@@ -351,6 +446,7 @@ class OptimalGait(GaitMethod):
         kind: _GoalKind,
         search: Callable[[_Searches], Manoeuvre],
         velocity: Array | float = 0.0,
+        boundary: BoundaryConditions | None = None,
     ) -> Manoeuvre:
         """Return the manoeuvre of a search without effort limits if it keeps them, and otherwise
         that of a search with them; ``velocity`` (n,) is held before.
@@ -358,7 +454,7 @@ class OptimalGait(GaitMethod):
         Limits that are the robot's own, and that no manoeuvre is found to keep, are not kept.
         """
         found = search(kind.of_any_effort)
-        if self._keeps_efforts(found, velocity):
+        if self._keeps_efforts(found, velocity, boundary):
             return found
         try:
             return search(kind.within_efforts)
@@ -367,10 +463,16 @@ class OptimalGait(GaitMethod):
                 return found
             raise
 
-    def _keeps_efforts(self, found: Manoeuvre, velocity: Array | float = 0.0) -> bool:
+    def _keeps_efforts(
+        self,
+        found: Manoeuvre,
+        velocity: Array | float = 0.0,
+        boundary: BoundaryConditions | None = None,
+    ) -> bool:
         if self._efforts is None:
             return True
-        return self._efforts.excess(found.held.positions, velocity) <= 1 + _LIMIT_ROUNDING
+        L_B = None if boundary is None else boundary.momenta_in_base(found.held.quaternions)
+        return self._efforts.excess(found.held.positions, velocity, L_B) <= 1 + _LIMIT_ROUNDING
 
     def _count_intervals(self, correction: bool) -> int:
         intervals = self.options.intervals
@@ -389,7 +491,9 @@ class OptimalGait(GaitMethod):
         notes: Notes,
         velocity: Array | float = 0.0,
     ) -> GaitSchedule:
-        path = self._prediction.path(state, positions)
+        attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
+        path = self._prediction.path(state, positions, attitudes)
+        L_B = _momenta_in_base(state, attitudes)
         end = path.position[-1], path.quaternion[-1]
         left = PoseError.between(*end, goal, positions[-1], self.robot)
         controls = self._kind_of(goal).specification.controls
@@ -408,18 +512,26 @@ class OptimalGait(GaitMethod):
         if goal.end_effectors:
             notes["predicted_end_effector_position_error"] = left.farthest_end_effector
             notes["predicted_end_effector_attitude_error"] = left.most_turned_end_effector
-        notes["limited_by"] = self._list_active_limits(positions, velocity)
-        schedule = self._schedule_of(goal, positions, path, notes, is_clear=True, velocity=velocity)
+        if L_B is not None:
+            momenta, rest = (state.linear_momentum, state.angular_momentum), np.zeros(self.robot.n)
+            _, omega = self.robot.base_twist(attitudes[-1], positions[-1], rest, *momenta)
+            notes["final_base_rate"] = omega.tolist()
+        notes["limited_by"] = self._list_active_limits(positions, velocity, L_B)
+        schedule = self._schedule_of(
+            goal, positions, path, notes, is_clear=True, velocity=velocity, L_B=L_B
+        )
         return replace(schedule, controls=controls)
 
-    def _list_active_limits(self, positions: Array, velocity: Array | float) -> str:
+    def _list_active_limits(
+        self, positions: Array, velocity: Array | float, L_B: Array | None = None
+    ) -> str:
         """Return the active limits of held commands, with the joints at each limit."""
         if len(positions) < 2:
             return "nothing"
         speed, change = self._limits.shares(positions, self.control_period, velocity)
         shares = {"velocity": speed, "acceleration": change}
         if self._efforts is not None:
-            shares["effort"] = np.abs(self._efforts.shares(positions, velocity))
+            shares["effort"] = np.abs(self._efforts.shares(positions, velocity, L_B))
         names = np.array(self.robot.joint_names)
         active = {
             limit: names[share.max(axis=0) > _ACTIVE_LIMIT_SHARE].tolist()
@@ -444,6 +556,9 @@ class OptimalGait(GaitMethod):
         if goal.end_effectors:
             parts = [part in goal.base for part in ("position", "attitude")]
             numbers["base"] = np.array(parts, dtype=float)
+        momenta = np.concatenate([state.linear_momentum, state.angular_momentum])
+        if momenta.any():
+            numbers["momenta"] = momenta
         if self._efforts is not None:
             numbers["effort"] = self._efforts.limit
         if self.clearance is not None:
@@ -510,12 +625,13 @@ class OptimalGait(GaitMethod):
             beside = robot.center_of_mass(last) - boundary.center
             if np.linalg.norm(beside) > _MAX_CACHED_END_ERROR:
                 raise CandidateError("it ends in another position")
+        attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
         factor, overrun = limits.excess(positions, period)
         if self._efforts is not None:
-            factor = max(factor, self._efforts.excess(positions))
+            L_B = _momenta_in_base(state, attitudes)
+            factor = max(factor, self._efforts.excess(positions, L_B=L_B))
         if factor > 1 + _LIMIT_ROUNDING or overrun > _LIMIT_ROUNDING:
             raise CandidateError("it exceeds a limit of the joints")
-        attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
         kind = self._kind_of(request.goal)
         aim = quaternion_multiply(state.quaternion, boundary.turn)
         aim = aim if request.goal.end_effectors else request.goal.quaternion
@@ -530,6 +646,13 @@ class OptimalGait(GaitMethod):
         self._constraints.check(positions, attitudes, period)
         if too_near := self._too_near(positions, self._base_poses(state, positions, attitudes)):
             raise CandidateError(too_near)
+
+
+def _momenta_in_base(state: RobotState, attitudes: Array) -> Array | None:
+    """Return the angular momenta (N + 1, 3) in the base at attitudes (N + 1, 4); None: zero."""
+    if not state.angular_momentum.any():
+        return None
+    return np.asarray(state.angular_momentum @ matrices_from_quaternions(attitudes))
 
 
 @dataclass(frozen=True)

@@ -99,6 +99,7 @@ class MultipleShooting:
         self.iterations, self.converged = 0, False
         """Number of the solver's steps for its last solution, and whether the solver converged."""
         self.turn = stages.turn
+        self._drifting = stages.drifting
         self._program = program(stages, intervals)
         # The solver's matrices are small: threads of its linear algebra would wait for each other.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -164,7 +165,9 @@ class MultipleShooting:
             ubx=most,
             lbg=self._program.lower,
             ubg=self._program.upper,
-            p=_pack_parameters(boundary, limits, guess if duration.fixed else None),
+            p=_pack_parameters(
+                boundary, limits, guess if duration.fixed else None, drifting=self._drifting
+            ),
         )
         stats = self._solver.stats()
         self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
@@ -189,7 +192,11 @@ class MultipleShooting:
 
 
 def _pack_parameters(
-    boundary: BoundaryConditions, limits: MotionLimits, gentle: Trajectory | None
+    boundary: BoundaryConditions,
+    limits: MotionLimits,
+    gentle: Trajectory | None,
+    *,
+    drifting: bool = False,
 ) -> Array:
     typical = np.where(np.isfinite(limits.velocity), limits.velocity, limits.acceleration)
     weights = np.array([1.0, 0.0])
@@ -202,6 +209,7 @@ def _pack_parameters(
         [
             *(boundary.start, boundary.turn, boundary.direction, center, boundary.end_effectors),
             *(typical, weights),
+            boundary.angular_momentum if drifting else np.zeros(0),
             *(limits.distances, limits.world),
         ]
     )

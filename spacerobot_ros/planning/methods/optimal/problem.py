@@ -12,7 +12,7 @@ import numpy as np
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot, symbolic_rotations
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_from_quaternion
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.resources import suggestion
@@ -199,14 +199,15 @@ class BoundaryConditions:
     direction
         (3,) kept direction of the path constraints, in the starting base.
     velocity
-        (n,) first velocities of the joints, m/s or rad/s, at zero momentum; a number is that of
-        all.
+        (n,) first velocities of the joints, m/s or rad/s; a number is that of all.
     end_effectors
         (7 k,) goals of k links (:meth:`.EndEffectorRows.pack`).
     ends
         Ends of the guesses, in turn; none: the likely shape, and the turn.
     state
         The state at the start.
+    angular_momentum
+        (3,) total, about the centre of mass, in the base at the start, kg m^2/s.
     """
 
     start: Array
@@ -219,6 +220,21 @@ class BoundaryConditions:
     end_effectors: Array = field(default_factory=lambda: np.zeros(0))
     ends: tuple[PossibleEnd, ...] = ()
     state: RobotState | None = None
+    angular_momentum: Array = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the angular momentum is not zero."""
+        return bool(self.angular_momentum.any())
+
+    def momenta_in_base(self, quaternions: Array) -> Array | None:
+        """Return the angular momentum (..., 3) in the base at turns (..., 4) since the start; None:
+        it is zero.
+        """
+        if not self.drifts:
+            return None
+        # With R_0B' on the left.
+        return np.asarray(self.angular_momentum @ matrices_from_quaternions(quaternions))
 
 
 @dataclass(frozen=True)

@@ -140,6 +140,9 @@ _MIN_TICKS_IN_MOTION = 4
 _ADDITIONAL_TICKS = (0, 1, 3, 7)
 """Control periods that lengthen a manoeuvre in motion whose commands exceed a limit."""
 
+_ADDITIONAL_TICKS_OF_DRIFT = (0, 0, 1, 3, 7)
+"""Likewise where the robot drifts; the second time, the aim is corrected."""
+
 
 @dataclass(frozen=True)
 class Manoeuvre:
@@ -270,8 +273,8 @@ class ManoeuvreSearch:
         self._distances = model.distances
         self._begin = model.begin
         self._holder = CommandHolder(model)
-        self._stages: dict[tuple[bool, bool], Stages] = {}
-        self._solvers: dict[tuple[int, bool, float, tuple[int, ...]], MultipleShooting] = {}
+        self._stages: dict[tuple[bool, bool, bool], Stages] = {}
+        self._solvers: dict[tuple[int, bool, float, tuple[int, ...], bool], MultipleShooting] = {}
 
     def search(
         self,
@@ -382,7 +385,9 @@ class ManoeuvreSearch:
         if not near:
             return manoeuvre
         coarser = intervals // _COARSE_GRID_RATIO
-        if near[0].distance > _DEEP_CONTACT or coarser < _MIN_COARSE_INTERVALS:
+        # On a coarse grid the attitude of a robot that drifts is too far off.
+        on_full_grid = progress.boundary.drifts or coarser < _MIN_COARSE_INTERVALS
+        if near[0].distance > _DEEP_CONTACT or on_full_grid:
             return self._clear_on_grid(progress, manoeuvre, intervals, TOLERANCE)
         # The way round is far: it is found on a coarse grid first.
         clear = self._clear_on_grid(progress, manoeuvre, coarser, _COARSE_TOLERANCE)
@@ -437,7 +442,7 @@ class ManoeuvreSearch:
         assert kept is not None
         within = replace(progress, limits=kept.within(progress.limits))
         solver = self._get_solver(within, intervals, tolerance)
-        guess = _build_guesses(self._robot, solver).resample(trajectory)
+        guess = _build_guesses(self._robot, solver, progress.boundary).resample(trajectory)
         solution = self._solve_from_guess(within, solver, guess, progress.stop_rule(found=False))
         progress.cancellation.raise_if_requested()
         result = _NO_PATH_FOUND if solution is None else f"{solution.duration:.6g} s"
@@ -450,13 +455,19 @@ class ManoeuvreSearch:
         self, progress: _Progress, intervals: int, tolerance: float = TOLERANCE
     ) -> MultipleShooting:
         pairs = progress.kept.pairs if progress.kept is not None else ()
-        return self.solver(intervals, progress.boundary.center is not None, tolerance, pairs)
+        return self.solver(
+            intervals,
+            progress.boundary.center is not None,
+            tolerance,
+            pairs,
+            drifting=progress.boundary.drifts,
+        )
 
     def _search_from_guesses(
         self, progress: _Progress, grid: MultipleShooting, full: MultipleShooting, starts: int
     ) -> list[Manoeuvre]:
         """Return manoeuvres from at most ``starts`` guesses on a grid; none where none is found."""
-        guesses = _build_guesses(self._robot, grid)
+        guesses = _build_guesses(self._robot, grid, progress.boundary)
         boundary, limits = progress.boundary, progress.limits
         of_boundary = guesses.generate(boundary, limits, boundary.likely)
         if progress.library is not None:
@@ -520,7 +531,7 @@ class ManoeuvreSearch:
             try:
                 refined: Trajectory | None = solution
                 if grid is not full:
-                    guess = _build_guesses(self._robot, full).resample(solution)
+                    guess = _build_guesses(self._robot, full, progress.boundary).resample(solution)
                     stop = progress.stop_rule(found=bool(found))
                     refined = self._solve_from_guess(progress, full, guess, stop)
                     progress.cancellation.raise_if_requested()
@@ -542,18 +553,22 @@ class ManoeuvreSearch:
         position: bool,
         tolerance: float = TOLERANCE,
         pairs: tuple[int, ...] = (),
+        *,
+        drifting: bool = False,
     ) -> MultipleShooting:
         """Return the solver with a number of intervals, with or without a position, which keeps
-        pairs of links apart.
+        pairs of links apart; ``drifting``, for an angular momentum that is not zero.
         """
-        key = intervals, position, tolerance, pairs
+        key = intervals, position, tolerance, pairs, drifting
         if key not in self._solvers:
             instants = max(2, math.ceil(_DISTANCE_INSTANTS / intervals))
-            of = partial(self._get_stages, position, pairs, instants)
+            of = partial(self._get_stages, position, pairs, instants, drifting)
             self._solvers[key] = (
                 MultipleShooting(of(), intervals, tolerance)
                 if self._efforts is None
-                else EffortLimitedShooting(of, intervals, self._efforts, tolerance)
+                else EffortLimitedShooting(
+                    of, intervals, self._efforts, tolerance, drifting=drifting
+                )
             )
         return self._solvers[key]
 
@@ -562,9 +577,10 @@ class ManoeuvreSearch:
         position: bool,
         pairs: tuple[int, ...],
         instants: int,
+        drifting: bool,
         inequalities: Sequence[PathInequality] = (),
     ) -> Stages:
-        key = position, bool(inequalities)
+        key = position, bool(inequalities), drifting
         if key not in self._stages:
             self._stages[key] = Stages.of(
                 self._robot,
@@ -574,6 +590,7 @@ class ManoeuvreSearch:
                 inequalities,
                 compiling=self._compiling,
                 end_effectors=self._end_effectors and self._end_effectors.function,
+                drifting=drifting,
             )
         if not pairs or self._distances is None:
             return self._stages[key]
@@ -600,7 +617,7 @@ class ManoeuvreSearch:
             )
             T = max(round(options.duration / self._period), 1) * self._period
         elif progress.gentle:
-            guess = self._slow_to_effort_limits(guess)
+            guess = self._slow_to_effort_limits(guess, boundary)
             T = max(_GENTLE_DURATION_FACTOR * guess.duration, shortest)
         else:
             duration = DurationBounds(shortest, options.longest)
@@ -608,16 +625,18 @@ class ManoeuvreSearch:
             if solution is None or solver.converged or self._constraints.base_rate > 0:
                 return solution
             # A solution without convergence is not yet as fast as possible.
-            return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest))
+            return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest), boundary)
         guess = guess.retimed(T / guess.duration)
         solution = solver.solve(boundary, limits, guess, stop, DurationBounds(T, T))
         if solution is None or not progress.gentle:
             return solution
-        return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest))
+        return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest), boundary)
 
-    def _slow_to_effort_limits(self, trajectory: Trajectory) -> Trajectory:
+    def _slow_to_effort_limits(
+        self, trajectory: Trajectory, boundary: BoundaryConditions
+    ) -> Trajectory:
         """Return the trajectory, slowed to the effort limits of the joints."""
-        return trajectory if self._efforts is None else self._efforts.slowed(trajectory)
+        return trajectory if self._efforts is None else self._efforts.slowed(trajectory, boundary)
 
     def _make_held_commands(self, progress: _Progress, trajectory: Trajectory | None) -> Manoeuvre:
         """Return a solution as held commands.
@@ -630,13 +649,51 @@ class ManoeuvreSearch:
         if trajectory is None:
             raise CandidateError(_NO_PATH_FOUND)
         fixed = progress.options.duration > 0
-        held = self._holder.hold(trajectory, progress.boundary, progress.limits, fixed=fixed)
+        if progress.boundary.drifts:
+            held = self._hold_in_whole_ticks(progress, trajectory)
+        else:
+            held = self._holder.hold(trajectory, progress.boundary, progress.limits, fixed=fixed)
         if held is None:
             raise CandidateError(_NO_HELD_COMMANDS)
         attitudes = quaternion_multiply(progress.quaternion, held.quaternions)
         self._constraints.check(held.positions, attitudes, self._period)
         duration = (len(held.positions) - 1) * self._period
         return Manoeuvre(held, duration, trajectory)
+
+    def _hold_in_whole_ticks(
+        self, progress: _Progress, trajectory: Trajectory
+    ) -> HeldCommands | None:
+        """Return a solution of a robot that drifts as held commands; None where that fails.
+
+        Were it stretched to whole control periods, the base would turn on meanwhile. So the
+        trajectory of least effort in as many control periods, or a few more, is solved for.
+        """
+        boundary, limits, kept = progress.boundary, progress.limits, progress.kept
+        within = limits if kept is None else kept.within(limits)
+        narrowed = replace(
+            within,
+            velocity=_LIMIT_SHARE_IN_GIVEN_TIME * limits.velocity,
+            acceleration=_LIMIT_SHARE_IN_GIVEN_TIME * limits.acceleration,
+        )
+        solver = self._get_solver(progress, len(trajectory.shapes) - 1)
+        ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
+        guess, aim = trajectory, boundary
+        # In a given time there is no other than the first.
+        most = 2 if progress.options.duration > 0 else len(_ADDITIONAL_TICKS_OF_DRIFT)
+        for more in _ADDITIONAL_TICKS_OF_DRIFT[:most]:
+            T = (ticks + more) * self._period
+            guess = guess.retimed(T / guess.duration)
+            stop = progress.stop_rule(found=False)
+            solution = solver.solve(aim, narrowed, guess, stop, DurationBounds(T, T))
+            progress.cancellation.raise_if_requested()
+            if solution is None:
+                continue
+            held = self._holder.hold(solution, boundary, limits, fixed=True)
+            if held is not None:
+                return held
+            guess = solution
+            aim = self._holder.corrected_aim(solution, boundary, ticks + more)
+        return None
 
 
 class MotionSearch:
@@ -647,15 +704,10 @@ class MotionSearch:
     model
         Model and constraints of the manoeuvres.
     solver
-        Returns the solver with a number of intervals, with or without a position, of a tolerance,
-        which keeps pairs of links apart.
+        Returns the solver (:meth:`ManoeuvreSearch.solver`).
     """
 
-    def __init__(
-        self,
-        model: ManoeuvreModel,
-        solver: Callable[[int, bool, float, tuple[int, ...]], MultipleShooting],
-    ) -> None:
+    def __init__(self, model: ManoeuvreModel, solver: Callable[..., MultipleShooting]) -> None:
         self._robot, self._period = model.robot, model.control_period
         self._constraints, self._begin = model.constraints, model.begin
         self._holder = CommandHolder(model)
@@ -687,7 +739,9 @@ class MotionSearch:
         coarser = intervals
         if intervals >= _COARSE_GRID_RATIO_IN_MOTION * _MIN_COARSE_INTERVALS_IN_MOTION:
             coarser = intervals // _COARSE_GRID_RATIO_IN_MOTION
-        coarse = self._solver(coarser, boundary.center is not None, TOLERANCE, ())
+        coarse = self._solver(
+            coarser, boundary.center is not None, TOLERANCE, (), drifting=boundary.drifts
+        )
         stop = StopRule(options.iterations, cancellation)
         candidates: list[Trajectory] = []
         starts, rejection = 0, _NO_PATH_FOUND
@@ -745,7 +799,8 @@ class MotionSearch:
             There are none that reach the goal within the limits.
         """
         position = boundary.center is not None
-        solver = self._solver(intervals, position, TOLERANCE, ())
+        drifting = boundary.drifts
+        solver = self._solver(intervals, position, TOLERANCE, (), drifting=drifting)
         held = self._make_held_commands(solver, boundary, limits, candidate, motion, options, stop)
         if kept is None:
             return held
@@ -755,7 +810,7 @@ class MotionSearch:
             if not near:
                 return held
             kept.add(near)
-            solver = self._solver(intervals, position, TOLERANCE, kept.pairs)
+            solver = self._solver(intervals, position, TOLERANCE, kept.pairs, drifting=drifting)
             within = kept.within(limits)
             held = self._make_held_commands(
                 solver, boundary, within, candidate, motion, options, stop
@@ -820,7 +875,7 @@ class MotionSearch:
         CandidateError
             There are none that reach the goal within the limits.
         """
-        guesses = _build_guesses(self._robot, solver)
+        guesses = _build_guesses(self._robot, solver, boundary)
         guess, duration = guesses.resample(candidate), options.duration
         most = 1 if duration > 0 else len(_ADDITIONAL_TICKS)
         if duration == 0:
@@ -828,12 +883,13 @@ class MotionSearch:
             guess = guess if finer is None else finer
             duration = guess.duration
         ticks = max(1, math.ceil(duration / self._period - 1e-6))
+        aim = boundary
         for more, room in itertools.product(
             _ADDITIONAL_TICKS[:most], _ACCELERATION_SHARES_IN_MOTION
         ):
             T = (ticks + more) * self._period
             solution = solver.solve(
-                boundary,
+                aim,
                 self._narrow_limits(limits, room),
                 replace(guess, step=T / solver.intervals),
                 stop,
@@ -848,6 +904,8 @@ class MotionSearch:
                 )
             if held is not None:
                 return held
+            if solution is not None and boundary.drifts:
+                aim = self._holder.corrected_aim(solution, boundary, ticks + more)
         raise CandidateError(_NO_HELD_COMMANDS)
 
     def _guesses(
@@ -859,16 +917,19 @@ class MotionSearch:
     ) -> Iterator[Trajectory]:
         """Yield the rest of the motion so far, then guesses with loops, from its velocity."""
         velocity = np.broadcast_to(boundary.velocity, boundary.start.shape)
-        guesses = _build_guesses(self._robot, solver)
+        guesses = _build_guesses(self._robot, solver, boundary)
         if len(remaining) > 1:
             yield guesses.from_ticks(remaining, velocity, self._period)
         for guess in guesses.generate(boundary, limits, boundary.likely):
             yield guesses.with_initial_velocity(guess, velocity, limits)
 
 
-def _build_guesses(robot: SpaceRobot, solver: MultipleShooting) -> InitialGuesses:
+def _build_guesses(
+    robot: SpaceRobot, solver: MultipleShooting, boundary: BoundaryConditions
+) -> InitialGuesses:
     curvature = robot.function("curvature", compile=False)
-    return InitialGuesses(solver.turn, curvature, solver.intervals)
+    L_0 = boundary.angular_momentum if boundary.drifts else None
+    return InitialGuesses(solver.turn, curvature, solver.intervals, L_0)
 
 
 def _durations_agree(found: list[Trajectory]) -> bool:

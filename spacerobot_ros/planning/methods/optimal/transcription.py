@@ -13,6 +13,11 @@ momentum is zero: ``D(q) w + D_q(q) u = 0`` (paper 1, eq. 3). So the attitude fo
 of the shape, however fast it is travelled, and the base's position needs no state: the centre of
 mass rests, and the last shape and attitude tell where the base is.
 
+Where a robot drifts, its angular momentum L about the centre of mass is constant in the world, so
+``D(q) w + D_q(q) u = h X' L_0``, with L_0 in the base at the start. X at a Gauss point is the
+weighted mean of the quaternions at both knots, normalised, which makes the attitude of order two.
+These functions are others than those at zero momentum, and are made where a robot drifts.
+
 All stages have the same functions. Their derivatives are made once, and put in their places in
 the program's sparse matrices.
 
@@ -48,17 +53,22 @@ from spacerobot_ros.planning.methods.optimal.problem import PathConstraints
 GAUSS = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
 """Gauss points of an interval, from 0 to 1."""
 
+_DIRECTION = 3
+"""Size of the kept direction, the first parameter of an interval."""
+
 Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class PathInequality:
-    """An inequality ``function(q, qdot, qddot) >= 0`` that holds on the way.
+    """An inequality ``function(q, qdot, qddot, L_B) >= 0`` that holds on the way.
 
     Attributes
     ----------
     function
         Of SX: shape, velocities and accelerations of the joints, each (n,), to any number of rows.
+        Where the robot drifts, a fourth argument is its angular momentum (3,) about the centre of
+        mass in the base.
     instants
         Where in each interval it is imposed, 0 its beginning, 1 its end.
     """
@@ -117,7 +127,7 @@ class Stages:
     path
         Rows of the interval that are inequalities, ``>= 0``: the last ones of it.
     turn
-        ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step that begins at q.
+        The rotation vector (3,) of a step (:func:`turn_function`).
     distances
         Distances of pairs of links, and of links and obstacles, in an interval, less the smallest
         ones that are allowed, both as its rows and ``>= 0``; None: none.
@@ -131,6 +141,11 @@ class Stages:
     turn: ca.Function
     distances: Block | None = None
 
+    @property
+    def drifting(self) -> bool:
+        """Whether the angular momentum is a parameter of the interval; else it is zero."""
+        return self.interval.values.numel_in(1) > _DIRECTION
+
     @classmethod
     def of(
         cls,
@@ -142,6 +157,7 @@ class Stages:
         *,
         compiling: bool = False,
         end_effectors: ca.Function | None = None,
+        drifting: bool = False,
     ) -> Stages:
         """Derive the functions of a robot's problem, or read them from the cache.
 
@@ -159,6 +175,8 @@ class Stages:
             Whether they are evaluated so often that compiling them pays.
         end_effectors
             Of SX: ``(turn (4,), shape (n,), parameters)``, rows that vanish at the end.
+        drifting
+            Whether the angular momentum is a parameter; else it is zero.
         """
         n = robot.n
         X, s, v = ca.SX.sym("X", 4), ca.SX.sym("s", n), ca.SX.sym("v", n)
@@ -174,9 +192,12 @@ class Stages:
             p.append(ca.SX.sym("end_effectors", end_effectors.size1_in(2)))
             reached.append(end_effectors(X, s, p[-1]))
         ends = Block.of("end", ca.vertcat(X, s), ca.vertcat(*p), ca.vertcat(*reached))
-        interval = _cached_interval(robot, constraints, inequalities, compiling=compiling)
+        interval = _cached_interval(
+            robot, constraints, inequalities, compiling=compiling, drifting=drifting
+        )
         path = interval.rows - _count_dynamics_rows(n)
-        return cls(n, begins, interval, ends, path, turn_function(robot))
+        turn = turn_function(robot, drifting=drifting)
+        return cls(n, begins, interval, ends, path, turn)
 
     def keeping(self, rows: Sequence[DistanceRows], instants: int) -> Stages:
         """Return the problem in which pairs of links keep distances, too, at a number of instants
@@ -196,6 +217,7 @@ def _cached_interval(
     inequalities: Sequence[PathInequality],
     *,
     compiling: bool,
+    drifting: bool,
 ) -> Block:
     """Return the block of an interval from the cache, or derive it."""
     q, X, direction = ca.SX.sym("q", robot.n), ca.SX.sym("X", 4), ca.SX.sym("d", 3)
@@ -206,12 +228,13 @@ def _cached_interval(
         float(constraints.imposed_base_rate).hex(),
         ca.Function("on_knots", [q, X, direction], [on_knots]).serialize(),
         *(f"{each.instants} {each.function.serialize()}" for each in inequalities),
+        f"drifting {drifting}",
     ]
     key = hashlib.sha256("\n".join(facts).encode()).hexdigest()
 
     @cache
     def derived() -> Block:
-        return _interval(robot, constraints, inequalities)
+        return _interval(robot, constraints, inequalities, drifting=drifting)
 
     return Block(
         cached_function("interval", key, lambda: derived().values, compiling=compiling),
@@ -221,20 +244,30 @@ def _cached_interval(
 
 
 def _interval(
-    robot: SpaceRobot, constraints: PathConstraints, inequalities: Sequence[PathInequality]
+    robot: SpaceRobot,
+    constraints: PathConstraints,
+    inequalities: Sequence[PathInequality],
+    *,
+    drifting: bool,
 ) -> Block:
     """Return the dynamics of an interval, then its path constraints."""
     n = robot.n
     X, s, v, a = (ca.SX.sym(name, size) for name, size in zip("Xsva", (4, n, n, n), strict=True))
     X_next, s_next, v_next = ca.SX.sym("X+", 4), ca.SX.sym("s+", n), ca.SX.sym("v+", n)
-    h, direction = ca.SX.sym("h"), ca.SX.sym("direction", 3)
+    h, direction = ca.SX.sym("h"), ca.SX.sym("direction", _DIRECTION)
+    L_0 = ca.SX.sym("L_0", 3 if drifting else 0)
     z = ca.vertcat(h, X, s, v, a, X_next, s_next, v_next)
     rotation, (rotation_jac, rotation_hess) = (
-        _rotation(robot),
-        _rotation_derivative_functions(robot),
+        _rotation(robot, drifting=drifting),
+        _rotation_derivative_functions(robot, drifting=drifting),
     )
 
     points = [_state_within_interval(tau, s, h * v, h * v_next) for tau in GAUSS]
+    if drifting:
+        points = [
+            ca.vertcat(point, h * _momentum_in_base(tau, X, X_next, L_0))
+            for tau, point in zip(GAUSS, points, strict=True)
+        ]
     rates = [rotation(point) for point in points]
     motion = ca.vertcat(v_next - v - h * a, s_next - s - h * v_next)
 
@@ -256,17 +289,17 @@ def _interval(
     attitude_jac = ca.jacobian(X_next, z) - outer_jac @ inner_jac
     attitude_hess = inner_jac.T @ outer_hess @ inner_jac
     for point, P, W, mu in zip(points, point_jac, rate_jac, by_rate, strict=True):
-        weight = ca.SX.sym("weight", 2 * n)
+        weight = ca.SX.sym("weight", point.numel())
         bend = ca.substitute(ca.hessian(ca.dot(weight, point), z)[0], weight, ca.densify(W.T @ mu))
         attitude_hess += P.T @ rotation_hess(point, mu) @ P + bend
 
-    kept = _path(n, constraints, inequalities, z, rates, direction)
+    kept = _path(n, constraints, inequalities, z, rates, direction, L_0)
     by_motion, by_path = ca.SX.sym("lambda_v", 2 * n), ca.SX.sym("lambda_g", kept.shape[0])
     plain = ca.dot(by_motion, motion) + ca.dot(by_path, kept)
     return Block.with_derivatives(
         "interval",
         z,
-        direction,
+        ca.vertcat(direction, L_0),
         ca.vertcat(by_motion, by_attitude, by_path),
         ca.vertcat(motion, X_next - stepped, kept),
         ca.vertcat(ca.jacobian(motion, z), attitude_jac, ca.jacobian(kept, z)),
@@ -335,9 +368,12 @@ def _path(
     z: ca.SX,
     rates: Sequence[ca.SX],
     direction: ca.SX,
+    L_0: ca.SX,
 ) -> ca.SX:
     """Return the rows of an interval that must not be negative."""
-    h, X, s, v, a, _, _, v_next = ca.vertsplit(z, np.cumsum([0, 1, 4, n, n, n, 4, n, n]).tolist())
+    h, X, s, v, a, X_next, _, v_next = ca.vertsplit(
+        z, np.cumsum([0, 1, 4, n, n, n, 4, n, n]).tolist()
+    )
     rows = [ca.SX(0, 1), constraints.symbolic(s - h * v / 2, X, direction)]
     if constraints.base_rate > 0:
         # Rates change steadily within an interval and are largest at its ends.
@@ -349,7 +385,8 @@ def _path(
     for each in inequalities:
         for tau in each.instants:
             point = _state_within_interval(tau, s, h * v, h * v_next)
-            rows.append(each.function(point[:n], point[n:] / h, a))
+            drift = [_momentum_in_base(tau, X, X_next, L_0)] if L_0.numel() else []
+            rows.append(each.function(point[:n], point[n:] / h, a, *drift))
     return ca.vertcat(*rows)
 
 
@@ -359,24 +396,45 @@ def _state_within_interval(tau: float, s: ca.SX, u: ca.SX, u_next: ca.SX) -> ca.
     return ca.vertcat(s + (tau - 1 / 2) * u + tau**2 / 2 * change, u + tau * change)
 
 
-def _rotation(robot: SpaceRobot) -> ca.Function:
-    """Return the base's rotation ``w = -D^-1 D_q u`` (3,) of ``[q; u]``."""
-    q, u = ca.SX.sym("q", robot.n), ca.SX.sym("u", robot.n)
+def _momentum_in_base(tau: float, X: ca.SX, X_next: ca.SX, L_0: ca.SX) -> ca.SX:
+    """Return the angular momentum (3,) in the base, tau of the way between two attitudes."""
+    mean = (1 - tau) * X + tau * X_next
+    v, w = mean[:3], mean[3]
+    # R(mean)' L_0 for a quaternion of any norm.
+    turned = (w**2 - ca.sumsqr(v)) * L_0 + 2 * v * ca.dot(v, L_0) - 2 * w * ca.cross(v, L_0)
+    return turned / ca.sumsqr(mean)
+
+
+def _rotation(robot: SpaceRobot, *, drifting: bool) -> ca.Function:
+    """Return the base's rotation ``w = -D^-1 D_q u`` (3,) of ``[q; u]``.
+
+    Drifting, it is ``D^-1 (l - D_q u)`` of ``[q; u; l]``, with the angular impulse l (3,).
+    """
+    q, u, impulse = (ca.SX.sym(name, k) for name, k in _rotation_symbols(robot, drifting))
     D, D_q = robot.function("locked_inertia", compile=False)(q)
-    return ca.Function("rotation", [ca.vertcat(q, u)], [-solve_positive_definite(D, D_q @ u)])
+    of_joints = D_q @ u - impulse if drifting else D_q @ u
+    point = ca.vertcat(q, u, impulse)
+    return ca.Function("rotation", [point], [-solve_positive_definite(D, of_joints)])
 
 
-def _rotation_derivative_functions(robot: SpaceRobot) -> tuple[ca.Function, ca.Function]:
+def _rotation_symbols(robot: SpaceRobot, drifting: bool) -> list[tuple[str, int]]:
+    return [("q", robot.n), ("u", robot.n), ("l", 3 if drifting else 0)]
+
+
+def _rotation_derivative_functions(
+    robot: SpaceRobot, *, drifting: bool
+) -> tuple[ca.Function, ca.Function]:
     """Return the Jacobian of the rotation w, and the Hessian of ``mu' w``.
 
-    By differentiating ``D w + D_q u = 0`` once and twice.
+    By differentiating ``D w + D_q u = 0``, or l on the right, once and twice.
     """
-    n = robot.n
-    q, u, w, mu = (ca.SX.sym(name, k) for name, k in (("q", n), ("u", n), ("w", 3), ("mu", 3)))
-    point = ca.vertcat(q, u)
+    q, u, impulse = (ca.SX.sym(name, k) for name, k in _rotation_symbols(robot, drifting))
+    w, mu = ca.SX.sym("w", 3), ca.SX.sym("mu", 3)
+    point = ca.vertcat(q, u, impulse)
     D, D_q = robot.function("locked_inertia", compile=False)(q)
-    at = -solve_positive_definite(D, D_q @ u)
-    momentum = D @ w + D_q @ u
+    of_joints = D_q @ u - impulse if drifting else D_q @ u
+    at = -solve_positive_definite(D, of_joints)
+    momentum = D @ w + of_joints
     W = -solve_positive_definite(D, ca.jacobian(momentum, point))
     eta, adjoint = ca.SX.sym("eta", 3), -solve_positive_definite(D, mu)
     weighted = ca.dot(eta, momentum)
@@ -394,12 +452,21 @@ def magnus(first: ca.SX, second: ca.SX) -> ca.SX:
     return (first + second) / 2 + math.sqrt(3) / 12 * ca.cross(first, second)
 
 
-def turn_function(robot: SpaceRobot) -> ca.Function:
-    """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, base components."""
+def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
+    """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, base components.
+
+    Drifting, a fourth argument is the angular impulse (3,) of the step: the angular momentum in
+    the base about half-way, times the duration of the step.
+    """
     q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
-    rotation = _rotation(robot)
-    rates = [rotation(_state_within_interval(tau, q + u / 2, u, u_next)) for tau in GAUSS]
-    return ca.Function("turn", [q, u, u_next], [ca.cse(magnus(*rates))])
+    impulse = ca.SX.sym("impulse", 3 if drifting else 0)
+    rotation = _rotation(robot, drifting=drifting)
+    rates = [
+        rotation(ca.vertcat(_state_within_interval(tau, q + u / 2, u, u_next), impulse))
+        for tau in GAUSS
+    ]
+    arguments = [q, u, u_next, impulse] if drifting else [q, u, u_next]
+    return ca.Function("turn", arguments, [ca.cse(magnus(*rates))])
 
 
 @dataclass(frozen=True)
@@ -486,7 +553,8 @@ def program(stages: Stages, intervals: int) -> Program:
     kept = 0 if stages.distances is None else stages.distances.rows
     goals = int(stages.end.values.size1_in(1)) - 7
     sizes = {"start": n, "turn": 4, "direction": 3, "center": 3, "end_effectors": goals}
-    sizes |= {"typical": n, "weights": 2}
+    drift = int(stages.interval.values.numel_in(1)) - _DIRECTION
+    sizes |= {"typical": n, "weights": 2, "angular_momentum": drift}
     if stages.distances is not None:
         sizes["distances"] = int(stages.distances.values.numel_in(1))
     p = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
@@ -509,7 +577,7 @@ def program(stages: Stages, intervals: int) -> Program:
             stages.interval,
             np.hstack([zero, X[:-1], s[:-1], v[:-1], a, X[1:], s[1:], v[1:]]),
             np.hstack([of_intervals, of_path]),
-            p["direction"],
+            ca.vertcat(p["direction"], p["angular_momentum"]),
         ),
         _PlacedBlock(
             stages.end,

@@ -1,0 +1,178 @@
+"""Plans of ``optimal`` at momentum that is not zero, and the functions behind them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from planning.drifting import END_ERROR, angle_between, flown_by_pinocchio
+from planning.test_optimal import ARM_START, FOLDER
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import attitude_error, matrices_from_quaternions
+from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, plan
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.core.joint_efforts import JointEfforts
+from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.methods.optimal.held_commands import DriftVariation
+from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
+
+ATTITUDE = Rotation.from_rotvec([0.4, -0.3, 0.7]).as_quat()
+NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
+START = RobotState(
+    np.array([0.3, -0.2, 0.5]),
+    ATTITUDE,
+    ARM_START,
+    np.array([0.5, -0.4, 0.9]),
+    np.array([1.5, -0.6, 1.1]),
+)
+TURN = Rotation.from_rotvec([0.1, -0.2, 0.15])
+QUICK: dict[str, Any] = {"answers": 1, "starts": 2, "intervals": 20, "cache": 0}
+
+
+@pytest.fixture(scope="module")
+def arm() -> SpaceRobot:
+    return SpaceRobot.from_file(FOLDER / "three_joint_arm.urdf")
+
+
+@pytest.fixture(scope="module")
+def schedule(arm: SpaceRobot) -> GaitSchedule:
+    goal = (Rotation.from_quat(ATTITUDE) * TURN).as_rotvec()
+    return plan(arm, rotvec=goal, start=START, **QUICK)
+
+
+def test_a_robot_that_drifts_ends_where_its_plan_says(schedule: GaitSchedule) -> None:
+    """By Pinocchio at that momentum: attitude and position at the end, joints at rest."""
+    r_WB, quaternion = flown_by_pinocchio("three_joint_arm", schedule, START)
+    goal = (Rotation.from_quat(ATTITUDE) * TURN).as_quat()
+    assert angle_between(quaternion, goal) < END_ERROR
+    np.testing.assert_allclose(r_WB, schedule.path.position[-1], atol=END_ERROR)
+    np.testing.assert_array_equal(schedule.positions[0], ARM_START)
+    limit = np.pi / 2  # No joint of the arm is faster, so the robot is not led along a jump.
+    assert np.abs(schedule.velocities).max() < limit
+
+
+def test_the_base_turns_on_at_the_rate_that_the_momentum_gives(
+    arm: SpaceRobot, schedule: GaitSchedule
+) -> None:
+    rate, last = np.array(schedule.notes["final_base_rate"]), schedule.positions[-1]
+    attitude = schedule.path.quaternion[-1]
+    momenta = arm.momentum(attitude, last, np.zeros(3), rate, np.zeros(arm.n))
+    np.testing.assert_allclose(momenta[1], START.angular_momentum, atol=1e-12)
+
+
+def test_the_first_variation_of_a_drifting_attitude_is_that_of_its_integration(
+    arm: SpaceRobot,
+) -> None:
+    """Against differences of the prediction, for a change that vanishes at both ends."""
+    period, N, L = 0.05, 60, np.array([1.5, -0.6, 1.1])
+    s = np.linspace(0.0, 1.0, N + 1)[:, np.newaxis]
+    positions = ARM_START + np.hstack([np.sin(2 * s), 0.5 * s**2, np.cos(3 * s) - 1])
+    wave = np.hstack([np.sin(np.pi * s) ** 2, 0.3 * np.sin(2 * np.pi * s) ** 2, 0 * s])
+    prediction = BasePrediction(arm, period, 0.01)
+
+    def end(amount: float) -> Array:
+        return prediction.attitudes(positions + amount * wave, NO_TURN, L)[-1]
+
+    step = 1e-5
+    expected = attitude_error(end(-step), end(step)) / (2 * step)
+    quaternions = prediction.attitudes(positions, NO_TURN, L)
+    R = matrices_from_quaternions(quaternions)
+    K = arm.function("curvature", compile=False)(positions.T).full()
+    K = K.reshape(6, N + 1, 3, 3)[3:]
+    moved = np.gradient(positions, axis=0)
+    twists = np.einsum("akji,kj,ki->ka", K, moved, wave)[:, :, np.newaxis]
+    variation = DriftVariation(arm)
+    xi = variation.accumulated(positions, L @ R, R, R @ twists, wave[:, :, np.newaxis], period)
+    np.testing.assert_allclose(R[-1].T @ xi[:, 0], expected, rtol=0.01, atol=1e-4)
+    still = np.einsum("kab,kbw->aw", R, twists)[:, 0]
+    assert np.linalg.norm(R[-1].T @ still - expected) > 10 * np.linalg.norm(
+        R[-1].T @ xi[:, 0] - expected
+    )
+
+
+def test_efforts_of_a_robot_that_drifts_are_those_of_forward_dynamics(arm: SpaceRobot) -> None:
+    q, qdot = np.array([0.3, -0.5, 0.8]), np.array([0.4, 0.2, -0.3])
+    L_B, period = np.array([0.7, -1.2, 0.4]), 0.1
+    positions = np.array([q - period * qdot / 2, q + period * qdot / 2])
+    limit = np.array([2.0, 3.0, 5.0])
+    efforts = JointEfforts(arm, limit, period)
+    tau = efforts.shares(positions, qdot, np.array([L_B, L_B]))[0] * limit
+    _, omega = arm.base_twist(NO_TURN, positions[0], qdot, L_W=L_B)
+    rates = arm.forward_dynamics(positions[0], np.zeros(3), omega, qdot, np.zeros(6), tau)
+    np.testing.assert_allclose(rates[6:], 0.0, atol=1e-10)
+    still = efforts.shares(positions, qdot)[0] * limit
+    assert np.abs(tau - still).max() > 0.01
+    none = efforts.shares(positions, qdot, np.zeros((2, 3)))[0] * limit
+    np.testing.assert_allclose(none, still, atol=1e-12)
+    peak = np.abs(efforts.shares(positions, qdot, np.array([L_B, L_B]))).max()
+    assert efforts.excess(positions, qdot, np.array([L_B, L_B])) == pytest.approx(np.sqrt(peak))
+
+
+def test_the_momentum_in_the_base_turns_against_it() -> None:
+    L_0 = np.array([0.2, -0.7, 0.4])
+    boundary = BoundaryConditions(ARM_START, NO_TURN, ARM_START, angular_momentum=L_0)
+    assert boundary.drifts
+    turns = Rotation.from_rotvec([[0.0, 0.0, 0.0], [0.3, -0.2, 0.9]])
+    found = boundary.momenta_in_base(turns.as_quat())
+    assert found is not None
+    np.testing.assert_allclose(found, turns.inv().apply(L_0), atol=1e-15)
+    at_rest = replace(boundary, angular_momentum=np.zeros(3))
+    assert not at_rest.drifts
+    assert at_rest.momenta_in_base(turns.as_quat()) is None
+
+
+def test_all_places_of_a_goal_are_displaced() -> None:
+    hand = EndEffectorGoal("hand", np.array([1.0, 2.0, 3.0]))
+    goal = Goal.of_end_effectors([hand], position=[0.5, 0.25, -1.0])
+    moved = goal.displaced(np.array([0.1, -0.2, 0.4]))
+    np.testing.assert_allclose(moved.position, [0.6, 0.05, -0.6])
+    np.testing.assert_allclose(moved.end_effectors[0].position, [1.1, 1.8, 3.4])
+    np.testing.assert_array_equal(moved.quaternion, goal.quaternion)
+
+
+def test_a_planar_robot_that_tumbles_is_refused() -> None:
+    tumbling = [0.3, 0.0, 0.4]
+    with pytest.raises(PlanningError, match=r"0\.5 kg m\^2/s, which turns its base about another"):
+        plan("planar_chain", rotvec=[0, 0, 0.1], angular_momentum=tumbling, **QUICK)
+
+
+def test_methods_that_plan_at_rest_name_the_one_that_does_not() -> None:
+    with pytest.raises(
+        PlanningError, match=r"lie_bracket plans for zero momentum; .* optimal plan"
+    ):
+        plan(
+            "sliding_masses", position=(0.1, 0, 0), method="lie_bracket", linear_momentum=[1, 0, 0]
+        )
+
+
+@pytest.mark.parametrize("given", [[1.0, 2.0], [0.0, np.nan, 1.0]])
+def test_a_momentum_that_is_none_is_refused(given: list[float]) -> None:
+    with pytest.raises(ParameterError, match=r"angular_momentum is .* three finite numbers"):
+        plan("planar_chain", rotvec=[0, 0, 0.1], angular_momentum=given, **QUICK)
+
+
+def test_shape_and_position_of_a_base_that_coasts_are_refused() -> None:
+    with pytest.raises(PlanningError, match="at one instant at most"):
+        plan(
+            "sliding_masses",
+            position=(0.1, 0, 0),
+            joint_positions=[0.1, 0.2, 0.3],
+            linear_momentum=[1.0, 0.0, 0.0],
+            **QUICK,
+        )
+
+
+@pytest.mark.slow
+def test_a_base_that_coasts_is_at_its_goal_when_the_plan_ends() -> None:
+    momentum = [0.3, -0.2, 0.1]
+    schedule = plan("sliding_masses", position=(0.1, 0.05, 0), linear_momentum=momentum, cache=0)
+    state = RobotState(np.zeros(3), NO_TURN, np.zeros(3), np.array(momentum))
+    r_WB, quaternion = flown_by_pinocchio("sliding_masses", schedule, state)
+    np.testing.assert_allclose(r_WB, [0.1, 0.05, 0.0], atol=END_ERROR)
+    assert angle_between(quaternion, NO_TURN) < END_ERROR
