@@ -129,6 +129,7 @@ _POSE_STAMPED_TYPE = "geometry_msgs/msg/PoseStamped"
 _STATUS_TYPE = "diagnostic_msgs/msg/DiagnosticStatus"
 _STRING_TYPE = "std_msgs/msg/String"
 _TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
+_TWIST_STAMPED_TYPE = "geometry_msgs/msg/TwistStamped"
 _WRENCH_STAMPED_TYPE = "geometry_msgs/msg/WrenchStamped"
 
 # The plant publishes its state in this order: the clock first, so that a subscriber that sees a
@@ -339,6 +340,14 @@ _TOPIC_TABLE = (
         "attitude, and goals with one stamp, of the base too, are one goal",
     ),
     Topic(
+        "end_effector/twist",
+        _TWIST_STAMPED_TYPE,
+        _PUBLISHED_BY_USER,
+        "twist that the end-effector is to have, in the frame of its header: the world, the base "
+        "link or the end-effector; likewise `NAME/twist` of links in the planner's "
+        "`end_effectors`. The joints brake when none comes for `twist_timeout`",
+    ),
+    Topic(
         "joint_reference",
         _JOINT_STATE_TYPE,
         ("planner",),
@@ -435,6 +444,11 @@ def goal_topic(end_effector: str) -> str:
     return _name_in_topics(end_effector) + "/goal_pose"
 
 
+def twist_topic(end_effector: str) -> str:
+    """Return the topic of the twists of an end-effector."""
+    return _name_in_topics(end_effector) + "/twist"
+
+
 def pose_topic(end_effector: str) -> Topic:
     """Return the entry of the poses of an end-effector, by its name in letters that topics have."""
     name = _name_in_topics(end_effector)
@@ -447,7 +461,7 @@ def _name_in_topics(link: str) -> str:
 
 
 def topic_named(name: str) -> Topic:
-    """Return the entry of a topic; goals and poses of any end-effector have that of
+    """Return the entry of a topic; goals, twists and poses of any end-effector have that of
     ``end_effector``.
 
     Raises
@@ -457,6 +471,8 @@ def topic_named(name: str) -> Topic:
     """
     if name not in TOPICS and name.endswith("/goal_pose"):
         return replace(TOPICS[goal_topic("end_effector")], name=name)
+    if name not in TOPICS and name.endswith("/twist"):
+        return replace(TOPICS[twist_topic("end_effector")], name=name)
     if name not in TOPICS and name.endswith("/pose"):
         return pose_topic(name.removesuffix("/pose"))
     return TOPICS[name]

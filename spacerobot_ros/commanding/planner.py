@@ -28,9 +28,11 @@ from spacerobot_ros.planning.execution.status import (
     end_effector_values,
     goal_values,
 )
+from spacerobot_ros.planning.execution.teleoperation import TwistCommand
 from spacerobot_ros.planning.execution.tracker import Setpoint
 from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.topics import twist_topic
 
 # Constants save the slow look-up of enum members for every state.
 _ACTIVE = Activity.ACTIVE
@@ -156,6 +158,32 @@ class PlannerCommander(Commander):
             goal = replace(goal, goal=last.goal.joined_with(goal.goal))
         self._last_goal = goal
         super()._accept_goal(BASE_GOAL_KEY, goal)
+
+    def receive_twist(self, link: str, frame: str, linear: Array, angular: Array) -> None:
+        """Let a link follow a twist until twists stop; a log line says why it does not.
+
+        Parameters
+        ----------
+        link
+            Name of the link.
+        frame
+            Name of the frame of both: the world's, the base's, or the link's own.
+        linear, angular
+            (3,) velocity of the link's origin, m/s, and angular velocity, rad/s.
+        """
+        try:
+            if not self.active:
+                raise PlanningError(f"This node is {self.activity.value}.")
+            if self.plant.blocked:
+                raise PlanningError(self.plant.blocked)
+            if self.executive is None or self.robot is None:
+                raise PlanningError("There is no robot on robot_description yet.")
+            world = self.config.world_frame
+            twist = TwistCommand.checked(self.robot, link, linear, angular, frame, world)
+            with self._long_work():
+                self.executive.propose_twist(twist)
+        except PlanningError as refusal:
+            self._log_fault("twist", f"{twist_topic(link)}: {refusal}")
 
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None

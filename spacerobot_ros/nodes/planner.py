@@ -7,7 +7,8 @@ from copy import deepcopy
 from threading import Thread
 from typing import Any, ClassVar
 
-from geometry_msgs.msg import PoseStamped
+import numpy as np
+from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Path
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -36,7 +37,7 @@ from spacerobot_ros.planning.execution.status import (
 )
 from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
 from spacerobot_ros.times import stamp_bytes
-from spacerobot_ros.topics import goal_topic
+from spacerobot_ros.topics import goal_topic, twist_topic
 
 
 class PlannerNode(CommanderNode):
@@ -83,6 +84,7 @@ class PlannerNode(CommanderNode):
         self.take_goals("goal_pose")
         for name in self.config.goal_links:
             self.take_goals(goal_topic(name), name)
+            self._take_twists(name)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.create_service(Trigger, "~/statistics", self._on_statistics)
 
@@ -119,6 +121,18 @@ class PlannerNode(CommanderNode):
             self._message.feed("velocity", setpoint.velocity)
 
     # -- inputs -------------------------------------------------------------------------------
+
+    def _take_twists(self, link: str) -> None:
+        """Subscribe to the twists of a link."""
+
+        def on_twist(message: TwistStamped) -> None:
+            twist, commander = message.twist, self.commander
+            linear, angular = (
+                np.array([each.x, each.y, each.z]) for each in (twist.linear, twist.angular)
+            )
+            commander.receive_twist(link, message.header.frame_id, linear, angular)
+
+        self.create_subscription(TwistStamped, twist_topic(link), on_twist, STREAM)
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or an end-effector.

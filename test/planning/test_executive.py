@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,11 @@ from support.planner_phases import (
     stub_of,
     stuck,
     taking_over,
+    twisting,
     until,
 )
 
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.planning.execution.executive import (
     TRANSITIONS,
     Event,
@@ -44,6 +47,7 @@ from spacerobot_ros.planning.execution.executive import (
     Phase,
     Transition,
 )
+from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFrame
 from spacerobot_ros.planning.execution.worker import PlanReason
 
 PAGE = Path(__file__).parents[2] / "docs" / "planner_state_machine.md"
@@ -73,6 +77,12 @@ def abort(loop: Loop) -> None:
 
 def stop(loop: Loop) -> None:
     loop.stop()
+
+
+def twist(loop: Loop) -> None:
+    command = TwistCommand("mass_2", np.array([0.3, 0.01, -0.4]), np.ones(3), TwistFrame.BASE)
+    with suppress(PlanningError):
+        loop.executive.propose_twist(command)
 
 
 def stopped_plant(loop: Loop) -> None:
@@ -197,6 +207,15 @@ HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
     (P.BRAKING, E.TIME_JUMPED, P.IDLE): (braking, jump(-100.0)),
     (P.BRAKING, E.TIME_JUMPED, P.MEASURING): (braking, propose_goal(OTHER), jump(1e6)),
     (P.BRAKING, E.TIME_JUMPED, P.EVALUATING): (long_braking, jump(1e6)),
+    (P.IDLE, E.TWIST, P.TELEOPERATING): (twisting,),
+    (P.TELEOPERATING, E.AT_REST, P.IDLE): (twisting, to(P.IDLE)),
+    (P.TELEOPERATING, E.AT_REST, P.MEASURING): (*(twisting, propose_goal(OTHER), to(P.MEASURING)),),
+    (P.TELEOPERATING, E.TIME_JUMPED, P.IDLE): (twisting, jump(1e6)),
+    (P.TELEOPERATING, E.TIME_JUMPED, P.MEASURING): (twisting, propose_goal(OTHER), jump(-0.3)),
+    (P.TELEOPERATING, E.PLANT_RESET, P.IDLE): (twisting, reset_plant),
+    (P.TELEOPERATING, E.PLANT_RESET, P.MEASURING): (twisting, propose_goal(OTHER), reset_plant),
+    (P.TELEOPERATING, E.PLANT_STOPPED, P.IDLE): (twisting, stopped_plant),
+    (P.TELEOPERATING, E.DEACTIVATED, P.IDLE): (twisting, stop),
     (P.IDLE, E.DEACTIVATED, P.IDLE): (resting, stop),
     (P.MEASURING, E.DEACTIVATED, P.IDLE): (measuring, stop),
     (P.PLANNING, E.DEACTIVATED, P.IDLE): (planning, stop),
@@ -268,6 +287,7 @@ ACTIONS: dict[str, Callable[[Loop], object]] = {
     "far": lambda loop: loop.propose_goal(FAR),
     "abort": lambda loop: loop.abort(),
     "stop": lambda loop: loop.stop(),
+    "twist": lambda loop: twist(loop),
     "latch": stopped_plant,
     "told of reset": reset_plant,
     "later": jump(50.0),

@@ -11,6 +11,7 @@ from support.planner_loop import NEAR, Loop, MovingStub, Place, StubMethod
 from spacerobot_ros.planning.execution.executive import (
     Phase,
 )
+from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFrame
 
 FAR: Place = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 OTHER: Place = ([-0.04, 0.0, 0.01], [0.0, 0.0, 0.0])
@@ -61,6 +62,17 @@ def braking_off_path(**options: Any) -> Loop:
     """Brake to plan from rest, because the base is off its path."""
     loop = executing(held=True, ticks=400, wrong_path=0.1, drift_position=1e-3, **options)
     loop.tick(60)
+    return loop
+
+
+def twisting() -> Loop:
+    """Let a slider follow twists."""
+    loop = resting()
+    loop.tick(3)
+    twist = np.array([0.02, -0.01, 0.015])
+    command = TwistCommand("mass_1", twist, np.zeros(3), TwistFrame.WORLD)
+    loop.executive.propose_twist(command)
+    loop.tick(4)
     return loop
 
 

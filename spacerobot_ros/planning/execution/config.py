@@ -60,6 +60,13 @@ class PlannerConfig(CommanderConfig):
         minimum=0.01,
         maximum=1000.0,
     )
+    twist_timeout: float = parameter(
+        0.5,
+        "simulated time without a twist on NAME/twist after which the joints brake",
+        unit="s",
+        minimum=0.001,
+        maximum=1000.0,
+    )
     takeover_time: float = parameter(
         1.0,
         "flown on along the schedule, before a plan for another goal takes over in motion, by "

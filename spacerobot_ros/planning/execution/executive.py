@@ -17,10 +17,14 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled, PoseError, RobotState
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
@@ -39,6 +43,7 @@ from spacerobot_ros.planning.execution.status import (
     end_effector_values,
     goal_values,
 )
+from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFollower
 from spacerobot_ros.planning.execution.tracker import Setpoint, TakeOver, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import (
     OffPathJob,
@@ -52,6 +57,7 @@ from spacerobot_ros.planning.execution.worker import (
     RemainingJob,
     TakeOverJob,
 )
+from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateGait, ResolvedRateOptions
 
 _MAX_GAP, _MAX_GAP_PERIODS = 1.0, 10
 """Times between two states above these, or below zero, are jumps of time: s, control periods."""
@@ -78,12 +84,14 @@ class Phase(Enum):
     TAKING_OVER = "taking over"  # A schedule is tracked until its successor takes over.
     BRAKING = "braking"  # The joints brake along the planned path.
     EVALUATING = "evaluating"  # A schedule has ended; measured states are compared with the goal.
+    TELEOPERATING = "teleoperating"  # An end-effector follows twists, or brakes after the last one.
 
 
 class Event(Enum):
     """Cause of a change of phase."""
 
     NEW_GOAL = "new goal"
+    TWIST = "twist"  # The first twist of a teleoperation.
     PLAN_REQUESTED = "plan requested"  # A plan from the measured state was requested.
     PLANNED = "planned"
     REFUSED = "refused"  # The method has found no plan.
@@ -131,12 +139,17 @@ _TRANSITION_RULES: tuple[tuple[Iterable[Phase], Event, Iterable[Phase]], ...] = 
     ([Phase.EXECUTING], Event.NEW_GOAL, [Phase.BRAKING]),
     ([Phase.EXECUTING], Event.TRACKING_ERROR, [Phase.BRAKING]),
     ([Phase.BRAKING], Event.AT_REST, [Phase.IDLE, *_REST_PHASES]),
+    # Teleoperation.
+    ([Phase.IDLE], Event.TWIST, [Phase.TELEOPERATING]),
+    ([Phase.TELEOPERATING], Event.AT_REST, [Phase.IDLE, Phase.MEASURING]),
     # Interruptions.
     (_MOTION_PHASES, Event.JOINTS_STUCK, _REST_PHASES),
     (_MOTION_PHASES, Event.TIME_JUMPED, _REST_PHASES),
     ([Phase.BRAKING], Event.TIME_JUMPED, [Phase.IDLE]),
     ((Phase.PLANNING, *_MOTION_PHASES), Event.PLANT_RESET, _REST_PHASES),
     ([Phase.BRAKING], Event.PLANT_RESET, [Phase.IDLE]),
+    ([Phase.TELEOPERATING], Event.TIME_JUMPED, [Phase.IDLE, Phase.MEASURING]),
+    ([Phase.TELEOPERATING], Event.PLANT_RESET, [Phase.IDLE, Phase.MEASURING]),
     (_MOTION_PHASES, Event.ABORTED, [Phase.BRAKING]),
     ((*_REST_PHASES, Phase.PLANNING), Event.ABORTED, [Phase.IDLE]),
     (set(Phase) - {Phase.IDLE}, Event.PLANT_STOPPED, [Phase.IDLE]),
@@ -183,6 +196,25 @@ class ActiveGoal:
     """Positions of the stuck joints, m or rad, as measured for the last plan."""
     required: frozenset[Controlled] = frozenset()
     """Parts of the goal that plans without the stuck joints must control."""
+
+
+@dataclass
+class Teleoperation:
+    """The twists that an end-effector follows."""
+
+    follower: TwistFollower
+    twist: TwistCommand | None
+    """The last one; None: the joints brake."""
+    received_ns: int
+    """Stamp of the state before it, ns."""
+    reported: str | None = None
+    """Beginning of the reason that was reported last; empty: the twist is followed."""
+    limited_ns: int = 0
+    """Stamp of the last state at which it was not followed, ns."""
+    pose: Array | None = None
+    """(7,) the last measured pose of the base."""
+    pose_ns: int = 0
+    """Stamp of that state, ns."""
 
 
 class Executive:
@@ -246,6 +278,12 @@ class Executive:
         self._commanded_from_ns = 0
         """Stamp of the first state that the present schedule or plan answers, ns."""
         self._total_plan_time, self._plan_count, self._command_count = 0.0, 0, 0
+        self._followers: dict[str, TwistFollower] = {}
+        """By link."""
+        self._teleoperation: Teleoperation | None = None
+        """That of the phase ``TELEOPERATING``."""
+        self._refused_twist_ns: int | None = None
+        """Stamp of the state before the last twist that was refused, ns."""
 
     @property
     def setpoint(self) -> Setpoint:
@@ -255,7 +293,7 @@ class Executive:
     @property
     def measuring(self) -> bool:
         """Whether the executive will plan from the next measured base, or evaluate it."""
-        return self._new_goal is not None or self.phase is _EVALUATING
+        return self._new_goal is not None or self.phase in (_EVALUATING, Phase.TELEOPERATING)
 
     @property
     def statistics(self) -> PlannerStatistics:
@@ -275,6 +313,53 @@ class Executive:
                 self._drop_plan()
                 self._change_phase(Event.NEW_GOAL, Phase.EXECUTING)
 
+    def propose_twist(self, twist: TwistCommand) -> None:
+        """Let an end-effector follow a twist from the next state on, until twists stop.
+
+        After a refusal, and after an abort, twists are refused until none has come for
+        ``twist_timeout``: so an operator who goes on sending moves nothing by surprise.
+
+        Raises
+        ------
+        PlanningError
+            A goal is pursued, another link is moved, or the joints cannot move the link so.
+        """
+        try:
+            self._require_no_goal(twist.link)
+            follower = self._follower_of(twist.link)
+        except PlanningError:
+            self._refused_twist_ns = self._stamp_ns
+            raise
+        if self.phase is Phase.IDLE:
+            self._teleoperation = Teleoperation(follower, twist, self._stamp_ns)
+            self._change_phase(Event.TWIST, Phase.TELEOPERATING)
+        assert self._teleoperation is not None
+        self._teleoperation.twist, self._teleoperation.received_ns = twist, self._stamp_ns
+
+    def _require_no_goal(self, link: str) -> None:
+        """Raise PlanningError where no twist of a link is followed now."""
+        teleoperation, refused = self._teleoperation, self._refused_twist_ns
+        if self.phase not in (Phase.IDLE, Phase.TELEOPERATING) or self._new_goal is not None:
+            raise PlanningError("Twists are not followed while a goal is pursued: abort it first.")
+        if refused is not None and self._stamp_ns - refused <= self.config.twist_timeout * 1e9:
+            raise PlanningError(
+                f"Twists are not followed until none has come for {self.config.twist_timeout:g} s."
+            )
+        if teleoperation is not None and teleoperation.follower.link != link:
+            raise PlanningError(
+                f"'{teleoperation.follower.link}' follows twists: '{link}' waits until they stop."
+            )
+
+    def _follower_of(self, link: str) -> TwistFollower:
+        if link not in self._followers:
+            config = self.config
+            options = config.options.get(ResolvedRateGait.name, ResolvedRateOptions())
+            clearance = Clearance.wanted(self._robot.description, config.clearance)
+            self._followers[link] = TwistFollower(
+                self._robot, link, options, config.control_period, clearance
+            )
+        return self._followers[link]
+
     def abort(self) -> str | None:
         """Give up all goals and come to rest.
 
@@ -285,6 +370,16 @@ class Executive:
         match self.phase:
             case Phase.IDLE:
                 return None
+            case Phase.TELEOPERATING:
+                assert self._teleoperation is not None
+                self._new_goal, self._refused_twist_ns = None, self._stamp_ns
+                self._teleoperation.twist = None
+                message = "The joints brake."
+                aborted = PlannerStatus(
+                    PlannerState.TELEOPERATING, f"Aborted on request. {message}"
+                )
+                self.outputs.append(aborted)
+                return message
             case Phase.MEASURING if self._active_goal is None:
                 self._new_goal = None
                 self._change_phase(Event.ABORTED, Phase.IDLE)
@@ -372,6 +467,8 @@ class Executive:
 
     def _plan_again(self, message: str) -> None:
         self._average.forget()
+        if self._teleoperation is not None:
+            self._end_teleoperation(Event.PLANT_RESET, "The plant was reset: the joints rest.")
         # The held shape and the schedule belong to the time before the reset.
         self._tracker.stop()
         if self._active_goal is not None:
@@ -397,7 +494,9 @@ class Executive:
 
     def add_base_measurement(self, measured: MeasuredState) -> None:
         """Use a base measurement that arrives after its state was answered."""
-        if self.measuring:
+        if self._teleoperation is not None:
+            self._see_base(self._teleoperation, measured)
+        elif self.measuring:
             if self._tracker.is_active:
                 # A moving robot has no average: only its last state counts.
                 self._average.restart()
@@ -406,8 +505,11 @@ class Executive:
     def update(self, measured: MeasuredState) -> Setpoint:
         """Return the setpoint for a measured state; see :attr:`setpoint`."""
         stamp, q, tracker = measured.stamp_ns, measured.q, self._tracker
-        if not 0 <= stamp - self._stamp_ns <= self._max_gap_ns and tracker.is_active:
-            self._handle_time_jump(stamp)
+        if not 0 <= stamp - self._stamp_ns <= self._max_gap_ns:
+            if tracker.is_active:
+                self._handle_time_jump(stamp)
+            elif self._teleoperation is not None:
+                self._end_teleoperation(Event.TIME_JUMPED, "The time of the states has jumped.")
         self._stamp_ns = stamp
         if tracker.has_ended(stamp, q):
             self._end_schedule(stamp)
@@ -422,7 +524,9 @@ class Executive:
             stuck = tracker.track(stamp, q, obeyed=not self.plant_rests)
             if stuck and self._active_goal is not None:
                 self._handle_stuck_joints(self._active_goal, stuck)
-        if not tracker.is_active:
+        if self._teleoperation is not None:
+            self._follow_twist(self._teleoperation, measured)
+        elif not tracker.is_active:
             tracker.hold(q, obeyed=not self.plant_rests)
         self._command_count += 1
         return tracker.setpoint
@@ -456,6 +560,54 @@ class Executive:
             self._worker.poll()
             return False
         return True
+
+    # -- TELEOPERATING ------------------------------------------------------------------------
+
+    def _see_base(self, teleoperation: Teleoperation, measured: MeasuredState) -> None:
+        """Keep the measured pose of the base, if it is one."""
+        base = measured.base()
+        if base is not None and np.all(np.isfinite(base.pose)):
+            teleoperation.pose, teleoperation.pose_ns = base.pose, measured.stamp_ns
+
+    def _follow_twist(self, teleoperation: Teleoperation, measured: MeasuredState) -> None:
+        """Write the rates for the last twist; brake where it is old, and end at rest."""
+        stamp, q, timeout = measured.stamp_ns, measured.q, self.config.twist_timeout * 1e9
+        self._see_base(teleoperation, measured)
+        twist, reason = teleoperation.twist, ""
+        if self._new_goal is not None or stamp - teleoperation.received_ns > timeout:
+            twist = teleoperation.twist = None
+        if teleoperation.pose is None or stamp - teleoperation.pose_ns > timeout:
+            twist, reason = None, "The base is not measured."
+        if not np.all(np.isfinite(q)):
+            self._end_teleoperation(Event.AT_REST, "The joints are not measured.")
+            self._tracker.hold(q)
+            return
+        pose = np.eye(7)[6] if teleoperation.pose is None else teleoperation.pose
+        before = self._tracker.setpoint.velocity
+        rates, limited = teleoperation.follower.rates(twist, pose, q, before)
+        self._tracker.drive(q, rates)
+        if teleoperation.twist is None and not np.any(rates):
+            self._end_teleoperation(Event.AT_REST, "No twists come any more: the joints rest.")
+            return
+        reason = reason or limited
+        # A reason is told when it begins and when it is over for a while; its numbers change.
+        beginning = reason.split(":")[0].split(" come within ")[0].split(" touch,")[0]
+        if reason:
+            teleoperation.limited_ns = stamp
+        lasts = bool(teleoperation.reported) and stamp - teleoperation.limited_ns <= timeout
+        if beginning != teleoperation.reported and (reason or not lasts):
+            teleoperation.reported = beginning
+            followed = f"'{teleoperation.follower.link}' follows twists."
+            message = f"{reason} The twist is followed as far as possible." if reason else followed
+            self.outputs.append(PlannerStatus(PlannerState.TELEOPERATING, message))
+
+    def _end_teleoperation(self, event: Event, message: str) -> None:
+        """End the teleoperation at once."""
+        self._teleoperation = None
+        self._tracker.stop()
+        self._average.restart()
+        self._change_phase(event, self._phase_at_rest())
+        self.outputs.append(PlannerStatus(PlannerState.IDLE, message))
 
     # -- at rest: MEASURING and EVALUATING ----------------------------------------------------
 
@@ -937,9 +1089,9 @@ class Executive:
         self._change_phase(event, self._phase_at_rest())
 
     def _forget_goals(self) -> None:
-        """Drop the plan and every goal."""
+        """Drop the plan, every goal, and the teleoperation."""
         self._drop_plan()
-        self._new_goal = self._active_goal = None
+        self._new_goal = self._active_goal = self._teleoperation = None
 
     def _latest_goal(self) -> IdentifiedGoal | None:
         """Return the latest proposed goal that is not decided."""

@@ -34,11 +34,15 @@ class PlannerState(str, Enum):
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"
+    TELEOPERATING = "teleoperating"
 
     @property
     def decided(self) -> bool:
         """Whether the goal of the status is decided: it is not pursued any more."""
-        return self not in (PlannerState.IDLE, PlannerState.PLANNING, PlannerState.EXECUTING)
+        return self in (
+            *(PlannerState.REACHED, PlannerState.FAILED),
+            *(PlannerState.REFUSED, PlannerState.ABORTED),
+        )
 
     @property
     def level(self) -> int:

@@ -325,6 +325,17 @@ class TrajectoryTracker:
             return []
         return self._stuck_watch.find_stuck(q, position, velocity)
 
+    def drive(self, q: Array, velocity: Array) -> None:
+        """Write a setpoint of velocities (n,) that follow no schedule."""
+        setpoint = self.setpoint
+        if self._commands_plant or not self._holds_position:
+            setpoint.position[:] = q
+        else:
+            # The reference of a controller follows what was commanded, not what was measured.
+            setpoint.position[:] += setpoint.velocity * self._config.control_period
+        setpoint.velocity[:] = velocity
+        self._holds_position = True
+
     def hold(self, q: Array, *, obeyed: bool = True) -> None:
         """Write the setpoint that keeps the shape without a schedule."""
         # The reference of a controller must not follow the measured shape; for a plant, rest is any

@@ -60,7 +60,7 @@ _STEP = 0.02
 _FEWEST_STEPS = 20
 """Steps along a path at least."""
 
-_LEAST_PROGRESS = 0.01
+LEAST_PROGRESS = 0.01
 """Progress on the line below which a singularity is near: the line in reaches of the end-effector,
 for a motion of the joints by one radian of the fastest one."""
 
@@ -636,7 +636,7 @@ class ResolvedRateGait(GaitMethod):
         robot = self.robot
         beyond = np.maximum(robot.lower - path.shapes, path.shapes - robot.upper)
         outside = np.flatnonzero(beyond.max(axis=1) > _LIMIT_ROUNDING)
-        slow = np.flatnonzero(path.progress < _LEAST_PROGRESS)
+        slow = np.flatnonzero(path.progress < LEAST_PROGRESS)
         if len(outside) and (not len(slow) or outside[0] < slow[0]):
             k = int(outside[0])
             joint = robot.description.movable_joints[int(np.argmax(beyond[k]))]

@@ -1,0 +1,299 @@
+"""Teleoperation: rates of the joints that give an end-effector a twist while the base floats.
+
+At zero momentum the generalised Jacobian ``J*(q)`` maps the rates of the joints to the twist of an
+end-effector (Umetani and Yoshida), so ``qdot = J*^+ [v; omega]``: of all rates that give the twist
+those that are least, each joint measured by its velocity limit. With ``keep_attitude`` the base
+turns by ``-A qdot = 0`` besides, and the rates lie in the reaction null space.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from spacerobot_ros.collision import BasePoses
+from spacerobot_ros.errors import PlanningError, sentence_case
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+)
+from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.methods.optimal.end_effectors import (
+    EndEffectorRows,
+    reach_of_end_effector,
+)
+from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
+from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
+from spacerobot_ros.planning.methods.resolved_rate import LEAST_PROGRESS, ResolvedRateOptions
+
+_SLOW_PROGRESS = 2 * LEAST_PROGRESS
+"""Progress below which the end-effector slows down before a singularity."""
+
+_LOOK_AHEAD = 1e-3
+"""Motion of the fastest joint after which the progress is looked at again, rad."""
+
+_SHARES_BEFORE_CONTACT = (1.0, 0.5, 0.25, 0.0)
+"""Shares of the rates that are tried where links come too near; with the last one joints brake."""
+
+_MIDPOINT_STEPS = 2
+"""Steps to the rates in the middle of a tick."""
+
+_ROUNDING = 1e-12
+"""Rates and twists below this are none."""
+
+
+class TwistFrame(Enum):
+    """The frame in which the components of a twist are given."""
+
+    WORLD = "world"
+    BASE = "base"
+    LINK = "link"
+
+
+@dataclass(frozen=True)
+class TwistCommand:
+    """The wanted twist of a link's origin, against the world.
+
+    Attributes
+    ----------
+    link
+        Name of the link.
+    linear, angular
+        (3,) velocity, m/s, and angular velocity, rad/s, in the frame.
+    frame
+        The frame of both.
+    """
+
+    link: str
+    linear: Array
+    angular: Array
+    frame: TwistFrame
+
+    @classmethod
+    def checked(
+        cls, robot: SpaceRobot, link: str, linear: Array, angular: Array, frame: str, world: str
+    ) -> TwistCommand:
+        """Return a twist in the frame of a name; ``world`` is that of the world.
+
+        Raises
+        ------
+        PlanningError
+            The link, the frame or a number is refused.
+        """
+        description = robot.description
+        if link not in description.frames or link == description.base_link:
+            raise PlanningError(f"Robot '{description.name}' has no end-effector '{link}'.")
+        frames = {
+            world: TwistFrame.WORLD,
+            description.base_link: TwistFrame.BASE,
+            link: TwistFrame.LINK,
+        }
+        # Frames of a robot may have a prefix.
+        found = frames.get(frame) or frames.get(frame.rpartition("/")[2])
+        if found is None:
+            names = "', '".join(frames)
+            raise PlanningError(f"The frame '{frame}' of the twist is none of '{names}'.")
+        if not (np.all(np.isfinite(linear)) and np.all(np.isfinite(angular))):
+            raise PlanningError("The twist has a number that is not finite.")
+        return cls(link, np.asarray(linear, float), np.asarray(angular, float), found)
+
+    def in_base(self, R_WB: Array, R_BE: Array) -> tuple[Array, Array]:
+        """Return both velocities (3,) in components of the base."""
+        R = {
+            TwistFrame.WORLD: R_WB.T,
+            TwistFrame.BASE: np.eye(3),
+            TwistFrame.LINK: R_BE,
+        }[self.frame]
+        return R @ self.linear, R @ self.angular
+
+
+class TwistFollower:
+    """Rates of the joints for twists of one link, within all limits.
+
+    The rotation follows the twist where the joints have the freedom for it; otherwise the origin of
+    the link alone does. The robot slows down and stops before a dynamic singularity, before the
+    limits of its joints, and before links come too near; a twist that leads away is followed.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    link
+        The link.
+    options
+        Of ``resolved_rate``: limits of the motion, and whether the base keeps its attitude.
+    control_period
+        Duration of a command, s.
+    clearance
+        Distances that are kept; None: any.
+
+    Raises
+    ------
+    PlanningError
+        The joints cannot move the link as twists demand.
+    """
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        link: str,
+        options: ResolvedRateOptions,
+        control_period: float,
+        clearance: Clearance | None = None,
+    ) -> None:
+        self.link, self._robot, self._period = link, robot, control_period
+        self._limits = limits = MotionLimits.of(robot, options, "resolved_rate")
+        finite = np.where(np.isfinite(limits.velocity), limits.velocity, 1.0)
+        self._weights = finite / finite.max(initial=1e-300)
+        self._keeps_attitude = options.keep_attitude == 1
+        self._clearance = clearance
+        self._required: Array | None = None
+        """Distances (P,) that pairs of bodies keep from the first shape on, m."""
+        turning = Turning.of(robot)
+        axes = turning.axes if turning.loops else np.zeros((0, 3))
+        (directions,) = EndEffectorRows(robot, [(link, True)], axes).directions
+        self._displacements, self._rotations = directions.displacements, directions.rotations
+        kept = len(axes) if self._keeps_attitude else 0
+        if len(self._displacements) + kept > robot.n or not len(self._displacements):
+            still = " and keep the attitude of the base" if kept else ""
+            raise PlanningError(
+                f"The joints of robot '{robot.description.name}' are too few to move '{link}' by "
+                f"twists{still}."
+            )
+        self.turns = len(self._displacements) + len(self._rotations) + kept <= robot.n
+        """Whether the rotation follows the twist."""
+        reach = reach_of_end_effector(robot, limits.lower, limits.upper, link)
+        self._scales = np.concatenate(
+            [
+                np.full(len(self._displacements), 1 / reach),
+                np.ones(len(self._rotations) if self.turns else 0),
+            ]
+        )
+
+    def rates(
+        self, twist: TwistCommand | None, pose: Array, q: Array, before: Array
+    ) -> tuple[Array, str]:
+        """Return the rates (n,) of the next tick, and why the twist is not followed.
+
+        Parameters
+        ----------
+        twist
+            The wanted twist; None: rest.
+        pose
+            (7,) of the base: position, m, and quaternion.
+        q
+            (n,) shape, m or rad.
+        before
+            (n,) rates that were commanded last.
+        """
+        wanted, reason = np.zeros(len(q)), ""
+        if twist is not None:
+            wanted, reason = self._wanted(twist, pose, q)
+            # Rates are held for a tick: they are those of its middle.
+            for _ in range(_MIDPOINT_STEPS):
+                half = self._limited(wanted, q, before) * self._period / 2
+                turn = quaternion_from_rotvec(-self._robot.connection(q + half / 2)[3:] @ half)
+                middle = np.append(pose[:3], quaternion_multiply(pose[3:], turn))
+                wanted, reason = self._wanted(twist, middle, q + half)
+        for share in _SHARES_BEFORE_CONTACT:
+            rates = self._limited(share * wanted, q, before)
+            if self._clearance is None or not np.any(rates):
+                break
+            clause = self._too_near(self._clearance, rates, pose, q)
+            if not clause:
+                break
+            reason = f"{sentence_case(clause)}."
+        return rates, reason
+
+    def _wanted(self, twist: TwistCommand, pose: Array, q: Array) -> tuple[Array, str]:
+        """Return rates in proportion to those of the twist, and why they are less."""
+        limits = self._limits
+        R_BE, _ = self._robot.link_pose(self.link, q)
+        v, omega = twist.in_base(matrix_from_quaternion(pose[3:]), R_BE)
+        rows = [self._displacements @ v]
+        if self.turns:
+            rows.append(self._rotations @ omega)
+        motion = self._scales * np.concatenate(rows)
+        if np.linalg.norm(motion) <= _ROUNDING:
+            return np.zeros(len(q)), ""
+        rates, progress = self._solution(q, motion)
+        factor, reason = 1.0, ""
+        if progress < _SLOW_PROGRESS and not self._leads_away(q, motion, rates, progress):
+            factor = max(0.0, (progress - LEAST_PROGRESS) / (_SLOW_PROGRESS - LEAST_PROGRESS))
+            reason = (
+                f"'{self.link}' is near a dynamic singularity: it moves by {progress:.3g} of its "
+                "reach for a radian of the fastest joint."
+            )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = min(factor, float(np.nanmin(limits.velocity / np.abs(rates))))
+            room = np.where(rates > 0, limits.upper - q, q - limits.lower)
+            by_stops = np.where(rates != 0, self._stoppable(room) / np.abs(rates), np.inf)
+        nearest = int(np.argmin(by_stops))
+        if by_stops[nearest] < factor:
+            factor = float(by_stops[nearest])
+            joint = self._robot.joint_names[nearest]
+            reason = f"Joint '{joint}' comes to its limit at {q[nearest]:.4g}."
+        return factor * rates, reason
+
+    def _leads_away(self, q: Array, motion: Array, rates: Array, progress: float) -> bool:
+        """Whether rates (n,) lead away from a singularity."""
+        fastest = np.abs(rates / self._weights).max()
+        if fastest == 0.0:
+            return False
+        return self._solution(q + _LOOK_AHEAD * rates / fastest, motion)[1] > progress
+
+    def _solution(self, q: Array, motion: Array) -> tuple[Array, float]:
+        """Return the rates (n,) of a scaled motion, and the motion for a radian of the joints."""
+        J = self._robot.generalised_jacobian(self.link, q)
+        rows = [self._displacements @ J[:3]]
+        if self.turns:
+            rows.append(self._rotations @ J[3:])
+        M = self._scales[:, np.newaxis] * np.vstack(rows) * self._weights
+        goal = motion
+        if self._keeps_attitude:
+            M = np.vstack([M, self._robot.connection(q)[3:] * self._weights])
+            goal = np.concatenate([motion, np.zeros(3)])
+        # An attitude that does not depend on the joints is kept anyway: rows of zeros.
+        scaled = np.linalg.lstsq(M, goal, rcond=1e-9)[0]
+        if np.linalg.norm(M @ scaled - goal) > 1e-6 * np.linalg.norm(goal):
+            return np.zeros(len(q)), 0.0
+        return self._weights * scaled, float(np.linalg.norm(motion) / np.linalg.norm(scaled))
+
+    def _stoppable(self, room: Array) -> Array:
+        """Return the largest rates (n,) from which joints stop within some room (n,)."""
+        a, h = self._limits.acceleration, self._period
+        free = np.maximum(room - a * h**2 / 8, 0.0)
+        return np.asarray(a * (np.sqrt(h**2 / 4 + 2 * free / a) - h / 2))
+
+    def _limited(self, wanted: Array, q: Array, before: Array) -> Array:
+        """Return rates (n,) on the way to the wanted ones, within acceleration and travel."""
+        limits, most = self._limits, self._limits.acceleration * self._period
+        change = wanted - before
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = float(np.nanmin(np.append(most / np.abs(change), 1.0)))
+        # All joints change together, so that the direction of the motion stays; but stops count.
+        rates = before + share * change
+        up, down = self._stoppable(limits.upper - q), self._stoppable(q - limits.lower)
+        return np.asarray(np.clip(rates, -down, up))
+
+    def _too_near(self, clearance: Clearance, rates: Array, pose: Array, q: Array) -> str:
+        """Return a clause where links come too near until the joints could rest; else nothing."""
+        if self._required is None:
+            at = BasePoses(pose[np.newaxis, :3], pose[np.newaxis, 3:])
+            try:
+                self._required = clearance.required(q, at if clearance.has_obstacles else None)
+            except PlanningError as refusal:
+                return str(refusal).removesuffix(".")
+        next_ = q + rates * self._period
+        rest = next_ + rates * np.abs(rates) / (2 * self._limits.acceleration)
+        shapes = np.clip(np.vstack([next_, rest]), self._limits.lower, self._limits.upper)
+        base = None
+        if clearance.has_obstacles:
+            base = BasePoses(np.tile(pose[:3], (2, 1)), np.tile(pose[3:], (2, 1)))
+        found = clearance.approaches(shapes, self._required, base)
+        return clearance.clause(found[0], None) if found else ""

@@ -1,0 +1,329 @@
+"""Twists of end-effectors with the base free: followed by Pinocchio's velocities, and limited."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
+from support.planner_loop import NEAR, TICK, Array, Loop, robot_of
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.execution.executive import Phase
+from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFollower, TwistFrame
+from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateOptions
+from spacerobot_ros.simulation import InitialState
+
+HAND = "end_effector"
+START = InitialState(
+    np.array([0.4, -0.3, 0.2]),
+    Rotation.from_rotvec([0.3, -0.5, 0.4]).as_quat(),
+    np.array([0.4, -0.9, 1.1]),
+)
+PLANAR = InitialState(joint_positions=np.array([0.9, 0.7]))
+LINEAR, ANGULAR = np.array([0.02, -0.03, 0.025]), np.array([0.01, 0.02, -0.015])
+
+
+def loop_of(robot: str = "three_joint_arm", initial: InitialState = START, **given: Any) -> Loop:
+    parameters = {
+        "resolved_rate.max_acceleration": [0.6, 0.8, 1.0][: robot_of(robot).n] + [1.0] * 4,
+        **given,
+    }
+    count = robot_of(robot).n
+    parameters["resolved_rate.max_acceleration"] = parameters["resolved_rate.max_acceleration"][
+        :count
+    ]
+    loop = Loop({"method": "resolved_rate", **parameters}, robot=robot, initial=initial)
+    loop.tick(2)
+    return loop
+
+
+def send(loop: Loop, frame: TwistFrame = TwistFrame.WORLD, link: str = HAND, **twist: Any) -> None:
+    linear, angular = twist.get("linear", LINEAR), twist.get("angular", ANGULAR)
+    loop.executive.propose_twist(TwistCommand(link, np.array(linear), np.array(angular), frame))
+
+
+def twist_of(loop: Loop, tick: int, link: str = HAND) -> tuple[Array, Rotation]:
+    """Return the twist (6,) of a link in W by Pinocchio, and R_WE, in the middle of a tick."""
+    robot = loop.executive._robot
+    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
+    q, rates = (loop.shapes[tick] + loop.shapes[tick + 1]) / 2, loop.commands[tick]
+    pose = (loop.poses[tick] + loop.poses[tick + 1]) / 2
+    u = oracle.joint_velocities(rates)
+    u[:6] = -oracle.connection(q) @ rates
+    oracle.set_configuration(q, pose[3:], pose[:3])
+    return oracle.frame_jacobian_W(link) @ u, Rotation.from_matrix(oracle.frame_W(link)[0])
+
+
+def fly(loop: Loop, ticks: int, **options: Any) -> None:
+    for _ in range(ticks):
+        send(loop, **options)
+        loop.tick()
+
+
+@pytest.mark.parametrize("frame", TwistFrame)
+def test_the_origin_of_the_link_has_the_velocity_of_the_twist_in_its_frame(
+    frame: TwistFrame,
+) -> None:
+    loop = loop_of()
+    fly(loop, 30, frame=frame)
+    assert loop.executive.phase is Phase.TELEOPERATING
+    for tick in (20, 31):
+        twist, R_WE = twist_of(loop, tick)
+        R = {
+            TwistFrame.WORLD: Rotation.identity(),
+            TwistFrame.BASE: Rotation.from_quat(loop.poses[tick][3:] + loop.poses[tick + 1][3:]),
+            TwistFrame.LINK: R_WE,
+        }[frame]
+        # Three joints: the rotation does not follow.
+        np.testing.assert_allclose(twist[:3], R.apply(LINEAR), atol=1e-6)
+    assert np.linalg.norm(loop.poses[-1][:3] - START.position) > 1e-3
+    assert loop.states[-1] == "teleoperating"
+    assert loop.statuses[-1].message == "'end_effector' follows twists."
+    assert loop.states.count("teleoperating") == 1
+
+
+def test_seven_joints_follow_the_rotation_as_well() -> None:
+    q = np.array([0.2, -0.3, 0.1, -1.8, 0.3, 1.6, 0.4])
+    loop = loop_of("seven_joint_arm", InitialState(START.position, START.quaternion, q))
+    fly(loop, 30, link="link_7")
+    twist, _ = twist_of(loop, 31, "link_7")
+    np.testing.assert_allclose(twist, [*LINEAR, *ANGULAR], atol=1e-6)
+    # The least rates of all, each measured by its limit.
+    robot = robot_of("seven_joint_arm")
+    J = robot.generalised_jacobian("link_7", (loop.shapes[31] + loop.shapes[32]) / 2)
+    R = Rotation.from_quat(loop.poses[31][3:] + loop.poses[32][3:]).as_matrix()
+    J = np.vstack([R @ J[:3], R @ J[3:]]) * robot.velocity_limit
+    least = robot.velocity_limit * (np.linalg.pinv(J) @ twist)
+    np.testing.assert_allclose(loop.commands[31], least, atol=1e-6)
+
+
+def test_with_keep_attitude_the_base_turns_by_nothing() -> None:
+    q = np.array([-0.2, 1.04, -1.08, -1.9, -0.38, 0.38, -1.64])
+    initial = InitialState(START.position, START.quaternion, q)
+    loop = loop_of("seven_joint_arm", initial, **{"resolved_rate.keep_attitude": 1})
+    fly(loop, 40, link="link_7")
+    twist, _ = twist_of(loop, 41, "link_7")
+    np.testing.assert_allclose(twist[:3], LINEAR, atol=1e-6)
+    turned = Rotation.from_quat(loop.poses[-1][3:]) * Rotation.from_quat(START.quaternion).inv()
+    assert turned.magnitude() < 5e-5
+    free = loop_of("seven_joint_arm", initial)
+    fly(free, 40, link="link_7")
+    turned = Rotation.from_quat(free.poses[-1][3:]) * Rotation.from_quat(START.quaternion).inv()
+    assert turned.magnitude() > 1e-4
+
+
+def test_rates_change_within_the_limits_and_the_joints_brake_when_twists_stop() -> None:
+    loop = loop_of(twist_timeout=0.32)
+    fly(loop, 25, linear=10 * LINEAR)
+    commands = np.array(loop.commands)
+    most = np.array([0.6, 0.8, 1.0])
+    assert np.abs(np.diff(commands, axis=0) / TICK / most).max() <= 1 + 1e-9
+    assert np.abs(commands).max() <= 0.5 + 1e-12
+    before = len(loop.commands)
+    loop.tick(60)
+    # The last twist came with tick 26, and is old with the seventh state after it.
+    assert np.ptp(np.array(loop.commands[before : before + 6]), axis=0).max() < 0.2
+    assert np.linalg.norm(loop.commands[before + 5]) > 0.05
+    speeds = np.abs(np.array(loop.commands[before + 6 :])).max(axis=1)
+    assert np.all(np.diff(speeds) <= 1e-12)
+    assert speeds[-1] == 0.0
+    assert loop.executive.phase is Phase.IDLE
+    assert loop.statuses[-1].message == "No twists come any more: the joints rest."
+    assert loop.states[-1] == "idle"
+    commands = np.array(loop.commands)
+    assert np.abs(np.diff(commands, axis=0) / TICK / most).max() <= 1 + 1e-9
+    # They may come again.
+    fly(loop, 3)
+    assert loop.states[-1] == "teleoperating"
+
+
+def test_the_hand_stops_before_the_singularity_of_paper_4_and_comes_back() -> None:
+    # Stretched, the arm has no rate that moves the hand on outwards.
+    loop = loop_of("planar_manipulator", PLANAR)
+    robot = robot_of("planar_manipulator")
+    outward = np.array([0.08, 0.02, 0.0])
+    for _ in range(400):
+        send(loop, linear=outward, angular=np.zeros(3))
+        loop.tick()
+    assert np.abs(loop.commands[-1]).max() < 2e-3
+    said = loop.statuses[-1].message
+    assert "'end_effector' is near a dynamic singularity: it moves by " in said
+    assert said.endswith("The twist is followed as far as possible.")
+    J = robot.generalised_jacobian(HAND, loop.shapes[-1])[:2]
+    assert abs(np.linalg.det(J)) < 0.1 * abs(
+        np.linalg.det(robot.generalised_jacobian(HAND, loop.shapes[0])[:2])
+    )
+    moves = np.array(loop.commands)
+    assert np.abs(np.diff(moves, axis=0)).max() <= 0.8 * TICK + 1e-12
+    for _ in range(60):
+        send(loop, linear=-outward, angular=np.zeros(3))
+        loop.tick()
+    assert loop.statuses[-1].message == "'end_effector' follows twists."
+    J = robot.generalised_jacobian(HAND, loop.shapes[-1])[:2]
+    assert abs(np.linalg.det(J)) > 0.1
+
+
+def test_joints_stop_at_their_limits() -> None:
+    initial = InitialState(joint_positions=np.array([0.3, 2.5]))
+    loop = loop_of("planar_manipulator", initial, clearance=0.0)
+    robot = robot_of("planar_manipulator")
+    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
+    rates = np.array([0.0, 0.3])
+    for _ in range(60):
+        q = loop.shapes[-1]
+        u = oracle.joint_velocities(rates)
+        u[:6] = -oracle.connection(q) @ rates
+        oracle.set_configuration(q, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+        towards = (oracle.frame_jacobian_W(HAND) @ u)[:3]
+        send(loop, TwistFrame.BASE, linear=towards, angular=np.zeros(3))
+        loop.tick()
+    shapes = np.array(loop.shapes)
+    assert shapes[:, 1].max() <= 2.8 + 1e-9
+    assert shapes[:, 1].max() > 2.75
+    assert any("Joint 'elbow' comes to its limit at 2." in s.message for s in loop.statuses)
+    most = np.array([0.6, 0.8]) * TICK
+    assert np.all(np.abs(np.diff(np.array(loop.commands), axis=0)) <= most + 1e-9)
+
+
+def test_links_do_not_come_too_near() -> None:
+    robot = robot_of("three_joint_arm")
+    clearance = Clearance(robot.description, 0.05)
+    options = ResolvedRateOptions()
+    q = np.array([0.0, -0.9, 2.2])
+    follower = TwistFollower(robot, HAND, options, TICK, clearance)
+    free = TwistFollower(robot, HAND, options, TICK)
+    pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    base = TwistCommand(HAND, np.array([-0.3, 0.0, -0.1]), np.zeros(3), TwistFrame.BASE)
+    nearest = np.inf
+    rates, said = np.zeros(3), set()
+    for _ in range(150):
+        rates, reason = follower.rates(base, pose, q, rates)
+        said.add(reason.split(" ")[0])
+        q = q + TICK * rates
+        found = clearance.geometry.nearest(q)
+        assert found is not None
+        nearest = min(nearest, found[0])
+    assert nearest >= 0.05 - 2e-6
+    q, rates = np.array([0.0, -0.9, 2.2]), np.zeros(3)
+    least = np.inf
+    for _ in range(150):
+        rates, _ = free.rates(base, pose, q, rates)
+        q = q + TICK * rates
+        found = clearance.geometry.nearest(q)
+        assert found is not None
+        least = min(least, found[0])
+    assert least < 0.04
+
+
+@pytest.mark.parametrize(
+    ("link", "linear", "frame", "message"),
+    [
+        ("nobody", LINEAR, "world", "Robot 'three_joint_arm' has no end-effector 'nobody'."),
+        ("base_link", LINEAR, "world", "Robot 'three_joint_arm' has no end-effector 'base_link'."),
+        (HAND, LINEAR, "odom", "The frame 'odom' of the twist is none of"),
+        (
+            HAND,
+            LINEAR,
+            "",
+            "The frame '' of the twist is none of 'inertial', 'base_link', 'end_eff",
+        ),
+        (HAND, [0.0, np.nan, 0.0], "inertial", "The twist has a number that is not finite."),
+    ],
+)
+def test_twists_that_are_none_are_refused(link: str, linear: Any, frame: str, message: str) -> None:
+    robot = robot_of("three_joint_arm")
+    world = "inertial" if frame in ("", "inertial") else "world"
+    with pytest.raises(PlanningError) as refusal:
+        TwistCommand.checked(robot, link, np.array(linear), np.zeros(3), frame, world)
+    assert str(refusal.value).startswith(message)
+
+
+def test_frames_may_have_a_prefix() -> None:
+    robot = robot_of("three_joint_arm")
+    for name, frame in (
+        ("robot_1/base_link", TwistFrame.BASE),
+        ("end_effector", TwistFrame.LINK),
+        ("world", TwistFrame.WORLD),
+    ):
+        found = TwistCommand.checked(robot, HAND, LINEAR, ANGULAR, name, "world")
+        assert (found.frame, found.link) == (frame, HAND)
+
+
+def refusal(loop: Loop, **options: Any) -> str:
+    with pytest.raises(PlanningError) as found:
+        send(loop, **options)
+    return str(found.value)
+
+
+def test_a_goal_comes_first_and_twists_have_to_pause_before_they_count_again() -> None:
+    loop = Loop({"twist_timeout": 0.4}, initial=InitialState(joint_positions=np.zeros(3)))
+    loop.tick()
+    options: dict[str, Any] = {"link": "mass_1", "linear": [0.02, 0.0, 0.0]}
+    fly(loop, 5, **options)
+    loop.propose_goal(NEAR)
+    pursued = "Twists are not followed while a goal is pursued: abort it first."
+    assert refusal(loop, **options) == pursued
+    for _ in range(400):
+        loop.tick()
+        if loop.states[-1] == "reached":
+            break
+        assert refusal(loop, **options) == pursued
+    assert loop.states[-1] == "reached"
+    assert refusal(loop, **options) == "Twists are not followed until none has come for 0.4 s."
+    loop.tick(7)
+    assert refusal(loop, **options) == "Twists are not followed until none has come for 0.4 s."
+    loop.tick(9)
+    send(loop, **options)
+    assert loop.executive.phase is Phase.TELEOPERATING
+
+
+def test_an_abort_brakes_and_another_link_waits() -> None:
+    loop = loop_of()
+    fly(loop, 10)
+    assert refusal(loop, link="link_2") == (
+        "'end_effector' follows twists: 'link_2' waits until they stop."
+    )
+    loop.tick(20)
+    fly(loop, 10)
+    assert loop.abort() == "The joints brake."
+    assert loop.statuses[-1].message == "Aborted on request. The joints brake."
+    refusal(loop)
+    loop.tick(30)
+    assert loop.executive.phase is Phase.IDLE
+    assert loop.abort() is None
+
+
+def test_without_a_measured_base_the_joints_brake() -> None:
+    loop = loop_of(twist_timeout=0.3)
+    fly(loop, 10)
+    for _ in range(20):
+        send(loop)
+        loop.tick(base=False)
+    assert loop.commands[-1].tolist() == [0.0, 0.0, 0.0]
+    assert loop.statuses[-1].message == (
+        "The base is not measured. The twist is followed as far as possible."
+    )
+    loop.late()
+    fly(loop, 3)
+    assert np.abs(loop.commands[-1]).max() > 0
+    loop.measured.broken = True
+    loop.tick()
+    assert loop.statuses[-1].message == "The joints are not measured."
+    assert loop.executive.phase is Phase.IDLE
+
+
+def test_joints_that_are_too_few_are_told() -> None:
+    robot = robot_of("planar_manipulator")
+    with pytest.raises(PlanningError) as found:
+        TwistFollower(robot, HAND, ResolvedRateOptions(keep_attitude=1), TICK)
+    assert str(found.value) == (
+        "The joints of robot 'planar_manipulator' are too few to move 'end_effector' by twists and "
+        "keep the attitude of the base."
+    )
+    assert not TwistFollower(robot, HAND, ResolvedRateOptions(), TICK).turns
+    seven = robot_of("seven_joint_arm")
+    assert TwistFollower(seven, "link_7", ResolvedRateOptions(), TICK).turns
