@@ -192,6 +192,7 @@ MUTABLE = {
     "spacerobot_ros.commanding.plant_state._PendingJump",
     "spacerobot_ros.control.goal_monitor.GoalMonitor",
     "spacerobot_ros.planning.execution.executive.ActiveGoal",
+    "spacerobot_ros.planning.execution.executive.Teleoperation",
     "spacerobot_ros.planning.methods.optimal.search._Progress",
     "spacerobot_ros.report.solids.Solids",
     "spacerobot_ros.simulation.trials.MethodRecord",
