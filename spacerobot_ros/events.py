@@ -42,6 +42,15 @@ class EventKind(str, Enum):
     RELEASED = "released"
     """The robot has released the target."""
 
+    WHEEL_NEAR_LIMIT = "wheel_near_limit"
+    """A reaction wheel comes near its largest rate."""
+    WHEEL_SATURATED = "wheel_saturated"
+    WHEEL_FAILED = "wheel_failed"
+    """A reaction wheel does not answer its torque; control goes on without it."""
+    DUMP_STARTED = "dump_started"
+    """The momentum of reaction wheels is dumped to the thrusters."""
+    DUMP_ENDED = "dump_ended"
+
     GOAL_ACCEPTED = "goal_accepted"
     GOAL_REFUSED = "goal_refused"
     GOAL_REACHED = "goal_reached"

@@ -301,6 +301,11 @@ class Flights:
         count, robot = len(self), self.robot
         if self.actuation not in PLANTS:
             raise ParameterError(f"The actuation is '{self.actuation}', not velocity or effort.")
+        if self.actuation == "effort" and robot.description.wheel_names:
+            raise ParameterError(
+                f"Robot '{robot.description.name}' has reaction wheels, whose motors lanes do not "
+                "model: fly it by engine 'flights'."
+            )
         if self.ticks < 1:
             raise ParameterError(f"A flight of {self.ticks} ticks is too short; it needs one.")
         if not self.instants:

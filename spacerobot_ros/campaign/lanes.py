@@ -354,6 +354,8 @@ class _ControlledLanes:
             return "some of its thrusters are excluded"
         if plant.beyond_limits != "clip":
             return "the plant refuses commands beyond limits"
+        if nominal_robots(scenario).controller.description.wheel_names:
+            return "the robot has reaction wheels, which engine 'flights' flies"
         for dispersion in campaign.dispersions:
             name = dispersion.name
             own = name.startswith("coordinated_control.") and not name.startswith(_GAIN_PREFIX)

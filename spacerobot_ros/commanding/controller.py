@@ -65,6 +65,12 @@ class ControllerCommander(Commander):
             self.states.require(topic, required=self.host.has_publisher(topic))
         super().activate()
 
+    def dump_momentum(self) -> tuple[bool, str]:
+        """Dump the momentum of the reaction wheels; return whether it is done, and a sentence."""
+        if self.executive is None or not self.active:
+            return False, "The controller is not active, or has no robot yet."
+        return self.executive.dump_momentum()
+
     def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Take a reference, and answer its state if complete."""
         self.states.put_required(topic, stamp_ns, message)

@@ -11,6 +11,7 @@ from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.reference import PROFILES, Errors
+from spacerobot_ros.control.wheels import WheelOptions
 from spacerobot_ros.model.shared_parameters import CommanderConfig
 from spacerobot_ros.parameters import group, parameter, registered
 
@@ -55,6 +56,11 @@ class ControllerConfig(CommanderConfig):
     joint_outputs: str = parameter("", "joints that are outputs")
     profile: str = parameter("step", "how references move to goals", choices=tuple(PROFILES))
     motion: MotionLimits = group(MotionLimits())
+    use_thrusters: bool = parameter(
+        True,
+        "whether the base has thrusters; false: reaction wheels alone turn it, and its position is "
+        "not controlled",
+    )
     max_force: float = parameter(
         0.0, "largest force of the thrusters; 0: no limit", unit="N", minimum=0.0
     )
@@ -83,6 +89,7 @@ class ControllerConfig(CommanderConfig):
         unit="s",
         minimum=0.0,
     )
+    wheels: WheelOptions = group(WheelOptions())
     error_margin: ErrorMargin = group(ErrorMargin())
     status_period: float = parameter(
         1.0, "simulated time between status messages", unit="s", minimum=0.01

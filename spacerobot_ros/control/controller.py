@@ -25,8 +25,11 @@ from spacerobot_ros.control.state import (
     PoseReference,
     Reference,
 )
+from spacerobot_ros.control.wheels import WheelControl
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.model.wheels import ReactionWheels
 
 _BRAKE_RATE = 2.0
 """Decay rate of joint motion when the base is no longer known, 1/s."""
@@ -65,6 +68,8 @@ class CoordinatedController:
     estimation_time
         Longest time for which the base is estimated by integration when its measurements stop
         (paper 4, section IV), s. Then the thrusters are off and the joints are brought to rest.
+    wheels
+        The reaction wheels of a robot that has some: the law's robot is its gyrostat.
     """
 
     def __init__(
@@ -76,7 +81,9 @@ class CoordinatedController:
         motion: MotionLimits,
         control_period: float,
         estimation_time: float,
+        wheels: WheelControl | None = None,
     ) -> None:
+        self.wheels = wheels
         self.law, self._kinds = law, law.outputs.selection.kinds
         self._limits, self.joint_rate_limits = limits, rates
         self._profile_type, self._motion = profile, motion
@@ -101,6 +108,8 @@ class CoordinatedController:
         self.coming_to_rest = False
         self._sent = self._estimator = self._brake = None
         self.mode = Mode.MEASURED
+        if self.wheels is not None:
+            self.wheels.reset()
 
     def continue_for(self, other: CoordinatedController) -> None:
         """Pursue the goals of another controller from now on."""
@@ -137,6 +146,8 @@ class CoordinatedController:
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
         motion = self._motion.within_thrust(self._limits, self.law.robot, state.q)
+        if self.wheels is not None:
+            motion = self.wheels.motion_within(motion, state.q)
         self.profile = self._profile_type(start, goal, motion)
         self._began = time
 
@@ -199,6 +210,8 @@ class CoordinatedController:
                 self.law.integrate_error(periods * self._control_period, limited=result.limited)
         else:
             result = self._limits.apply(commanded)
+            if self.wheels is not None:
+                self.wheels.coast()
         self._sent = result.realised
         return result
 
@@ -206,9 +219,31 @@ class CoordinatedController:
         self, state: ControlState, commanded: Actuation, periods: int = 1
     ) -> Saturated:
         """Return the realised part of a command that is held for some control periods."""
+        if self.wheels is not None:
+            return self._apply_with_wheels(self.wheels, state, commanded, periods)
         result = self._limits.apply(commanded)
         kept = self.joint_rate_limits.apply(state, result.realised, self._limits.effort, periods)
         return result if kept is result.realised else Saturated.of(commanded, kept)
+
+    def _apply_with_wheels(
+        self, wheels: WheelControl, state: ControlState, commanded: Actuation, periods: int
+    ) -> Saturated:
+        """Return the realised part of a command on the gyrostat, by wheels first."""
+        given = self._give(wheels, commanded)
+        kept = self.joint_rate_limits.apply(state, given, self._limits.effort, periods)
+        if kept is not given:
+            # Joints that are too fast have the wrench lowered.
+            kept = self._give(wheels, kept)
+        return Saturated.of(commanded, kept)
+
+    def _give(self, wheels: WheelControl, wanted: Actuation) -> Actuation:
+        """Return what wheels and then thrusters and joints give of a command."""
+        torque = wheels.give(wanted.wrench_B[3:])
+        rest = wanted.wrench_B.copy()
+        rest[3:] -= torque
+        limited = self._limits.apply(Actuation(rest, wanted.tau)).realised
+        wheels.thrust = limited.wrench_B
+        return Actuation(wanted.wrench_B - (rest - limited.wrench_B), limited.tau)
 
     def limits_expression(
         self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX
@@ -345,12 +380,22 @@ class CoordinatedController:
 def build_controller(robot: SpaceRobot, config: ControllerConfig) -> CoordinatedController:
     """Return the controller of a robot that a configuration describes.
 
+    The law of a robot with reaction wheels controls its gyrostat, without the wheels as joints.
+
     Raises
     ------
     ParameterError
         The robot does not have the outputs that are named, or the law cannot drive them.
     """
-    law_type = LAWS[config.law]
+    law_type, thrust = LAWS[config.law], config.use_thrusters
+    force, torque = config.max_force or math.inf, config.max_torque or math.inf
+    if not thrust:
+        force = torque = 0.0
+    wheels = None
+    if robot.description.wheel_names:
+        found = ReactionWheels.of(robot.description)
+        wheels = WheelControl(found, config.wheels, config.control_period, torque)
+        robot = wheels.gyrostat
     link = robot.description.end_effector(config.end_effector_frame)
     chosen = OutputSelection(
         tuple(config.base_outputs.split()),
@@ -358,15 +403,39 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
         tuple(config.joint_outputs.split()),
         link,
     )
-    outputs = chosen if chosen.labels else law_type.default_outputs(robot, link)
+    outputs = chosen
+    if not chosen.labels:
+        outputs = law_type.default_outputs(robot, link)
+        if not thrust:
+            outputs = replace(outputs, base=tuple(x for x in outputs.base if x.startswith("r")))
+    if not thrust:
+        _require_torque(outputs, robot, wheels)
     return CoordinatedController(
-        law_type(robot, outputs, config.gains, config.options[config.law]),
-        ActuatorLimits(
-            config.max_force or math.inf, config.max_torque or math.inf, robot.effort_limit
-        ),
+        law_type(robot, outputs, config.gains, config.options[config.law], thrust=thrust),
+        ActuatorLimits(force, torque, robot.effort_limit),
         JointRateLimits(robot, config.joint_rates * robot.velocity_limit, config.control_period),
         PROFILES[config.profile],
         config.motion,
         config.control_period,
         config.estimation_time,
+        wheels,
     )
+
+
+def _require_torque(
+    outputs: OutputSelection, robot: SpaceRobot, wheels: WheelControl | None
+) -> None:
+    """Refuse outputs of a base without thrusters that its wheels do not move."""
+    name, turns = robot.description.name, [axis for axis in outputs.base if axis.startswith("r")]
+    if len(turns) < len(outputs.base):
+        raise ParameterError(
+            f"The position of the base of robot '{name}' is not controlled without thrusters "
+            "(use_thrusters is false): leave x, y and z out of base_outputs."
+        )
+    rank = 0 if wheels is None else wheels.rank
+    if len(turns) > rank:
+        raise ParameterError(
+            f"Robot '{name}' has no thrusters (use_thrusters is false), and its reaction wheels "
+            f"turn it about {rank} of {len(turns)} controlled axes: leave rx, ry or rz out of "
+            "base_outputs."
+        )

@@ -11,7 +11,7 @@ from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
-from spacerobot_ros.control.state import ControlState, PoseReference, Reference
+from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
@@ -141,11 +141,12 @@ class ControlExecutive:
                 f"The law '{law.name}' does not control the {key.replace('_', '-')} of this robot; "
                 f"its outputs are {', '.join(law.outputs.labels)}."
             )
-        shape = goal.goal.joint_positions
-        if shape is not None and len(shape) != law.robot.n:
+        shape, wheels = goal.goal.joint_positions, self.controller.wheels
+        n = law.robot.n if wheels is None else law.robot.n + len(wheels.wheels)
+        if shape is not None and len(shape) != n:
             raise PlanningError(
                 f"The goal has a shape of {len(shape)} joints; robot "
-                f"'{law.robot.description.name}' has {law.robot.n}."
+                f"'{law.robot.description.name}' has {n}."
             )
         self._pending.pop(key, None)
         self._pending[key] = goal
@@ -271,6 +272,12 @@ class ControlExecutive:
             self._monitor.shift_time(jump)
             self._next_report += jump
         self._time = time
+        wheels = self.controller.wheels
+        if wheels is not None:
+            if self.plant_blocked:
+                wheels.forget_answers()
+            measured, q, qdot = wheels.observe(measured, q, qdot)
+            reference = wheels.reference(reference)
         self._guided = reference is not None
         if measured is not None:
             if self._abort_requested or self._hold_here or self.plant_blocked:
@@ -286,10 +293,25 @@ class ControlExecutive:
             self._watch_rates(qdot)
         if reference is not None:
             self.controller.follow(reference)
-        return self.controller.command(time, measured, q, qdot)
+        result = self.controller.command(time, measured, q, qdot)
+        if wheels is None:
+            return result
+        loss = Actuation(result.loss.wrench_B, wheels.shape(result.loss.tau))
+        return Saturated(wheels.actuation(result.realised), loss)
+
+    def dump_momentum(self) -> tuple[bool, str]:
+        """Dump the momentum of the reaction wheels; return whether it is done, and a sentence."""
+        if self.controller.wheels is None:
+            name = self.controller.law.robot.description.name
+            return False, f"Robot '{name}' has no reaction wheels."
+        return self.controller.wheels.request_dump()
 
     def evaluate(self, time: float, result: Saturated) -> None:
         """Evaluate the errors after the command ``result``, and report a change of state."""
+        if self.controller.wheels is not None:
+            for event in self.controller.wheels.events():
+                self._report_event(event)
+                self._next_report = time
         if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
             self._watch_errors()
         if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
@@ -366,6 +388,8 @@ class ControlExecutive:
         self._pending.clear()
         poses = {key: PoseReference(goal.position, goal.quaternion) for key, goal in goals.items()}
         shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
+        if self.controller.wheels is not None:
+            shapes = [shape[self.controller.wheels.wheels.other] for shape in shapes]
         self.controller.set_goals(
             time,
             state,
@@ -387,6 +411,8 @@ class ControlExecutive:
         """Return the goals of all controlled poses, to resume with."""
         goal, selection = self.controller.goal, self.controller.law.outputs.selection
         shape = goal.joints.q if goal.joints is not None and selection.joints else None
+        if shape is not None and self.controller.wheels is not None:
+            shape = self.controller.wheels.shape(shape)
         poses = {BASE_GOAL_KEY: goal.base, END_EFFECTOR: goal.end_effector}
         return {
             key: IdentifiedGoal(Goal(pose.position, pose.quaternion, shape), self._goal_id)
@@ -449,7 +475,8 @@ _STATE_AND_EVENT_OF_DECISION = {
 
 
 def _command_report(controller: CoordinatedController, result: Saturated) -> CommandReport:
-    status, loss = controller.law.status, result.loss
+    status, loss, wheels = controller.law.status, result.loss, controller.wheels
+    state = controller.law.state
     return CommandReport(
         law=controller.law.name,
         singular=status.singular,
@@ -459,4 +486,7 @@ def _command_report(controller: CoordinatedController, result: Saturated) -> Com
         lost_torque_Nm=float(np.linalg.norm(loss.wrench_B[3:])),
         lost_effort=float(np.abs(loss.tau).max(initial=0.0)),
         errors=controller.labelled_errors(),
+        wheels={} if wheels is None else wheels.shares,
+        momentum={} if wheels is None else wheels.budget(state.q, state.qdot),
+        dumping=wheels is not None and wheels.dumping,
     )

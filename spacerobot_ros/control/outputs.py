@@ -247,6 +247,9 @@ class OutputVector:
         The model.
     selection
         The outputs.
+    thrust
+        Whether forces on the base move the centre of mass; otherwise its columns of ``J_z`` are
+        zero.
 
     Raises
     ------
@@ -254,8 +257,11 @@ class OutputVector:
         The robot lacks a selected output; see :meth:`OutputSelection.require_valid`.
     """
 
-    def __init__(self, robot: SpaceRobot, selection: OutputSelection) -> None:
+    def __init__(
+        self, robot: SpaceRobot, selection: OutputSelection, *, thrust: bool = True
+    ) -> None:
         selection.require_valid(robot.description)
+        self.thrust = thrust
         self.robot, self.model = robot, robot.expressions()
         self.selection = selection
         self.labels = selection.labels
@@ -296,6 +302,9 @@ class OutputVector:
         self._error_function: ca.Function | None = None
         self.acceleration = ca.vertcat(*(group.acceleration for group in groups))
         self.J_z = ca.vertcat(*(group.J for group in groups))
+        if not thrust:
+            # No actuator moves the centre of mass.
+            self.J_z[:, :3] = 0
         self.bias = ca.vertcat(*(group.bias for group in groups))
 
     def pack_state(self, state: ControlState, memory: Array) -> None:
@@ -333,6 +342,12 @@ class OutputVector:
         np.concatenate(parts, out=memory)
         _require_finite("reference", memory)
 
+    def without_force(self, Q: ca.SX) -> ca.SX:
+        """Return generalised forces (N,) without their force on the centre of mass, where no
+        actuator makes one.
+        """
+        return Q if self.thrust else ca.vertcat(ca.SX.zeros(3), Q[3:])
+
     def errors(self, state: ControlState, reference: Reference) -> Array:
         """Return the errors (m,) of a state from a reference; see :meth:`pack_reference`."""
         if self._error_function is None:
@@ -360,8 +375,10 @@ class OutputVector:
         # The rate of J_B(q) z0dot at constant z0dot, then that of the axes it is given along.
         z0dot = ca.SX.sym("z0dot", self.N)
         twist_rate = ca.jtimes(J_B @ z0dot, self.q, self.qdot)
-        twist_rate = ca.substitute(twist_rate, z0dot, self.z0dot)
-        twist_B = J_B @ self.z0dot
+        # A centre of mass without thrust adds no acceleration.
+        moving = self.z0dot if self.thrust else ca.vertcat(ca.SX.zeros(3), self.z0dot[3:])
+        twist_rate = ca.substitute(twist_rate, z0dot, moving)
+        twist_B = J_B @ moving
         bias = [
             R @ (twist_rate[part] + ca.cross(self.omega, twist_B[part]))
             for part in (slice(0, 3), slice(3, 6))

@@ -11,6 +11,9 @@ from spacerobot_ros.errors import SpaceRobotError
 _ERROR_PREFIX = "error."
 """Prefix of the keys of output errors."""
 
+_WHEEL_PREFIX, _MOMENTUM_PREFIX = "wheel.", "momentum."
+"""Prefixes of the keys of the rates of reaction wheels, and of the momentum budget."""
+
 
 class ControllerState(str, Enum):
     """The value of ``state`` in controller/status."""
@@ -61,6 +64,13 @@ class CommandReport:
         (N or N m).
     errors
         Error of each output by its label, m or rad.
+    wheels
+        Rate of each reaction wheel by name, as a share of its largest one.
+    momentum
+        Angular momentum about the centre of mass, N m s: of ``base``, ``arm``, ``wheels``, and
+        their ``sum``; empty without reaction wheels.
+    dumping
+        Whether the momentum of the wheels is being dumped.
     """
 
     law: str
@@ -71,6 +81,9 @@ class CommandReport:
     lost_torque_Nm: float
     lost_effort: float
     errors: Mapping[str, float] = field(default_factory=dict)
+    wheels: Mapping[str, float] = field(default_factory=dict)
+    momentum: Mapping[str, float] = field(default_factory=dict)
+    dumping: bool = False
 
 
 @dataclass(frozen=True)
@@ -107,6 +120,13 @@ class ControllerStatus:
                 (f"{_ERROR_PREFIX}{label}", f"{error:.6g}")
                 for label, error in self.command.errors.items()
             )
+            if self.command.wheels:
+                values["dumping"] = str(self.command.dumping).lower()
+            for prefix, numbers in (
+                (_WHEEL_PREFIX, self.command.wheels),
+                (_MOMENTUM_PREFIX, self.command.momentum),
+            ):
+                values.update((f"{prefix}{key}", f"{x:.6g}") for key, x in numbers.items())
         return values
 
     @classmethod
@@ -125,16 +145,24 @@ class ControllerStatus:
                     law=values["law"],
                     singular=values["singular"] == "true",
                     **{name: float(values[name]) for name in _NUMBER_KEYS},
-                    errors={
-                        key.removeprefix(_ERROR_PREFIX): float(value)
-                        for key, value in values.items()
-                        if key.startswith(_ERROR_PREFIX)
-                    },
+                    errors=_numbers_below(_ERROR_PREFIX, values),
+                    wheels=_numbers_below(_WHEEL_PREFIX, values),
+                    momentum=_numbers_below(_MOMENTUM_PREFIX, values),
+                    dumping=values.get("dumping") == "true",
                 )
             state = ControllerState(values["state"])
             return cls(state, message, values.get("goal_id", ""), command)
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"This is no status of a controller: {error}.") from error
+
+
+def _numbers_below(prefix: str, values: Mapping[str, str]) -> dict[str, float]:
+    """Return the numbers whose keys begin with a prefix, by the rest of their keys."""
+    return {
+        key.removeprefix(prefix): float(value)
+        for key, value in values.items()
+        if key.startswith(prefix)
+    }
 
 
 _NUMBER_KEYS = (

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
 from spacerobot_ros.commanding.controller import (
     BASE_REFERENCE,
@@ -61,6 +62,7 @@ class CoordinatedControlNode(CommanderNode):
         self._joint_commands = self.send_raw(JointState, "joint_commands")
         self._base_wrench = self.send_raw(WrenchStamped, "base_wrench")
         self.listen("controller/status")
+        self.create_service(Trigger, "~/dump_momentum", self._on_dump_momentum)
         self.take_goals("goal_pose")
         self.take_goals("end_effector/goal_pose", END_EFFECTOR)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
@@ -93,6 +95,10 @@ class CoordinatedControlNode(CommanderNode):
 
     def _on_reference(self, topic: str, raw: bytes) -> None:
         self.commander.receive_reference(topic, first_time_ns(raw), raw)
+
+    def _on_dump_momentum(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = self.commander.dump_momentum()
+        return response
 
     # -- outputs ------------------------------------------------------------------------------
 

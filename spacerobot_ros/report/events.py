@@ -43,7 +43,17 @@ class FlightEvent:
         return f"{label}: {', '.join(details)}" if details else label
 
 
-_DETAIL_KEYS = ("fault", "disturbance", "joints", "reason", "method", "node", "first", "second")
+_DETAIL_KEYS = (
+    "fault",
+    "disturbance",
+    "joints",
+    "reason",
+    "method",
+    "node",
+    "first",
+    "second",
+    "wheel",
+)
 """Keys that distinguish an event from others of its kind."""
 
 
@@ -75,6 +85,11 @@ _MARKS = {
     EventKind.FAULTS_CLEARED: _Mark("faults off", "^", _WARN, 1, hollow=True),
     EventKind.DISTURBANCE: _Mark("disturbance", "<", _WARN, 1),
     EventKind.DISTURBANCE_ENDED: _Mark("disturbance over", "<", _WARN, 1, hollow=True),
+    EventKind.WHEEL_NEAR_LIMIT: _Mark("wheel near its limit", "o", _WARN, 1, hollow=True),
+    EventKind.WHEEL_SATURATED: _Mark("wheel saturated", "o", _WARN, 1),
+    EventKind.WHEEL_FAILED: _Mark("wheel failed", "o", _BAD, 1),
+    EventKind.DUMP_STARTED: _Mark("momentum dump", "o", _PLAIN, 1),
+    EventKind.DUMP_ENDED: _Mark("momentum dumped", "o", _GOOD, 1),
     EventKind.CONTACT: _Mark("contact", "P", _BAD, 1),
     EventKind.CONTACT_ENDED: _Mark("contact over", "P", _BAD, 1, hollow=True),
     EventKind.CAPTURED: _Mark("captured", "D", _GOOD, 1),
@@ -128,6 +143,7 @@ _PROMINENT_KINDS = _FAULT_KINDS | {
     EventKind.LATCHED,
     EventKind.GOAL_ABORTED,
     EventKind.CONTACT,
+    EventKind.WHEEL_FAILED,
 }
 """Kinds that are marked over the whole height of a chart."""
 

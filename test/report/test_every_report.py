@@ -32,6 +32,7 @@ FAULTS = {
     "late_poses": {"fault on: sensor_dropout odom", "fault off: sensor_dropout odom"},
     "weak_motors": {"fault on: joint_slow slider_1", "correction"},
     "wrong_masses": {"correction"},
+    "wheel_failure": {"fault on: joint_slow wheel_plus_x", "wheel failed: wheel_plus_x"},
     "killed_nodes": {"node silent", "node back"},
 }
 """What must stand below the charts of some: the fault, what found it, its end."""

@@ -25,6 +25,7 @@ EXPECTED: dict[str, tuple[bool, float | None, float | None]] = {
     "stuck_slider": (False, None, None),
     "broken_thrusters": (True, 4e-3, 4e-3),
     "weak_motors": (True, 2e-3, 2e-3),
+    "wheel_failure": (True, 4e-3, 4e-3),
     "late_poses": (True, 2e-3, 2e-3),
     "biased_pose": (True, 0.11, 2e-3),
     "missed_capture": (True, 1e-6, 1e-6),

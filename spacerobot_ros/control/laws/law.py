@@ -165,6 +165,8 @@ class ControlLaw(ABC):
         Diagonals of Kp and Kd by group, in the law's units (:class:`GainPair`).
     options
         An instance of the law's ``Options``; None: their defaults.
+    thrust
+        Whether thrusters push the base; otherwise the law commands no force.
 
     Raises
     ------
@@ -184,9 +186,12 @@ class ControlLaw(ABC):
         outputs: OutputSelection,
         gains: Gains,
         options: LawOptions | None = None,
+        *,
+        thrust: bool = True,
     ) -> None:
         self.robot = robot
-        self.outputs = OutputVector(robot, self.accepted_outputs(robot, outputs))
+        accepted = self.accepted_outputs(robot, outputs)
+        self.outputs = OutputVector(robot, accepted, thrust=thrust)
         self.options: Any = configured(self.Options, values_of(options or self.Options()))
         self.singular_value_threshold: float = self.options.singular_value_threshold
         inputs = self._inputs()

@@ -108,7 +108,7 @@ class ModelBasedLaw(ControlLaw):
         acceleration = a - z1.bias - z1.J_z @ xi
         mobility = z1.J_z @ mobility
         J_actuators = z1.J_z @ z1.J_q_inverse
-        other = z1.J_q_inverse.T @ (H @ xi + C)
+        other = z1.J_q_inverse.T @ z1.without_force(H @ xi + C)
         force = solve_positive_definite(mobility, acceleration)
         # 1 / sqrt(sum of 1/s^2 over the singular values s), not above the smallest of them. Where
         # J_z is singular this is not a number, and neither is the undamped command.

@@ -1,0 +1,431 @@
+"""Reaction wheels as flight software: allocation of a torque, saturation, dumping, failures.
+
+A law for base and arm wants a torque on the base of the gyrostat (:mod:`spacerobot_ros.model.
+wheels`). The wheels give as much of it as their torques and rates allow; the rest is left to the
+thrusters, if there are any.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.control.limits import MotionLimits
+from spacerobot_ros.control.state import Actuation, ControlState, Reference
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.model.wheels import ReactionWheels
+from spacerobot_ros.parameters import parameter
+
+_MIN_PERIODS_TO_LIMIT = 2
+"""Shortest time for a wheel to reach its largest rate, in control periods."""
+
+_SATURATED_SHARE = 0.99
+"""Share of the largest rate from which on a wheel counts as saturated."""
+
+_RELEASE = 0.05
+"""Share of the largest rate by which a wheel is slower before it is announced again."""
+
+_DUMP_TIME = 5.0
+"""Time constant with which rates decay while momentum is dumped, s."""
+
+_DUMPED_SHARE = 0.02
+"""Share of the largest rates below which momentum counts as dumped."""
+
+_DUMP_TORQUE_SHARE = 0.5
+"""Share of the thrusters' torque for dumping; control needs the other part."""
+
+_MOTION_SHARE = 0.5
+"""Share of the torque and of the momentum of wheels for references."""
+
+_FAILURE_TIME = 0.5
+"""Time at full torque after which the answer of a wheel is judged, s."""
+
+_LEAST_ANSWER = 0.5
+"""Least share of the commanded impulse that a wheel in order takes up."""
+
+_TINY = 1e-12
+"""Width that bounds of the solver get, N m, and a share of a torque that counts as zero."""
+
+_SMOOTHING = 1e-6
+"""Weight of the torques relative to their sum, which chooses the smallest of equal allocations."""
+
+
+@dataclass(frozen=True)
+class WheelOptions:
+    """The parameters of reaction wheels."""
+
+    warning_rate: float = parameter(
+        0.9,
+        "share of a wheel's largest rate at which an event announces its saturation",
+        minimum=0.01,
+        maximum=1.0,
+    )
+    dump_rate: float = parameter(
+        0.0,
+        "share of a wheel's largest rate at which the momentum of the wheels is dumped to the "
+        "thrusters; 0: on request alone",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    excluded: str = parameter("", "joints of wheels out of use, separated by spaces")
+
+
+class WheelAllocation:
+    """Distributes a torque over wheels by least squares within bounds.
+
+    The torques solve ``min |A tau - torque|`` with ``lower <= tau <= upper``; of several solutions
+    it is the one with the smallest shares of the largest torques.
+
+    Parameters
+    ----------
+    axes
+        (3, k) axes A of the wheels.
+    torque
+        (k,) largest torques of their motors, N m.
+    """
+
+    def __init__(self, axes: Array, torque: Array) -> None:
+        self._scaled, self._torque = axes * torque, torque
+        self._inverse = np.linalg.pinv(self._scaled)
+        largest = max(float(torque.max(initial=0.0)), _TINY)
+        self._extended = np.vstack([self._scaled / largest, _SMOOTHING * np.eye(len(torque))])
+        self._size = largest
+        self.rank = int(np.linalg.matrix_rank(self._scaled)) if len(torque) else 0
+        """Number of independent axes."""
+
+    def allocate(self, torque: Array, lower: Array, upper: Array) -> Array:
+        """Return the torques (k,) whose sum along the axes is nearest to ``torque`` (3,), N m."""
+        tau = self._torque * (self._inverse @ torque)
+        if np.all((lower <= tau) & (tau <= upper)):
+            return np.asarray(tau)
+        from scipy.optimize import lsq_linear  # Slow to import, and rarely needed.
+
+        wanted = np.concatenate([torque / self._size, np.zeros(len(lower))])
+        bounds = (lower - _TINY) / self._torque, (upper + _TINY) / self._torque
+        shares = lsq_linear(self._extended, wanted, bounds, method="bvls", tol=1e-14).x
+        return np.clip(self._torque * shares, lower, upper)
+
+    def within(self, limits: Array) -> float:
+        """Return the largest sum that is possible along every axis within ``limits`` (k,), which
+        are torques or momenta of the wheels; zero if the wheels do not span the space.
+        """
+        if self.rank < 3:
+            return 0.0
+        rows = np.linalg.norm(self._torque[:, None] * self._inverse, axis=1)
+        return float((limits / rows).min())
+
+
+class WheelControl:
+    """The wheels of a controlled robot: measured rates, commanded torques, and what they announce.
+
+    Parameters
+    ----------
+    wheels
+        The wheels.
+    options
+        Their parameters.
+    control_period
+        Time between two commands, s.
+    thruster_torque
+        Largest torque of the thrusters, N m; infinite: any, zero: there are no thrusters.
+
+    Raises
+    ------
+    ParameterError
+        A name is that of no wheel, or momentum is to be dumped without thrusters.
+    """
+
+    def __init__(
+        self,
+        wheels: ReactionWheels,
+        options: WheelOptions,
+        control_period: float,
+        thruster_torque: float,
+    ) -> None:
+        self.wheels, self._options = wheels, options
+        self._period, self._thruster_torque = control_period, thruster_torque
+        self._used = np.ones(len(wheels), dtype=np.bool_)
+        for name in options.excluded.split():
+            if name not in wheels.names:
+                raise ParameterError(
+                    f"Parameter 'wheels.excluded' names '{name}'; the wheels of robot "
+                    f"'{wheels.description.name}' are {', '.join(wheels.names)}."
+                )
+            self._used[wheels.names.index(name)] = False
+        if options.dump_rate and not self.has_thrusters:
+            raise ParameterError(
+                f"Parameter 'wheels.dump_rate' is {options.dump_rate:g}, but 'use_thrusters' is "
+                "false: momentum is dumped to thrusters alone; set it to 0."
+            )
+        self.gyrostat = SpaceRobot(wheels.gyrostat)
+        """The robot that the laws control."""
+        self._allocate = self._make_allocation()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget measurements; wheels that have failed stay out of use."""
+        count = len(self.wheels)
+        self.torque = np.zeros(count)
+        """Commanded torques (k,) of the motors, N m."""
+        self.thrust = np.zeros(6)
+        """Wrench (6,) that is left to the thrusters, N and N m."""
+        self.rates, self._omega = np.zeros(count), np.zeros(3)
+        self._q, self._spins = np.zeros(0), np.zeros(count)
+        self._announced = np.zeros(count)
+        """Share of its largest rate at which each wheel was announced last; zero: it was not."""
+        self.dumping = False
+        """Whether momentum is being dumped."""
+        self._events: list[Event] = []
+        self.forget_answers()
+
+    def forget_answers(self) -> None:
+        """Judge the answers of the wheels from now on: commands until now were not obeyed."""
+        self._asked, self._answered = np.zeros(len(self.wheels)), np.zeros(len(self.wheels))
+        self._known = False
+
+    @property
+    def has_thrusters(self) -> bool:
+        """Whether there are thrusters."""
+        return self._thruster_torque > 0
+
+    @property
+    def rank(self) -> int:
+        """Number of independent axes of the wheels in use."""
+        return self._allocate.rank
+
+    # -- measurements -------------------------------------------------------------------------
+
+    def observe(
+        self, measured: ControlState | None, q: Array, qdot: Array
+    ) -> tuple[ControlState | None, Array, Array]:
+        """Take a state of the robot; return that of the gyrostat."""
+        wheels = self.wheels
+        self._q, self.rates = q, qdot[wheels.index]
+        q, qdot = q[wheels.other], qdot[wheels.other]
+        if measured is None:
+            self._known = False
+            return None, q, qdot
+        self._omega = measured.omega_WB_B.copy()
+        self._judge_answers()
+        self._watch_rates()
+        return replace(measured, q=q, qdot=qdot), q, qdot
+
+    def reference(self, reference: Reference | None) -> Reference | None:
+        """Return a reference for the robot as one for the gyrostat."""
+        if reference is None or reference.joints is None:
+            return reference
+        parts = (getattr(reference.joints, name) for name in ("q", "qdot", "qddot"))
+        joints = type(reference.joints)(*(part[self.wheels.other] for part in parts))
+        return replace(reference, joints=joints)
+
+    def shape(self, q: Array) -> Array:
+        """Return the shape of the robot with the joints (n - k,) of the gyrostat."""
+        whole = np.zeros(len(self.wheels) + len(self.wheels.other))
+        whole[self.wheels.other] = q
+        return whole
+
+    def actuation(self, realised: Actuation) -> Actuation:
+        """Return the wrench of the thrusters, and the efforts of all joints."""
+        tau = self.shape(realised.tau)
+        tau[self.wheels.index] = self.torque
+        return Actuation(self.thrust.copy(), tau)
+
+    def events(self) -> list[Event]:
+        """Return the events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    # -- torques ------------------------------------------------------------------------------
+
+    def give(self, torque: Array) -> Array:
+        """Command torques for a wanted torque (3,) on the base, N m; return the part they give.
+
+        The torque ``omega x A h`` of turning the spins with the base is compensated for.
+        """
+        A = self.wheels.axes_B
+        gyroscopic = np.cross(self._omega, A @ self.wheels.spins(self._omega, self.rates))
+        if self.dumping:
+            self.torque = self._dumping_torques()
+        else:
+            self.torque = np.zeros(len(self.wheels))
+            used = self._used
+            lower, upper = self._bounds()
+            wanted = -(torque + gyroscopic)
+            self.torque[used] = self._allocate.allocate(wanted, lower[used], upper[used])
+        given = -(A @ self.torque) - gyroscopic
+        if np.abs(given - torque).max() <= 1e3 * _TINY * np.abs(torque).max(initial=1e-6):
+            return torque.copy()
+        return np.asarray(given)
+
+    def coast(self) -> None:
+        """Command no torque."""
+        self.torque, self.thrust = np.zeros(len(self.wheels)), np.zeros(6)
+
+    def motion_within(self, motion: MotionLimits, q: Array) -> MotionLimits:
+        """Return limits of references that wheels alone can follow, for a shape (n - k,)."""
+        if self.has_thrusters or self.rank < 3:
+            return motion
+        wheels, used = self.wheels, self._used
+        inertia = float(np.linalg.eigvalsh(self.gyrostat.inertia_matrix(q)[3:6, 3:6])[-1])
+        torque = self._allocate.within(wheels.torque[used])
+        momentum = self._allocate.within((wheels.inertia * wheels.rate)[used])
+        share = _MOTION_SHARE / inertia
+        return replace(
+            motion,
+            angular_acceleration=min(motion.angular_acceleration, share * torque),
+            angular_speed=min(motion.angular_speed, share * momentum),
+        )
+
+    def _bounds(self) -> tuple[Array, Array]:
+        """Return the least and largest torques (k,) that keep torque and rate limits."""
+        wheels = self.wheels
+        soon = wheels.inertia / (_MIN_PERIODS_TO_LIMIT * self._period)
+        upper = np.clip(soon * (wheels.rate - self.rates), 0.0, wheels.torque)
+        lower = -np.clip(soon * (wheels.rate + self.rates), 0.0, wheels.torque)
+        return lower, upper
+
+    # -- momentum -----------------------------------------------------------------------------
+
+    def request_dump(self) -> tuple[bool, str]:
+        """Begin to dump the momentum of the wheels; return whether, and a sentence."""
+        if not self.has_thrusters:
+            return False, (
+                "There are no thrusters (use_thrusters is false) that could take the momentum of "
+                "the wheels."
+            )
+        if self.dumping:
+            return True, "Momentum is being dumped already."
+        if self._is_dumped:
+            return True, "The wheels hold no momentum."
+        self._begin_dump("on request")
+        return True, "The momentum of the wheels is dumped to the thrusters."
+
+    def budget(self, q: Array, qdot: Array) -> dict[str, float]:
+        """Return the parts of the angular momentum about the centre of mass by name, N m s: see
+        :func:`momentum_budget`; of the joints (n - k,) of the gyrostat.
+        """
+        parts = momentum_budget(self.wheels, self.gyrostat, self._omega, q, qdot, self.rates)
+        return {name: float(np.linalg.norm(part)) for name, part in parts.items()}
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Rate of each wheel as a share of its largest one, by name, with its sign."""
+        return dict(zip(self.wheels.names, (self.rates / self.wheels.rate).tolist(), strict=True))
+
+    @property
+    def _is_dumped(self) -> bool:
+        return bool(np.all(np.abs(self.rates) <= _DUMPED_SHARE * self.wheels.rate))
+
+    def _begin_dump(self, why: str) -> None:
+        self.dumping = True
+        self._add(EventKind.DUMP_STARTED, f"The momentum of the wheels is dumped {why}.", 0)
+
+    def _dumping_torques(self) -> Array:
+        wheels = self.wheels
+        tau = np.where(self._used, -wheels.inertia * self.rates / _DUMP_TIME, 0.0)
+        largest = _DUMP_TORQUE_SHARE * self._thruster_torque
+        excess = max(
+            float((np.abs(tau) / wheels.torque).max()),
+            float(np.linalg.norm(wheels.axes_B @ tau)) / largest,
+        )
+        return tau / max(1.0, excess)
+
+    # -- saturation and failures --------------------------------------------------------------
+
+    def _watch_rates(self) -> None:
+        wheels, options = self.wheels, self._options
+        if self.dumping and self._is_dumped:
+            self.dumping = False
+            self._add(EventKind.DUMP_ENDED, "The momentum of the wheels is dumped.", 0)
+        shares = np.abs(self.rates) / wheels.rate
+        for i in np.flatnonzero(self._used):
+            share, name = float(shares[i]), wheels.names[i]
+            turns = f"Wheel '{name}' turns at {self.rates[i]:.4g} of {wheels.rate[i]:.4g} rad/s"
+            if share < options.warning_rate - _RELEASE:
+                self._announced[i] = 0.0
+            elif share >= _SATURATED_SHARE > self._announced[i]:
+                self._announced[i] = share
+                message = f"{turns}: it is saturated, and takes no more torque in this direction."
+                self._add(EventKind.WHEEL_SATURATED, message, 1, name)
+            elif share >= options.warning_rate and not self._announced[i]:
+                self._announced[i] = share
+                self._add(EventKind.WHEEL_NEAR_LIMIT, f"{turns}{self._outlook(int(i))}.", 1, name)
+        if options.dump_rate and not self.dumping:
+            fastest = int(np.argmax(np.where(self._used, shares, 0.0)))
+            if shares[fastest] >= options.dump_rate:
+                self._begin_dump(f"because wheel '{wheels.names[fastest]}' is fast")
+
+    def _outlook(self, i: int) -> str:
+        """Return a clause on the time in which a wheel saturates at its present torque."""
+        seconds = self.time_to_saturation(i)
+        return f", and is saturated in {seconds:.3g} s" if math.isfinite(seconds) else ""
+
+    def time_to_saturation(self, i: int) -> float:
+        """Return the time in which wheel i reaches its largest rate at its torque, s."""
+        tau, wheels = self.torque[i], self.wheels
+        if tau == 0.0:
+            return math.inf
+        left = wheels.rate[i] - math.copysign(1.0, tau) * self.rates[i]
+        return max(0.0, float(wheels.inertia[i] * left / abs(tau)))
+
+    def _judge_answers(self) -> None:
+        """Take wheels out of use whose momentum does not change as their torque demands."""
+        wheels = self.wheels
+        spins = wheels.spins(self._omega, self.rates)
+        if self._known:
+            self._asked += np.abs(self.torque) * self._period
+            self._answered += np.sign(self.torque) * (spins - self._spins)
+        self._spins, self._known = spins, True
+        judged = self._asked >= wheels.torque * _FAILURE_TIME
+        weak = self._answered < _LEAST_ANSWER * self._asked
+        for i in np.flatnonzero(judged & self._used & weak):
+            self._fail(int(i))
+        self._asked[judged] = self._answered[judged] = 0.0
+
+    def _fail(self, i: int) -> None:
+        name, asked, answered = self.wheels.names[i], self._asked[i], self._answered[i]
+        self._used[i] = False
+        self._allocate = self._make_allocation()
+        left = ", and thrusters" if self.has_thrusters else ""
+        message = (
+            f"Wheel '{name}' took {answered:.3g} of {asked:.3g} N m s, and is out of use: "
+            f"{np.count_nonzero(self._used)} wheel(s){left} are left."
+        )
+        self._add(EventKind.WHEEL_FAILED, message, 1, name)
+
+    def _make_allocation(self) -> WheelAllocation:
+        used: npt.NDArray[np.bool_] = self._used
+        return WheelAllocation(self.wheels.axes_B[:, used], self.wheels.torque[used])
+
+    def _add(self, kind: EventKind, message: str, level: int, wheel: str = "") -> None:
+        about = {"wheel": wheel} if wheel else {}
+        self._events.append(Event(kind, message, level, about=about))
+
+
+def momentum_budget(
+    wheels: ReactionWheels,
+    gyrostat: SpaceRobot,
+    omega_WB_B: Array,
+    q: Array,
+    qdot: Array,
+    rates: Array,
+) -> dict[str, Array]:
+    """Return the parts (3,) of the angular momentum about the centre of mass by name, N m s, base
+    components.
+
+    ``base`` is that of the gyrostat turning with the base, its joints at rest; ``arm`` is that of
+    its joints (q, qdot: (n - k,)) with the base at rest; ``wheels`` is ``A h``; ``sum`` their sum.
+    """
+    H = gyrostat.inertia_matrix(q)
+    parts = {
+        "base": H[3:6, 3:6] @ omega_WB_B,
+        "arm": H[3:6, 6:] @ qdot,
+        "wheels": wheels.axes_B @ wheels.spins(omega_WB_B, rates),
+    }
+    return {**parts, "sum": parts["base"] + parts["arm"] + parts["wheels"]}
