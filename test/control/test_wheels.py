@@ -500,7 +500,7 @@ class Loop:
 
 
 def test_wheels_brake_the_base_and_thrusters_do_the_rest() -> None:
-    loop = Loop(max_torque=0.5, **{"gains.base_attitude.kd": 1.0})
+    loop = Loop(ROBOT, **{"max_torque": 0.5, "gains.base_attitude.kd": 1.0})
     loop.tick(0.0, [0.0] * 4)
     small = loop.tick(0.02, [0.0] * 4, (0.01, 0.0, 0.005))
     assert not small.wrench_B[3:].any()
