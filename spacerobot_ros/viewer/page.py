@@ -396,7 +396,7 @@ class Log:
 
 
 _ROBOT_PATH = "/robot"
-_OBSTACLES_PATH = "/obstacles"
+_OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Period of drawing of the slower parts, wall s."""
@@ -430,6 +430,8 @@ class Page:
         self._actions: list[Action] = []
         self._robot: RobotDescription | None = None
         self._drawing: scene.RobotDrawing | None = None
+        self._target: RobotDescription | None = None
+        self._target_drawing: scene.RobotDrawing | None = None
         self._table: ThrusterTable | None = None
         self._state = StackState()
         self._due: dict[str, float] = {}
@@ -503,6 +505,7 @@ class Page:
         self._kinematics = None if robot is None else ForwardKinematics(robot)
         self._around: scene.Surroundings | None = None
         self._server.scene.reset()
+        self._target_drawing = None
         reach = 1.0 if robot is None else scene.reach_of(robot)
         self._reach, self._trail = reach, Trail(0.003 * reach)
         self.editor.show_robot(robot, reach)
@@ -515,6 +518,21 @@ class Page:
         self._drawing.base.visible = False  # Until its first state comes.
         scene.draw_obstacles(self._server.scene, _OBSTACLES_PATH, robot.world)
         self._show_collision_shapes()
+        if self._target is not None:
+            self.show_target(self._target)
+
+    def show_target(self, target: RobotDescription) -> None:
+        """Draw the body that floats beside the robot, from its first state on."""
+        if self._target_drawing is not None:
+            self._target_drawing.base.remove()
+        self._target = target
+        self._target_drawing = scene.RobotDrawing(
+            self._server.scene,
+            _TARGET_PATH,
+            target,
+            on_note=lambda text: self.note(Notice(text, 1)),
+        )
+        self._target_drawing.base.visible = False
 
     def _show_collision_shapes(self) -> None:
         if self._drawing is not None:
@@ -542,6 +560,9 @@ class Page:
                 self.faults.show_menu(visible=not replays)
             if self._drawing is not None and state.measured is not None:
                 self._draw_robot(state, state.measured)
+            if self._target_drawing is not None and state.target is not None:
+                self._target_drawing.base.visible = True
+                self._target_drawing.place(state.target)
             self._time_line.show(state, now)
             if self._is_due("texts", _TEXTS_S):
                 self._draw_texts(state)

@@ -80,6 +80,8 @@ class StackState:
         The last state, and the wall time since it came, s; infinite before the first.
     tool
         (7,) pose of the end-effector in the world.
+    target
+        (7,) pose of the target's root link in the world.
     momenta, firing, clearance
         As the plant reports them.
     plant, planner, controller, replay
@@ -102,6 +104,7 @@ class StackState:
 
     measured: Measured | None = None
     tool: Array | None = None
+    target: Array | None = None
     age_s: float = float("inf")
     momenta: Momenta | None = None
     firing: Firing | None = None

@@ -192,6 +192,19 @@ def test_other_streams_are_shown_as_they_come(viewed: Viewed) -> None:
     assert state.firing.duty.tolist() == [0.25, 1.0]
 
 
+def test_the_target_is_where_its_odometry_says(viewed: Viewed) -> None:
+    assert viewed.look().target is None
+    odom = Odometry()
+    odom.pose.pose.position = Point(x=1.5, y=-0.25, z=0.75)
+    odom.pose.pose.orientation = Quaternion(x=0.5, y=-0.1, z=0.7, w=0.5)
+    viewed.streams.put("target/odom", odom)
+    target = viewed.look().target
+    assert target is not None
+    assert target.tolist() == [1.5, -0.25, 0.75, *TURNED]
+    viewed.listener.use(ROBOT)
+    assert viewed.look().target is None
+
+
 def test_momenta_without_expected_ones_are_shown(viewed: Viewed) -> None:
     for broken in ([1.0] * 6, [1.0] * 6 + [math.nan]):
         viewed.streams.put("momentum", Float64MultiArray(data=broken))

@@ -21,7 +21,7 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import parse_robot, parse_world
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
-from spacerobot_ros.resources import robot_file
+from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.viewer import scene
 from spacerobot_ros.viewer.content import GoalDistance
 from spacerobot_ros.viewer.page import CAMERA, Page, Plots, _Plot
@@ -240,6 +240,29 @@ def test_plumes_point_against_the_thrust() -> None:
     np.testing.assert_allclose(first[1] - first[0], -table.direction_B[2])
     assert np.linalg.norm(second[1] - second[0]) < 1.0
     assert scene.plumes(table, ("unknown",), np.ones(1), 1.0).shape == (0, 2, 3)
+
+
+def test_a_target_is_drawn_from_its_first_state_on_and_outlasts_a_new_robot(server: Any) -> None:
+    server.scene.reset()
+    page = Page(server, ViewerConfig())
+    page.show_robot(None)
+    page.show_target(load_robot(share_directory() / "config" / "targets" / "block.urdf"))
+    frame = server.scene.get_handle_by_name("/target")
+    assert not frame.visible
+    page.update(StackState(), 1.0)
+    assert not frame.visible
+    page.update(StackState(target=np.array([1.0, -2.0, 3.0, 0.5, -0.1, 0.7, 0.5])), 2.0)
+    assert frame.visible
+    np.testing.assert_allclose(frame.position, [1.0, -2.0, 3.0])
+    np.testing.assert_allclose(frame.wxyz, [0.5, 0.5, -0.1, 0.7])
+    page.show_robot(load_robot(robot_file("sliding_masses")))
+    again = server.scene.get_handle_by_name("/target")
+    assert again is not frame
+    assert not again.visible
+    assert server.scene.get_handle_by_name("/target/0") is not None
+    page.show_robot(None)
+    assert server.scene.get_handle_by_name("/target") is None
+    page.update(StackState(target=np.array([1.0, -2.0, 3.0, 0.0, 0.0, 0.0, 1.0])), 3.0)
 
 
 def test_collision_shapes_are_shown_on_request(server: Any) -> None:

@@ -128,6 +128,7 @@ class Listener:
         self._odom = Latest(streams, Odometry, "odom")
         self._joints = Latest(streams, JointState, "joint_states")
         self._end_effector = Latest(streams, PoseStamped, "end_effector_pose")
+        self._target = Latest(streams, Odometry, "target/odom")
         self._momentum = Latest(streams, Float64MultiArray, "momentum")
         self._expected = Latest(streams, Float64MultiArray, "momentum_expected")
         self._thrusters = Latest(streams, JointState, "thrusters")
@@ -167,6 +168,7 @@ class Listener:
         self._q: tuple[Array, Array, Array] | None = None
         self._measured: Measured | None = None
         self._tool_pose: Array | None = None
+        self._target_pose: Array | None = None
         self._momenta: Momenta | None = None
         self._expected_momenta: Array | None = None
         self._least_apart_ns = _LONGEST_EXPECTED_DELAY_NS
@@ -198,6 +200,7 @@ class Listener:
         return StackState(
             measured=self._measured,
             tool=self._tool_pose,
+            target=self._target_pose,
             age_s=now - self._came_at,
             momenta=self._momenta,
             firing=self._firing,
@@ -240,6 +243,10 @@ class Listener:
         tool = self._end_effector.take()
         if tool is not None:
             self._tool_pose = pose_array(tool.pose.position, tool.pose.orientation)
+        target = self._target.take()
+        if target is not None:
+            at = target.pose.pose
+            self._target_pose = pose_array(at.position, at.orientation)
         self._take_momenta()
         thrusters = self._thrusters.take()
         if thrusters is not None and len(thrusters.name) == len(thrusters.velocity):

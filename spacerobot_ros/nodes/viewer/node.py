@@ -162,6 +162,7 @@ class ViewerNode(FlightNode):
             self._streams, self, config.world_frame, self._on_status, config.watchdog_timeout
         )
         self.create_subscription(String, "robot_description", self._on_description, LATCHED)
+        self.create_subscription(String, "target/robot_description", self._on_target, LATCHED)
         self.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
         self.create_subscription(RosoutLog, "/rosout", self._on_log, _ROSOUT_QOS)
         self.create_subscription(
@@ -273,6 +274,12 @@ class ViewerNode(FlightNode):
         self._page.show_robot(self._robot)
         self._offer_end_effectors()
         self._show_plant()
+
+    def _on_target(self, message: String) -> None:
+        try:
+            self._page.show_target(parse_robot(message.data))
+        except SpaceRobotError as error:
+            self._note(f"target/robot_description: {error}", 2)
 
     def _on_status(self, key: str, name: str) -> None:
         if self._full_names.get(key) == name:
