@@ -178,9 +178,11 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	$(FLY) servicer_thrusters --set coordinated_control.time_limit=5
 	$(FLY) wheels --set plant.tick_rate=25 --set coordinated_control.tick_rate=25 \
 	    --set coordinated_control.time_limit=13
+	$(FLY) gravity_gradient --set plant.tick_rate=20 --set coordinated_control.tick_rate=20 \
+	    --set coordinated_control.time_limit=12
 	$(FLY) reach
 	$(FLY) two_hands
-	$(FLY) strut
+	$(FLY) strut --set plant.world=config/worlds/strut.urdf --set planner.world=config/worlds/strut.urdf
 	$(FLY) capture --set plant.target.robot=config/targets/block.urdf
 
 # What mkdocs prints of its theme's successor is no warning of the build.

@@ -152,7 +152,8 @@ def test_laws_of_lanes_are_one_function_and_control_the_goals(
     outputs = SimpleNamespace(selection=SimpleNamespace(**selection))
     law = SimpleNamespace(name="own", fixed_inputs=fixed, outputs=outputs, integrates=False)
     monkeypatch.setattr(lanes, "build_controller", lambda *_: SimpleNamespace(law=law))
-    monkeypatch.setattr(lanes, "nominal_robots", lambda _: SimpleNamespace(controller=None))
+    robot = SimpleNamespace(description=SimpleNamespace(wheel_names=()))
+    monkeypatch.setattr(lanes, "nominal_robots", lambda _: SimpleNamespace(controller=robot))
     assert _ControlledLanes().refusal(CONTROLLED, asked=False) == reason
 
     def refuse(*_: Any) -> Any:

@@ -368,6 +368,7 @@ def test_shapes_are_drawn_where_they_are() -> None:
     pose = np.array([1.0, 2.0, 3.0, 0.0, 0.0, c, c])
     np.testing.assert_allclose(matrix_from_quaternion(pose[3:]), quarter, atol=1e-15)
     plant: Any = SimpleNamespace(
+        capturing=None,
         robot=SimpleNamespace(description=parse_robot(URDF)),
         pose=pose,
         link_R=np.hstack([np.eye(3), quarter]),
@@ -402,6 +403,7 @@ def test_obstacles_are_drawn_where_they_rest() -> None:
     robot = with_world(parse_robot(URDF), world)
     for pose in ([1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8], [0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.8]):
         plant: Any = SimpleNamespace(
+            capturing=None,
             robot=SimpleNamespace(description=robot),
             pose=np.array(pose),
             link_R=np.hstack([np.eye(3), np.eye(3)]),

@@ -106,7 +106,8 @@ def test_the_first_variation_is_that_of_the_prediction(
         return Rotation.from_quat(model.prediction.attitudes(q, IDENTITY, np.zeros(3))[-1])
 
     quaternions = model.prediction.attitudes(positions, IDENTITY, np.zeros(3))
-    turns = holder._first_variation(positions, quaternions, waves)
+    boundary = BoundaryConditions(positions[0], IDENTITY, positions[-1])
+    turns = holder._first_variation(positions, quaternions, waves, boundary)
     assert turns.shape == (3, 21)
     size = float(np.abs(turns).max())
     for number in (0, 1, 5, 8, 13, 18, 19, 20):
@@ -230,7 +231,7 @@ def test_shapes_beyond_the_ends_of_joints_are_clipped_once_more(model: Manoeuvre
 
 def test_efforts_stretch_a_path_too(model: ManoeuvreModel) -> None:
     class Efforts:
-        def excess(self, positions: Array, before: object) -> float:
+        def excess(self, positions: Array, before: object, L_B: object) -> float:
             return 46.0 / (len(positions) - 1)
 
     limited: Any = replace(model, efforts=Efforts())  # type: ignore[arg-type]

@@ -159,7 +159,10 @@ class Search(ManoeuvreSearch):
         position: bool,
         tolerance: float = TOLERANCE,
         pairs: tuple[int, ...] = (),
+        *,
+        drifting: bool = False,
     ) -> Solver:
+        assert not drifting
         self.tolerances.append((intervals, tolerance))
         return self.scripted.setdefault(intervals, Solver(intervals))
 
@@ -462,7 +465,8 @@ class InMotion(MotionSearch):
         }
         self.asked: list[tuple[Any, ...]] = []
 
-        def solver(*asked: Any) -> Any:
+        def solver(*asked: Any, drifting: bool = False) -> Any:
+            assert not drifting
             self.asked.append(asked)
             return self.scripted.setdefault(asked[0], Solver(asked[0]))
 
