@@ -66,6 +66,7 @@ def test_the_robots_of_the_papers(
     assert len(content) > 20_000
 
 
+@pytest.mark.slow
 def test_the_papers_nominal_shape() -> None:
     shape = [0.0, -math.pi / 4, math.pi / 2]
     findings = analyze(SpaceRobot.from_file(robot_file("three_joint_arm")), shape)

@@ -31,6 +31,7 @@ GAIT = (
 PATIENCE = 120.0
 
 
+@pytest.mark.slow
 def test_a_stack_in_a_namespace_has_a_clock_and_a_bag_of_its_own(
     ros_context: rclpy.Context, tmp_path: Path
 ) -> None:

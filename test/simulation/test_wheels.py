@@ -20,6 +20,7 @@ def plant() -> EffortPlant:
     return EffortPlant(wheeled_robot(), 0.02, InitialState(joint_velocities=SPIN), 0.01)
 
 
+@pytest.mark.slow
 def test_a_wheel_at_its_largest_rate_gets_no_faster(plant: EffortPlant) -> None:
     plant.reset()
     counted = plant.effort_limited.copy()
