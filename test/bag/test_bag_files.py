@@ -226,10 +226,8 @@ def saved(part: Path) -> list[int]:
     return []
 
 
-@pytest.mark.parametrize(
-    "share",
-    [pytest.param(0.0, marks=pytest.mark.slow), 0.5, pytest.param(1.0, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_a_kill_in_any_step_of_a_split_loses_nothing_that_was_written(
     tmp_path: Path, share: float
 ) -> None:

@@ -25,7 +25,7 @@ WHOLE = ("time", "pose", "twist", "q", "qdot", "effort", "momentum")
 
 HEAVY = {
     *("servicer", "servicer_thrusters", "arm_attitude", "coordinated_control"),
-    *("reach", "two_hands", "strut", "planar_chain", "wheels"),
+    *("reach", "two_hands", "strut", "planar_chain", "gravity_gradient", "wheels", "capture"),
 }
 """Reference bags whose robot takes seconds to compile."""
 

@@ -178,6 +178,31 @@ def statement_lines(source: str, line: int) -> range:
     return found
 
 
+def using_lines(source: str, line: int) -> set[int]:
+    """Return the lines that use what the statement at a line defines.
+
+    Of a constant, an attribute or a class those that mention its name, of a function its body.
+    """
+    tree, statement = ast.parse(source), statement_lines(source, line)
+    names: set[str] = set()
+    found: set[int] = set()
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.stmt) or node.lineno not in statement:
+            continue
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            found |= set(range(node.body[0].lineno, (node.end_lineno or node.lineno) + 1))
+        elif isinstance(node, ast.ClassDef):
+            names.add(node.name)
+        else:
+            stored = (each for each in ast.walk(node) if isinstance(each, ast.Name))
+            names |= {each.id for each in stored if isinstance(each.ctx, ast.Store)}
+    for node in ast.walk(tree):
+        name = getattr(node, "id", None) or getattr(node, "attr", None)
+        if isinstance(node, (ast.Name, ast.Attribute)) and name in names:
+            found.add(node.lineno)
+    return found - set(statement)
+
+
 def _files(project: Path, paths: Sequence[str], exclude: Sequence[str]) -> list[str]:
     package = project / "spacerobot_ros"
     out = [package / path for path in exclude]

@@ -25,7 +25,14 @@ from difflib import SequenceMatcher
 from pathlib import Path
 
 from coverage import CoverageData
-from mutation.mutants import Mutant, described, mutants_of, sample, statement_lines
+from mutation.mutants import (
+    Mutant,
+    described,
+    mutants_of,
+    sample,
+    statement_lines,
+    using_lines,
+)
 from support.fork_server import ForkServer, How, environment_of, limits_of, write_source
 from support.forked import NotExchangedError, can_be_exchanged
 
@@ -166,13 +173,16 @@ class Reach:
             for line in statement_lines(source, mutant.line):
                 reaching |= set(lines.get(line, ()))
         imported = "" in reaching or not reaching
+        users: set[str] = set()
         if imported:
             # Constants and defaults: whoever uses anything of the file may see them.
             reaching |= {name for names in lines.values() for name in names}
             folder = "test/" + mutant.path.split("/")[1] + "/"
             reaching |= {name for name in self.seconds if name.startswith((folder, *_ANYWHERE))}
+            # First those that come to where it is used.
+            users = {n for line in using_lines(source, mutant.line) for n in lines.get(line, ())}
         known = (name for name in reaching if name in self.seconds)
-        return sorted(known, key=lambda name: (self.seconds[name][0], name)), imported
+        return sorted(known, key=lambda n: (n not in users, self.seconds[n][0], n)), imported
 
     def within(self, tests: Sequence[str], limit: float) -> list[str]:
         """Return as many of some tests as take a time together (CPU, s)."""

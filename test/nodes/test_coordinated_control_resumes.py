@@ -17,7 +17,6 @@ from std_srvs.srv import Trigger
 from support.control_loop import SHAPE, STATUS, TIP, URDF, Loop, pose
 from support.ros_harness import LATCHED, Harness, Probe, construction, nanoseconds
 from support.sentences import assert_one_sentence
-from support.slow import some_fast
 from support.warm_python import WarmPython
 
 from spacerobot_ros.errors import ParameterError
@@ -54,7 +53,8 @@ def replaced(loop: Loop, file: Path, **settings: Any) -> None:
 # -- going on ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("profile", some_fast(["step", "quintic"], "quintic"))
+@pytest.mark.slow
+@pytest.mark.parametrize("profile", ["step", "quintic"])
 def test_the_goals_are_met_by_the_next_controller(
     harness: Harness, file: Path, profile: str
 ) -> None:

@@ -22,6 +22,7 @@ _LONG = {
     "plant.actuation",
     "plant.initial_orientation",
     "plant.integration_step",
+    "planner.attitude_tolerance",
     "planner.joint_tolerance",
     "planner.method",
     "coordinated_control.model_error",

@@ -247,7 +247,8 @@ def test_what_is_missing_for_a_picture_of_the_robot_is_named(
     assert "has no joints" not in page.text
 
 
-@pytest.mark.parametrize("n", [1, pytest.param(9, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [1, 9])
 def test_any_number_of_joints(tmp_path: Path, n: int) -> None:
     t = np.linspace(0, 1, 60)[:, np.newaxis]
     page = report_of(tmp_path, Story(np.sin(t * np.arange(1, n + 1)) * 0.5))
