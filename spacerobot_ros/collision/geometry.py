@@ -150,7 +150,7 @@ class CollisionGeometry:
         Reason why a pair of links does not count, for those that are neither of one body nor of
         neighbouring ones.
     notes
-        Sentences on links whose shape is not what the user may expect.
+        Sentences on links whose shape may surprise the user.
     """
 
     def __init__(

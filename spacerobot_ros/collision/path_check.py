@@ -2,7 +2,7 @@
 
 A pair of solids moves against each other by at most v in a tick (``CollisionGeometry.reaches``). So
 its distance within the tick is at least ``(d_0 + d_1 - v) / 2``, with d_0 and d_1 those at its
-ends. Ticks where that is less than what is asked for are halved until v is small. Against obstacles
+ends. Ticks where that is less than the clearance are halved until v is small. Against obstacles
 the base moves, too, along a straight line and about one axis within a tick.
 """
 

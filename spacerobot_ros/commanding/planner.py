@@ -129,7 +129,7 @@ class PlannerCommander(Commander):
 
     def _change_masses(self, robot: SpaceRobot) -> None:
         assert self.executive is not None
-        # A given method is one for the robot without what it holds.
+        # A given method is one for the robot without its payload.
         method = self._method if robot is self._described else None
         with self._long_work():
             worker = PlanningWorker(robot, self.config, method, self._long_work)

@@ -122,7 +122,7 @@ class WheelAllocation:
 
 
 class WheelControl:
-    """The wheels of a controlled robot: measured rates, commanded torques, and what they announce.
+    """The wheels of a controlled robot: measured rates, commanded torques, and announcements.
 
     Parameters
     ----------

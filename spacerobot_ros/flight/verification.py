@@ -179,7 +179,7 @@ class _RecordedPlant:
     injections
         The faults that were injected in each tick, and the disturbances.
     grasps
-        What was requested in each tick: captures (true) and releases (false).
+        Requests in each tick: captures (true) and releases (false).
     """
 
     recorded: RecordedRobot

@@ -62,7 +62,7 @@ def parse_times(
     words
         The words.
     before
-        What the line has before them, for messages.
+        The words of the line before them, for messages.
     now
         Begin if the words name none, s.
     refusal

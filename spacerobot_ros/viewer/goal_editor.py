@@ -55,7 +55,7 @@ _MARK_SIZE = 0.12
 
 
 class Asked(Enum):
-    """What a goal asks for of a part of the robot."""
+    """Parts of the pose of a link that a goal is for."""
 
     NOTHING = "free"
     POSITION = "position"
@@ -420,7 +420,7 @@ class _AskedParts:
     gui, defer, on_note
         As for :class:`GoalEditor`.
     on_change
-        Called with the part when users have changed what the goal asks for, or the part whose
+        Called with the part when users have changed the parts of its goal, or the part whose
         numbers are shown.
     """
 
@@ -457,13 +457,13 @@ class _AskedParts:
         return str(self._numbers.value)
 
     def asked(self, part: Part) -> Asked:
-        """Return what the goal asks for of a part."""
+        """Return whether the goal is for the position or the pose of a part, or leaves it free."""
         if self._there and part in self._menus:
             return Asked(self._menus[part].value)
         return Asked.POSE if part == BASE_GOAL_KEY else Asked.NOTHING
 
     def asked_links(self) -> dict[str, Asked]:
-        """Return what the goal asks for of each link that it is for."""
+        """Return for each link of the goal whether it is for its position or its pose."""
         asked = {link: self.asked(link) for link in self.links}
         return {link: each for link, each in asked.items() if each is not Asked.NOTHING}
 

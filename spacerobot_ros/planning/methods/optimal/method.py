@@ -120,7 +120,7 @@ class _Searches:
 
 @dataclass(frozen=True)
 class _GoalKind:
-    """Goals with the same parts: what they ask for, and the searches for their manoeuvres."""
+    """Goals with the same parts: these parts, and the searches for their manoeuvres."""
 
     specification: GoalSpecification | EndEffectorSpecification
     model: ManoeuvreModel
