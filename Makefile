@@ -88,7 +88,7 @@ expected: $(STAMP)/test ## write what the tests expect of parameters and plans a
 MUTANTS := 400
 .PHONY: mutants
 mutants: $(STAMP)/mutants ## put random errors into the whole package; see out/mutants; MUTANTS=400 SEED=[another each time]
-	PYTHONPATH=.:test nice $(BIN)/python3 test/mutation/run.py --sample $(MUTANTS) \
+	PYTHONPATH=.:test nice $(BIN)/python3 test/mutation/run.py --sample $(MUTANTS) --at-least 15 \
 	    $(if $(filter command line,$(origin SEED)),--seed $(SEED))
 
 .PHONY: hostile-bags

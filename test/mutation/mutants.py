@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import random
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations
@@ -86,6 +87,12 @@ class Mutant:
         """What tells a mutant from others when lines elsewhere in the file have moved."""
         return (self.path, self.definition, self.operator, self.before, self.after)
 
+    @property
+    def folder(self) -> str:
+        """The package's folder that it lies in; modules outside of any are together."""
+        folder = self.path.split("/")[1]
+        return "modules of no folder" if folder.endswith(".py") else folder
+
     def apply(self, source: str) -> str | None:
         """Return the file with the error in it, or None where that changes nothing."""
         return _mutated(source, self.operator, self.occurrence)
@@ -120,17 +127,31 @@ def mutants_of(project: Path, paths: Sequence[str], exclude: Sequence[str]) -> I
                     yield Mutant(path, name, occurrence, start[0], where, "", "")
 
 
-def sample(project: Path, mutants: Sequence[Mutant], size: int, seed: int) -> list[Mutant]:
-    """Draw mutants at random, leaving out those that are no Python or no change."""
+def sample(
+    project: Path, mutants: Sequence[Mutant], size: int, seed: int, at_least: int = 0
+) -> tuple[list[Mutant], list[Mutant]]:
+    """Draw mutants at random, leaving out those that are no Python or no change.
+
+    Returns
+    -------
+    sample : list[Mutant]
+        As many as asked for.
+    more : list[Mutant]
+        Further ones of the folders of which the sample has fewer than `at_least`.
+    """
     order = list(mutants)
     random.Random(seed).shuffle(order)
     drawn: list[Mutant] = []
+    more: list[Mutant] = []
+    count: Counter[str] = Counter()
     for mutant in order:
-        if len(drawn) == size:
-            break
+        full = len(drawn) == size
+        if full and count[mutant.folder] >= at_least:
+            continue
         if (whole := described(project, mutant)) is not None:
-            drawn.append(whole)
-    return drawn
+            (more if full else drawn).append(whole)
+            count[mutant.folder] += 1
+    return drawn, more
 
 
 def described(project: Path, mutant: Mutant) -> Mutant | None:

@@ -345,7 +345,7 @@ def judge_all(
     results: Path,
     limits: Sequence[float],
     known: Mapping[Mutant, Verdict],
-) -> list[Verdict]:
+) -> dict[Mutant, Verdict]:
     """Judge mutants, several at a time; write each verdict to a file at once.
 
     Parameters
@@ -384,7 +384,7 @@ def judge_all(
             thread.start()
         for thread in threads:
             thread.join()
-    return list(verdicts.values())
+    return verdicts
 
 
 def _line(verdict: Verdict) -> str:
@@ -406,37 +406,47 @@ def interval(noticed: int, total: int) -> tuple[float, float]:
 
 
 def by_folder(verdicts: Iterable[Verdict]) -> dict[str, list[Verdict]]:
-    """Return the verdicts of each folder of the package; modules outside of any are together."""
+    """Return the verdicts of each folder of the package."""
     found: dict[str, list[Verdict]] = defaultdict(list)
     for verdict in verdicts:
-        folder = verdict.mutant.path.split("/")[1]
-        found["modules of no folder" if folder.endswith(".py") else folder].append(verdict)
+        found[verdict.mutant.folder].append(verdict)
     return dict(sorted(found.items()))
 
 
-def too_low(verdicts: Sequence[Verdict], wanted: float) -> list[str]:
-    """Return the folders, or "all", of which too small a share was noticed."""
-    shares = {
-        folder: 100 * sum(v.noticed for v in some) / len(some)
-        for folder, some in [*by_folder(verdicts).items(), ("all", list(verdicts))]
-        if len(some) >= SEVERAL or folder == "all"
-    }
-    return [
-        name for name, share in shares.items() if share < (wanted if name == "all" else LEAST_SHARE)
+def too_low(verdicts: Sequence[Verdict], more: Sequence[Verdict], wanted: float) -> list[str]:
+    """Return the folders, or "all", of which too small a share was noticed.
+
+    Parameters
+    ----------
+    verdicts
+        On the sample.
+    more
+        On the further mutants of folders of which the sample has few: they count for these alone.
+    """
+    low = [
+        folder
+        for folder, some in by_folder([*verdicts, *more]).items()
+        if len(some) >= SEVERAL and _percent(some) < LEAST_SHARE
     ]
+    return [*low, "all"] if _percent(verdicts) < wanted else low
 
 
-def table(verdicts: Iterable[Verdict]) -> str:
+def _percent(verdicts: Sequence[Verdict]) -> float:
+    return 100 * sum(v.noticed for v in verdicts) / len(verdicts)
+
+
+def table(verdicts: Sequence[Verdict], more: Sequence[Verdict] = ()) -> str:
     """Return what was noticed, by folder, and what was not, as Markdown."""
-    verdicts = sorted(verdicts, key=lambda v: (v.mutant.path, v.mutant.line))
     lines = ["| folder | mutants | noticed |", "|---|---|---|"]
-    for folder, some in [*by_folder(verdicts).items(), ("all", verdicts)]:
+    for folder, some in [*by_folder([*verdicts, *more]).items(), ("all", verdicts)]:
         count = sum(v.noticed for v in some)
         low, high = interval(count, len(some))
-        share = f"{100 * count / len(some):.1f} % ({100 * low:.0f} to {100 * high:.0f})"
-        lines.append(f"| {folder} | {len(some)} | {share} |")
+        share = f"{_percent(some):.1f} % ({100 * low:.0f} to {100 * high:.0f})"
+        lines.append(f"| {folder} | {len(some)} | {count}, {share} |")
+    if more:
+        lines += ["", f"Folders with few of the sample have {len(more)} more of their own."]
     lines += ["", "| survivor | in | before | after | tests run |", "|---|---|---|---|---|"]
-    for verdict in verdicts:
+    for verdict in sorted([*verdicts, *more], key=lambda v: (v.mutant.path, v.mutant.line)):
         if not verdict.noticed:
             m = verdict.mutant
             cells = [f"{m.path}:{m.line}", m.definition, f"`{m.before}`", f"`{m.after}`"]
@@ -483,6 +493,12 @@ def main() -> int:
     """Judge a sample of mutants; return 1 if fewer are noticed than wanted."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sample", type=int, default=400)
+    parser.add_argument(
+        "--at-least",
+        type=int,
+        default=0,
+        help="draw further mutants of folders with fewer, which count for their folder alone",
+    )
     parser.add_argument("--seed", type=int, help="of the sample; another one each time if left out")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument(
@@ -527,9 +543,15 @@ def main() -> int:
     seed = secrets.randbelow(10**6) if chosen.seed is None else chosen.seed
     if chosen.again is not None:
         drawn = _survivors(PROJECT, chosen.again, population)
+        more: list[Mutant] = []
     else:
-        drawn = sample(PROJECT, population, chosen.sample, seed)
-    print(f"{len(drawn)} of {len(population)} mutants, seed {seed}, {len(reach.seconds)} tests")
+        drawn, more = sample(PROJECT, population, chosen.sample, seed, chosen.at_least)
+    if not drawn:
+        parser.error("no mutants; --mutate takes folders of the package, such as planning/core")
+    print(
+        f"{len(drawn)} of {len(population)} mutants and {len(more)} more, seed {seed}, "
+        f"{len(reach.seconds)} tests"
+    )
     workers = [
         Worker(out / f"worker{n}", PROJECT, cache, reach, chosen.tests)
         for n in range(chosen.workers)
@@ -539,14 +561,15 @@ def main() -> int:
     if not chosen.resume and (chosen.again is None or chosen.again.resolve() != results):
         results.unlink(missing_ok=True)
     try:
-        verdicts = judge_all(drawn, workers, results, chosen.limits, known)
+        found = judge_all([*drawn, *more], workers, results, chosen.limits, known)
     finally:
         for worker in workers:
             worker.close()
-    text = f"Seed {seed}.\n\n{table(verdicts)}"
+    verdicts, others = [found[mutant] for mutant in drawn], [found[mutant] for mutant in more]
+    text = f"Seed {seed}.\n\n{table(verdicts, others)}"
     (out / "survivors.md").write_text(text)
     print(text)
-    low = too_low(verdicts, chosen.wanted)
+    low = too_low(verdicts, others, chosen.wanted)
     if low:
         print(f"Too few are noticed of: {', '.join(low)}.")
     return int(bool(low))
