@@ -1,4 +1,4 @@
-"""Imports point down, and only the upper layers know ROS."""
+"""Imports point down, only the upper layers know ROS, and what all modules have in common."""
 
 from __future__ import annotations
 
@@ -216,3 +216,10 @@ def test_values_are_frozen() -> None:
     found = dict(each for module in sources() for each in dataclasses_of(module))
     assert len(found) > 50
     assert {name for name, frozen in found.items() if not frozen} == MUTABLE
+
+
+def test_parameters_can_be_given_by_name() -> None:
+    for module in sources():
+        for node in ast.walk(tree_of(module)):
+            if isinstance(node, ast.FunctionDef | ast.Lambda):
+                assert not node.args.posonlyargs, f"{module}, line {node.lineno}"

@@ -342,11 +342,19 @@ def test_a_node_that_did_not_end_well_is_named(
     assert str(caught.value) == "Node 'recorder' ended with code 3: No space is left."
 
 
-def test_closing_ends_only_what_still_runs(make: Callable[..., MultiProcessStack]) -> None:
+def test_closing_ends_only_what_still_runs(
+    make: Callable[..., MultiProcessStack], record: Record, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stack = make("planar_chain")
     folder = folder_of(stack)
     child(stack, "plant").returncode = 0
+    wall = iter([100.0, 100.125, 100.375, 102.0])
+    monkeypatch.setattr(time, "monotonic", lambda: next(wall))
+    record.done.clear()
     stack.close()
+    monkeypatch.undo()
+    ends = zip((*RUNNING[1:], "recorder"), (0.375, 0.125, 0.0), strict=True)
+    assert record.done == [("end", name, {0: wait}) for name, wait in ends], "half a second in all"
     first, *others = (child(stack, node).signals for node in stack.processes)
     assert (first, others) == ([], [[signal.SIGTERM]] * 3)
     assert not folder.exists()
@@ -397,3 +405,106 @@ def test_a_wait_ends_at_once_when_a_node_has_ended(
     child(stack, "plant").returncode = 2
     with pytest.raises(SpaceRobotError, match="Node 'plant' has ended"):
         stack._wait_for(lambda: False, "nothing")
+
+
+class Executor:
+    """An executor of which every spin takes its whole time, and is kept."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        self.spins: list[float] = []
+        monkeypatch.setattr(processes, "time", SimpleNamespace(monotonic=lambda: self.now))
+
+    def spin_once(self, *, timeout_sec: float) -> None:
+        self.spins.append(timeout_sec)
+        self.now += timeout_sec
+
+
+@pytest.mark.parametrize("met_at", [100.0, 100.05, 102.5, 103.1])
+def test_waiting_spins_in_short_steps_until_it_is_met_or_late(
+    monkeypatch: pytest.MonkeyPatch, met_at: float
+) -> None:
+    executor = Executor(monkeypatch)
+    alive: list[int] = []
+    stack: Any = SimpleNamespace(executor=executor, require_alive=lambda: alive.append(1))
+    if met_at > 103:
+        with pytest.raises(SpaceRobotError) as caught:
+            MultiProcessStack._wait_for(stack, lambda: False, "the planner", 2.5)
+        assert str(caught.value) == "Timed out after 2.5 s waiting for the planner."
+        met_at = 102.5
+        assert executor.now > met_at
+    else:
+        MultiProcessStack._wait_for(stack, lambda: executor.now >= met_at, "it", 2.5)
+        assert len(alive) == len(executor.spins)
+    assert executor.now == pytest.approx(met_at, abs=0.021)
+    assert set(executor.spins) <= {0.02}
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.05, 1.0])
+def test_spinning_takes_its_time(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    executor = Executor(monkeypatch)
+    stack: Any = SimpleNamespace(executor=executor)
+    MultiProcessStack._spin_for(stack, seconds)
+    assert executor.now - 100.0 == pytest.approx(seconds, abs=0.0201)
+    assert executor.now - 100.0 >= seconds - 1e-9
+    assert len(executor.spins) == pytest.approx(seconds / 0.02, abs=1.0)
+
+
+class Service:
+    """A service that is found at the second look, and answers at the third."""
+
+    def __init__(self, answer: str) -> None:
+        self.looks, self.answer, self.asked = 0, answer, []  # type: ignore[var-annotated]
+
+    def service_is_ready(self) -> bool:
+        self.looks += 1
+        return self.looks >= 2
+
+    def call_async(self, request: str) -> Any:
+        self.asked.append(request)
+        return SimpleNamespace(done=self.done, result=lambda: f"{self.answer} of {request}")
+
+    def done(self) -> bool:
+        self.looks += 1
+        return self.looks >= 4
+
+
+def test_each_node_is_asked_once_it_is_there_and_all_answers_are_awaited() -> None:
+    waited: list[tuple[str, float]] = []
+
+    def wait_for(condition: Callable[[], bool], what: str, patience: float) -> None:
+        waited.append((what, patience))
+        assert not condition()
+        while not condition():
+            pass
+
+    stack: Any = SimpleNamespace(_wait_for=wait_for)
+    services: Any = {name: Service(f"answer {name}") for name in ("plant", "planner", "recorder")}
+    requests = {"planner": "P", "plant": "Q"}
+    answers = MultiProcessStack._call_services(stack, services, requests)
+    assert answers == {"planner": "answer planner of P", "plant": "answer plant of Q"}
+    assert [services[name].asked for name in services] == [["Q"], ["P"], []]
+    both = "planner, plant"
+    assert waited == [(f"the {both}", 60.0), (f"an answer of the {both}", 60.0)]
+
+
+@pytest.mark.parametrize("recorder", [False, True])
+def test_every_node_tells_its_connections(recorder: bool) -> None:
+    names = ("plant", "recorder") if recorder else ("plant",)
+    text = json.dumps([[["/odom", 2]], [["/clock", 1], ["/b", 3]]])
+    seen: list[Any] = []
+    stack: Any = SimpleNamespace(
+        names=names,
+        _get_connections="services",
+        _call_services=lambda services, requests: {
+            name: SimpleNamespace(message=text) for name in requests
+        },
+        _spin_for=lambda seconds: seen.append(seconds),
+        _all_connected=lambda nodes, recorded: seen.append((sorted(nodes), list(recorded))),
+    )
+    _CONNECTED(stack)
+    assert seen == [0.05, (sorted(names), ["/clock", "/b"] if recorder else [])]
+
+
+_CONNECTED = MultiProcessStack._connected
+"""The method itself: the nodes of other tests are all connected."""

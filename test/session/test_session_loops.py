@@ -21,6 +21,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes.common.streams import Connections
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session import run, stack
 from spacerobot_ros.session.stack import InProcessStack, Stack
@@ -518,3 +519,172 @@ def test_another_plant_in_the_same_domain_is_refused(time: Time) -> None:
     with pytest.raises(SpaceRobotError) as caught:
         InProcessStack._connect(connecting(time, 0.0, 2))
     assert_one_sentence(str(caught.value), "Another plant", "ROS_DOMAIN_ID")
+
+
+# -- the stack in one process -------------------------------------------------------------------
+
+
+class FakeNode:
+    """A node that notes what is done to it; ``fault`` and ``failure`` are errors to raise."""
+
+    def __init__(self, name: str, done: list[Any], *, active: bool = True) -> None:
+        self.name, self.done, self.is_active = name, done, active
+        self.fault: Exception | None = None
+        self.failure: Exception | None = None
+        self.statistics = f"statistics of the {name}"
+        self.time_ns = 1_500_000_000
+
+    def __getattr__(self, action: str) -> Callable[..., None]:
+        return lambda *given, **named: self.done.append((self.name, action, *named.values()))
+
+
+def flying(*, active: bool = True, planner: bool = True, recorder: bool = True) -> Any:
+    """Return a stand-in for a stack in one process with its nodes, which share ``done``."""
+    done: list[Any] = []
+    names = ("plant", "planner", "controller", "recorder")
+    nodes = {name: FakeNode(name, done, active=active) for name in names}
+    stack: Any = SimpleNamespace(
+        done=done,
+        nodes=nodes,
+        plant=nodes["plant"],
+        executor="executor",
+        client=SimpleNamespace(outcome=Outcome.REACHED),
+        _commanders=[nodes["planner"], nodes["controller"]],
+        _planner=nodes["planner"] if planner else None,
+        _recorder=nodes["recorder"] if recorder else None,
+    )
+    return stack
+
+
+END = [("recorder", "drain", 0.1), ("recorder", "trigger_deactivate"),
+       ("recorder", "trigger_cleanup")]  # fmt: skip
+STOPS = [(name, "trigger_deactivate") for name in ("plant", "planner", "controller")]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "options", "done"),
+    [
+        (Outcome.REACHED, {}, [*STOPS, *END]),
+        (Outcome.INTERRUPTED, {}, [("plant", "drain"), *STOPS, *END]),
+        (Outcome.INTERRUPTED, {"active": False}, END),
+        (Outcome.REACHED, {"recorder": False}, STOPS),
+    ],
+)
+def test_the_nodes_of_one_process_are_stopped_and_the_bag_completed(
+    outcome: Outcome, options: dict[str, bool], done: list[Any]
+) -> None:
+    stack = flying(**options)
+    stack.client.outcome = outcome
+    InProcessStack.finish(stack)
+    assert stack.done == done
+
+
+@pytest.mark.parametrize("kind", ["failure", "fault"])
+def test_a_bag_that_is_not_complete_is_an_error(kind: str) -> None:
+    stack = flying()
+    setattr(stack.nodes["recorder"], kind, SpaceRobotError(f"a {kind}"))
+    with pytest.raises(SpaceRobotError, match=f"a {kind}"):
+        InProcessStack.finish(stack)
+    assert stack.done[-1] == END[-1]
+
+
+def test_the_plan_of_a_planner_is_cancelled_and_its_figures_are_shown() -> None:
+    stack, without = flying(), flying(planner=False)
+    InProcessStack.interrupt(stack)
+    InProcessStack.interrupt(without)
+    assert (stack.done, without.done) == ([("planner", "interrupt")], [])
+    statistics: Any = vars(InProcessStack)["statistics"]
+    assert statistics.fget(stack) == "statistics of the planner"
+    assert statistics.fget(without) == PlannerStatistics()
+    time_ns: Any = vars(InProcessStack)["time_ns"]
+    assert time_ns.fget(stack) == 1_500_000_000
+
+
+def test_a_commander_whose_callback_has_failed_ends_the_run() -> None:
+    stack = flying()
+    InProcessStack._supervise(stack)
+    stack.nodes["controller"].fault = SpaceRobotError("It has failed.")
+    with pytest.raises(SpaceRobotError, match="It has failed"):
+        InProcessStack._supervise(stack)
+    stack.nodes["controller"].fault = None
+    stack.nodes["plant"].fault = SpaceRobotError("not asked here")
+    InProcessStack._supervise(stack)
+
+
+@pytest.mark.parametrize("goal", [GOAL, None])
+def test_the_plant_begins_last_and_the_goal_is_there_before(goal: Goal | None) -> None:
+    stack = flying()
+    timers: list[Any] = []
+
+    def create(period: float, call: Callable[[], None], clock: Any) -> str:
+        timers.append((period, clock.clock_type.name, call))
+        return "timer"
+
+    stack.client = SimpleNamespace(
+        node=SimpleNamespace(
+            create_timer=create, destroy_timer=lambda timer: stack.done.append(f"no {timer}")
+        ),
+        send=lambda *given: stack.done.append(given),
+    )
+    stack.plant.plant = SimpleNamespace(robot="robot")
+    stack.scenario = SimpleNamespace(
+        require_shape_of=lambda robot: stack.done.append(robot), end_effector_goal="hand"
+    )
+    InProcessStack.start(stack, goal)
+    assert stack.done == ["robot"] * (goal is not None), "nothing begins before the next spin"
+    ((period, clock, launch),) = timers
+    assert (period, clock) == (0.001, "STEADY_TIME")
+    stack.done.clear()
+    launch()
+    nodes = [(name, "trigger_activate") for name in ("recorder", "controller", "planner")]
+    sent = [] if goal is None else [(goal, "hand")]
+    assert stack.done == ["no timer", *nodes, *sent, ("plant", "trigger_activate")]
+
+
+@pytest.mark.parametrize(
+    ("given", "namespace"),
+    [("", ""), ("/", ""), ("left", "/left"), ("/left/", "/left"), ("a/b", "/a/b")],
+)
+def test_namespaces_have_a_slash_before_and_none_behind(given: str, namespace: str) -> None:
+    assert stack.checked_namespace(given) == namespace
+    words = stack.namespace_words(namespace)
+    if not namespace:
+        assert words == []
+        return
+    assert words[:2] == ["-r", f"__ns:={namespace}"]
+    assert set(words[2::2]) == {"-r"}
+    assert words[3::2] == ["/clock:=clock", "/tf:=tf", "/tf_static:=tf_static"]
+
+
+@pytest.mark.parametrize("name", ["1left", "le ft", "a//b"])
+def test_a_namespace_that_ros_does_not_take_is_named(name: str) -> None:
+    with pytest.raises(SpaceRobotError, match=f"The namespace '{name}' is not valid in ROS"):
+        stack.checked_namespace(name)
+
+
+class PlainStack(Stack):
+    """The base class by itself."""
+
+    time_ns = 0
+    statistics = PlannerStatistics()
+    start = finish = close = lambda *_: None  # type: ignore[assignment]
+
+
+def test_what_a_stack_cannot_fly_is_refused_before_any_node_runs(tmp_path: Path) -> None:
+    killed = load_scenario("faults/killed_nodes")
+    for scenario in (killed, killed.with_overrides("plant", {"time_mode": "lockstep"})):
+        with pytest.raises(SpaceRobotError) as caught:
+            PlainStack(scenario, None)
+        assert_one_sentence(str(caught.value), "kills nodes on the way", "--realtime")
+    chain = load_scenario("planar_chain")
+    refused = chain.with_overrides("coordinated_control", {"time_limit": -1.0})
+    with pytest.raises(SpaceRobotError, match="time_limit"):
+        PlainStack(refused, None)
+    made = PlainStack(chain, tmp_path / "a.mcap")
+    assert made.names == ("plant", *chain.commanders, "recorder")
+    assert (made.when_exists, made.bag) == ("refuse", tmp_path / "a.mcap")
+    assert PlainStack(chain, None).names == made.names[:-1]
+    (tmp_path / "a.mcap").touch()
+    following = chain.with_overrides("recorder", {"when_exists": "next"})
+    assert PlainStack(following, tmp_path / "a.mcap").bag != tmp_path / "a.mcap"
+    assert PlainStack(following, None).bag is None
