@@ -1,0 +1,380 @@
+"""Manoeuvres that come too near, and drifting ones in whole ticks: which problems are solved.
+
+Solvers, distances and held commands are stand-ins; a manoeuvre is told by its duration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from planning.test_search import (
+    BOUNDARY,
+    IDENTITY,
+    LIMITS,
+    OPTIONS,
+    PERIOD,
+    Array,
+    Guesses,
+    Holder,
+    Search,
+    Solver,
+    path,
+)
+
+from spacerobot_ros.collision import Approach, LinkPair
+from spacerobot_ros.errors import NotFoundError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning.core.cancellation import NEVER
+from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.methods.optimal import search as module
+from spacerobot_ros.planning.methods.optimal.held_commands import (
+    CommandHolder,
+    HeldCommands,
+    ManoeuvreModel,
+)
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import TOLERANCE
+from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
+    CandidateError,
+    MotionLimits,
+    PathConstraints,
+    Trajectory,
+)
+from spacerobot_ros.planning.methods.optimal.search import (
+    Manoeuvre,
+    _Progress,
+)
+from spacerobot_ros.resources import robot_file
+
+
+@pytest.fixture(scope="module")
+def model() -> ManoeuvreModel:
+    chain = SpaceRobot.from_file(robot_file("planar_chain"))
+    prediction = BasePrediction(chain, PERIOD, 0.01)
+    return ManoeuvreModel(chain, prediction, PERIOD, np.eye(3)[2:], PathConstraints())
+
+
+@pytest.fixture(autouse=True)
+def _scripted_guesses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_build_guesses", lambda *_: Guesses())
+
+
+class Kept:
+    """Pairs that are kept apart; distances of manoeuvres by their duration."""
+
+    def __init__(self, distances: dict[float, list[float]], rooms: dict[int, int]) -> None:
+        self.distances, self.rooms = distances, rooms
+
+    @property
+    def pairs(self) -> tuple[int, ...]:
+        return tuple(sorted(self.rooms))
+
+    def approaches(self, positions: Array, _: Array) -> list[Approach]:
+        duration = round((len(positions) - 1) * PERIOD, 6)
+        near = self.distances.get(duration, [])
+        return [
+            Approach(LinkPair("a", "b"), pair, d, 3.0, positions[0]) for pair, d in enumerate(near)
+        ]
+
+    def message(self, approach: Approach, period: float) -> str:
+        return f"pair {approach.pair} is {approach.distance} m apart, {period} s"
+
+    def include(self, other: Kept) -> None:
+        self.rooms |= other.rooms
+
+    def copy(self) -> Kept:
+        return Kept(self.distances, dict(self.rooms))
+
+    def add(self, near: Sequence[Approach]) -> None:
+        for each in near:
+            self.rooms[each.pair] = self.rooms.get(each.pair, 0) + 1
+
+    def within(self, limits: MotionLimits) -> MotionLimits:
+        return replace(limits, distances=np.array([float(self.rooms[p]) for p in self.pairs]))
+
+
+class Apart(Search):
+    """A search with scripted solvers that notes which pairs they keep apart."""
+
+    def __init__(self, model: ManoeuvreModel, kept: Kept, **scripts: Any) -> None:
+        super().__init__(model, **scripts)
+        self._begin = lambda _: kept  # type: ignore[assignment, return-value]
+        self.kept_apart: list[tuple[int, float, tuple[int, ...]]] = []
+
+    def solver(  # type: ignore[override]
+        self,
+        intervals: int,
+        position: bool,
+        tolerance: float = TOLERANCE,
+        pairs: tuple[int, ...] = (),
+        *,
+        drifting: bool = False,
+    ) -> Solver:
+        if pairs:
+            self.kept_apart.append((intervals, tolerance, pairs))
+        return super().solver(intervals, position, tolerance, drifting=False)
+
+
+def made(duration: float) -> Manoeuvre:
+    held = Holder().hold(path(duration))
+    assert held is not None
+    return Manoeuvre(held, duration, path(duration))
+
+
+def progress(kept: Kept, boundary: BoundaryConditions = BOUNDARY, **changes: Any) -> Any:
+    options = replace(OPTIONS, **changes)
+    asked = _Progress(boundary, LIMITS, IDENTITY, options, NEVER, None, gentle=False)
+    asked.kept = kept  # type: ignore[assignment]
+    return asked
+
+
+def test_what_keeps_clear_is_left_as_it_is(model: ManoeuvreModel) -> None:
+    kept = Kept({9.0: [-0.01]}, {})
+    search = Apart(model, kept, n40=[1.0])
+    found = [made(9.0), made(8.0)]
+    assert search._keep_clear(progress(kept), found, 40) is found
+    assert not search.kept_apart
+
+
+def test_a_shallow_contact_is_solved_for_on_the_full_grid_with_a_pair_more_each_time(
+    model: ManoeuvreModel,
+) -> None:
+    kept = Kept({8.0: [-0.019], 8.2: [0.004, -0.01], 8.4: [-0.01]}, {})
+    search = Apart(model, kept, n40=[8.2, 8.4, 8.6])
+    found = search._keep_clear(progress(kept), [made(8.0), made(8.65), made(8.5)], 40)
+    assert search.kept_apart == [(40, 1e-5, (0,)), (40, 1e-5, (0, 1)), (40, 1e-5, (0, 1))]
+    # Each solution is the guess of the next one, and distances have room for what was missing.
+    calls = search.scripted[40].calls
+    assert [call.guess.duration for call in calls] == pytest.approx([8.0, 8.2, 8.4])
+    assert [list(call.limits.distances) for call in calls] == [[1], [2, 1], [3, 1]]
+    # One that was found, keeps clear and is faster than the first freed one counts, too.
+    assert [each.duration for each in found] == pytest.approx([8.6, 8.5])
+    assert [each.kept_apart for each in found] == [2, 0]
+    # Pairs of one manoeuvre are not those of the next.
+    assert kept.rooms == {}
+
+
+def test_no_slower_manoeuvre_is_freed_than_the_first(model: ManoeuvreModel) -> None:
+    kept = Kept({8.0: [0.0], 8.3: [0.0]}, {})
+    search = Apart(model, kept, n40=[8.2])
+    (only,) = search._keep_clear(progress(kept), [made(8.3), made(8.0)], 40)
+    assert only.duration == pytest.approx(8.2)
+
+
+@pytest.mark.parametrize(
+    ("fine", "expected"),
+    [([8.4], 8.4), ([8.9], 8.7), ([None], 8.7), ([8.5] * 6, 8.7)],
+)
+def test_the_way_round_a_deep_contact_is_found_on_a_coarse_grid(
+    model: ManoeuvreModel, fine: list[float | None], expected: float
+) -> None:
+    kept = Kept({8.0: [-0.02], 8.5: [-0.001]}, {})
+    search = Apart(model, kept, n40=fine, n8=[8.7])
+    (found,) = search._keep_clear(progress(kept, iterations=90), [made(8.0)], 40)
+    assert search.kept_apart[0] == (8, 1e-4, (0,))
+    assert all(each == (40, 1e-5, (0,)) for each in search.kept_apart[1:])
+    assert found.duration == pytest.approx(expected)
+    # What is solved for on the full grid begins near it: it takes few steps.
+    (coarse,), (first, *_) = search.scripted[8].calls, search.scripted[40].calls
+    assert (coarse.stop.iterations, first.stop.iterations) == (90, 80)
+    assert first.guess.duration == pytest.approx(8.7)
+    # Where the coarse one keeps clear already, no pair is new: it has the room that it had.
+    assert list(first.limits.distances) == [1]
+
+
+@pytest.mark.parametrize(("intervals", "drifts"), [(39, False), (40, True)])
+def test_small_problems_and_drifting_robots_have_no_coarse_grid(
+    model: ManoeuvreModel, intervals: int, drifts: bool
+) -> None:
+    kept = Kept({8.0: [-0.3]}, {})
+    search: Any = Apart(model, kept, **{f"n{intervals}": [8.7, 8.7]})
+    momentum = np.array([0.0, 0.0, 0.1]) if drifts else np.zeros(3)
+    boundary = replace(BOUNDARY, angular_momentum=momentum)
+    assert boundary.drifts is drifts
+    search._hold_in_whole_ticks = lambda _, trajectory: Holder().hold(trajectory)
+    (found,) = search._keep_clear(progress(kept, boundary), [made(8.0)], intervals)
+    assert {each[0] for each in search.kept_apart} == {intervals}
+    assert found.duration == pytest.approx(8.7)
+
+
+def test_after_six_solutions_that_are_too_near_new_guesses_keep_their_pairs_apart(
+    model: ManoeuvreModel,
+) -> None:
+    kept = Kept({8.0: [-0.01, 0.001], 8.1: [0.002]}, {})
+    # Six that are too near; then guesses on the coarse grid, and one of them on the full grid.
+    search = Apart(model, kept, n40=[8.1] * 6 + [9.0], n8=[8.8] * 3)
+    asked = progress(kept)
+    (found,) = search._keep_clear(asked, [made(8.0)], 40)
+    assert asked.rejection == "pair 0 is 0.002 m apart, 0.05 s"
+    assert search.kept_apart[:6] == [(40, 1e-5, (0, 1))] * 6
+    assert kept.rooms == {0: 6, 1: 1}
+    assert list(asked.limits.distances) == [6, 1]
+    assert asked.starts == 3
+    assert found.duration == pytest.approx(9.0)
+
+
+def test_nothing_is_begun_anew_after_the_time_budget(model: ManoeuvreModel) -> None:
+    kept = Kept({8.0: [-0.01]}, {})
+    search = Apart(model, kept, n40=[None, 9.0], n8=[8.8] * 4)
+    late = progress(kept, time_budget=1e-9)
+    assert search._keep_clear(late, [made(8.0)], 40) == []
+    assert late.rejection == "the solver found no path within the limits"
+    assert late.starts == 0
+
+
+def test_a_refined_solution_keeps_clear_with_pairs_of_its_own(model: ManoeuvreModel) -> None:
+    kept = Kept({9.0: [0.001]}, {3: 1})
+    search = Apart(model, kept, n40=[9.0, 9.2], n8=[8.0])
+    asked = progress(kept)
+    fine, coarse = search.scripted[40], search.scripted[8]
+    solution = coarse.solve(None, LIMITS, path(8.0), asked.stop_rule(found=False), None)
+    assert solution is not None
+    (found,) = search._refine_solutions(asked, [solution], coarse, fine)  # type: ignore[arg-type]
+    assert found.duration == pytest.approx(9.2)
+    assert found.kept_apart == 2
+    assert kept.rooms == {3: 1}
+
+
+def test_a_search_without_room_says_which_pair_is_in_the_way(model: ManoeuvreModel) -> None:
+    kept = Kept({8.0: [-0.01]}, {})
+    search = Apart(model, kept, n40=[8.0] * 99, n8=[7.9] * 99)
+    with pytest.raises(NotFoundError, match=r"pair 0 is -0.01 m apart, 0.05 s\. More optimal"):
+        search.search(BOUNDARY, LIMITS, IDENTITY, 40, OPTIONS)
+
+
+# -- robots that drift ---------------------------------------------------------------------------
+
+
+class Ticks(Search):
+    """A search whose solver and commands for whole ticks are scripted."""
+
+    def __init__(self, model: ManoeuvreModel, solutions: Any, held: Iterator[bool]) -> None:
+        super().__init__(model)
+        self.solutions, self.held = solutions, held
+        self.calls: list[tuple[Any, ...]] = []
+        self.aims: list[tuple[float, int]] = []
+        self._holder = self  # type: ignore[assignment]
+
+    def _get_solver(self, *asked: Any) -> Any:
+        self.grid = asked[1]
+        return self
+
+    def solve(self, aim: Any, limits: Any, guess: Any, stop: Any, bounds: Any) -> Any:
+        self.calls.append((aim, limits, round(guess.duration, 6), bounds.shortest, bounds.longest))
+        return path(bounds.longest) if next(self.solutions) else None
+
+    def hold(self, trajectory: Trajectory, boundary: Any, limits: Any, *, fixed: bool) -> Any:
+        assert fixed
+        assert boundary == "goal"
+        assert limits is LIMITS
+        return f"held for {trajectory.duration:.2f} s" if next(self.held) else None
+
+    def corrected_aim(self, trajectory: Trajectory, boundary: Any, ticks: int) -> str:
+        assert boundary == "goal"
+        self.aims.append((round(trajectory.duration, 6), ticks))
+        return f"aim {len(self.aims)}"
+
+
+@pytest.mark.parametrize(
+    ("duration", "solutions", "held", "result", "times", "aims"),
+    [
+        # 8.03 s are 160.6 periods: 161, and the same again with a corrected aim.
+        (0.0, "+", "+", "held for 8.05 s", [8.05], []),
+        (0.0, "++", "-+", "held for 8.05 s", [8.05, 8.05], [(8.05, 161)]),
+        # One, three and seven periods more; without a solution the aim stays.
+        (0.0, "+-+", "-+", "held for 8.10 s", [8.05, 8.05, 8.10], [(8.05, 161)]),
+        (
+            0.0,
+            "+++++",
+            "-----",
+            None,
+            [8.05, 8.05, 8.10, 8.20, 8.40],
+            [(8.05, 161), (8.05, 161), (8.10, 162), (8.20, 164), (8.40, 168)],
+        ),
+        # In a given time there are no others.
+        (0.5, "++", "--", None, [8.05, 8.05], [(8.05, 161), (8.05, 161)]),
+    ],
+)
+def test_a_drifting_manoeuvre_is_solved_for_in_whole_ticks(
+    model: ManoeuvreModel,
+    duration: float,
+    solutions: str,
+    held: str,
+    result: str | None,
+    times: list[float],
+    aims: list[tuple[float, int]],
+) -> None:
+    search: Any = Ticks(model, (x == "+" for x in solutions), (x == "+" for x in held))
+    asked: Any = SimpleNamespace(
+        boundary="goal",
+        limits=LIMITS,
+        kept=Kept({}, {0: 4}),
+        options=replace(OPTIONS, duration=duration),
+        cancellation=NEVER,
+        stop_rule=lambda found: found,
+    )
+    assert search._hold_in_whole_ticks(asked, path(8.03)) == result
+    assert search.grid == 2
+    assert [call[3:] for call in search.calls] == [pytest.approx((T, T)) for T in times]
+    assert [call[2] for call in search.calls] == pytest.approx(times)
+    goals = ["goal"]
+    for solved, aim in zip(solutions, [f"aim {k + 1}" for k in range(9)], strict=False):
+        goals.append(aim if solved == "+" else goals[-1])
+    assert [call[0] for call in search.calls] == goals[: len(times)]
+    assert search.aims == aims
+    limits = search.calls[0][1]
+    np.testing.assert_allclose(limits.velocity, 0.99 * LIMITS.velocity)
+    np.testing.assert_allclose(limits.acceleration, 0.99 * LIMITS.acceleration)
+    assert list(limits.distances) == [4]
+
+
+def test_drifting_robots_hold_whole_ticks_and_others_stretch(model: ManoeuvreModel) -> None:
+    search: Any = Search(model)
+    search._hold_in_whole_ticks = lambda *_: HeldCommands(
+        path(5.0).at_ticks(3), np.tile(IDENTITY, (4, 1)), 0.0
+    )
+    at_rest, drifting = (
+        progress(Kept({}, {}), replace(BOUNDARY, angular_momentum=np.array([0, 0, L])))
+        for L in (0.0, 0.1)
+    )
+    assert search._make_held_commands(at_rest, path(5.0)).duration == pytest.approx(5.0)
+    assert search._make_held_commands(drifting, path(5.0)).duration == pytest.approx(0.15)
+    search._hold_in_whole_ticks = lambda *_: None
+    with pytest.raises(CandidateError, match="held commands could not be brought to the goal"):
+        search._make_held_commands(drifting, path(5.0))
+    with pytest.raises(CandidateError, match="no path"):
+        search._make_held_commands(drifting, None)
+
+
+def test_the_aim_is_turned_by_the_difference_of_solution_and_commands() -> None:
+    from scipy.spatial.transform import Rotation
+
+    arm = SpaceRobot.from_file(robot_file("three_joint_arm"))
+    reached = Rotation.from_rotvec([0.3, -0.2, 0.5])
+    asked: list[Any] = []
+
+    class Prediction:
+        def attitudes(self, positions: Array, start: Array, L_0: Array) -> Array:
+            asked.extend([len(positions), start, L_0])
+            return np.array([IDENTITY, [0.5, 0.5, 0.5, 0.5], reached.as_quat()])
+
+    holder: Any = object.__new__(CommandHolder)
+    holder._prediction = Prediction()
+    solved, goal = Rotation.from_rotvec([0.28, -0.21, 0.52]), Rotation.from_rotvec([0.3, -0.2, 0.4])
+    ends = np.tile(IDENTITY, (3, 1))
+    ends[-1] = solved.as_quat()
+    shapes = np.zeros((3, arm.n))
+    L_0 = np.array([0.1, -0.3, 0.2])
+    boundary = BoundaryConditions(shapes[0], goal.as_quat(), shapes[0], angular_momentum=L_0)
+    trajectory = Trajectory(0.5, shapes, shapes, ends)
+    found = CommandHolder.corrected_aim(holder, trajectory, boundary, 17)
+    expected = goal * (reached.inv() * solved)
+    assert (Rotation.from_quat(found.turn).inv() * expected).magnitude() < 1e-12
+    assert asked[0] == 18
+    np.testing.assert_array_equal(asked[1], IDENTITY)
+    np.testing.assert_array_equal(asked[2], L_0)
