@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.batch import (
     BatchResult,
@@ -18,10 +20,15 @@ from spacerobot_ros.batch import (
     Starts,
     fly_lanes,
     fly_one_by_one,
+    scalar,
 )
+from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.goal_monitor import GoalMonitor
 from spacerobot_ros.control.laws.law import GainPair, Gains
 from spacerobot_ros.control.limits import MotionLimits
+from spacerobot_ros.control.outputs import OutputDistance
+from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.control.thrusters import ThrusterTable, thruster_table
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, load_robot
@@ -218,3 +225,169 @@ def test_a_controller_at_another_rate_is_refused() -> None:
     flights = controlled("planar_manipulator", SHAPE, ticks=5)
     with pytest.raises(ParameterError, match="another rate"):
         dataclasses.replace(flights, control_period=0.02)
+
+
+@pytest.mark.parametrize("law", ["transposed_jacobian", "model_based"])
+def test_the_function_of_lanes_is_the_controller_and_its_monitor(
+    monkeypatch: pytest.MonkeyPatch, law: str
+) -> None:
+    """State by state: measurements, commands, and what the monitor remembers and decides."""
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    flights = controlled(
+        *("planar_manipulator", SHAPE),
+        ticks=9,
+        count=3,
+        law=law,
+        gains=Gains.uniform(1000.0, 60.0) if law == "transposed_jacobian" else Gains.uniform(9, 6),
+        position_tolerance=0.2,
+        attitude_tolerance=0.03,
+        max_force=10.0,
+        motion=MotionLimits(1.0, 1.0, 1.0, 1.0),
+    )
+    control = BatchController.of(flights)
+    function = control.function()
+    # The base and two joints: their two rates, after the pose and the twist of the base.
+    assert dict(zip(function.name_in(), map(function.size1_in, range(11)), strict=True)) == {
+        **{"state": 17, "pose": 7, "twist": 6, "normals": 16, "bias": 8, "sigma": 6, "time": 1},
+        **{"profile": function.size1_in(7), "gains": 10, "bounds": 5, "monitor": 3},
+    }
+    rng = np.random.default_rng(8)
+    start = ControlState.at_rest(np.array([0.01, -0.02, 0.0]), np.array([0.0, 0, 0, 1]), SHAPE)
+    profile, bounds = control.begin_flight(1, start)
+    goal = profile.goal
+    numbers, gains = control.profile_argument(profile), control.gains_argument([2, 1])[1]
+    assert numbers[0] == profile.duration > 0
+    begun = control.begin_flight(1, start)
+    np.testing.assert_array_equal(begun[1], bounds)
+    monitor, decisions = GoalMonitor(), []
+    memory = np.array([-1.0, 0.0, 0.0])
+    assert goal.base is not None
+    upright = goal.base.quaternion / np.linalg.norm(goal.base.quaternion)
+    at_goal = ControlState.at_rest(goal.base.position, upright, SHAPE)
+    cases = [(tick, False, 1.0) for tick in range(4)] + [(900 + k, True, 1.0) for k in range(25)]
+    cases += [(925 + k, False, 40.0 if k < 4 else 400.0) for k in range(8)]
+    for tick, settled, size in cases:
+        spread = 1e-4 if settled else 0.003 * size
+        truth = at_goal if settled else start
+        q, qdot = truth.q + spread * rng.normal(size=2), 10 * spread * rng.normal(size=2)
+        twist = spread * np.array([1.0, -2.0, 0.0, 0.0, 0.0, 1.5])
+        normals, sigma = rng.normal(size=16), 1e-5 * np.arange(1.0, 7.0)
+        bias = 1e-5 * rng.normal(size=8)
+        for plane in (bias, normals):
+            plane[[2, 3, 4]] = 0.0
+        normals[[8, 9, 10]] = 0.0
+        turn = Rotation.from_rotvec(bias[3:6] + sigma[1] * normals[3:6])
+        measured = ControlState(
+            truth.r_WB + bias[:3] + sigma[0] * normals[:3],
+            (Rotation.from_quat(truth.quaternion_WB) * turn).as_quat(),
+            twist[:3] + sigma[2] * normals[6:9],
+            twist[3:] + sigma[3] * normals[9:12],
+            q + bias[6:] + sigma[4] * normals[12:14],
+            qdot + sigma[5] * normals[14:],
+        )
+        state = np.concatenate([q, truth.quaternion_WB, qdot, np.zeros(9)])
+        pose = np.concatenate([truth.r_WB, truth.quaternion_WB])
+        results = function(
+            *(state, pose, twist, normals, bias, sigma, control.time_of_tick(tick)),
+            *(numbers, gains, bounds, memory),
+        )
+        command, exact, seen, after, verdict = (np.array(each).ravel() for each in results)
+        wanted = np.zeros(17)
+        measured.stack(wanted)
+        np.testing.assert_allclose(seen, wanted, rtol=1e-12, atol=1e-15)
+        expected = np.concatenate(control.command(tick, measured))
+        if not exact[0]:
+            np.testing.assert_allclose(command, expected, rtol=1e-9, atol=1e-9)
+        assert bool(exact[0]) <= (size > 1.0)
+        saturated = control.exact_command(1, profile, tick, measured).realised
+        np.testing.assert_allclose(np.concatenate([saturated.tau, saturated.wrench_B]), expected)
+        decision = control.decide(monitor, tick, measured.qdot, bounds)
+        decisions.append(decision)
+        assert verdict[0] == decision
+        memory = after
+        np.testing.assert_allclose(memory, dataclasses.astuple(monitor)[1:])
+    assert decisions[:4] == [Decision.NONE] * 4
+    # Settled for 0.2 s, twenty ticks of 10 ms after the first.
+    assert decisions[4:29] == [Decision.NONE] * 20 + [Decision.REACHED] * 5
+    assert decisions[-1] is Decision.LOST
+    assert memory[1:].max() >= 3
+
+
+@pytest.mark.parametrize("until_decided", [True, False])
+def test_a_flight_ends_a_tick_after_the_decision_or_holds_its_goal(
+    monkeypatch: pytest.MonkeyPatch, until_decided: bool
+) -> None:
+    """With a stand-in for the controller: efforts by tick, and a decision at tick 2."""
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    flights = controlled("planar_manipulator", SHAPE, ticks=5, count=3)
+    config = cast(Any, flights.program).config
+    program = Controlled(config, base=BASE, until_decided=until_decided)
+    flights = dataclasses.replace(flights, program=program, sensors=None)
+    seen: list[tuple[Any, ...]] = []
+
+    class Stub:
+        def begin_flight(self, row: int, state: ControlState) -> tuple[Any, Array]:
+            seen.append(("begin", row, state.r_WB[0]))
+            return SimpleNamespace(goal="goal"), np.array([0.5, 0.25])
+
+        def command(self, tick: int, state: ControlState) -> list[Array]:
+            seen.append(("command", tick, float(state.qdot[0])))
+            wrench = np.array([3.0, -4.0, 0.0, 0.0, 0.0, 0.5 * (tick + 1)])
+            return [np.array([0.1, -0.2]) * (tick + 1), wrench]
+
+        def decide(self, monitor: Any, tick: int, qdot: Array, bounds: Array) -> Decision:
+            assert (bounds.tolist(), len(qdot)) == ([0.5, 0.25], 2)
+            return {2: Decision.FAILED, 3: Decision.REACHED}.get(tick, Decision.NONE)
+
+        def distance(self, state: ControlState, goal: Any) -> OutputDistance:
+            assert goal == "goal"
+            return OutputDistance(state.q[0], 0.25, 0.125)
+
+    result = BatchResult.empty(flights)
+    scalar._fly_row(flights, 1, result, cast(Any, Stub()))
+    ticks = 3 if until_decided else 5
+    assert [each[:2] for each in seen] == [("begin", 1), *(("command", k) for k in range(ticks))]
+    assert seen[0][2] == pytest.approx(flights.starts.position[1, 0])
+    assert (result.decision[1], result.decided_tick[1]) == (Decision.FAILED, 2)
+    assert result.end_tick.tolist() == [5, ticks, 5]
+    np.testing.assert_allclose(result.peak_wrench[1], [5.0, 0.5 * ticks])
+    # Of every tick of 10 ms the force of 5 N, and torques of 0.5, 1, 1.5 N m and so on.
+    np.testing.assert_allclose(result.impulse[1], [0.05 * ticks, 0.005 * sum(range(ticks + 1))])
+    np.testing.assert_allclose(result.peak_effort[1], [0.1 * ticks, 0.2 * ticks])
+    plant = scalar.plant_of(flights, 1)
+    shapes, rates = [plant.q.copy()], []
+    for k in range(1, ticks + 1):
+        plant.step(np.array([0.1, -0.2]) * k, np.array([3.0, -4.0, 0.0, 0.0, 0.0, 0.5 * k]))
+        shapes.append(plant.q.copy())
+        rates.append(np.abs(plant.qdot))
+    np.testing.assert_array_equal(result.lowest[1], np.min(shapes, axis=0))
+    np.testing.assert_array_equal(result.highest[1], np.max(shapes, axis=0))
+    np.testing.assert_array_equal(result.peak_rate[1], np.max(rates, axis=0))
+    np.testing.assert_array_equal(result.end_state[1, :2], shapes[-1])
+    assert result.decided_distance[1].tolist() == [shapes[2][0], 0.25, 0.125]
+    # The wrench is all that changes the momenta.
+    assert result.momentum_drift[1].max() < 1e-12
+    assert np.abs(result.end_state[1, -7:-4]).max() > 0.01
+    np.testing.assert_array_equal(np.isnan(result.q[1]).all(axis=1), [False, False, until_decided])
+    assert np.isnan(result.end_state[[0, 2]]).all()
+
+
+def test_what_has_no_function_is_not_flown_in_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    flights = controlled("planar_manipulator", SHAPE, ticks=5, count=3)
+    control = BatchController.of(flights)
+    gains = dataclasses.replace(Gains.uniform(4.0, 4.0), base_position=GainPair(4.0, 4.0, 0.5))
+    control.program = dataclasses.replace(control.program, gains=(Gains.uniform(4.0, 4.0), gains))
+    with pytest.raises(ParameterError) as refusal:
+        control.function()
+    assert str(refusal.value) == (
+        "Controllers with integral gains (ki) are not flown in lanes; engine 'flights' flies them."
+    )
+    control.program = dataclasses.replace(control.program, gains=())
+    assert control._gains(2) == control._config.gains
+    monkeypatch.setattr(type(control.law), "fixed_inputs", None)
+    with pytest.raises(ParameterError) as refusal:
+        control.function()
+    assert str(refusal.value) == (
+        f"The law '{control.law.name}' with these options is not flown in lanes."
+    )

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.batch import Controlled, Flights, FollowedSchedule, HeldCommands, Starts
+from spacerobot_ros.batch import (
+    BatchResult,
+    Controlled,
+    Flights,
+    FollowedSchedule,
+    HeldCommands,
+    SensorErrors,
+    Starts,
+)
+from spacerobot_ros.batch.flights import NOISES
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import InertialParameters, SpaceRobot, load_robot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import InitialState
+from spacerobot_ros.simulation.config import SensorConfig
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +72,7 @@ def controlled(period: float = 0.05, gains: tuple[object, ...] = ()) -> Controll
         (FollowedSchedule(np.zeros((5, 2))), {}, "The joints are (5, 2), not (ticks, 3)."),
         (FollowedSchedule(np.zeros((3, 5, 3))), {}, "There are joints of 3 flights, not 2."),
         (HeldCommands(np.zeros(3)), {}, "The joints are (3,), not (ticks, 3)."),
+        (HeldCommands(np.zeros((1, 1, 2, 3))), {}, "The joints are (1, 1, 2, 3), not (ticks, 3)."),
         (HeldCommands(np.zeros((0, 3))), {}, "The joints are (0, 3), not (ticks, 3)."),
         (HeldCommands(NOT_A_NUMBER), {}, "The joints have a number that is not finite."),
         (HeldCommands(np.zeros((5, 3)), np.zeros((5, 6))), {},
@@ -107,3 +120,120 @@ def test_flights_have_their_last_tick_and_the_steps_of_their_plant(sliders: Spac
     assert flights(sliders, STILL, instants=(0, 4, 10)).instants == (0, 4, 10)
     assert flights(sliders, STILL, integration_step=0.02).substeps == 3
     assert flights(sliders, STILL, integration_step=0.05).substeps == 1
+
+
+def test_one_row_of_commands_is_enough(sliders: SpaceRobot) -> None:
+    assert len(flights(sliders, HeldCommands(np.zeros((1, 3))))) == 2
+    assert len(flights(sliders, HeldCommands(np.zeros((2, 1, 3))))) == 2
+    assert len(flights(sliders, STILL, ticks=1)) == 2
+
+
+def test_starts_are_rows_of_initial_states(sliders: SpaceRobot) -> None:
+    first = InitialState(
+        position=np.array([1.0, 2.0, 3.0]),
+        quaternion=np.array([0.0, 0.6, 0.0, 0.8]),
+        joint_positions=np.array([0.1, 0.2, 0.3]),
+        joint_velocities=np.array([0.01, 0.02, 0.03]),
+        linear_momentum=np.array([4.0, 5.0, 6.0]),
+        angular_momentum=np.array([7.0, 8.0, 9.0]),
+    )
+    second = InitialState(center_of_mass=np.array([-1.0, -2.0, -3.0]))
+    starts = Starts.of(sliders, [first, second])
+    assert starts.position.tolist() == [[1, 2, 3], [-1, -2, -3]]
+    assert starts.quaternion.tolist() == [[0, 0.6, 0, 0.8], [0, 0, 0, 1]]
+    assert starts.q[0].tolist() == [0.1, 0.2, 0.3]
+    assert starts.qdot.tolist() == [[0.01, 0.02, 0.03], [0, 0, 0]]
+    assert starts.momenta.tolist() == [[4, 5, 6, 7, 8, 9], [0] * 6]
+    assert starts.of_center.tolist() == [False, True]
+    for index, wanted in enumerate((first, second)):
+        again = Starts.of(sliders, [starts.initial_state(index)])
+        once = Starts.of(sliders, [wanted])
+        for each in dataclasses.fields(Starts):
+            assert getattr(again, each.name).tolist() == getattr(once, each.name).tolist()
+    three = Starts.repeated(sliders, first, 3)
+    assert (len(three), three.momenta.shape, three.of_center.shape) == (3, (3, 6), (3,))
+    three.q[1] = 0.0
+    assert three.q[2].tolist() == [0.1, 0.2, 0.3]
+
+
+def test_sensors_are_rows_of_configurations(sliders: SpaceRobot) -> None:
+    one = SensorConfig(
+        **dict(zip(NOISES, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], strict=True)),
+        position_bias=(1.0, 2.0, 3.0),
+        attitude_bias=(4.0, 5.0, 6.0),
+        joint_bias=(7.0, 8.0, 9.0),
+        seed=17,
+    )
+    errors = SensorErrors.of(sliders, [SensorConfig(seed=3), one])
+    assert errors.noise.tolist() == [[0.0] * 6, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]]
+    assert errors.pose_bias.tolist() == [[0.0] * 6, [1, 2, 3, 4, 5, 6]]
+    assert errors.joint_bias.tolist() == [[0.0] * 3, [7, 8, 9]]
+    assert (errors.seeds.tolist(), len(errors)) == ([3, 17], 2)
+    assert errors.config(1) == one
+    assert errors.used.tolist() == [False, True]
+    none = SensorErrors.none(sliders, 4)
+    assert (len(none), none.noise.shape, none.pose_bias.shape) == (4, (4, 6), (4, 6))
+    assert (none.joint_bias.shape, none.seeds.dtype, none.used.any()) == ((4, 3), np.int64, False)
+    none.noise[0, 5], none.pose_bias[1, 5], none.joint_bias[2, 0] = 1e-9, -1e-9, 1e-9
+    assert none.used.tolist() == [True, True, True, False]
+    # The order of the groups is that in which the plant's sensors name them.
+    assert [name.rpartition("_")[2] for name in NOISES] == ["noise"] * 6
+
+
+def test_results_begin_empty(sliders: SpaceRobot) -> None:
+    made = flights(sliders, STILL, instants=(0, 4, 10))
+    made.starts.q[1] = 0.125
+    result = BatchResult.empty(made)
+    np.testing.assert_allclose(result.time, [0.0, 0.2, 0.5])
+    shapes = {"pose": 7, "twist": 6, "q": 3, "qdot": 3, "momentum": 7, "measured_pose": 7}
+    for name, width in {**shapes, "measured_q": 3}.items():
+        assert getattr(result, name).shape == (2, 3, width)
+        assert np.isnan(getattr(result, name)).all()
+    shapes = {"peak_rate": 3, "peak_effort": 3, "peak_wrench": 2, "impulse": 2}
+    for name, width in shapes.items():
+        assert getattr(result, name).tolist() == [[0.0] * width] * 2
+    for name, width in {"decided_distance": 3, "end_state": 26, "momentum_drift": 2}.items():
+        assert getattr(result, name).shape == (2, width)
+        assert np.isnan(getattr(result, name)).all()
+    assert {name: each.tolist() for name, each in result.limited.items()} == {
+        "rate": [[0] * 3] * 2,
+        "stroke": [[0] * 3] * 2,
+    }
+    assert (result.decision.tolist(), result.decided_tick.tolist()) == ([0, 0], [-1, -1])
+    assert (result.end_tick.tolist(), result.fallback_ticks.tolist()) == ([10, 10], [0, 0])
+    assert np.isnan(result.propellant).all()
+    for limits in (result.lowest, result.highest):
+        assert limits.tolist() == made.starts.q.tolist()
+        limits[0] = 9.0
+        assert not (made.starts.q == 9.0).any()
+    efforts = flights(sliders, STILL, actuation="effort")
+    assert list(BatchResult.empty(efforts).limited) == ["effort", "stroke"]
+
+
+def test_errors_are_distances_and_angles_to_a_pose(sliders: SpaceRobot) -> None:
+    rng, rotations = np.random.default_rng(6), Rotation.random(6, random_state=2)
+    result = BatchResult.empty(flights(sliders, STILL, instants=(0, 4, 10)))
+    result.pose[:] = np.hstack([rng.normal(size=(6, 3)), rotations.as_quat()]).reshape(2, 3, 7)
+    one = Rotation.from_quat([0.5, -0.1, 0.2, 0.4])
+    distance, angle = result.errors(np.array([1.0, -2.0, 0.5]), one.as_quat())
+    moved = result.pose.reshape(6, 7)[:, :3] - [1.0, -2.0, 0.5]
+    np.testing.assert_allclose(distance.ravel(), np.sqrt((moved**2).sum(axis=1)))
+    np.testing.assert_allclose(angle.ravel(), (one.inv() * rotations).magnitude(), rtol=1e-12)
+    # One pose for each flight, here those of its second instant.
+    goals = result.pose[:, 1]
+    distance, angle = result.errors(goals[:, :3], goals[:, 3:])
+    np.testing.assert_allclose(distance[:, 1], 0.0)
+    np.testing.assert_allclose(angle[:, 1], 0.0, atol=1e-15)
+    between = (rotations[4].inv() * rotations[3]).magnitude()
+    assert angle[1, 0] == pytest.approx(between, rel=1e-12)
+    assert angle.shape == distance.shape == (2, 3)
+
+
+def test_flights_name_their_thrusters_and_times(sliders: SpaceRobot) -> None:
+    table: Any = SimpleNamespace(names=("a", "b"))
+    made = flights(sliders, controlled(0.0500000001), actuation="effort", thrusters=table)
+    assert made.thruster_count == 2
+    assert BatchResult.empty(made).propellant.tolist() == [0.0, 0.0]
+    # Of each actuation the plant's own step, unless one is given.
+    assert flights(sliders, STILL).substeps == 5
+    assert flights(sliders, STILL, actuation="effort").substeps == 50
