@@ -27,6 +27,7 @@ from spacerobot_ros.planning.execution.status import (
     ScheduleStart,
     end_effector_values,
     goal_values,
+    waypoint_counts,
 )
 from spacerobot_ros.planning.execution.teleoperation import TwistCommand
 from spacerobot_ros.planning.execution.tracker import Setpoint
@@ -197,7 +198,11 @@ class PlannerCommander(Commander):
 
     def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:
         status = PlannerStatus(PlannerState.PLANNING, message, goal.goal_id, goal_values(goal.goal))
-        status = replace(status, end_effector_goals=end_effector_values(goal.goal))
+        status = replace(
+            status,
+            end_effector_goals=end_effector_values(goal.goal),
+            end_effector_waypoints=waypoint_counts(goal.goal),
+        )
         self._publish_status(status)
 
     def _abort_goal(self) -> str | None:

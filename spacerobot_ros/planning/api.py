@@ -18,7 +18,7 @@ from spacerobot_ros.model.urdf import load_world
 from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal, RobotState, Tolerance
-from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.core.method import END_EFFECTOR_METHOD, PATH_METHOD, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.methods.registry import build_method, method_options
 from spacerobot_ros.resources import robot_file
@@ -38,11 +38,12 @@ def plan(
     joint_positions: npt.ArrayLike | None = None,
     end_effector_position: EndEffectorValues | None = None,
     end_effector_pose: EndEffectorValues | None = None,
+    end_effector_path: EndEffectorValues | None = None,
     end_effector: str = "",
     start: RobotState | npt.ArrayLike | None = None,
     linear_momentum: npt.ArrayLike | None = None,
     angular_momentum: npt.ArrayLike | None = None,
-    method: str = "optimal",
+    method: str | None = None,
     control_period: float = 0.05,
     tolerance: Tolerance = _DEFAULT_TOLERANCE,
     integration_step: float = DEFAULT_INTEGRATION_STEP,
@@ -65,6 +66,9 @@ def plan(
     end_effector_position, end_effector_pose
         Position (3,) in m, or position and quaternion (7,), of the link ``end_effector`` (its name;
         empty: the link of that name); or of several links, by name.
+    end_effector_path
+        Positions (K, 3) in m, or positions and quaternions (K, 7), which one end-effector passes
+        on straight lines; the last one is its goal.
     start
         The start: a state, or the shape (n,) alone with the base at the origin of W; None is the
         shape zero, or as near to it as the joint limits allow.
@@ -72,7 +76,8 @@ def plan(
         (3,) each in W, kg m/s and kg m^2/s, the second about the centre of mass; None: those of the
         start. ``optimal`` plans for robots that drift.
     method
-        Name of a gait method; ``options`` are its own.
+        Name of a gait method; ``options`` are its own. None: ``resolved_rate`` for a goal with a
+        path, and else ``optimal``.
     control_period, tolerance, integration_step
         Duration of a command (s), largest error at the goal, and longest step of the prediction
         (s): the plant's, for a flight that ends where the plan does.
@@ -95,7 +100,9 @@ def plan(
     if not isinstance(robot, SpaceRobot):
         robot = SpaceRobot.from_file(robot_file(str(robot)))
     if goal is None:
-        hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
+        hands = end_effector_goals(
+            end_effector_position, end_effector_pose, end_effector, path=end_effector_path
+        )
         quaternion = None if rotvec is None else quaternion_from_rotvec(rotvec)
         if hands:
             goal = Goal.of_end_effectors(
@@ -108,6 +115,7 @@ def plan(
                 joint_positions,
             )
     goal = goal.for_robot(robot.description)
+    method = method or (PATH_METHOD if goal.has_path else END_EFFECTOR_METHOD)
     options_of_method = {method: method_options(method, options)}
     planner = build_method(
         method,
@@ -145,9 +153,13 @@ def _among_obstacles(
 
 
 def end_effector_goals(
-    position: EndEffectorValues | None, pose: EndEffectorValues | None, link: str = ""
+    position: EndEffectorValues | None,
+    pose: EndEffectorValues | None,
+    link: str = "",
+    *,
+    path: EndEffectorValues | None = None,
 ) -> tuple[EndEffectorGoal, ...]:
-    """Return goals of end-effectors from positions and poses: of one ``link``, or by name.
+    """Return goals of end-effectors from positions, poses and paths: of one ``link``, or by name.
 
     Raises
     ------
@@ -155,7 +167,7 @@ def end_effector_goals(
         One is no position or no pose, or a link has two goals, or one is named twice.
     """
     goals = []
-    for values, count in ((position, 3), (pose, 7)):
+    for values, count in ((position, 3), (pose, 7), (path, None)):
         if values is None:
             continue
         by_link = values if isinstance(values, Mapping) else {link: values}
@@ -164,6 +176,9 @@ def end_effector_goals(
                 f"The goals of end-effectors are given by name, and '{link}' is named beside them."
             )
         for name, numbers in by_link.items():
+            if count is None:
+                goals.append(EndEffectorGoal.along(str(name), numbers))
+                continue
             goal = EndEffectorGoal.checked(str(name), numbers)
             if len(goal.values) != count:
                 kind = "a position has 3" if count == 3 else "a pose has 7"

@@ -67,8 +67,7 @@ def test_the_error_of_a_link_is_seen_along_its_directions() -> None:
         np.array([[0.0, 0.0, 1.0]]),
         np.array([0.5, -0.2, 0.1]),
         Rotation.from_rotvec([0.3, 0.1, 0.0]).as_quat(),
-        _Way(np.array([[0.0, 0, 0], [2.0, 1.0, 0.0]])),
-        turn,
+        _Way(np.array([[0.0, 0, 0], [2.0, 1.0, 0.0]]), turn),
     )
     wanted = Rotation.from_rotvec(0.25 * turn) * Rotation.from_rotvec([0.3, 0.1, 0.0])
     off = Rotation.from_rotvec([0.0, 0.0, 0.05])
@@ -88,7 +87,7 @@ class Arc:
 
     def __init__(self, length: float, radius: float = 1.0) -> None:
         self.length, self.radius = length, radius
-        self.weights = np.array([1.0, 0.25])
+        self.weights, self.marks = np.array([1.0, 0.25]), np.zeros(0)
         self.asked: list[float] = []
 
     def tangent(self, q: Array, X: Array, share: float) -> tuple[Array, Array, float]:

@@ -37,6 +37,9 @@ POSITION_SLACK = 0.5
 _MAX_COORDINATE = 1e12
 """Largest coordinate, m or rad; a float64 resolves a millimetre up to it."""
 
+MAX_PATH_POSES = 10_000
+"""Largest number of poses of a given path: it bounds the time of a plan."""
+
 _MAX_ANGLE = 2e6 * np.pi
 """A million turns, rad: beyond them an angle does not resolve its attitude."""
 
@@ -53,11 +56,16 @@ class EndEffectorGoal:
         (3,) r_WE of the origin of its frame, m.
     quaternion
         (4,) of R_WE, (x, y, z, w); None: any attitude.
+    waypoints
+        Places before the goal through which straight lines lead to it, in their order: positions
+        (K, 3), m, or poses (K, 7) where the goal has an attitude, which turns in step. The link
+        moves straight to the first. None: the method chooses the way.
     """
 
     link: str
     position: Array
     quaternion: Array | None = None
+    waypoints: Array | None = None
 
     @classmethod
     def checked(cls, link: str, pose: npt.ArrayLike) -> EndEffectorGoal:
@@ -77,13 +85,61 @@ class EndEffectorGoal:
         given = Goal.checked(values[:3], values[3:] if len(values) == 7 else [0, 0, 0, 1])
         return cls(link, given.position, given.quaternion if len(values) == 7 else None)
 
+    @classmethod
+    def along(cls, link: str, poses: npt.ArrayLike) -> EndEffectorGoal:
+        """Return the goal at the end of a path: positions (K, 3), m, or poses (K, 7).
+
+        A path of one pose is a goal without waypoints. Quaternions are scaled to length one.
+
+        Raises
+        ------
+        GoalError
+            There are no poses or too many of them, or one is none.
+        """
+        values, name = _convert_numbers(poses, f"path of '{link}'"), f"The path of '{link}'"
+        if not values.size:
+            raise GoalError(f"{name} has no poses.")
+        if values.ndim != 2 or values.shape[1] not in (3, 7):
+            raise GoalError(
+                f"{name} is of shape {values.shape}; each of its poses takes 3 numbers, a "
+                "position, or 7, a position and a quaternion."
+            )
+        if len(values) > MAX_PATH_POSES:
+            raise GoalError(f"{name} has {len(values)} poses; it can have {MAX_PATH_POSES}.")
+        refused = ~(np.abs(values) <= _MAX_COORDINATE).all(axis=1)
+        if refused.any():
+            k = int(np.argmax(refused))
+            raise GoalError(
+                f"Pose {k + 1} of the path of '{link}' is {values[k].tolist()}, which is not "
+                f"finite or farther than {_MAX_COORDINATE:g} m away."
+            )
+        if values.shape[1] == 7:
+            sizes = np.linalg.norm(values[:, 3:], axis=1)
+            if not sizes.all():
+                k = int(np.argmin(sizes))
+                raise GoalError(
+                    f"Pose {k + 1} of the path of '{link}' has a zero quaternion, not a rotation; "
+                    "give all of its poses an orientation, or none."
+                )
+            values = np.hstack([values[:, :3], values[:, 3:] / sizes[:, np.newaxis]])
+        goal = cls.checked(link, values[-1])
+        return replace(goal, waypoints=values[:-1]) if len(values) > 1 else goal
+
+    @property
+    def values_on_way(self) -> Array:
+        """The waypoints and the goal (K + 1, 3) or (K + 1, 7), as :meth:`along` takes them."""
+        end = np.array(self.values)[np.newaxis]
+        return end if self.waypoints is None else np.vstack([self.waypoints, end])
+
     def as_goal(self) -> Goal:
         """Return it as a pose for a message: the quaternion is zero where any attitude will do."""
         return Goal(self.position, np.zeros(4) if self.quaternion is None else self.quaternion)
 
     @property
     def values(self) -> tuple[float, ...]:
-        """Position (3,), or position and quaternion (7,), as :meth:`checked` takes them."""
+        """Position (3,), or position and quaternion (7,), of the goal itself, as :meth:`checked`
+        takes them.
+        """
         attitude = [] if self.quaternion is None else self.quaternion.tolist()
         return (*self.position.tolist(), *attitude)
 
@@ -264,6 +320,11 @@ class Goal:
         shape = self.joint_positions if other.joint_positions is None else other.joint_positions
         return replace(of_base, joint_positions=shape, end_effectors=tuple(links.values()))
 
+    @property
+    def has_path(self) -> bool:
+        """Whether an end-effector is to follow a given path to the goal."""
+        return any(each.waypoints is not None for each in self.end_effectors)
+
     def displaced(self, by: Array) -> Goal:
         """Return the goal with all its places (3,) displaced in W, m."""
         hands = tuple(replace(each, position=each.position + by) for each in self.end_effectors)
@@ -278,8 +339,8 @@ class Goal:
         return (
             bool(same_shape)
             and self.base == other.base
-            and {each.link: each.values for each in self.end_effectors}
-            == {each.link: each.values for each in other.end_effectors}
+            and {each.link: each.values_on_way.tolist() for each in self.end_effectors}
+            == {each.link: each.values_on_way.tolist() for each in other.end_effectors}
             and np.array_equal(self.position, other.position)
             and np.array_equal(self.quaternion, other.quaternion)
         )

@@ -27,6 +27,9 @@ _REST_MOMENTUM = 1e-9
 END_EFFECTOR_METHOD = "optimal"
 """Name of the method that plans for goals of end-effectors."""
 
+PATH_METHOD = "resolved_rate"
+"""Name of the method that takes end-effectors along given paths."""
+
 _LIMIT_SLACK = 1e-9
 """Rounding error by which a goal shape may exceed a joint limit, m or rad."""
 
@@ -117,6 +120,8 @@ class GaitMethod(ABC):
         A method that chooses among others states them in each schedule alone.
     plans_for_base, plans_for_end_effectors
         Whether it plans goals of the base, and goals of end-effectors.
+    follows_paths
+        Whether it takes end-effectors along given paths.
     starts_in_motion
         Whether its gaits may begin while the joints move (``PlanRequest.motion``).
     Options
@@ -132,6 +137,7 @@ class GaitMethod(ABC):
     controls: frozenset[Controlled] = POSE
     plans_for_base: ClassVar[bool] = True
     plans_for_end_effectors: ClassVar[bool] = False
+    follows_paths: ClassVar[bool] = False
     starts_in_motion: ClassVar[bool] = False
     Options: ClassVar[type[Any]] = EmptyOptions
     options: Any
@@ -221,6 +227,8 @@ class GaitMethod(ABC):
         """
         if not self.plans_for_end_effectors:
             self._require_goal_of_base(goal)
+        if not self.follows_paths:
+            self._require_no_path(goal)
         if not is_clear:
             start = RobotState(path.position[0], path.quaternion[0], positions[0])
             self._require_clear(positions, self._base_poses(start, positions))
@@ -273,12 +281,22 @@ class GaitMethod(ABC):
 
     def _require_goal_of_base(self, goal: Goal) -> None:
         """Refuse goals of end-effectors, by methods that reach none."""
+        self._require_no_path(goal)
         if goal.end_effectors:
             names = " and ".join(f"'{each.link}'" for each in goal.end_effectors)
             raise PlanningError(
                 f"{self.name} plans for the pose of the base, and the goal is for {names}: "
                 f"{END_EFFECTOR_METHOD} plans for end-effectors."
             )
+
+    def _require_no_path(self, goal: Goal) -> None:
+        """Refuse goals with a path, by methods that follow none."""
+        for each in goal.end_effectors:
+            if each.waypoints is not None:
+                raise PlanningError(
+                    f"{self.name} does not follow paths, and '{each.link}' is to follow one: "
+                    f"{PATH_METHOD} does."
+                )
 
     @property
     def _has_obstacles(self) -> bool:

@@ -42,6 +42,7 @@ from spacerobot_ros.planning.execution.status import (
     describe_remaining_error,
     end_effector_values,
     goal_values,
+    waypoint_counts,
 )
 from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFollower
 from spacerobot_ros.planning.execution.tracker import Setpoint, TakeOver, TrajectoryTracker
@@ -1158,6 +1159,7 @@ class Executive:
                 values["end_effector_position_error_m"] = remaining.farthest_end_effector
                 values["end_effector_attitude_error_rad"] = remaining.most_turned_end_effector
         values["end_effector_goals"] = end_effector_values(aim)
+        values["end_effector_waypoints"] = waypoint_counts(aim)
         if schedule is not None:
             values |= {"method": schedule.method, "duration_s": schedule.duration}
             values["notes"] = schedule.notes

@@ -134,7 +134,13 @@ class GoalFile:
 
 def _decode_goal(entry: Mapping[str, Any]) -> Goal:
     goal = Goal.checked(entry["position"], entry["quaternion"], entry["joint_positions"])
-    goals = [EndEffectorGoal.checked(*each) for each in entry.get("end_effectors", {}).items()]
+    paths = entry.get("paths", {})
+    goals = [
+        EndEffectorGoal.along(link, [*paths[link], values])
+        if link in paths
+        else EndEffectorGoal.checked(link, values)
+        for link, values in entry.get("end_effectors", {}).items()
+    ]
     if not goals:
         return goal
     parts = frozenset(part for part in POSE if part in entry["base"])
@@ -152,4 +158,10 @@ def _encode_goal(identified: IdentifiedGoal) -> dict[str, Any]:
     if goal.end_effectors:
         entry["end_effectors"] = {each.link: list(each.values) for each in goal.end_effectors}
         entry["base"] = sorted(goal.base)
+    if goal.has_path:
+        entry["paths"] = {
+            each.link: each.waypoints.tolist()
+            for each in goal.end_effectors
+            if each.waypoints is not None
+        }
     return {**entry, "id": identified.goal_id} if identified.goal_id else entry

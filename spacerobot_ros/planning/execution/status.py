@@ -17,6 +17,9 @@ _END_EFFECTOR_ERRORS = ("end_effector_position_error_m", "end_effector_attitude_
 _GOAL_PREFIX = "goal_of_"
 """Beginning of the keys of goals of end-effectors, before the link."""
 
+_WAYPOINTS_PREFIX = "waypoints_of_"
+"""Beginning of the keys of numbers of waypoints, before the link."""
+
 _NUMBER_KEYS = (
     *_END_EFFECTOR_ERRORS,
     *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "ends_at_s", "duration_s"),
@@ -70,6 +73,8 @@ class PlannerStatus:
         New plans after the first for this goal that count as corrections.
     end_effector_goals
         Goals of end-effectors by link: a position (3,), m, or position and quaternion (7,).
+    end_effector_waypoints
+        Numbers of waypoints on given paths to these goals, by link.
     end_effector_position_error_m, end_effector_attitude_error_rad
         Largest remaining errors of end-effectors; None if they have no goals, or were not
         evaluated.
@@ -96,6 +101,7 @@ class PlannerStatus:
     position_error_m: float | None = None
     attitude_error_rad: float | None = None
     end_effector_goals: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    end_effector_waypoints: Mapping[str, int] = field(default_factory=dict)
     end_effector_position_error_m: float | None = None
     end_effector_attitude_error_rad: float | None = None
     manoeuvre_time_s: float = 0.0
@@ -117,6 +123,8 @@ class PlannerStatus:
             values["attitude_error_rad"] = _format_note(self.attitude_error_rad)
         for link, numbers in self.end_effector_goals.items():
             values[f"{_GOAL_PREFIX}{link}"] = _format_note(list(numbers))
+        for link, count in self.end_effector_waypoints.items():
+            values[f"{_WAYPOINTS_PREFIX}{link}"] = str(count)
         for name in _END_EFFECTOR_ERRORS:
             error = getattr(self, name)
             if error is not None:
@@ -148,12 +156,18 @@ class PlannerStatus:
                 for name in list(given)
                 if name.startswith(_GOAL_PREFIX)
             }
+            waypoints = {
+                name.removeprefix(_WAYPOINTS_PREFIX): int(given.pop(name))
+                for name in list(given)
+                if name.startswith(_WAYPOINTS_PREFIX)
+            }
             return cls(
                 state=state,
                 message=message,
                 goal_id=given.pop("goal_id", ""),
                 goal=tuple(float(word) for word in given.pop("goal", "").split()),
                 end_effector_goals=end_effectors,
+                end_effector_waypoints=waypoints,
                 corrections=int(given.pop("corrections", "0")),
                 method=given.pop("method", ""),
                 **numbers,
@@ -223,6 +237,13 @@ def goal_values(goal: Goal) -> tuple[float, ...]:
 def end_effector_values(goal: Goal) -> dict[str, tuple[float, ...]]:
     """Return the goals of end-effectors by link, as a status reports them."""
     return {each.link: each.values for each in goal.end_effectors}
+
+
+def waypoint_counts(goal: Goal) -> dict[str, int]:
+    """Return the numbers of waypoints of end-effectors with a path, as a status reports them."""
+    return {
+        each.link: len(each.waypoints) for each in goal.end_effectors if each.waypoints is not None
+    }
 
 
 def describe_remaining_error(error: PoseError, controls: frozenset[Controlled]) -> str:

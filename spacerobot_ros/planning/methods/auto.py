@@ -80,6 +80,8 @@ class AutoGait(GaitMethod):
         names = self._list_comparable(refusals)
         if request.goal.end_effectors:
             names = [name for name in self._candidates if name not in self._unsuitable]
+        if request.goal.has_path:
+            names = [name for name in names if self._candidates[name].method.follows_paths]
         if request.motion is not None:
             for name in names:
                 if not self._candidates[name].method.starts_in_motion:

@@ -27,6 +27,7 @@ from spacerobot_ros.planning.core.goal import Controlled, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.methods.registry import build_method
+from spacerobot_ros.planning.methods.resolved_rate import PathProgress
 
 
 @dataclass(frozen=True)
@@ -141,9 +142,14 @@ class RemainingJointsGait(GaitMethod):
     ) -> tuple[list[str], GaitSchedule | None]:
         """Return the names of the methods to try, and the previous schedule for these methods.
 
-        Progress with other joints does not count.
+        Progress with other joints does not count, but for that on a given path.
         """
         progress = None if previous is None else previous.progress
+        if isinstance(progress, _RemainingProgress) and isinstance(progress.inner, PathProgress):
+            progress = progress.inner
+        if previous is not None and isinstance(progress, PathProgress):
+            moving = previous.positions[:, ~self._is_stuck]
+            return self._names, replace(previous, positions=moving, progress=progress)
         if previous is None or not isinstance(progress, _RemainingProgress):
             return self._names, None
         if progress.stuck != self._stuck.keys():

@@ -1,10 +1,10 @@
 """End-effectors along given lines while the base floats: resolved-rate motion.
 
 At zero momentum the generalised Jacobian ``J*(q)`` maps the rates of the joints to the velocity of
-an end-effector in the world (Umetani and Yoshida). The rates that take it along a line, straight
-or through waypoints, the attitude about one axis, are ``qdot = J*^+ xdot``. Where ``J*`` loses
-rank no rates do: a dynamic singularity. Whether the line meets one depends on the shape alone,
-which depends on the path that led there (paper 4, section V; path-dependent workspaces).
+an end-effector in the world (Umetani and Yoshida). The rates that take it along a line, straight,
+through waypoints or along a given path, are ``qdot = J*^+ xdot``. Where ``J*`` loses rank no rates
+do: a dynamic singularity. Whether the line meets one depends on the shape alone, which depends on
+the path that led there (paper 4, section V; path-dependent workspaces).
 
 The path is followed in its own length, not in time: its tangent is a vector of the null space of
 ``[J*, -x']``, which is finite up to the singularity, where the progress on the line becomes zero.
@@ -21,6 +21,7 @@ from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
@@ -53,6 +54,7 @@ from spacerobot_ros.planning.methods.optimal.end_effectors import (
 )
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
+from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedWay
 
 _STEP = 0.02
 """Longest step along a path of the joints, rad of the fastest one."""
@@ -70,6 +72,9 @@ _ZERO_PROGRESS = 1e-8
 _APPROACH = 0.25
 """Share of the way to a singularity that is a step at most."""
 
+_AT_MARK = 1e-6
+"""Share of the way within which a jump of its curvature counts as passed."""
+
 _ZERO_DISTANCE = 1e-10
 """Error of an end-effector that counts as zero, m or rad."""
 
@@ -81,6 +86,9 @@ _LENGTH_SAMPLES = 200
 
 _INTERVALS = 160
 """Intervals of the linear program."""
+
+_MOST_INTERVALS = 1600
+"""Its intervals for ways with many corners at most."""
 
 _USED_ACCELERATION = 0.99
 """Share of the limits of acceleration for the path; corrections of the ticks may use the rest."""
@@ -113,10 +121,18 @@ class ResolvedRateOptions(MotionOptions):
     )
     as_far_as_possible: int = parameter(
         0,
-        "1: a line that meets a singularity or a joint limit is followed until shortly before, "
-        "0: it is refused",
+        "1: a line that meets a singularity, a joint limit or a contact is followed until shortly "
+        "before, 0: it is refused",
         minimum=0,
         maximum=1,
+    )
+    corner_tolerance: float = parameter(
+        0.005,
+        "largest distance of the end-effector from the straight lines of a given path, whose "
+        "corners are rounded, and as many rad of its attitude; 0: it stops at every corner",
+        unit="m",
+        minimum=0.0,
+        maximum=1000.0,
     )
 
 
@@ -124,13 +140,26 @@ class _Way:
     """A smooth way through points (K, 3), m, from the origin: a natural cubic spline by the lengths
     of its chords, which through two points is the straight line.
 
+    Parameters
+    ----------
+    points
+        The points.
+    turn
+        (3,) rotation vector from the start to the end, in step with the way, rad.
+
     Attributes
     ----------
-    length
+    length, whole
         Of the chords together, m.
+    is_straight
+        Whether it is a straight line.
+    marks
+        Shares of the way at which its curvature jumps: none.
     """
 
-    def __init__(self, points: Array) -> None:
+    marks = np.zeros(0)
+
+    def __init__(self, points: Array, turn: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
         from scipy.interpolate import CubicSpline
 
         # A point that comes twice is no way.
@@ -138,7 +167,8 @@ class _Way:
         kept = np.flatnonzero(np.append(np.inf, chords) > _ZERO_DISTANCE)
         along = np.append(0.0, np.cumsum(chords))[kept]
         self.is_straight = len(kept) <= 2
-        self.length = float(along[-1])
+        self.length = self.whole = float(along[-1])
+        self._turn = np.asarray(turn, dtype=float)
         if len(kept) == 1:
             along, kept = np.array([0.0, 1.0]), np.array([0, 0])
         self._place = CubicSpline(along / along[-1], points[kept], bc_type="natural")
@@ -151,6 +181,18 @@ class _Way:
     def rate(self, share: float) -> Array:
         """Return the derivative (3,) of the displacement by the share."""
         return np.asarray(self._rate(share))
+
+    def turned(self, share: float) -> Array:
+        """Return the turn (4,) since the start after a share of the way."""
+        return quaternion_from_rotvec(share * self._turn)
+
+    def spin(self, share: float) -> Array:
+        """Return the angular velocity (3,) by the share, rad."""
+        return self._turn
+
+    def travelled(self, share: float) -> float:
+        """Return the metres of the way after a share of it."""
+        return share * self.length
 
 
 @dataclass(frozen=True)
@@ -167,8 +209,6 @@ class _LinkLine:
         (3,) and (4,) of its pose at the start.
     way
         The way from the start to the goal.
-    turn
-        (3,) the rotation vector from the start to the goal, rad.
     """
 
     link: str
@@ -176,13 +216,11 @@ class _LinkLine:
     rotations: Array
     r_CE: Array
     quaternion: Array
-    way: _Way
-    turn: Array
+    way: _Way | RoundedWay
 
     def miss(self, R: Array, r: Array, progress: float) -> Array:
         """Return the errors (k + l,) of a pose to that after a share ``progress`` of the line."""
-        turned = quaternion_from_rotvec(progress * self.turn)
-        target = quaternion_multiply(turned, self.quaternion)
+        target = quaternion_multiply(self.way.turned(progress), self.quaternion)
         found = quaternion_inverse(quaternion_from_matrix(R))
         rotation = rotvec_from_quaternion(quaternion_multiply(target, found))
         return np.concatenate(
@@ -205,6 +243,8 @@ class _Lines:
         (n,) motion of each joint while the fastest one moves by a radian, m or rad.
     length
         Length of the lines together, scaled.
+    marks
+        Shares of the lines at which their curvature jumps.
     """
 
     def __init__(self, robot: SpaceRobot, lines: Sequence[_LinkLine], limits: MotionLimits) -> None:
@@ -220,13 +260,14 @@ class _Lines:
             scales += [1 / reach] * len(line.displacements) + [1.0] * len(line.rotations)
         self._scales = np.array(scales)
         self.is_straight = all(line.way.is_straight for line in lines)
+        self.marks = np.unique(np.concatenate([line.way.marks for line in lines]))
         shares = np.linspace(0.0, 1.0, 2 if self.is_straight else _LENGTH_SAMPLES)
         self.length = float(np.mean([np.linalg.norm(self._rate(share)) for share in shares]))
 
     def _rate(self, share: float) -> Array:
         """Return the scaled derivative (m,) of the rows by the share of the lines."""
         rates = [
-            np.append(x.displacements @ x.way.rate(share), x.rotations @ x.turn)
+            np.append(x.displacements @ x.way.rate(share), x.rotations @ x.way.spin(share))
             for x in self._lines
         ]
         return np.asarray(np.concatenate(rates) * self._scales)
@@ -283,10 +324,11 @@ class _Lines:
     def place(self, share: float) -> str:
         """Return a share of the lines in words."""
         line = self._lines[0]
-        way, kind = line.way.length, "line" if line.way.is_straight else "path"
+        way, kind = line.way.whole, "line" if line.way.is_straight else "path"
         if way > _ZERO_DISTANCE:
-            return f"after {share * way:.6g} of {way:.6g} m of the {kind} of '{line.link}'"
-        turn = float(np.linalg.norm(line.turn))
+            done = line.way.travelled(share)
+            return f"after {done:.6g} of {way:.6g} m of the {kind} of '{line.link}'"
+        turn = float(np.linalg.norm(line.way.spin(share)))
         return f"after {share * turn:.6g} of {turn:.6g} rad of the turn of '{line.link}'"
 
 
@@ -342,7 +384,9 @@ def _trace(lines: _Lines, q: Array, cancellation: Cancellation) -> JointPath:
     while progress[-1] > _ZERO_PROGRESS:
         cancellation.raise_if_requested()
         left = total - y[-1]
-        step = min(longest, left / progress[-1])
+        ahead = lines.marks[lines.marks * total > y[-1] + _AT_MARK * total] * total - y[-1]
+        # Steps end where the curvature of the way jumps.
+        step = min(longest, left / progress[-1], *ahead[:1] / progress[-1])
         if len(progress) > 1 and (falls := progress[-2] - progress[-1]) > 0:
             slope = falls / (lengths[-1] - lengths[-2])
             step = min(step, _APPROACH * progress[-1] / slope)
@@ -430,12 +474,12 @@ class _TimedPath:
     interval: float
 
     @classmethod
-    def of(cls, path: JointPath, limits: MotionLimits) -> _TimedPath:
+    def of(cls, path: JointPath, limits: MotionLimits, intervals: int = _INTERVALS) -> _TimedPath:
         """Return a path at its fastest."""
         from scipy.interpolate import CubicSpline
 
         shape = CubicSpline(path.length, path.shapes)
-        places, interval = np.linspace(0.0, path.length[-1], _INTERVALS + 1, retstep=True)
+        places, interval = np.linspace(0.0, path.length[-1], intervals + 1, retstep=True)
         slopes, bends = shape(places, 1), shape(places, 2)
         speed = np.sqrt(_fastest_speeds(slopes, bends, limits, float(interval)))
         time = np.cumsum(np.append(0.0, 2 * interval / (speed[1:] + speed[:-1])))
@@ -458,18 +502,43 @@ class _TimedPath:
         return found[:, :-1], shares
 
 
+@dataclass(frozen=True)
+class PathProgress:
+    """How a schedule follows a given path.
+
+    Attributes
+    ----------
+    route
+        The path in W, from where the end-effector was.
+    along
+        (M + 1,) length of the route that is done at the last M + 1 ticks, metres and radians.
+    """
+
+    route: PosePath
+    along: Array
+
+    def rest(self, positions: Array, q: Array) -> PosePath:
+        """Return the part of the route that is ahead in a shape (n,).
+
+        ``positions`` (N + 1, n) are the shapes at the ticks of the schedule.
+        """
+        nearest = int(np.argmin(np.linalg.norm(positions[-len(self.along) :] - q, axis=1)))
+        return self.route.after(float(self.along[nearest]))
+
+
 class ResolvedRateGait(GaitMethod):
-    """End-effectors on straight lines, or through waypoints, to their goals, with the base free.
+    """End-effectors on straight lines, or along paths, to their goals, with the base free.
 
     From rest to rest, as fast as the limits of the joints allow. Positions, or poses with a turn
-    about one axis, of one end-effector or of several at once. Lines that meet a dynamic
-    singularity or a limit of a joint are refused, or followed until shortly before; ``optimal``
-    reaches most of their ends.
+    about one axis, of one end-effector or of several at once; along a given path, of one. Lines
+    that meet a dynamic singularity, a limit of a joint or a contact are refused, or followed until
+    shortly before; ``optimal`` reaches most of their ends.
     """
 
     name: ClassVar[str] = "resolved_rate"
     plans_for_base: ClassVar[bool] = False
     plans_for_end_effectors: ClassVar[bool] = True
+    follows_paths: ClassVar[bool] = True
     Options: ClassVar[type[ResolvedRateOptions]] = ResolvedRateOptions
     options: ResolvedRateOptions
 
@@ -498,6 +567,8 @@ class ResolvedRateGait(GaitMethod):
         state = replace(request.state, q=q)
         goal = request.goal.for_robot(self.robot.description)
         self._require_goal_of_end_effectors(goal)
+        if goal.has_path:
+            return self._plan_along_path(replace(request, state=state, goal=goal), cancellation)
         error = PoseError.between(state.position, state.quaternion, goal, q, self.robot)
         waypoints = self._waypoints(request, goal)
         at_goal = Tolerance(_ZERO_DISTANCE, _ZERO_DISTANCE).admits(error, self.controls)
@@ -506,24 +577,128 @@ class ResolvedRateGait(GaitMethod):
         lines = self._lines(state, goal, request.tolerance, waypoints)
         if lines.length < _ZERO_DISTANCE:
             return self._schedule(state, goal, q[np.newaxis], {})
-        path = _trace(lines, q, cancellation)
+        positions, _, notes = self._follow(lines, state, cancellation)
+        return self._schedule(state, goal, positions, notes)
+
+    def _plan_along_path(self, request: PlanRequest, cancellation: Cancellation) -> GaitSchedule:
+        """Plan along the path of the goal, with a rest at each of its sharp corners."""
+        now, goal, tolerance = request.state, request.goal, self.options.corner_tolerance / 2
+        route = self._route(request, tolerance)
+        whole = float(np.linalg.norm(route.chords, axis=1).sum())
+        positions, along, metres = [now.q[np.newaxis]], [np.zeros(1)], 0.0
+        notes: Notes = {}
+        least = math.inf
+        for piece in route.pieces(tolerance) if len(route.positions) > 1 else ():
+            way = (piece, metres, whole)
+            lines = self._lines(now, goal, request.tolerance, piece.positions[1:-1], way)
+            shapes, shares, found = self._follow(lines, now, cancellation)
+            least = min(least, float(str(found["least"])))
+            notes = {**found, **notes, "least": least}
+            positions.append(shapes[1:])
+            along.append(along[-1][-1] + shares[1:] * piece.along[-1])
+            if "stopped" in found:
+                break
+            metres += float(np.linalg.norm(piece.chords, axis=1).sum())
+            base = self._prediction.path(now, shapes)
+            now = RobotState(base.position[-1], base.quaternion[-1], shapes[-1])
+        progress = PathProgress(route, np.concatenate(along))
+        return self._schedule(request.state, goal, np.vstack(positions), notes, progress)
+
+    def _route(self, request: PlanRequest, tolerance: float) -> PosePath:
+        """Return the path of a request in W, from where the end-effector is.
+
+        Raises
+        ------
+        PlanningError
+            The goal has several end-effectors, or its path too many corners.
+        """
+        state, goal = request.state, request.goal
+        if len(goal.end_effectors) > 1:
+            raise PlanningError(
+                f"{self.name} takes one end-effector along a path, and the goal is for "
+                f"{len(goal.end_effectors)}: send their paths one after the other."
+            )
+        (aim,) = goal.end_effectors
+        r, quaternion = end_effector_pose(
+            self.robot, aim.link, state.position, state.quaternion, state.q
+        )
+        before = request.previous
+        if before is not None and isinstance(before.progress, PathProgress):
+            rest = before.progress.rest(before.positions, state.q)
+        else:
+            points = aim.values_on_way[-1:] if request.correction else aim.values_on_way
+            # Without an attitude any will do: it does not turn.
+            any_ = np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1))
+            rest = PosePath(points[:, :3], any_ if aim.quaternion is None else points[:, 3:])
+        if aim.quaternion is None:
+            quaternion = rest.quaternions[0]
+        route = PosePath.through(
+            np.vstack([r, rest.positions]), np.vstack([quaternion, rest.quaternions])
+        )
+        is_fresh = before is None or not isinstance(before.progress, PathProgress)
+        return route.simplified(tolerance) if is_fresh else route
+
+    def _follow(
+        self, lines: _Lines, state: RobotState, cancellation: Cancellation
+    ) -> tuple[Array, Array, Notes]:
+        """Return shapes (N + 1, n) and shares of the lines (N + 1,) at ticks, with notes.
+
+        Raises
+        ------
+        PlanningError
+            The lines meet a singularity or a limit; :meth:`plan` says when they are refused.
+        """
+        path = _trace(lines, state.q, cancellation)
         notes: Notes = {}
         obstacle = self._find_obstacle(lines, path)
+        if self.options.as_far_as_possible:
+            obstacle = self._find_contact(state, path, obstacle)
         if obstacle is not None:
             last, reason = obstacle
             if not (self.options.as_far_as_possible and last > 0):
                 raise PlanningError(reason)
             path, notes = path.until(last), {"stopped": reason}
-        positions = self._held_commands(lines, state, _TimedPath.of(path, self._limits))
-        name, first = lines.measure(q, path.turns[0])
+        intervals = _INTERVALS
+        if len(lines.marks):
+            intervals = min(max(_INTERVALS, len(path.length) - 1), _MOST_INTERVALS)
+        timed = _TimedPath.of(path, self._limits, intervals)
+        positions = self._held_commands(lines, state, timed)
+        name, first = lines.measure(state.q, path.turns[0])
         least = min(
             lines.measure(shape, X)[1] for shape, X in zip(path.shapes, path.turns, strict=True)
         )
         notes |= {"singularity_measure": name, "at_start": first, "least": least}
-        return self._schedule(state, goal, positions, notes)
+        return positions, timed.at_ticks(len(positions) - 1)[1], notes
+
+    def _find_contact(
+        self, state: RobotState, path: JointPath, obstacle: tuple[int, str] | None
+    ) -> tuple[int, str] | None:
+        """Return the last place of a path before links come too near, with the reason; else an
+        ``obstacle`` that has been found.
+        """
+        last = len(path.shapes) - 1 if obstacle is None else obstacle[0]
+        attitudes = quaternion_multiply(state.quaternion, path.turns)
+
+        def clause(until: int) -> str:
+            shapes = path.shapes[: until + 1]
+            base = self._base_poses(state, shapes, attitudes[: until + 1])
+            return self._too_near(shapes, base, at_ticks=False)
+
+        if last < 1 or not (found := clause(last)):
+            return obstacle
+        free, met = 0, last
+        while met - free > 1:
+            middle = (free + met) // 2
+            if nearer := clause(middle):
+                met, found = middle, nearer
+            else:
+                free = middle
+        return free, f"On the way {found}."
 
     def path(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> JointPath:
         """Return the path along the lines of a goal, to their ends or to a singularity.
+
+        A path that the goal gives does not count: the lines lead straight to its end.
 
         It is the same whatever the limits of the joints are, which may end it before.
 
@@ -563,9 +738,17 @@ class ResolvedRateGait(GaitMethod):
             )
 
     def _lines(
-        self, state: RobotState, goal: Goal, tolerance: Tolerance, waypoints: Array
+        self,
+        state: RobotState,
+        goal: Goal,
+        tolerance: Tolerance,
+        waypoints: Array,
+        piece: tuple[PosePath, float, float] | None = None,
     ) -> _Lines:
         """Return the lines of a goal, along directions in which the joints move the links.
+
+        ``piece`` is a part of a given path that the first link follows, the metres before it and
+        those of the whole path; None: it goes through the waypoints to the goal.
 
         Raises
         ------
@@ -595,21 +778,23 @@ class ResolvedRateGait(GaitMethod):
                 wanted = quaternion_multiply(from_start, each.quaternion)
                 between = quaternion_multiply(wanted, quaternion_inverse(quaternion))
                 turn = rotvec_from_quaternion(between)
-            points = each.position[np.newaxis]
-            if each is goals[0]:
-                points = np.vstack([waypoints, points])
-            line = _LinkLine(
-                each.link,
-                directions.displacements,
-                directions.rotations,
-                r_BE - r_BC,
-                quaternion,
-                _Way(np.vstack([np.zeros(3), (points - state.position) @ R_BW.T - r_BE])),
-                turn,
+            is_base, is_led = each.link == robot.base_link, each is goals[0]
+            points = np.vstack([waypoints, each.position] if is_led else [each.position])
+            way: _Way | RoundedWay
+            if is_led and piece is not None:
+                path, before, whole = piece
+                seen = PosePath(
+                    path.positions @ R_BW.T, quaternion_multiply(from_start, path.quaternions)
+                )
+                way = RoundedWay(seen, self.options.corner_tolerance / 2, before, whole)
+            else:
+                points = np.vstack([np.zeros(3), (points - state.position) @ R_BW.T - r_BE])
+                way = _Way(points) if is_base else _Way(points, turn)
+            # Of the base its attitude alone is kept.
+            moved = np.zeros((0, 3)) if is_base else directions.displacements
+            lines.append(
+                _LinkLine(each.link, moved, directions.rotations, r_BE - r_BC, quaternion, way)
             )
-            if each.link == robot.base_link:  # Its attitude alone is kept.
-                line = replace(line, displacements=np.zeros((0, 3)), turn=np.zeros(3))
-            lines.append(line)
         found = _Lines(robot, lines, self._limits)
         self._require_freedom(found, goal)
         return found
@@ -707,7 +892,12 @@ class ResolvedRateGait(GaitMethod):
         return positions
 
     def _schedule(
-        self, state: RobotState, goal: Goal, positions: Array, notes: Notes
+        self,
+        state: RobotState,
+        goal: Goal,
+        positions: Array,
+        notes: Notes,
+        progress: PathProgress | None = None,
     ) -> GaitSchedule:
         path = self._prediction.path(state, positions)
         end = path.position[-1], path.quaternion[-1]
@@ -722,4 +912,4 @@ class ResolvedRateGait(GaitMethod):
         for each in goal.end_effectors:
             r_WE, quaternion = end_effector_pose(self.robot, each.link, *end, positions[-1])
             notes[f"final_pose_of_{each.link}"] = [*r_WE.tolist(), *quaternion.tolist()]
-        return self._schedule_of(goal, positions, path, notes)
+        return self._schedule_of(goal, positions, path, notes, progress=progress)

@@ -245,6 +245,7 @@ class OptimalGait(GaitMethod):
         # Measured shapes may be a little beyond the joint limits.
         q = np.clip(request.state.q, self.robot.lower, self.robot.upper)
         goal = request.goal.for_robot(self.robot.description)
+        self._require_no_path(goal)
         state = replace(
             request.state,
             q=q,

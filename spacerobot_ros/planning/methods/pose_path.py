@@ -1,0 +1,250 @@
+"""Given paths of an end-effector: straight lines through poses, rounded at their corners.
+
+Within a distance ``d`` of a corner both lines are blended: the place is ``c - a l_1 + b l_2``, with
+the lines ``l_1`` and ``l_2`` to and from the corner ``c``, ``a = (1 - t)^2 d / |l_1|``, and
+``b = t^2 d / |l_2|``, for t from 0 to 1. The tangent is continuous, and the place at most ``d / 4``
+beside the lines. The attitude is blended likewise, by rotations in the place of displacements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_rotvec,
+    quaternion_inverse,
+    quaternion_multiply,
+    quaternions_from_rotvecs,
+    rotvec_from_quaternion,
+    rotvecs_from_quaternions,
+)
+
+MOST_CORNERS = 500
+"""Largest number of corners that is planned for: it bounds the time of a plan."""
+
+_SAME_POSE = 1e-10
+"""Distance of equal poses, m or rad."""
+
+_SHARPEST_BLEND = -0.5
+"""Cosine of the largest angle of a corner that is rounded; beyond it the motion stops there."""
+
+_MARKS_OF_BLEND = 4
+"""Parts of a blend at whose ends the way is looked at."""
+
+
+@dataclass(frozen=True)
+class PosePath:
+    """Straight lines through poses, the attitude turning about one axis in step with each.
+
+    Attributes
+    ----------
+    positions
+        (K, 3), m.
+    quaternions
+        (K, 4), (x, y, z, w).
+    """
+
+    positions: Array
+    quaternions: Array
+
+    @classmethod
+    def through(cls, positions: Array, quaternions: Array) -> PosePath:
+        """Return the path through poses, of which equal ones in succession count as one."""
+        path = cls(positions, quaternions)
+        kept = np.append(True, path.lengths > _SAME_POSE)
+        return path if kept.all() else cls(positions[kept], quaternions[kept])
+
+    @cached_property
+    def chords(self) -> Array:
+        """Displacements (K - 1, 3) from pose to pose, m."""
+        return np.asarray(np.diff(self.positions, axis=0))
+
+    @cached_property
+    def turns(self) -> Array:
+        """Rotation vectors (K - 1, 3) from attitude to attitude, rad, as the positions are seen."""
+        between = quaternion_multiply(
+            self.quaternions[1:], quaternion_inverse(self.quaternions[:-1])
+        )
+        return rotvecs_from_quaternions(between)
+
+    @cached_property
+    def lengths(self) -> Array:
+        """(K - 1,) of each line: metres and radians together."""
+        return np.asarray(np.linalg.norm(self.chords, axis=1) + np.linalg.norm(self.turns, axis=1))
+
+    @cached_property
+    def along(self) -> Array:
+        """(K,) length of the path up to each pose, metres and radians together."""
+        return np.append(0.0, np.cumsum(self.lengths))
+
+    def after(self, length: float) -> PosePath:
+        """Return the rest of the path after some of its length; at its end it is one pose."""
+        length = min(max(length, 0.0), float(self.along[-1]))
+        if len(self.positions) == 1:
+            return self
+        i = int(
+            np.clip(np.searchsorted(self.along, length, side="right") - 1, 0, len(self.chords) - 1)
+        )
+        share = (length - self.along[i]) / self.lengths[i]
+        r = self.positions[i] + share * self.chords[i]
+        turned = quaternion_multiply(
+            quaternion_from_rotvec(share * self.turns[i]), self.quaternions[i]
+        )
+        return PosePath.through(
+            np.vstack([r, self.positions[i + 1 :]]), np.vstack([turned, self.quaternions[i + 1 :]])
+        )
+
+    def simplified(self, tolerance: float) -> PosePath:
+        """Return a path through fewer of the poses, off the others by at most a tolerance.
+
+        ``tolerance`` is in m and rad. (Douglas and Peucker; places are compared after equal shares
+        of the length, so that a way there and back stays one.)
+
+        Raises
+        ------
+        PlanningError
+            It has too many corners.
+        """
+        kept, open_parts = {0, len(self.positions) - 1}, [(0, len(self.positions) - 1)]
+        while open_parts:
+            first, last = open_parts.pop()
+            if last - first < 2:
+                continue
+            off = self._off_line(first, last)
+            worst = int(np.argmax(off))
+            if off[worst] <= max(tolerance, _SAME_POSE):
+                continue
+            kept.add(first + 1 + worst)
+            if len(kept) > MOST_CORNERS + 2:
+                raise PlanningError(
+                    f"The path has more than {MOST_CORNERS} corners: give fewer poses, or a larger "
+                    "resolved_rate.corner_tolerance."
+                )
+            open_parts += [(first, first + 1 + worst), (first + 1 + worst, last)]
+        order = sorted(kept)
+        return PosePath(self.positions[order], self.quaternions[order])
+
+    def _off_line(self, first: int, last: int) -> Array:
+        """Return how far the poses between two of them are off the line of these, m or rad."""
+        inner = slice(first + 1, last)
+        shares = (self.along[inner] - self.along[first]) / (self.along[last] - self.along[first])
+        r = self.positions[first] + shares[:, np.newaxis] * (
+            self.positions[last] - self.positions[first]
+        )
+        start = self.quaternions[first]
+        turn = rotvec_from_quaternion(
+            quaternion_multiply(self.quaternions[last], quaternion_inverse(start))
+        )
+        turned = quaternion_multiply(quaternions_from_rotvecs(shares[:, np.newaxis] * turn), start)
+        left = rotvecs_from_quaternions(
+            quaternion_multiply(self.quaternions[inner], quaternion_inverse(turned))
+        )
+        off = np.linalg.norm(self.positions[inner] - r, axis=1)
+        return np.asarray(np.maximum(off, np.linalg.norm(left, axis=1)))
+
+    def pieces(self, tolerance: float) -> Iterator[PosePath]:
+        """Yield the parts between stops: at sharp corners, and without a tolerance at each."""
+        directions = np.hstack([self.chords, self.turns])
+        size = np.linalg.norm(directions, axis=1)
+        cosines = (directions[1:] * directions[:-1]).sum(axis=1) / (size[1:] * size[:-1])
+        stops = 1 + np.flatnonzero((cosines < _SHARPEST_BLEND) | (tolerance <= 0.0))
+        for first, last in zip([0, *stops], [*stops, len(self.positions) - 1], strict=True):
+            yield PosePath(self.positions[first : last + 1], self.quaternions[first : last + 1])
+
+
+class RoundedWay:
+    """The way along a path, rounded at the corners: a displacement and a turn from its start.
+
+    Parameters
+    ----------
+    path
+        The path, of two poses or more.
+    tolerance
+        Largest distance of the way from the lines, m, and of its attitudes, rad.
+    before, whole
+        Metres before its start, and of the whole path, for messages.
+
+    Attributes
+    ----------
+    length
+        Of the lines together, m.
+    is_straight
+        Whether it is one straight line.
+    marks
+        Shares of the way at which its curvature changes.
+    """
+
+    def __init__(
+        self, path: PosePath, tolerance: float, before: float = 0.0, whole: float | None = None
+    ) -> None:
+        self._path, self._total = path, float(path.along[-1])
+        self._metres = np.append(0.0, np.cumsum(np.linalg.norm(path.chords, axis=1)))
+        self.length = float(self._metres[-1])
+        self._before, self.whole = before, self.length if whole is None else whole
+        self.is_straight = len(path.positions) == 2
+        near = np.minimum(path.lengths[1:], path.lengths[:-1]) / 2
+        self._blends = np.concatenate([[0.0], np.minimum(near, 4 * tolerance), [0.0]])
+        """(K,) distances from the corners at which their blends begin and end."""
+        parts = np.linspace(-1.0, 1.0, _MARKS_OF_BLEND + 1)
+        inner = slice(1, -1)
+        marks = path.along[inner, np.newaxis] + np.outer(self._blends[inner], parts)
+        self.marks = np.unique(marks) / self._total
+
+    def place(self, share: float) -> Array:
+        """Return the displacement (3,) after a share of the way, m."""
+        base, before, after, a, b, _, _ = self._at(share)
+        chords, start = self._path.chords, self._path.positions[0]
+        place = self._path.positions[base] - start
+        return np.asarray(place - a * chords[before] + b * chords[after])
+
+    def rate(self, share: float) -> Array:
+        """Return the derivative (3,) of the displacement by the share."""
+        _, before, after, _, _, a_rate, b_rate = self._at(share)
+        chords = self._path.chords
+        return np.asarray(b_rate * chords[after] - a_rate * chords[before])
+
+    def turned(self, share: float) -> Array:
+        """Return the turn (4,) since the start after a share of the way."""
+        base, before, after, a, b, _, _ = self._at(share)
+        path = self._path
+        to_base = quaternion_multiply(
+            path.quaternions[base], quaternion_inverse(path.quaternions[0])
+        )
+        back = quaternion_multiply(quaternion_from_rotvec(-a * path.turns[before]), to_base)
+        return quaternion_multiply(quaternion_from_rotvec(b * path.turns[after]), back)
+
+    def spin(self, share: float) -> Array:
+        """Return the angular velocity (3,) by the share, rad."""
+        _, before, after, _, b, a_rate, b_rate = self._at(share)
+        turns = self._path.turns
+        carried = matrix_from_quaternion(quaternion_from_rotvec(b * turns[after]))
+        return np.asarray(b_rate * turns[after] - a_rate * (carried @ turns[before]))
+
+    def travelled(self, share: float) -> float:
+        """Return the metres of the whole path after a share of the way."""
+        return self._before + float(np.interp(share * self._total, self._path.along, self._metres))
+
+    def _at(self, share: float) -> tuple[int, int, int, float, float, float, float]:
+        """Return a pose, the lines to and from it, the shares ``a`` of the first that are left and
+        ``b`` of the second that are done, and the derivatives of both by the share of the way.
+        """
+        along, lengths, total = self._path.along, self._path.lengths, self._total
+        s = share * total
+        i = int(np.clip(np.searchsorted(along, s, side="right") - 1, 0, len(lengths) - 1))
+        corner = i + 1 if s > along[i + 1] - self._blends[i + 1] else i
+        d = self._blends[corner]
+        if abs(s - along[corner]) >= d:
+            return i, max(i - 1, 0), i, 0.0, (s - along[i]) / lengths[i], 0.0, total / lengths[i]
+        t = (s - along[corner] + d) / (2 * d)
+        before, after = corner - 1, corner
+        to, on = d / lengths[before], d / lengths[after]
+        scale = total / (2 * d)
+        a, b = to * (1 - t) ** 2, on * t**2
+        return corner, before, after, a, b, -2 * to * (1 - t) * scale, 2 * on * t * scale
