@@ -125,6 +125,7 @@ _PUBLISHED_BY_USER = ("user",)
 _ARRAY_TYPE = "std_msgs/msg/Float64MultiArray"
 _JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
 _ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
+_PATH_TYPE = "nav_msgs/msg/Path"
 _POSE_STAMPED_TYPE = "geometry_msgs/msg/PoseStamped"
 _STATUS_TYPE = "diagnostic_msgs/msg/DiagnosticStatus"
 _STRING_TYPE = "std_msgs/msg/String"
@@ -348,6 +349,14 @@ _TOPIC_TABLE = (
         "`end_effectors`. The joints brake when none comes for `twist_timeout`",
     ),
     Topic(
+        "end_effector/path",
+        _PATH_TYPE,
+        _PUBLISHED_BY_USER,
+        "path for the end-effector in the world, straight from pose to pose, with the base free: a "
+        "goal, at its last pose; likewise `NAME/path` of links in the planner's `end_effectors`. "
+        "Orientations of zeros in all poses mean any attitude",
+    ),
+    Topic(
         "joint_reference",
         _JOINT_STATE_TYPE,
         ("planner",),
@@ -369,7 +378,7 @@ _TOPIC_TABLE = (
     ),
     Topic(
         "planned_path",
-        "nav_msgs/msg/Path",
+        _PATH_TYPE,
         ("planner",),
         "the path of the base that the schedule predicts",
         latched=True,
@@ -449,6 +458,11 @@ def twist_topic(end_effector: str) -> str:
     return _name_in_topics(end_effector) + "/twist"
 
 
+def path_topic(end_effector: str) -> str:
+    """Return the topic of the paths of an end-effector."""
+    return _name_in_topics(end_effector) + "/path"
+
+
 def pose_topic(end_effector: str) -> Topic:
     """Return the entry of the poses of an end-effector, by its name in letters that topics have."""
     name = _name_in_topics(end_effector)
@@ -461,8 +475,8 @@ def _name_in_topics(link: str) -> str:
 
 
 def topic_named(name: str) -> Topic:
-    """Return the entry of a topic; goals, twists and poses of any end-effector have that of
-    ``end_effector``.
+    """Return the entry of a topic; goals, twists, paths and poses of any end-effector have that
+    of ``end_effector``.
 
     Raises
     ------
@@ -473,6 +487,8 @@ def topic_named(name: str) -> Topic:
         return replace(TOPICS[goal_topic("end_effector")], name=name)
     if name not in TOPICS and name.endswith("/twist"):
         return replace(TOPICS[twist_topic("end_effector")], name=name)
+    if name not in TOPICS and name.endswith("/path"):
+        return replace(TOPICS[path_topic("end_effector")], name=name)
     if name not in TOPICS and name.endswith("/pose"):
         return pose_topic(name.removesuffix("/pose"))
     return TOPICS[name]

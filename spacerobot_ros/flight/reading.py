@@ -249,14 +249,22 @@ class FlightBag:
             yield time_ns, message.name, event
 
     def goals(self, topic: str) -> tuple[SentGoal, ...]:
-        """Return the goal poses that are poses in the frame of the odometry."""
+        """Return the goal poses, and the last poses of paths, that are poses in the frame of the
+        odometry.
+        """
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
         goals, ids = [], GoalIds()
         for time_ns, message in self.messages(topic):
             stamp = message.header.stamp
             goal_id = ids.of(stamp.sec, stamp.nanosec)
-            p, o = message.pose.position, message.pose.orientation
+            aim, frame = message, message.header.frame_id
+            if topic.endswith("/path"):
+                if not message.poses:
+                    continue
+                aim = message.poses[-1]
+                frame = aim.header.frame_id or frame
+            p, o = aim.pose.position, aim.pose.orientation
             attitude = [o.x, o.y, o.z, o.w]
             if topic != "goal_pose" and not any(attitude):
                 # Zeros ask for the position of an end-effector alone.
@@ -265,7 +273,7 @@ class FlightBag:
                 goal = Goal.checked([p.x, p.y, p.z], attitude)
             except PlanningError:
                 continue
-            if not world or message.header.frame_id in ("", world):
+            if not world or frame in ("", world):
                 goals.append(SentGoal(time_ns / SECOND, goal, goal_id))
         return tuple(goals)
 
@@ -370,7 +378,13 @@ def read_flight(bag: FlightBag) -> Flight:
     scenario = _scenario_in_bag(bag)
     statuses = {name: _read_statuses(bag, name) for name in COMMANDERS}
     decider = next((name for name in COMMANDERS if statuses[name]), COMMANDERS[0])
-    goals, tool_goals = bag.goals("goal_pose"), bag.goals("end_effector/goal_pose")
+    goals = bag.goals("goal_pose")
+    tool_goals = tuple(
+        sorted(
+            (*bag.goals("end_effector/goal_pose"), *bag.goals("end_effector/path")),
+            key=lambda sent: sent.time,
+        )
+    )
     reports = [status for _, status in statuses[decider]]
     # Bags of version 0.1 have no ids.
     sent = goals or next((bag.goals(goal_topic(link)) for link in scenario.goal_links), ())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from copy import deepcopy
+from dataclasses import replace
 from threading import Thread
 from typing import Any, ClassVar
 
@@ -23,7 +24,7 @@ from spacerobot_ros.messages.readers import MessageDecoder, joint_template
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.nodes.common.commander import CommanderNode
-from spacerobot_ros.nodes.common.messages import goal_markers, goal_of, shape_of
+from spacerobot_ros.nodes.common.messages import goal_markers, goal_of, path_poses, shape_of
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
@@ -37,7 +38,7 @@ from spacerobot_ros.planning.execution.status import (
 )
 from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
 from spacerobot_ros.times import stamp_bytes
-from spacerobot_ros.topics import goal_topic, twist_topic
+from spacerobot_ros.topics import goal_topic, path_topic, twist_topic
 
 
 class PlannerNode(CommanderNode):
@@ -85,6 +86,7 @@ class PlannerNode(CommanderNode):
         for name in self.config.goal_links:
             self.take_goals(goal_topic(name), name)
             self._take_twists(name)
+            self._take_paths(name)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.create_service(Trigger, "~/statistics", self._on_statistics)
 
@@ -133,6 +135,28 @@ class PlannerNode(CommanderNode):
             commander.receive_twist(link, message.header.frame_id, linear, angular)
 
         self.create_subscription(TwistStamped, twist_topic(link), on_twist, STREAM)
+
+    def _take_paths(self, link: str) -> None:
+        """Subscribe to the paths of a link."""
+
+        def on_path(message: Path) -> None:
+            self.receive(link, message, lambda: self._read_path(link, message))
+
+        self.create_subscription(Path, path_topic(link), on_path, STREAM)
+
+    def _read_path(self, link: str, message: Path) -> Goal:
+        """Return the goal of a path for an end-effector.
+
+        Raises
+        ------
+        PlanningError
+            It is refused.
+        """
+        what, frame = f"The path of the end-effector '{link}'", self.config.world_frame
+        aim = EndEffectorGoal.along(link, path_poses(message, frame, what, self._pose_of))
+        if link == DEFAULT_END_EFFECTOR:
+            aim = replace(aim, link="")
+        return Goal.of_end_effectors([aim], joint_positions=self._goal_shape())
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or an end-effector.

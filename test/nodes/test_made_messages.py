@@ -117,7 +117,8 @@ def test_the_goal_is_a_ghost_of_the_base_and_the_path_a_line(name: str) -> None:
     robot = load_robot(robot_file(name))
     # The order of the links in a file says nothing: the base is the root of the tree.
     robot = replace(robot, links=robot.links[::-1])
-    *ghosts, line = goal_markers(GOAL, PATH, robot, "map").markers
+    *ghosts, line, given = goal_markers(GOAL, PATH, robot, "map").markers
+    assert (given.ns, given.id, given.action) == ("given_path", 0, Marker.DELETE)
     expected = [homogeneous(GOAL) @ each for each in base_visuals(robot.urdf)]
     assert expected
     found = []

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from abc import abstractmethod
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
@@ -200,12 +201,12 @@ class CommanderNode(FlightNode):
         self.commander.answer()
 
     def _on_goal(self, key: str, message: PoseStamped) -> None:
-        commander, part = self.commander, key.replace("_", "-")
+        self.receive(key, message, lambda: self.read_goal(key, message))
 
-        stamp = message.header.stamp
-        accepted = commander.receive_goal(
-            key, stamp.sec, stamp.nanosec, lambda: self.read_goal(key, message)
-        )
+    def receive(self, key: str, message: PoseStamped | Path, read: Callable[[], Goal]) -> None:
+        """Have the commander receive the goal that ``read`` returns; log it if it is accepted."""
+        stamp, part = message.header.stamp, key.replace("_", "-")
+        accepted = self.commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
         if accepted is not None:
             self.log("info", goal_description(part, accepted.goal_id, message, accepted.goal))
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseStamped, TransformStamped
+from nav_msgs.msg import Path
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -25,7 +26,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.planning import BasePath, Goal
-from spacerobot_ros.times import set_stamp
+from spacerobot_ros.times import SECOND, set_stamp
 
 _MARKER_TYPES = {
     "box": Marker.CUBE,
@@ -98,7 +99,8 @@ def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> Marke
 
 
 def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str) -> MarkerArray:
-    """Return markers of the base at its goal, and of the planned path of the base as a line.
+    """Return markers of the base at its goal, of the planned path of the base as a line, and of
+    the path that an end-effector is given.
 
     The ghost has the visuals of the base link and of the links that are fixed to it.
     """
@@ -114,13 +116,24 @@ def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str
         placed = base @ link_pose @ shape.pose
         set_pose(marker.pose, placed.r, quaternion_from_matrix(placed.R))
         markers.append(marker)
-    line = Marker(ns="planned_path", id=len(markers), type=Marker.LINE_STRIP, action=Marker.ADD)
+    markers.append(_line_marker("planned_path", len(markers), path.position, frame))
+    given = [each.values_on_way for each in goal.end_effectors if each.waypoints is not None]
+    if given:
+        markers.append(_line_marker("given_path", 0, given[0][:, :3], frame))
+    else:  # One of an earlier goal is erased.
+        markers.append(Marker(ns="given_path", action=Marker.DELETE))
+    return MarkerArray(markers=markers)
+
+
+def _line_marker(namespace: str, number: int, places: Array, frame: str) -> Marker:
+    """Return the marker of a line through places (K, 3)."""
+    line = Marker(ns=namespace, id=number, type=Marker.LINE_STRIP, action=Marker.ADD)
     line.header.frame_id = frame
     line.scale.x = 0.005
     line.color.r, line.color.g, line.color.b, line.color.a = 0.95, 0.6, 0.1, 1.0
     line.pose.orientation.w = 1.0
-    line.points = [Point(x=x, y=y, z=z) for x, y, z in path.position.tolist()]
-    return MarkerArray(markers=[*markers, line])
+    line.points = [Point(x=x, y=y, z=z) for x, y, z in places.tolist()]
+    return line
 
 
 def goal_message(goal: Goal, frame: str, time_ns: int) -> PoseStamped:
@@ -177,15 +190,7 @@ def goal_of(
     PlanningError
         It is in another frame, or no pose; ``what`` names it.
     """
-    given = message.header.frame_id.removeprefix("/")
-    pose = None
-    if given not in ("", frame):
-        pose = pose_of(given)
-        if pose is None:
-            raise PlanningError(
-                f"{what} is in frame '{given}'; goals are taken in '{frame}', in frames of the "
-                "robot once its state is known, and in those that /tf connects with them."
-            )
+    pose = _pose_of_frame(message.header.frame_id, frame, what, pose_of)
     p, o = message.pose.position, message.pose.orientation
     goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], shape)
     if pose is None:
@@ -194,7 +199,68 @@ def goal_of(
     return Goal.checked(moved[:3], moved[3:], shape)
 
 
-def goal_description(part: str, goal_id: str, message: PoseStamped, goal: Goal) -> str:
+def _pose_of_frame(
+    name: str, frame: str, what: str, pose_of: Callable[[str], Array | None]
+) -> Array | None:
+    """Return the pose (7,) of a frame by its name in ``frame``; None: it is that frame.
+
+    Raises
+    ------
+    PlanningError
+        It is not known; ``what`` is in it.
+    """
+    given = name.removeprefix("/")
+    if given in ("", frame):
+        return None
+    pose = pose_of(given)
+    if pose is None:
+        raise PlanningError(
+            f"{what} is in frame '{given}'; goals are taken in '{frame}', in frames of the "
+            "robot once its state is known, and in those that /tf connects with them."
+        )
+    return pose
+
+
+def path_poses(
+    message: Path,
+    frame: str,
+    what: str,
+    pose_of: Callable[[str], Array | None] = lambda frame: None,
+) -> Array:
+    """Return the poses (K, 7) of a path message in ``frame``, or their positions (K, 3).
+
+    Positions alone where all orientations are zeros. ``pose_of`` is as for :func:`goal_of`. A pose
+    without a frame is in that of the path.
+
+    Raises
+    ------
+    PlanningError
+        A frame is not known, or the stamps of the poses go back; ``what`` names the path.
+    """
+    given = [each.header.frame_id or message.header.frame_id for each in message.poses]
+    poses, times = np.zeros((len(given), 7)), np.zeros(len(given), dtype=np.int64)
+    for k, each in enumerate(message.poses):
+        p, o, stamp = each.pose.position, each.pose.orientation, each.header.stamp
+        poses[k] = p.x, p.y, p.z, o.x, o.y, o.z, o.w
+        times[k] = stamp.sec * SECOND + stamp.nanosec
+    back = np.flatnonzero(np.diff(times) < 0)
+    if len(back):
+        k = int(back[0]) + 1
+        raise PlanningError(
+            f"{what} goes back in time: pose {k + 1} is stamped {times[k] / SECOND:.9g} s, after "
+            f"{times[k - 1] / SECOND:.9g} s; leave the stamps out, or put the poses in order."
+        )
+    for name in dict.fromkeys(given):
+        other = _pose_of_frame(name, frame, what, pose_of)
+        if other is not None:
+            rows = np.array([each == name for each in given])
+            r, quaternions = poses[rows, :3], poses[rows, 3:]
+            poses[rows, :3] = other[:3] + r @ matrix_from_quaternion(other[3:]).T
+            poses[rows, 3:] = quaternion_multiply(other[3:], quaternions)
+    return poses if poses[:, 3:].any() else poses[:, :3]
+
+
+def goal_description(part: str, goal_id: str, message: PoseStamped | Path, goal: Goal) -> str:
     """Return one log line about a received goal."""
     frame = printable(message.header.frame_id)
     given = f", given in '{frame}'" if frame else ""
@@ -203,7 +269,9 @@ def goal_description(part: str, goal_id: str, message: PoseStamped, goal: Goal) 
     attitude = "any attitude"
     if aim.quaternion is not None:
         attitude = f"({', '.join(f'{x:.4g}' for x in aim.quaternion)})"
-    return f"Goal {goal_id} of the {part}: ({position}) m, {attitude}{given}."
+    waypoints = getattr(aim, "waypoints", None)
+    through = "" if waypoints is None else f" through {len(waypoints)} waypoint(s)"
+    return f"Goal {goal_id} of the {part}: ({position}) m, {attitude}{through}{given}."
 
 
 def compose_poses(outer: Array, inner: Array) -> Array:

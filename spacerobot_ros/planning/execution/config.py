@@ -29,7 +29,7 @@ class PlannerConfig(CommanderConfig):
     )
     end_effectors: tuple[str, ...] = parameter(
         (),
-        "links that take goals on NAME/goal_pose, beside end_effector/goal_pose for the link "
+        "links that take goals on NAME/goal_pose and paths on NAME/path, beside those of the link "
         "end_effector",
         texts=True,
     )

@@ -1,0 +1,272 @@
+"""Given paths of an end-effector with the base free, held against Pinocchio's momentum."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from planning.test_pose_path import distance_from
+from planning.test_resolved_rate import ARM, ATTITUDE, PERIOD, PLACE, poses, robot_of
+
+from spacerobot_ros.errors import GoalError, PlanningError
+from spacerobot_ros.planning import Goal, RobotState, Tolerance, build_method, plan
+from spacerobot_ros.planning.core.goal import MAX_PATH_POSES, EndEffectorGoal
+from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, waypoint_counts
+from spacerobot_ros.planning.methods.registry import METHODS, method_options
+from spacerobot_ros.planning.methods.resolved_rate import JointPath, PathProgress, ResolvedRateGait
+
+Array = npt.NDArray[np.float64]
+
+HAND = "end_effector"
+WAY = np.array([[0.05, 0.0, 0.02], [0.12, -0.1, 0.03], [0.02, -0.06, 0.1]])
+"""From the start of the arm, m: the corner at the second is sharp."""
+STATE = RobotState(PLACE, ATTITUDE.as_quat(), ARM)
+NEAR = Tolerance(1e-6, 1e-6)
+
+
+@pytest.fixture(scope="module")
+def start() -> Array:
+    return poses("three_joint_arm", ARM[np.newaxis], HAND)[HAND][0]
+
+
+def method_of(name: str = "resolved_rate", **options: Any) -> Any:
+    chosen = {"resolved_rate": method_options("resolved_rate", options)}
+    return build_method(name, robot_of("three_joint_arm"), PERIOD, 0.01, chosen)
+
+
+@pytest.fixture(scope="module")
+def flown(start: Array) -> GaitSchedule:
+    return plan(
+        "three_joint_arm",
+        end_effector_path=start + WAY,
+        start=STATE,
+        control_period=PERIOD,
+        corner_tolerance=0.02,
+    )
+
+
+# -- plans --------------------------------------------------------------------------------------
+
+
+def test_the_hand_keeps_to_the_lines_within_the_tolerance(
+    start: Array, flown: GaitSchedule
+) -> None:
+    lines, off, places = np.vstack([start, start + WAY]), [], []
+    for tick in range(0, flown.ticks + 1, 3):
+        shapes = flown.positions[: tick + 1]
+        if tick:  # In the middle of a held command.
+            shapes = np.vstack([shapes[:-1], shapes[-2:].mean(axis=0)])
+        places.append(poses("three_joint_arm", shapes, HAND)[HAND][0])
+        off.append(distance_from(lines, places[-1]))
+    assert 0.002 < max(off) < 0.02
+    near = [np.linalg.norm(np.array(places) - each, axis=1).min() for each in lines]
+    assert max(near) < 0.03
+    end = poses("three_joint_arm", flown.positions, HAND)[HAND][0]
+    np.testing.assert_allclose(end, start + WAY[-1], atol=1e-8)
+
+
+def test_the_limits_of_the_joints_are_kept_on_the_way(flown: GaitSchedule) -> None:
+    limit = robot_of("three_joint_arm").velocity_limit
+    rates = np.vstack([np.zeros((1, 3)), flown.velocities, np.zeros((1, 3))])
+    assert np.all(np.abs(rates) <= limit * (1 + 1e-8))
+    assert np.all(np.abs(np.diff(rates, axis=0)) / PERIOD <= limit / 0.5 * (1 + 1e-8))
+    assert flown.method == "resolved_rate"
+    assert float(str(flown.notes["least"])) <= float(str(flown.notes["at_start"]))
+
+
+def test_the_hand_rests_at_a_sharp_corner_and_goes_on(start: Array, flown: GaitSchedule) -> None:
+    # The sum of the squares of the rates is least there, but for the ends.
+    speeds = np.linalg.norm(flown.velocities, axis=1)
+    inner = np.arange(3, len(speeds) - 3)
+    slowest = int(inner[np.argmin(speeds[inner])])
+    there = [
+        np.linalg.norm(poses("three_joint_arm", flown.positions[: k + 1], HAND)[HAND][0] - corner)
+        for k in (slowest, slowest + 1)
+        for corner in [start + WAY[1]]
+    ]
+    assert min(there) < 1e-8
+
+
+def test_a_plan_in_between_goes_on_along_the_rest_of_the_path(
+    start: Array, flown: GaitSchedule
+) -> None:
+    method, goal = method_of(corner_tolerance=0.02), flown.goal
+    progress = flown.progress
+    assert isinstance(progress, PathProgress)
+    assert len(progress.along) == len(flown.positions)
+    assert progress.along[0] == 0.0
+    assert progress.along[-1] == pytest.approx(progress.route.along[-1])
+    assert np.all(np.diff(progress.along) >= -1e-9)
+    tick = int(np.searchsorted(progress.along, progress.route.along[2] + 0.02))
+    # Braking came before the schedule: its shapes do not count.
+    braked = replace(flown, positions=np.vstack([[9.0, 9.0, 9.0], flown.positions]))
+    r, _ = poses("three_joint_arm", flown.positions[: tick + 1], HAND)[HAND]
+    state = RobotState(r - start + PLACE, ATTITUDE.as_quat(), flown.positions[tick] + 1e-4)
+    request = PlanRequest(state, goal, NEAR, correction=True, previous=braked)
+    route = method._route(request, 0.01)
+    assert len(route.positions) == 3
+    done = progress.route.after(progress.along[tick]).positions
+    np.testing.assert_allclose(route.positions[1:], done, atol=1e-12)
+    np.testing.assert_allclose(route.positions[-1], start + WAY[-1], atol=1e-12)
+    at_end = replace(request, state=replace(state, q=flown.positions[-1]))
+    assert len(method._route(at_end, 0.01).positions) == 2
+    # Without an earlier schedule a correction goes straight.
+    assert len(method._route(replace(request, previous=None), 0.01).positions) == 2
+    first = method._route(PlanRequest(STATE, goal, NEAR), 0.0)
+    np.testing.assert_allclose(first.positions, np.vstack([start, start + WAY]), atol=1e-9)
+
+
+def test_a_hand_at_the_end_of_its_rest_stays(start: Array) -> None:
+    aim = EndEffectorGoal.along(HAND, [start, start])
+    goal = Goal.of_end_effectors([aim]).for_robot(robot_of("three_joint_arm").description)
+    assert method_of().plan(PlanRequest(STATE, goal, NEAR)).ticks == 0
+
+
+def test_auto_takes_the_method_that_follows_paths(start: Array) -> None:
+    path = start + np.array([[0.0, 0.0, 0.0], [0.004, 0.0, 0.003]])
+    schedule = plan("three_joint_arm", end_effector_path={HAND: path}, start=STATE, method="auto")
+    assert schedule.method == "resolved_rate"
+    assert str(schedule.notes["because"]).endswith("is the only one that plans this goal.")
+
+
+# -- refusals -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(set(METHODS) - {"resolved_rate", "auto"}))
+def test_other_methods_name_the_one_that_follows_paths(name: str) -> None:
+    method: Any = SimpleNamespace(name=name)
+    goal = Goal.of_end_effectors([EndEffectorGoal.along("hand", [[1, 2, 3], [1, 2, 4]])])
+    with pytest.raises(PlanningError) as refusal:
+        METHODS[name]._require_no_path(method, goal)
+    assert str(refusal.value) == (
+        f"{name} does not follow paths, and 'hand' is to follow one: resolved_rate does."
+    )
+    assert not METHODS[name].follows_paths
+    METHODS[name]._require_no_path(
+        method, Goal.of_end_effectors([replace(goal.end_effectors[0], waypoints=None)])
+    )
+
+
+@pytest.mark.parametrize("name", ["optimal", "area_loop"])
+def test_another_method_refuses_before_it_plans(name: str) -> None:
+    with pytest.raises(PlanningError, match=f"^{name} does not follow paths, and 'end_effector'"):
+        plan("three_joint_arm", end_effector_path=[[1, 1, 1], [1, 1, 1.1]], method=name)
+
+
+def test_one_end_effector_follows_a_path_and_the_base_is_free() -> None:
+    paths = {HAND: [[1, 1, 1], [1, 1, 1.1]]}
+    with pytest.raises(PlanningError, match="takes one end-effector along a path, and the goal is"):
+        plan(
+            "three_joint_arm", end_effector_path=paths, end_effector_position={"link_3": [1, 1, 1]}
+        )
+    with pytest.raises(PlanningError, match="asks for the pose of the base, too"):
+        plan("three_joint_arm", end_effector_path=paths, position=[0, 0, 0])
+    with pytest.raises(GoalError, match="has 2 goals; it can have one"):
+        plan("three_joint_arm", end_effector_path=paths, end_effector_position={HAND: [1, 1, 1]})
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ([], "The path of 'hand' has no poses."),
+        (np.zeros((0, 7)), "The path of 'hand' has no poses."),
+        ([1.0, 2.0, 3.0], r"The path of 'hand' is of shape \(3,\); each of its poses takes 3"),
+        (np.ones((3, 4)), r"is of shape \(3, 4\)"),
+        (np.ones((2, 3, 3)), r"is of shape \(2, 3, 3\)"),
+        (np.zeros((MAX_PATH_POSES + 1, 3)), "has 10001 poses; it can have 10000."),
+        ([[0, 0, 0], [0, np.nan, 0]], r"Pose 2 of the path of 'hand' is \[0.0, nan, 0.0\], which"),
+        ([[0, 0, 0], [0, 0, 0], [2e12, 0, 0]], "Pose 3 of .* farther than 1e\\+12 m away"),
+        ([[0, 0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0, 0]], "Pose 2 of .* has a zero quaternion"),
+        ("there", "The goal path of 'hand' 'there' is not a list of numbers"),
+    ],
+)
+def test_paths_that_are_none_are_refused(path: Any, message: str) -> None:
+    with pytest.raises(GoalError, match=message):
+        EndEffectorGoal.along("hand", path)
+
+
+# -- contacts -----------------------------------------------------------------------------------
+
+
+def contact(beyond: float, obstacle: tuple[int, str] | None = None, *, last: int = 9) -> Any:
+    """Return the last place of a path of ten shapes whose joint comes too near beyond a value."""
+    shapes = np.arange(last + 1.0)[:, np.newaxis]
+    path = JointPath(
+        shapes[:, 0], shapes, np.tile([0.0, 0, 0, 1], (last + 1, 1)), *[shapes[:, 0]] * 2
+    )
+    asked: list[int] = []
+
+    def too_near(found: Array, base: Array, *, at_ticks: bool) -> str:
+        assert (len(base), at_ticks) == (len(found), False)
+        asked.append(len(found))
+        return f"links touch at {found[-1, 0]:g}" if found[-1, 0] > beyond else ""
+
+    method: Any = SimpleNamespace(_base_poses=lambda state, q, X: X, _too_near=too_near)
+    state: Any = SimpleNamespace(quaternion=np.array([0.0, 0.6, 0.0, 0.8]))
+    return ResolvedRateGait._find_contact(method, state, path, obstacle), asked
+
+
+def test_a_contact_on_the_way_ends_it_just_before() -> None:
+    assert contact(6.5)[0] == (6, "On the way links touch at 7.")
+    assert contact(0.0)[0] == (0, "On the way links touch at 1.")
+    assert contact(8.0)[0] == (8, "On the way links touch at 9.")
+    assert contact(9.0)[0] is None
+    _, asked = contact(6.5)
+    assert asked[0] == 10
+    assert len(asked) <= 5
+
+
+def test_the_first_of_a_contact_and_another_obstacle_counts() -> None:
+    assert contact(6.5, (4, "a limit"))[0] == (4, "a limit")
+    assert contact(2.5, (4, "a limit"))[0] == (2, "On the way links touch at 3.")
+    assert contact(-1.0, (0, "a limit"))[0] == (0, "a limit")
+
+
+# -- one place ----------------------------------------------------------------------------------
+
+
+def test_a_path_is_a_goal_with_waypoints() -> None:
+    aim = EndEffectorGoal.along("hand", [[1, 2, 3, 0, 0, 2, 0], [4, 5, 6, 0, 0, 0, -5.0]])
+    assert aim.quaternion is not None
+    np.testing.assert_array_equal(aim.quaternion, [0, 0, 0, -1])
+    np.testing.assert_array_equal(aim.waypoints, [[1, 2, 3, 0, 0, 1, 0]])
+    np.testing.assert_array_equal(aim.values_on_way[1], aim.values)
+    one = EndEffectorGoal.along("hand", [[1, 2, 3]])
+    assert (one.waypoints, one.quaternion) == (None, None)
+    np.testing.assert_array_equal(one.values_on_way, [[1, 2, 3]])
+    goal, other = (
+        Goal.of_end_effectors([aim]),
+        Goal.of_end_effectors([replace(aim, waypoints=None)]),
+    )
+    assert goal.has_path
+    assert not other.has_path
+    assert not goal.equals(other)
+    assert goal.equals(Goal.of_end_effectors([EndEffectorGoal.along("hand", aim.values_on_way)]))
+    assert waypoint_counts(goal) == {"hand": 1}
+    assert waypoint_counts(other) == {}
+
+
+def test_files_of_goals_keep_paths(tmp_path: Any) -> None:
+    path = tmp_path / "goal.json"
+    poses = [[1, 2, 3, 0, 0, 0.6, 0.8], [4, 5, 6, 0, 0, 0, 1]]
+    goal = Goal.of_end_effectors(
+        [EndEffectorGoal.along("hand", poses), EndEffectorGoal.checked("foot", [7, 8, 9])]
+    )
+    GoalFile(str(path)).save({"base": IdentifiedGoal(goal, "4.2")})
+    loaded = GoalFile(str(path)).load()["base"]
+    assert loaded.goal.equals(goal)
+    assert loaded.goal.has_path
+
+
+def test_statuses_tell_the_number_of_waypoints() -> None:
+    status = PlannerStatus(PlannerState.EXECUTING, end_effector_waypoints={"hand": 12})
+    values = status.to_values()
+    assert values["waypoints_of_hand"] == "12"
+    assert PlannerStatus.from_values(values).end_effector_waypoints == {"hand": 12}
