@@ -139,7 +139,9 @@ def test_orientations_of_zeros_ask_for_positions_alone() -> None:
 
 def test_stamps_may_be_left_out_and_go_on_but_not_back() -> None:
     message = path_through([[1, 2, 3], [4, 5, 6], [7, 8, 9]])
-    for each, (sec, nanosec) in zip(message.poses, ((2, 500_000_000), (2, 500_000_000), (3, 0)), strict=True):
+    for each, (sec, nanosec) in zip(
+        message.poses, ((2, 500_000_000), (2, 500_000_000), (3, 0)), strict=True
+    ):
         each.header.stamp.sec, each.header.stamp.nanosec = sec, nanosec
     assert len(path_poses(message, "world", "It")) == 3
     message.poses[2].header.stamp.sec = 1

@@ -27,6 +27,7 @@ Array = npt.NDArray[np.float64]
 HAND = "end_effector"
 WAY = np.array([[0.05, 0.0, 0.02], [0.12, -0.1, 0.03], [0.02, -0.06, 0.1]])
 """From the start of the arm, m: the corner at the second is sharp."""
+SHORT = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 1.1]])
 STATE = RobotState(PLACE, ATTITUDE.as_quat(), ARM)
 NEAR = Tolerance(1e-6, 1e-6)
 
@@ -157,11 +158,11 @@ def test_other_methods_name_the_one_that_follows_paths(name: str) -> None:
 @pytest.mark.parametrize("name", ["optimal", "area_loop"])
 def test_another_method_refuses_before_it_plans(name: str) -> None:
     with pytest.raises(PlanningError, match=f"^{name} does not follow paths, and 'end_effector'"):
-        plan("three_joint_arm", end_effector_path=[[1, 1, 1], [1, 1, 1.1]], method=name)
+        plan("three_joint_arm", end_effector_path=SHORT, method=name)
 
 
 def test_one_end_effector_follows_a_path_and_the_base_is_free() -> None:
-    paths = {HAND: [[1, 1, 1], [1, 1, 1.1]]}
+    paths = {HAND: SHORT}
     with pytest.raises(PlanningError, match="takes one end-effector along a path, and the goal is"):
         plan(
             "three_joint_arm", end_effector_path=paths, end_effector_position={"link_3": [1, 1, 1]}
@@ -233,7 +234,7 @@ def test_the_first_of_a_contact_and_another_obstacle_counts() -> None:
 
 
 def test_a_path_is_a_goal_with_waypoints() -> None:
-    aim = EndEffectorGoal.along("hand", [[1, 2, 3, 0, 0, 2, 0], [4, 5, 6, 0, 0, 0, -5.0]])
+    aim = EndEffectorGoal.along("hand", [[1, 2, 3, 0, 0, 2, 0], [4, 5, 6, 0, 0, 0, -5]])
     assert aim.quaternion is not None
     np.testing.assert_array_equal(aim.quaternion, [0, 0, 0, -1])
     np.testing.assert_array_equal(aim.waypoints, [[1, 2, 3, 0, 0, 1, 0]])
@@ -255,7 +256,7 @@ def test_a_path_is_a_goal_with_waypoints() -> None:
 
 def test_files_of_goals_keep_paths(tmp_path: Any) -> None:
     path = tmp_path / "goal.json"
-    poses = [[1, 2, 3, 0, 0, 0.6, 0.8], [4, 5, 6, 0, 0, 0, 1]]
+    poses: Any = [[1, 2, 3, 0, 0, 0.6, 0.8], [4, 5, 6, 0, 0, 0, 1]]
     goal = Goal.of_end_effectors(
         [EndEffectorGoal.along("hand", poses), EndEffectorGoal.checked("foot", [7, 8, 9])]
     )
