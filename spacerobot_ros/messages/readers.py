@@ -139,7 +139,8 @@ class TemplateReader:
         self._type_name, self._spans, self._max_size = type_name, spans, max_size
         self._fields = fields_of(type_name)
         self._size = -1
-        self._raw = bytes(2)  # The initial template matches no message.
+        self.raw = bytes(2)  # The initial template matches no message.
+        """The accepted message, little-endian."""
         self._fixed_spans: list[tuple[slice, bytes]] = []
         self._joined_spans: list[tuple[slice, bytes]] = []
         self._value_spans: dict[str, tuple[int, int]] = {}
@@ -155,7 +156,7 @@ class TemplateReader:
         UnreadableError
             The bytes are not a message of the type; the earlier message stays.
         """
-        if raw is self._raw:
+        if raw is self.raw:
             return
         if len(raw) == self._size:
             # Messages of one writer have equal padding: longer spans, with padding, are compared
@@ -164,10 +165,10 @@ class TemplateReader:
                 if raw[place] != text:
                     break
             else:
-                self._raw = raw
+                self.raw = raw
                 return
             if all(raw[place] == text for place, text in self._fixed_spans):
-                self._raw = raw
+                self.raw = raw
                 self._join_fixed_spans(raw)
                 return
         self._learn_layout(raw)
@@ -175,7 +176,7 @@ class TemplateReader:
     def floats(self, path: str) -> Array:
         """Return a read-only view of the values at ``path``."""
         offset, count = self._value_spans[path]
-        return np.frombuffer(self._raw, np.float64, count, offset)
+        return np.frombuffer(self.raw, np.float64, count, offset)
 
     def byte_span(self, path: str) -> slice:
         """Return the span of bytes of the values at ``path`` in messages of this layout."""
@@ -190,7 +191,7 @@ class TemplateReader:
         """Return a text of messages of this layout."""
         assert self._layout is not None
         leaf = self._layout.leaves[path]
-        return self._raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
+        return self.raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
 
     def texts(self, path: str) -> list[str]:
         """Return a list of texts of messages of this layout."""
@@ -204,7 +205,7 @@ class TemplateReader:
     @property
     def stamp_ns(self) -> int:
         """Header stamp of the accepted message, ns."""
-        seconds, nanoseconds = unpack_stamp(self._raw)
+        seconds, nanoseconds = unpack_stamp(self.raw)
         return int(seconds * SECOND + nanoseconds)
 
     def _join_fixed_spans(self, raw: bytes) -> None:
@@ -238,9 +239,9 @@ class TemplateReader:
         except TooLongError as error:
             # The stamp of the refused message stays readable, but its bytes do not count as
             # accepted.
-            self._raw, self._size = raw[: HEADER_STAMP.stop], -1
+            self.raw, self._size = raw[: HEADER_STAMP.stop], -1
             raise CommandError(str(error)) from error
-        self._raw, self._size, self._layout = raw, len(raw), layout
+        self.raw, self._size, self._layout = raw, len(raw), layout
         fixed = [(0, len(LITTLE_ENDIAN)), *layout.fixed]
         self._fixed_spans = [(slice(a, b), raw[a:b]) for a, b in fixed]
         self._value_spans = {}
@@ -312,8 +313,9 @@ class JointReader:
         stamp = self._reader.stamp_ns
         if stamp > LATEST_NS and self._measured:
             raise UnreadableError(f"no command can carry its stamp of {stamp / SECOND:.10g} s")
+        accepted = self._reader.raw  # The message itself may have been big-endian.
         for target, place in self._copies:
-            target[:] = raw[place]
+            target[:] = accepted[place]
         if self._order is not None:
             for name, values in self.values.items():
                 if self._reader.has_values(name):

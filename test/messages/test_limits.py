@@ -1,0 +1,315 @@
+"""What definitions and messages may be at most, and what is read of the allowed ones."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import WrenchStamped
+from nav_msgs.msg import Path
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header, String
+
+from spacerobot_ros.errors import CommandError
+from spacerobot_ros.messages import definitions
+from spacerobot_ros.messages.definitions import fields_of
+from spacerobot_ros.messages.layout import (
+    Layout,
+    TooLongError,
+    column_dtype,
+    encode_list,
+    read_columns,
+    stamp_pairs,
+    stamped_copies,
+)
+from spacerobot_ros.messages.readers import (
+    JointReader,
+    MessageDecoder,
+    UnreadableError,
+    joint_template,
+    read_text,
+)
+from spacerobot_ros.times import LATEST_NS, stamp_bytes
+
+S = 10**9
+NAME = "a/msg/B"
+
+
+def refused(text: str, name: str = NAME) -> str:
+    with pytest.raises(ValueError, match=r"\w") as caught:
+        definitions._parse_definition(name, text.encode())
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["a/B", "a/msg/1B", "a/msg/B/C", "1a/msg/B", "a/foo/B"])
+def test_types_have_names_of_three_parts(name: str) -> None:
+    assert refused("int32 x\n", name) == "a type is called 'package/msg/Type'"
+
+
+def test_texts_of_types_are_limited() -> None:
+    line = "int32 x\n"
+    full = line + "#" * (262_144 - len(line))
+    assert definitions._parse_definition(NAME, full.encode())
+    long = "its text is longer than 262144 bytes or 5000 lines, which no message needs"
+    assert refused(full + "#") == long
+    lines = line + "\n" * 4_999
+    assert definitions._parse_definition(NAME, lines.encode())
+    assert refused(lines + "\n") == long
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        # Of strings and messages every element counts, of numbers the list.
+        ("int32[5000] x\n", 1),
+        ("string[1000] x\n", 1000), ("string[999] x\nint8 y\n", 1000),
+        ("string[] x\nint8[] y\n", 2),
+        ("C[500] c\n" + "=" * 80 + "\nMSG: a/C\nint8 x\nint8 y\n", 1000),
+        ("C[] c\n" + "=" * 80 + "\nMSG: a/C\nint8 x\nint8 y\n", 2),
+    ],
+)  # fmt: skip
+def test_fields_are_counted_with_those_of_messages_in_them(text: str, count: int) -> None:
+    types = definitions._parse_definition(NAME, text.encode())
+    assert definitions._FieldCounts(types).of(NAME, 0) == count
+    if count < 1000:
+        assert definitions._parse_definition(NAME, f"string[{1000 - count}] z\n{text}".encode())
+    more = f"string[{1001 - count}] z\n{text}"
+    assert refused(more).startswith("a/msg/B has more than 1000 fields")
+
+
+def chain(depth: int) -> str:
+    parts = [f"C{i + 1} x\n" if i < depth else "int8 x\n" for i in range(depth + 1)]
+    rule = "=" * 80
+    return "".join(p if not i else f"{rule}\nMSG: a/C{i}\n{p}" for i, p in enumerate(parts))
+
+
+def test_types_are_nested_at_most_32_deep_and_never_in_themselves() -> None:
+    assert definitions._parse_definition(NAME, chain(32).encode())
+    deep = "its types are nested more than 32 deep, or in themselves"
+    assert refused(chain(33)) == refused("B x\n") == deep
+    assert refused("C x\n") == "it does not define a/msg/C"
+
+
+@pytest.mark.parametrize(("length", "cut"), [(200, False), (201, True)])
+def test_errors_are_one_line(length: int, cut: bool) -> None:
+    text = "x" * length
+    found = definitions._error_in_one_line(ValueError(f" {text}\n"))
+    assert found == ("x" * 200 + " ..." if cut else text)
+    assert definitions._error_in_one_line(KeyError()) == "KeyError"
+    assert definitions._error_in_one_line(ValueError("a \n  b")) == "a b"
+
+
+@pytest.mark.parametrize(
+    ("given", "short"),
+    [("std_msgs/msg/String", ("std_msgs", "String")), ("std_msgs/String", ("std_msgs", "String"))],
+)
+def test_short_names_of_types_are_known(given: str, short: tuple[str, str]) -> None:
+    assert definitions._split_type_name(given) == short
+    for wrong in ("String", "std_msgs/msg/", "a/msg/B/c", "/String"):
+        with pytest.raises(Exception, match="is not the name of a message type"):
+            definitions._split_type_name(wrong)
+
+
+# -- messages -----------------------------------------------------------------------------------
+
+
+def state(names: list[str], sec: int = 0, nanosec: int = 0, frame: str = "", **more: Any) -> bytes:
+    values: dict[str, Any] = {"position": [float(i + 1) for i in range(len(names))], **more}
+    header = Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=frame)
+    return serialize_message(JointState(header=header, name=names, **values))
+
+
+def test_a_measured_state_may_be_as_long_as_two_of_its_robot() -> None:
+    reader = JointReader(["arms", "ü"], ["position"], measured=True)
+    longest = 4096 + 2 * (4 + 32 + 2 + 32)
+    short = state(["arms", "ü"], frame="f")
+    fits = state(["arms", "ü"], frame="f" * (longest - len(short) + 1))
+    assert len(fits) == longest
+    assert reader.accept(fits) == 0
+    longer = state(["arms", "ü"], frame="f" * (longest - len(short) + 9))
+    with pytest.raises(UnreadableError) as caught:
+        reader.accept(longer)
+    said = f"it has {len(longer)} bytes, of which at most {longest} can be meant"
+    assert str(caught.value) == said
+    assert JointReader(["arms", "ü"], ["position"]).accept(longer) == 0
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_the_stamp_of_a_measured_state_is_one_of_an_answer(measured: bool) -> None:
+    reader = JointReader(["a"], ["position"], measured=measured)
+    last = state(["a"], 2**31 - 1, 999_999_999)
+    assert reader.accept(last) == LATEST_NS
+    late = last[:8] + (1_000_000_000).to_bytes(4, "little") + last[12:]
+    if not measured:
+        assert reader.accept(late) == LATEST_NS + 1
+        return
+    with pytest.raises(UnreadableError, match="no command can carry its stamp of 2147483648 s"):
+        reader.accept(late)
+
+
+def test_joints_are_taken_by_their_names_and_refused_messages_leave_nothing() -> None:
+    reader = JointReader(["a", "b", "c"], ["position", "velocity"])
+    position, velocity = reader.values["position"], reader.values["velocity"]
+    swapped = state(["c", "a", "b"], velocity=[7.0, 8.0, 9.0])
+    for _ in range(2):
+        reader.accept(swapped)
+        assert (position.tolist(), velocity.tolist()) == ([2, 3, 1], [8, 9, 7])
+    reader.accept(state(["a", "b", "c"], position=[4.0, 5.0, 6.0]))
+    assert (position.tolist(), velocity.tolist()) == ([4, 5, 6], [0, 0, 0])
+    for names, more in (
+        (["a", "b"], {}), (["a", "b", "b"], {}), (["a", "b", "x"], {}),
+        (["a", "b", "c"], {"position": []}), (["a", "b", "c"], {"velocity": [1.0]}),
+    ):  # fmt: skip
+        wrong = state(names, 5, 7, **more)
+        for _ in range(2):
+            with pytest.raises(CommandError):
+                reader.require(wrong)
+        with pytest.raises(CommandError):
+            reader.accept(wrong)
+        assert reader.stamp_ns == 5 * S + 7
+        assert position.tolist() == [4, 5, 6]
+
+
+def test_references_lack_what_they_do_not_give() -> None:
+    decoder = MessageDecoder(["a", "b"])
+    position, velocity = decoder.joint_reference(state(["b", "a"]))
+    assert (position.tolist(), velocity.tolist()) == ([2, 1], [0, 0])
+    decoder.accept(state(["a", "b"], velocity=[0.5, 0.25]))
+    assert (decoder.q.tolist(), decoder.qdot.tolist()) == ([1, 2], [0.5, 0.25])
+
+
+@pytest.mark.parametrize("count", [10_000, 10_001])
+def test_a_list_of_texts_has_ten_thousand_at_most(count: int) -> None:
+    reader = JointReader(["a"], ["position"])
+    raw = state(["a"] * count, 3, position=[])
+    with pytest.raises(CommandError) as caught:
+        reader.accept(raw)
+    long = f"it has a list of {count} entries, more than 10000"
+    assert (str(caught.value) == long) is (count > 10_000)
+    assert reader.stamp_ns == 3 * S
+
+
+def test_messages_of_big_endian_machines_are_read() -> None:
+    little = state(["a"], 3, 4, position=[0.5])
+    header = (3).to_bytes(4, "big") + (4).to_bytes(4, "big") + (1).to_bytes(4, "big") + b"\0\0\0\0"
+    name = (1).to_bytes(4, "big") + (2).to_bytes(4, "big") + b"a\0\0\0"
+    number = (1).to_bytes(4, "big") + np.array([0.5], ">f8").tobytes()
+    big = b"\0\0\0\0" + header + name + number + bytes(8)
+    for raw in (little, big, little, big):
+        reader = JointReader(["a"], ["position"])
+        assert reader.accept(raw) == 3 * S + 4
+        assert reader.values["position"].tolist() == [0.5]
+    with pytest.raises(UnreadableError, match="its bytes are no JointState"):
+        JointReader(["a"], ["position"]).accept(b"\0\2" + little[2:])
+    with pytest.raises(UnreadableError, match="its bytes are no JointState"):
+        JointReader(["a"], ["position"]).accept(big[:-9])
+
+
+def test_single_texts_are_read_and_broken_ones_refused() -> None:
+    raw = serialize_message(String(data="a robot ü"))
+    assert read_text(raw, "std_msgs/msg/String", "data") == "a robot ü"
+    with pytest.raises(UnreadableError, match=r"^its bytes are no String$"):
+        read_text(raw[:-4], "std_msgs/msg/String", "data")
+
+
+def test_a_template_of_joints_has_all_their_quantities() -> None:
+    template = joint_template(["a", "bc"])
+    for number, name in enumerate(("position", "velocity", "effort")):
+        template.floats(name, 2)[:] = [number + 0.5, number + 0.25]
+    found = JointReader(["a", "bc"], ["position", "velocity", "effort"])
+    assert found.accept(template.serialised(stamp_bytes(2 * S + 5))) == 2 * S + 5
+    assert [values.tolist() for values in found.values.values()] == [
+        [0.5, 0.25], [1.5, 1.25], [2.5, 2.25]]  # fmt: skip
+
+
+# -- lists and columns --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_lists_of_messages_have_a_row_each(count: int) -> None:
+    times = np.arange(count, dtype=np.int64) * 1_500_000_000
+    positions = np.arange(3.0 * count).reshape(count, 3)
+    raw = encode_list(
+        "nav_msgs/msg/Path", {"header": {"frame_id": "world"}}, "poses",
+        {"header": {"frame_id": "hand"}},
+        {"header.stamp.sec": stamp_pairs(times), "pose.position.x": positions},
+    )  # fmt: skip
+    message = deserialize_message(raw, Path)
+    assert message.header.frame_id == "world"
+    assert len(message.poses) == count
+    for i, each in enumerate(message.poses):
+        assert each.header.frame_id == "hand"
+        assert each.header.stamp.sec * S + each.header.stamp.nanosec == times[i]
+        at = each.pose.position
+        assert [at.x, at.y, at.z] == positions[i].tolist()
+
+
+def test_copies_differ_in_stamps_and_numbers() -> None:
+    prototype = serialize_message(WrenchStamped(header=Header(frame_id="base")))
+    stamps = np.array([1, S + 2, 5 * S], np.int64)
+    forces = np.arange(9.0).reshape(3, 3) + 0.5
+    copies = stamped_copies(
+        prototype, "geometry_msgs/msg/WrenchStamped", stamps, {"wrench.force.x": forces}
+    )
+    name = "geometry_msgs/msg/WrenchStamped"
+    found = read_columns(copies, name, fields_of(name))
+    assert found is not None
+    assert list(found["header.stamp.sec"]) == [0, 1, 5]
+    assert list(found["header.stamp.nanosec"]) == [1, 2, 0]
+    assert list(found["wrench.force.y"]) == [1.5, 4.5, 7.5]
+    assert list(found["wrench.torque.z"]) == [0.0] * 3
+    assert found["header.frame_id"] == ["base"] * 3
+
+
+def test_messages_of_another_layout_have_no_columns() -> None:
+    name = "sensor_msgs/msg/JointState"
+    fields = fields_of(name)
+    some = [state(["a", "b"]), state(["a", "c"]), state(["a", "b"])]
+    found = read_columns(some, name, fields)
+    assert found is not None
+    assert not found.constant("name")
+    assert not found.constant("position")
+    same = read_columns([some[0], some[2]], name, fields)
+    assert same is not None
+    assert same.constant("name")
+    np.testing.assert_array_equal(same["position"], [[1.0, 2.0]] * 2)
+    # Equally long, with other lengths of their lists, in any of the messages.
+    other = state(["a", "b"], position=[1.0], velocity=[2.0])
+    assert len(other) == len(some[0])
+    for place in range(3):
+        mixed = [*some[:place], other, *some[place:]]
+        assert read_columns(mixed, name, fields) is None
+    assert read_columns([], name, fields) is None
+    assert read_columns([some[0], state(["a"])], name, fields) is None
+    assert read_columns([b"\0\0" + raw[2:] for raw in some], name, fields) is None
+    assert read_columns([raw[:-9] for raw in some], name, fields) is None
+    mixed = [some[0], b"\0\0" + some[1][2:]]
+    assert read_columns(mixed, name, fields) is None
+
+
+@pytest.mark.parametrize(
+    ("given", "wide"),
+    [("<f4", "f8"), ("<f8", "f8"), ("i1", "i8"), ("u1", "i8"), ("<u4", "i8"), ("<i4", "i8"),
+     ("<u8", "u8"), ("<i8", "i8"), ("?", "?")],
+)  # fmt: skip
+def test_columns_have_wide_numbers(given: str, wide: str) -> None:
+    assert column_dtype(np.dtype(given)) == np.dtype(wide)
+
+
+@pytest.mark.parametrize(("most", "refused"), [(math.inf, False), (3, False), (2, True)])
+def test_lists_of_a_layout_may_be_limited(most: float, refused: bool) -> None:
+    raw = state(["a", "b", "c"])
+    layout = Layout(raw, "sensor_msgs/msg/JointState", elements=True, max_elements=most)
+    if refused:
+        with pytest.raises(TooLongError, match="a list of 3 entries, more than 2"):
+            layout.walk("sensor_msgs/msg/JointState")
+        assert "header.stamp.sec" in layout.leaves
+        return
+    layout.walk("sensor_msgs/msg/JointState")
+    assert layout.end == 4 + 16 + 4 + 3 * 8 + 4 + 3 * 8 + 2 * 4
+    assert (layout.counts["name"], layout.leaves["name[2]"].size) == (3, 1)
+    assert layout.leaves["position"].shape == (3,)
