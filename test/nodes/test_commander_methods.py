@@ -12,14 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.exceptions import InvalidHandle
 from std_srvs.srv import Trigger
+from support.ros_harness import Harness
 
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.nodes.common import commander
 from spacerobot_ros.nodes.common import node as common_node
 from spacerobot_ros.nodes.common.commander import CommanderNode
 from spacerobot_ros.nodes.common.node import FlightNode
 from spacerobot_ros.nodes.plant import publisher
+from spacerobot_ros.nodes.plant.node import PlantNode
 from spacerobot_ros.nodes.plant.publisher import PlantReport, timing_status
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -430,3 +434,117 @@ def test_levels_are_of_what_has_happened_since_the_last_report(
         assert [each.name for each in array.status] == names
         assert {each.hardware_id for each in array.status} == {"mine"}
     assert (published[1].header.stamp.sec, published[1].header.stamp.nanosec) == (1, 500_000_000)
+
+
+# -- failures -------------------------------------------------------------------------------------
+
+
+def failing(**changes: Any) -> Any:
+    """Return a stand-in for an active node, which keeps its lines, events and calls."""
+    log = Log()
+    node: Any = SimpleNamespace(
+        log=log, done=[], _destroyed=False, _has_entities=True, _failure="", fault=None,
+        is_active=True, get_name=lambda: "plant", get_logger=lambda: log,
+    )  # fmt: skip
+    node.on_failure = lambda message, error: node.done.append(message)
+    node.report_event = lambda event: node.done.append((event.kind, event.level, event.message))
+    node.trigger_deactivate = lambda: node.done.append("deactivate")
+    node._report_failure = lambda *given: FlightNode._report_failure(node, *given)
+    vars(node).update(changes)
+    return node
+
+
+def error_lines(node: Any) -> list[str]:
+    return [line[1] for line in node.log.lines if line[0] == "error"]
+
+
+@pytest.mark.parametrize("active", [False, True])
+def test_an_error_is_reported_once_and_stops_its_node(active: bool) -> None:
+    node = failing(is_active=active)
+    for _ in range(2):
+        FlightNode._fail(node, "a timer", SpaceRobotError("It has failed."))
+    event = (EventKind.FAILED, 2, "It has failed.")
+    assert node.done == ["It has failed.", event, *(["deactivate"] if active else [])]
+    assert error_lines(node) == ["It has failed."]
+    assert str(node.fault) == "It has failed."
+
+
+def test_an_unexpected_error_is_told_with_its_line() -> None:
+    node = failing()
+
+    def inner() -> None:
+        raise ValueError(" it is\n odd. ")
+
+    try:
+        inner()
+    except ValueError as error:
+        line = error.__traceback__.tb_next.tb_lineno  # type: ignore[union-attr]
+        FlightNode._fail(node, "a timer", error)
+    place = f"(test_commander_methods.py, line {line})"
+    said = f"Node 'plant' has failed at a timer: ValueError: it is odd {place}."
+    assert error_lines(node) == [said]
+    node = failing()
+    FlightNode._fail(node, "a timer", KeyError())
+    assert error_lines(node) == ["Node 'plant' has failed at a timer: KeyError."]
+
+
+def test_a_second_failure_causes_no_third_one() -> None:
+    def fail(*_: Any) -> None:
+        raise ValueError("again")
+
+    node = failing(trigger_deactivate=fail, on_failure=fail)
+    FlightNode._fail(node, "a timer", SpaceRobotError("It has failed."))
+    first, second, third = error_lines(node)
+    assert first == "It has failed."
+    assert second.startswith("Node 'plant': ValueError: again (")
+    assert third.startswith("Node 'plant' cannot stop: ValueError: again (")
+    assert node.done == [(EventKind.FAILED, 2, "It has failed.")]
+    assert str(node.fault) == "It has failed."
+
+
+@pytest.mark.parametrize(
+    ("error", "entities", "destroyed", "told"),
+    [
+        (InvalidHandle("gone"), False, False, False), (InvalidHandle("gone"), True, False, True),
+        (ValueError("odd"), False, False, True), (ValueError("odd"), True, True, False),
+    ],
+)  # fmt: skip
+def test_callbacks_of_what_is_destroyed_are_no_failure(
+    error: Exception, entities: bool, destroyed: bool, told: bool
+) -> None:
+    node = failing(_has_entities=entities, _destroyed=destroyed)
+    FlightNode._fail(node, "a timer", error)
+    assert (node.fault is not None) is told
+
+
+# -- periods of a plant ---------------------------------------------------------------------------
+
+
+PERIODS = ("base_pose_period", "marker_period", "clearance_period", "tf_period")
+
+
+@pytest.mark.parametrize(
+    ("given", "real_time", "ticks"),
+    [
+        (0.0, True, [1, 0, 0, 0]),
+        (0.3, True, [3, 3, 3, 2]),
+        (9.0, True, [10, 10, 10, 2]),
+        (9.0, False, [90, 90, 90, 90]),
+    ],
+)
+def test_viewers_of_a_plant_in_real_time_wait_for_half_a_second_at_most(
+    harness: Harness, given: float, real_time: bool, ticks: list[int]
+) -> None:
+    settings: dict[str, Any] = {"robot": "planar_manipulator", "tick_rate": 10.0}
+    settings |= dict.fromkeys(PERIODS, given) | {"time_mode": "lockstep"}
+    if real_time:
+        settings |= {"time_mode": "realtime", "real_time_factor": 2.0, "command_timeout": 5.0}
+    plant = harness.make(PlantNode, settings, autostart=False)
+    assert (plant.tick, plant.time_ns) == (0, 0)
+    plant.trigger_configure()
+    found = [plant._pose_ticks, plant._marker_ticks, plant._clearance_ticks, plant._tf_ticks]
+    if not plant._transforms.publishes:
+        ticks = [*ticks[:3], 0]
+    assert found == ticks
+    assert (plant._clearance is None) is (given == 0.0)
+    assert (plant.tick, plant.simulated_time_s) == (0, 0.0)

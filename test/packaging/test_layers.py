@@ -223,3 +223,29 @@ def test_parameters_can_be_given_by_name() -> None:
         for node in ast.walk(tree_of(module)):
             if isinstance(node, ast.FunctionDef | ast.Lambda):
                 assert not node.args.posonlyargs, f"{module}, line {node.lineno}"
+
+
+HOOKS = {
+    "commanding.commander": ["_report_waiting_goal", "_pass_on_outputs"],
+    "planning.core.method": ["_setup", "require_suitable"],
+    "session.stack": ["interrupt", "_supervise"],
+}
+"""Methods of abstract classes that do nothing unless they are overridden, by module."""
+
+
+def test_methods_without_a_body_are_abstract_or_hooks() -> None:
+    found: dict[str, list[str]] = {}
+    for module in sources():
+        classes = [node for node in ast.walk(tree_of(module)) if isinstance(node, ast.ClassDef)]
+        for node in classes:
+            if "ABC" not in (ast.unparse(base) for base in node.bases):
+                continue
+            for each in node.body:
+                if (
+                    isinstance(each, ast.FunctionDef)
+                    and len(each.body) == 1
+                    and ast.get_docstring(each)
+                    and "abstractmethod" not in map(ast.unparse, each.decorator_list)
+                ):
+                    found.setdefault(module.partition(".")[2], []).append(each.name)
+    assert found == HOOKS
