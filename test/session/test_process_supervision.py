@@ -11,7 +11,7 @@ import signal
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -508,3 +508,25 @@ def test_every_node_tells_its_connections(recorder: bool) -> None:
 
 _CONNECTED = MultiProcessStack._connected
 """The method itself: the nodes of other tests are all connected."""
+
+
+def test_the_shape_of_a_goal_is_one_of_the_robot(
+    make: Callable[..., MultiProcessStack], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+    make_client = MultiProcessStack._make_client
+
+    def keep(stack: MultiProcessStack, names: Any) -> None:
+        asked.append(names and names())
+        make_client(stack, names)
+
+    monkeypatch.setattr(MultiProcessStack, "_make_client", keep)
+    monkeypatch.setattr(Scenario, "require_shape_of", lambda scenario, robot: asked.append(robot))
+    shaped = load_scenario("planar_chain")
+    assert shaped.goal.joint_positions is not None
+    plain = replace(shaped, goal=replace(shaped.goal, joint_positions=None))
+    robot = SimpleNamespace(joint_names=("a", "b"))
+    for scenario, known in ((plain, robot), (shaped, robot), (shaped, None)):
+        monkeypatch.setattr(processes, "robot_of", lambda config, known=known: known)
+        assert make(scenario, bag=None).time_ns == 0
+    assert asked == [None, robot, ("a", "b"), ()]
