@@ -140,6 +140,25 @@ def test_a_status_is_pairs_of_words() -> None:
     assert PlantStatus.from_values({"state": "failed"}, "m") == PlantStatus(PlantState.FAILED, "m")
 
 
+@pytest.mark.parametrize(
+    ("activity", "message", "latched"),
+    [
+        (PlantState.INACTIVE, "The plant is inactive", ", and a fault is latched: hot"),
+        (PlantState.PAUSED, "Time is stopped until '~/pause' resumes it",
+         ", and a fault is latched: hot"),
+    ],
+)  # fmt: skip
+def test_a_plant_at_rest_says_whether_a_fault_is_latched(
+    activity: PlantState, message: str, latched: str
+) -> None:
+    monitor: Any = object.__new__(status.PlantMonitor)
+    for fault, wanted in (("", f"{message}."), ("hot", f"{message}{latched}.")):
+        monitor._commands = SimpleNamespace(fault=fault, fault_reason="abort" if fault else "")
+        found = monitor._status(activity)
+        assert (found.message, found.latched_fault, found.state) == (wanted, fault, activity)
+        assert found.reason == ("abort" if fault else "")
+
+
 # -- stops of joints -----------------------------------------------------------------------------
 
 
