@@ -311,6 +311,14 @@ _TOPIC_TABLE = (
         "disturbances of the plant, one a line, or `clear`",
     ),
     Topic(
+        "obstacles",
+        _STRING_TYPE,
+        _PUBLISHED_BY_USER,
+        "URDF of the obstacles that are fixed in the world from now on, in place of those so far, "
+        "for the planner, the plant and viewers; empty: there are none",
+        latched=True,
+    ),
+    Topic(
         "joint_commands",
         _JOINT_STATE_TYPE,
         ("planner", "coordinated_control"),

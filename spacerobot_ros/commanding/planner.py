@@ -10,10 +10,16 @@ from typing import Any
 
 from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
 from spacerobot_ros.commanding.plant_state import Pairing, PlantChange
-from spacerobot_ros.errors import CommandError, PlanningError
+from spacerobot_ros.errors import (
+    CommandError,
+    PlanningError,
+    RobotDescriptionError,
+    printable,
+)
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.world import among_obstacles, obstacles_from_topic, shaped_links
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive, Transition
@@ -97,6 +103,10 @@ class PlannerCommander(Commander):
         """The status that the executive has reported last."""
         self._disturbances: tuple[str, ...] = ()
         """Lines of the active disturbances of the plant."""
+        self._obstacles: str | None = None
+        """The text on the topic obstacles; None: the robot has its own."""
+        self._world: RobotDescription | None = None
+        """The obstacles of this text."""
 
     def _make_status(self, state: str, message: str, goal_id: str) -> PlannerStatus:
         return PlannerStatus(PlannerState(state), message, goal_id)
@@ -124,16 +134,47 @@ class PlannerCommander(Commander):
             self.executive.cancel_plan()
 
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
-        worker = PlanningWorker(robot, self.config, self._method, self._long_work)
+        worker = self._make_worker(robot, self._method)
         self.executive = Executive(robot, self.config, worker, self._goal_file)
         self._measured = _MeasuredState(decoder)
+
+    def _make_worker(self, robot: SpaceRobot, method: GaitMethod | None) -> PlanningWorker:
+        """Return a worker that plans around the present obstacles."""
+        described = robot.description
+        if self._obstacles is not None:
+            described = among_obstacles(described, self._world)
+        return PlanningWorker(robot, self.config, method, self._long_work, described)
+
+    def receive_obstacles(self, text: str) -> None:
+        """Plan around the obstacles of a URDF text in place of those so far; empty: around none.
+
+        A text that is refused is logged, and the obstacles so far stay.
+        """
+        if text == self._obstacles:
+            return
+        try:
+            self._world = obstacles_from_topic(text)
+        except RobotDescriptionError as refusal:
+            kept = "The obstacles so far stay."
+            self._log_fault("obstacles", printable(f"obstacles: {refusal} {kept}"))
+            return
+        self._obstacles = text
+        links = [] if self._world is None else shaped_links(self._world)
+        listed = f": {', '.join(links)}" if links else ""
+        self.host.log("info", printable(f"Plans go round {len(links)} obstacle(s){listed}."))
+        executive, robot = self.executive, self.robot
+        if executive is not None and robot is not None:
+            method = self._method if robot is self._described else None
+            with self._long_work():
+                executive.use_obstacles(lambda: self._make_worker(robot, method))
+            self._pass_on_outputs()
 
     def _change_masses(self, robot: SpaceRobot) -> None:
         assert self.executive is not None
         # A given method is one for the robot without its payload.
         method = self._method if robot is self._described else None
         with self._long_work():
-            worker = PlanningWorker(robot, self.config, method, self._long_work)
+            worker = self._make_worker(robot, method)
         self.executive.use_robot(robot, worker)
         self._pass_on_outputs()
 

@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,6 +33,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.model.world import among_obstacles, obstacles_from_topic
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
@@ -125,14 +126,35 @@ class FlightBag:
 
     @property
     def description(self) -> RobotDescription | None:
-        """The first readable description of the robot; None where there is none."""
+        """The first readable description of the robot, among the obstacles that came last; None
+        where there is none.
+        """
         for part in self.parts:
             for text in part.bag.robot_descriptions(self.namespace):
                 try:
-                    return parse_robot(text.decode())
+                    found = parse_robot(text.decode())
                 except (RobotDescriptionError, UnicodeDecodeError):
                     continue
+                came = self.obstacles
+                return among_obstacles(found, came[-1][1]) if came else found
         return None
+
+    @cached_property
+    def obstacles(self) -> list[tuple[int, RobotDescription | None]]:
+        """The obstacles that came on the topic obstacles, with their log times, ns; None: that
+        there are none. Texts that nodes refuse are left out.
+        """
+        came = []
+        for time_ns, message in self.messages("obstacles"):
+            with suppress(RobotDescriptionError):
+                came.append((time_ns, obstacles_from_topic(message.data)))
+        return came
+
+    @property
+    def obstacles_change(self) -> bool:
+        """Whether obstacles came after the first state."""
+        states = self.series_of("odom")
+        return bool(states) and any(time / SECOND > states[0].time[0] for time, _ in self.obstacles)
 
     # -- signals ------------------------------------------------------------------------------
 
@@ -409,7 +431,8 @@ def read_flight(bag: FlightBag) -> Flight:
         end_effector_goals=tool_goals,
         status=status,
         gait=follower.gait,
-        measures_clearance=bool(bag.series_of("clearance")),
+        # The distances of a flight are to one set of obstacles.
+        measures_clearance=bool(bag.series_of("clearance")) and not bag.obstacles_change,
     )
     # A table of thrusters that is a file of its own is not looked for: a bag may name any file.
     in_urdf = scenario.in_file.get("plant", {}).get("thrusters") == IN_URDF

@@ -11,7 +11,12 @@ import re
 from dataclasses import replace
 from xml.etree.ElementTree import fromstring, tostring
 
+from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.urdf import parse_world
+
+MAX_OBSTACLES_TEXT = 1_000_000
+"""Largest number of characters of obstacles on a topic."""
 
 _CARRIED = re.compile(r"\s*<world>.*</world>", re.DOTALL)
 _END = re.compile(r"</robot\s*>")
@@ -28,3 +33,39 @@ def with_world(robot: RobotDescription, world: RobotDescription) -> RobotDescrip
         place = ends[-1].start()
         urdf = urdf[:place] + carried + urdf[place:]
     return replace(robot, world=world, urdf=urdf)
+
+
+def among_obstacles(robot: RobotDescription, world: RobotDescription | None) -> RobotDescription:
+    """Return a robot among other obstacles than so far; None: there are none around it."""
+    if world is None:
+        return replace(robot, world=None, urdf=_CARRIED.sub("", robot.urdf))
+    return with_world(robot, world)
+
+
+def obstacles_from_topic(text: str) -> RobotDescription | None:
+    """Return the obstacles of a text on the topic ``obstacles``; None, where it is empty.
+
+    The text is plain URDF: nothing in it is expanded.
+
+    Raises
+    ------
+    RobotDescriptionError
+        It is too long, has obstacles of its own around it, or :func:`.parse_world` refuses it.
+    """
+    if len(text) > MAX_OBSTACLES_TEXT:
+        raise RobotDescriptionError(
+            f"The obstacles are a text of {len(text)} characters, which may have at most "
+            f"{MAX_OBSTACLES_TEXT}: give them fewer links, or meshes in files."
+        )
+    if not text.strip():
+        return None
+    if "<world" in text:
+        raise RobotDescriptionError(
+            "Obstacles are not among others: leave the element <world> out of their URDF."
+        )
+    return parse_world(text)
+
+
+def shaped_links(world: RobotDescription) -> list[str]:
+    """Return the names of the links that are obstacles: those with a shape."""
+    return [each.name for each in world.links if each.collisions or each.shapes]

@@ -12,6 +12,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Path
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
@@ -88,6 +89,7 @@ class PlannerNode(CommanderNode):
             self._take_twists(name)
             self._take_paths(name)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
+        self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         self.create_service(Trigger, "~/statistics", self._on_statistics)
 
     def start_message(self) -> str:
@@ -135,6 +137,9 @@ class PlannerNode(CommanderNode):
             commander.receive_twist(link, message.header.frame_id, linear, angular)
 
         self.create_subscription(TwistStamped, twist_topic(link), on_twist, STREAM)
+
+    def _on_obstacles(self, message: String) -> None:
+        self.commander.receive_obstacles(message.data)
 
     def _take_paths(self, link: str) -> None:
         """Subscribe to the paths of a link."""

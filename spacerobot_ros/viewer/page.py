@@ -432,6 +432,9 @@ class Page:
         self._drawing: scene.RobotDrawing | None = None
         self._target: RobotDescription | None = None
         self._target_drawing: scene.RobotDrawing | None = None
+        self._obstacles: tuple[RobotDescription | None] | None = None
+        """The obstacles that were shown last; None: the robot carries its own."""
+        self._drawn_obstacles: list[viser.MeshHandle] = []
         self._table: ThrusterTable | None = None
         self._state = StackState()
         self._due: dict[str, float] = {}
@@ -506,6 +509,7 @@ class Page:
         self._around: scene.Surroundings | None = None
         self._server.scene.reset()
         self._target_drawing = None
+        self._drawn_obstacles = []
         reach = 1.0 if robot is None else scene.reach_of(robot)
         self._reach, self._trail = reach, Trail(0.003 * reach)
         self.editor.show_robot(robot, reach)
@@ -516,10 +520,20 @@ class Page:
             self._server.scene, _ROBOT_PATH, robot, on_note=lambda text: self.note(Notice(text, 1))
         )
         self._drawing.base.visible = False  # Until its first state comes.
-        scene.draw_obstacles(self._server.scene, _OBSTACLES_PATH, robot.world)
+        world = robot.world if self._obstacles is None else self._obstacles[0]
+        self._drawn_obstacles = scene.draw_obstacles(self._server.scene, _OBSTACLES_PATH, world)
         self._show_collision_shapes()
         if self._target is not None:
             self.show_target(self._target)
+
+    def show_obstacles(self, world: RobotDescription | None) -> None:
+        """Draw other obstacles than those that the robot carries; None: there are none."""
+        self._obstacles = (world,)
+        for each in self._drawn_obstacles:
+            each.remove()
+        self._drawn_obstacles = []
+        if self._robot is not None:
+            self._drawn_obstacles = scene.draw_obstacles(self._server.scene, _OBSTACLES_PATH, world)
 
     def show_target(self, target: RobotDescription) -> None:
         """Draw the body that floats beside the robot, from its first state on."""

@@ -171,19 +171,31 @@ def link_pose(kinematics: ForwardKinematics, link: str, pose: Array, q: Array) -
     return np.concatenate([pose[:3] + R_WB @ r_BL_B[number], quaternion])
 
 
-def draw_obstacles(scene: viser.SceneApi, path: str, world: RobotDescription | None) -> None:
-    """Draw the shapes of obstacles by which distances are measured; None: there are none."""
+def draw_obstacles(
+    scene: viser.SceneApi, path: str, world: RobotDescription | None
+) -> list[viser.MeshHandle]:
+    """Draw the shapes of obstacles by which distances are measured; None: there are none.
+
+    Returns
+    -------
+    list[viser.MeshHandle]
+        The meshes.
+    """
+    drawn = []
     for number, (visual, pose) in enumerate(obstacle_visuals(world)):
         red, green, blue, _ = visual.shape.rgba
-        scene.add_mesh_simple(
-            f"{path}/{number}",
-            visual.mesh.vertices @ pose.R.T + pose.r,
-            visual.mesh.faces.astype(np.uint32),
-            color=(round(255 * red), round(255 * green), round(255 * blue)),
-            flat_shading=True,
-            cast_shadow=False,
-            receive_shadow=False,
+        drawn.append(
+            scene.add_mesh_simple(
+                f"{path}/{number}",
+                visual.mesh.vertices @ pose.R.T + pose.r,
+                visual.mesh.faces.astype(np.uint32),
+                color=(round(255 * red), round(255 * green), round(255 * blue)),
+                flat_shading=True,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
         )
+    return drawn
 
 
 def reach_of(robot: RobotDescription) -> float:

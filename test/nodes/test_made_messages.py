@@ -418,3 +418,41 @@ def test_obstacles_are_drawn_where_they_rest() -> None:
             [1.0, -1.5, 4.0, 0, 0, math.sqrt(0.5), math.sqrt(0.5)]
         )
         assert (post.scale.x, post.scale.y, post.scale.z) == (1.0, 2.0, 3.0)
+
+
+def test_obstacles_that_are_gone_are_erased() -> None:
+    from rclpy.serialization import deserialize_message
+    from visualization_msgs.msg import MarkerArray
+
+    def world(*names: str) -> str:
+        shape = '<collision><geometry><sphere radius="0.2"/></geometry></collision>'
+        links = "".join(f'<link name="{name}">{shape}</link>' for name in names)
+        joints = "".join(
+            f'<joint name="of_{name}" type="fixed"><parent link="w"/><child link="{name}"/></joint>'
+            for name in names
+        )
+        return f'<robot name="w"><link name="w"/>{links}{joints}</robot>'
+
+    plant: Any = SimpleNamespace(
+        capturing=None,
+        robot=SimpleNamespace(
+            description=with_world(parse_robot(URDF), parse_world(world("post")))
+        ),
+        pose=np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8]),
+        link_R=np.hstack([np.eye(3), np.eye(3)]),
+        link_r=np.zeros((3, 2)),
+    )
+    node: Any = FakeNode()
+    markers = LinkMarkers(node, plant, "map")
+    drawn = []
+    for there in (None, parse_world(world("post", "ball")), None, parse_world(world("ball"))):
+        markers.use_obstacles(there)
+        markers.publish(7)
+        found = deserialize_message(node.published[-1], MarkerArray).markers
+        drawn.append([(each.ns, each.id, each.action) for each in found[2:]])
+    assert drawn == [
+        [("post", 2, Marker.DELETE)],
+        [("post", 2, Marker.ADD), ("ball", 3, Marker.ADD)],
+        [("ball", 3, Marker.DELETE), ("post", 2, Marker.DELETE)],
+        [("ball", 2, Marker.ADD), ("ball", 3, Marker.DELETE), ("post", 2, Marker.DELETE)],
+    ]

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -48,7 +49,7 @@ from spacerobot_ros.planning.execution.executive import (
     Transition,
 )
 from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFrame
-from spacerobot_ros.planning.execution.worker import PlanReason
+from spacerobot_ros.planning.execution.worker import PlanningWorker, PlanReason
 
 PAGE = Path(__file__).parents[2] / "docs" / "planner_state_machine.md"
 
@@ -88,6 +89,27 @@ def twist(loop: Loop) -> None:
 def stopped_plant(loop: Loop) -> None:
     loop.executive.plant_stopped("The plant is latched.")
     loop._take()
+
+
+def obstacles(*, near: bool) -> Act:
+    """Let other obstacles be there, which the rest of the schedule comes too near to, or not."""
+    clearance: Any = SimpleNamespace(
+        has_obstacles=True,
+        approaches=lambda positions, base: ["there"] * near,
+        clause=lambda approach, period: "link 'a' and obstacle 'b' touch",
+    )
+
+    def act(loop: Loop) -> None:
+        worker = loop.executive._worker
+
+        def make() -> PlanningWorker:
+            worker.clearance = clearance
+            return worker
+
+        loop.executive.use_obstacles(make)
+        loop._take()
+
+    return act
 
 
 def to(phase: Phase, *, base: bool = True) -> Act:
@@ -170,6 +192,7 @@ HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
             (E.PLANT_RESET, P.MEASURING, (start, reset_plant)),
             (E.PLANT_RESET, P.EVALUATING, (again(start), reset_plant)),
             (E.ABORTED, P.BRAKING, (start, abort)),
+            (E.OBSTACLES, P.EXECUTING, (start, obstacles(near=False))),
             (E.PLANT_STOPPED, P.IDLE, (start, stopped_plant)),
             (E.DEACTIVATED, P.IDLE, (start, stop)),
         )
@@ -197,6 +220,11 @@ HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
     (P.EVALUATING, E.PLANT_STOPPED, P.IDLE): (evaluating, stopped_plant),
     (P.PLANNING, E.PLANT_RESET, P.MEASURING): (planning, reset_plant),
     (P.PLANNING, E.PLANT_RESET, P.EVALUATING): (*(braking_off_path, to(P.PLANNING), reset_plant),),
+    (P.PLANNING, E.OBSTACLES, P.MEASURING): (planning, obstacles(near=True)),
+    (P.PLANNING, E.OBSTACLES, P.EVALUATING): (
+        *(braking_off_path, to(P.PLANNING), obstacles(near=False)),
+    ),
+    (P.EXECUTING, E.OBSTACLES, P.BRAKING): (executing, obstacles(near=True)),
     (P.EXECUTING, E.PLANT_RESET, P.EVALUATING): (executing, reset_plant),
     (P.EXECUTING, E.PLANT_RESET, P.MEASURING): (executing, propose_goal(OTHER), reset_plant),
     (P.BRAKING, E.PLANT_RESET, P.IDLE): (braking, reset_plant),

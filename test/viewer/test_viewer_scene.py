@@ -19,6 +19,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import parse_robot, parse_world
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.resources import robot_file, share_directory
@@ -263,6 +264,37 @@ def test_a_target_is_drawn_from_its_first_state_on_and_outlasts_a_new_robot(serv
     page.show_robot(None)
     assert server.scene.get_handle_by_name("/target") is None
     page.update(StackState(target=np.array([1.0, -2.0, 3.0, 0.0, 0.0, 0.0, 1.0])), 3.0)
+
+
+def test_other_obstacles_take_the_place_of_those_of_the_robot(server: Any) -> None:
+    def world(*names: str) -> Any:
+        shape = '<collision><geometry><sphere radius="0.2"/></geometry></collision>'
+        links = "".join(f'<link name="{name}">{shape}</link>' for name in names)
+        joints = "".join(
+            f'<joint name="of_{name}" type="fixed"><parent link="w"/><child link="{name}"/></joint>'
+            for name in names
+        )
+        return parse_world(f'<robot name="w"><link name="w"/>{links}{joints}</robot>')
+
+    def drawn() -> list[bool]:
+        found = (server.scene.get_handle_by_name(f"/obstacles/{number}") for number in range(3))
+        return [each is not None for each in found]
+
+    server.scene.reset()
+    page, robot = Page(server, ViewerConfig()), load_robot(robot_file("planar_chain"))
+    page.show_obstacles(world("a", "b", "c"))
+    assert drawn() == [False] * 3
+    page.show_robot(with_world(robot, world("d")))
+    assert drawn() == [True] * 3
+    page.show_obstacles(world("a", "b"))
+    assert drawn() == [True, True, False]
+    page.show_obstacles(None)
+    assert drawn() == [False] * 3
+    page.show_robot(with_world(robot, world("d")))
+    assert drawn() == [False] * 3
+    other = Page(server, ViewerConfig())
+    other.show_robot(with_world(robot, world("d")))
+    assert drawn() == [True, False, False]
 
 
 def test_collision_shapes_are_shown_on_request(server: Any) -> None:

@@ -17,11 +17,18 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.bag.salvage import last_state
-from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
+from spacerobot_ros.errors import (
+    CommandError,
+    ParameterError,
+    RobotDescriptionError,
+    SpaceRobotError,
+    printable,
+)
 from spacerobot_ros.messages.readers import CommandReader
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.shared_parameters import robot_of
+from spacerobot_ros.model.world import among_obstacles, obstacles_from_topic
 from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node
@@ -161,7 +168,10 @@ class PlantNode(FlightNode):
         )
         self._clearance = None
         if self._clearance_ticks:
-            self._clearance = ClearancePublisher.of(self, self.plant)
+            self._clearance = ClearancePublisher.of(self, self.plant, robot.description)
+        self._obstacles: str | None = None
+        """The text on the topic obstacles; None: the robot has its own."""
+        self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         for source in self._commands.sources:
             reader = CommandReader(source, robot, config.frame_prefix)
             self.take_raw(
@@ -440,6 +450,25 @@ class PlantNode(FlightNode):
             self.get_logger().warning(str(error))
             return
         self._look_at_status()
+
+    def _on_obstacles(self, message: String) -> None:
+        """Measure distances to the obstacles of a text, and draw them, in place of those so far."""
+        if message.data == self._obstacles:
+            return
+        try:
+            world = obstacles_from_topic(message.data)
+        except RobotDescriptionError as refusal:
+            kept = "The obstacles so far stay."
+            self.get_logger().error(printable(f"obstacles: {refusal} {kept}"))
+            return
+        self._obstacles = message.data
+        self._markers.use_obstacles(world)
+        if self._clearance_ticks:
+            described = among_obstacles(self.plant.robot.description, world)
+            with self.long_work():
+                self._clearance = ClearancePublisher.of(
+                    self, self.plant, described, self._clearance
+                )
 
     def on_silence(self, silence: Silence) -> None:
         """Bring all joints to rest if a commander is silent and the parameters request it."""

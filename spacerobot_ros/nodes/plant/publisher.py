@@ -22,7 +22,7 @@ from spacerobot_ros.messages.builders import (
 from spacerobot_ros.messages.readers import MessageTemplate
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Pose
+from spacerobot_ros.model.description import Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.nodes.common.messages import (
     diagnostic_name,
@@ -449,18 +449,39 @@ class ClearancePublisher:
         The plant's node.
     plant
         The plant.
+    monitor
+        Measures the distances.
+    stream
+        The topic; None: a new one.
     """
 
-    def __init__(self, node: FlightNode, plant: Plant, monitor: ClearanceMonitor) -> None:
+    def __init__(
+        self,
+        node: FlightNode,
+        plant: Plant,
+        monitor: ClearanceMonitor,
+        stream: RawOutput | None = None,
+    ) -> None:
         self._node, self._plant, self._monitor = node, plant, monitor
         self._name = node.get_fully_qualified_name()
-        self._stream = node.send_raw(DiagnosticStatus, "clearance")
+        self._stream = stream or node.send_raw(DiagnosticStatus, "clearance")
 
     @classmethod
-    def of(cls, node: FlightNode, plant: Plant) -> ClearancePublisher | None:
-        """Return the publisher of a plant; None where none of its links could touch."""
-        monitor = ClearanceMonitor.of(plant.robot.description, tuple(plant.robot.link_names))
-        return None if monitor is None else cls(node, plant, monitor)
+    def of(
+        cls,
+        node: FlightNode,
+        plant: Plant,
+        described: RobotDescription,
+        before: ClearancePublisher | None = None,
+    ) -> ClearancePublisher | None:
+        """Return the publisher of a plant among obstacles; None where no links could touch.
+
+        ``before`` is the publisher among those so far, whose topic goes on.
+        """
+        monitor = ClearanceMonitor.of(described, tuple(plant.robot.link_names))
+        if monitor is None:
+            return None
+        return cls(node, plant, monitor, None if before is None else before._stream)
 
     def publish(self, time_ns: int) -> None:
         """Publish the present clearance, and events of contacts that have begun or ended."""
@@ -485,7 +506,15 @@ class LinkMarkers:
     """
 
     def __init__(self, node: FlightNode, plant: FaultyPlant, world_frame: str) -> None:
-        self._plant = plant
+        self._plant, self._world_frame = plant, world_frame
+        self._publisher: Any = node.create_publisher(MarkerArray, "markers", STREAM)
+        self._drawn: set[tuple[str, int]] = set()
+        """Namespaces and numbers of all markers so far."""
+        self.use_obstacles(plant.robot.description.world)
+
+    def use_obstacles(self, world: RobotDescription | None) -> None:
+        """Draw other obstacles from now on; None: none."""
+        plant, world_frame = self._plant, self._world_frame
         self._poses: list[tuple[int, Pose]] = []
         markers: list[Marker] = []
         for index, link in enumerate(plant.robot.description.links):
@@ -500,14 +529,17 @@ class LinkMarkers:
                 for shape in link.shapes:
                     markers.append(shape_marker(shape, world_frame, link.name, len(markers)))
                     self._of_target.append(target.frames[link.name][1] @ shape.pose)
-        if (world := plant.robot.description.world) is not None:
+        if world is not None:
             for link in world.links:
                 for shape in link.shapes or link.collisions:
                     marker = shape_marker(shape, world_frame, link.name, len(markers))
                     at = world.frames[link.name][1] @ shape.pose
                     set_pose(marker.pose, at.r, quaternion_from_matrix(at.R))
                     markers.append(marker)
-        self._publisher: Any = node.create_publisher(MarkerArray, "markers", STREAM)
+        present = {(marker.ns, marker.id) for marker in markers}
+        for ns, number in sorted(self._drawn - present):
+            markers.append(Marker(ns=ns, id=number, action=Marker.DELETE))
+        self._drawn |= present
         self._template = MessageTemplate(
             MARKER_ARRAY_TYPE, serialize_message(MarkerArray(markers=markers))
         )

@@ -29,6 +29,7 @@ from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.model.world import obstacles_from_topic
 from spacerobot_ros.nodes.common.messages import goal_message, shape_message
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
@@ -163,6 +164,7 @@ class ViewerNode(FlightNode):
         )
         self.create_subscription(String, "robot_description", self._on_description, LATCHED)
         self.create_subscription(String, "target/robot_description", self._on_target, LATCHED)
+        self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         self.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
         self.create_subscription(RosoutLog, "/rosout", self._on_log, _ROSOUT_QOS)
         self.create_subscription(
@@ -280,6 +282,12 @@ class ViewerNode(FlightNode):
             self._page.show_target(parse_robot(message.data))
         except SpaceRobotError as error:
             self._note(f"target/robot_description: {error}", 2)
+
+    def _on_obstacles(self, message: String) -> None:
+        try:
+            self._page.show_obstacles(obstacles_from_topic(message.data))
+        except SpaceRobotError as error:
+            self._note(f"obstacles: {error}", 2)
 
     def _on_status(self, key: str, name: str) -> None:
         if self._full_names.get(key) == name:

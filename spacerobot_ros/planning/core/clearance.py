@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -80,8 +81,8 @@ class Clearance:
         return cls(robot, distance) if distance else None
 
     def of(self, robot: RobotDescription) -> Clearance:
-        """Return the same clearance of another robot."""
-        return Clearance(robot, self.distance)
+        """Return the same clearance of another robot among the same obstacles."""
+        return Clearance(replace(robot, world=self._robot.world), self.distance)
 
     @cached_property
     def geometry(self) -> CollisionGeometry:

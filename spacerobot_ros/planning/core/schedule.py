@@ -26,6 +26,17 @@ class BasePath:
     position: Array
     quaternion: Array
 
+    def at(self, times: Array) -> tuple[Array, Array]:
+        """Return positions (N, 3) and quaternions (N, 4) at times (N,), s, on straight lines."""
+        signs = np.cumprod(
+            np.sign((self.quaternion[1:] * self.quaternion[:-1]).sum(axis=1) + 1e-300)
+        )
+        quaternions = self.quaternion * np.append(1.0, signs)[:, np.newaxis]
+        rows = np.hstack([self.position, quaternions])
+        found = np.column_stack([np.interp(times, self.time, each) for each in rows.T])
+        sizes = np.linalg.norm(found[:, 3:], axis=1, keepdims=True)
+        return found[:, :3], found[:, 3:] / sizes
+
 
 @dataclass(frozen=True, repr=False)
 class GaitSchedule:

@@ -12,19 +12,19 @@ Other modules do the work of a phase: :mod:`.tracker` computes the commands alon
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.collision import BasePoses
+from spacerobot_ros.errors import ParameterError, PlanningError, sentence_case
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled, PoseError, RobotState
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
@@ -101,6 +101,7 @@ class Event(Enum):
     SCHEDULE_ENDED = "schedule ended"
     AT_REST = "at rest"  # The braking is over.
     TRACKING_ERROR = "tracking error"  # The base is off its path; the method plans from rest only.
+    OBSTACLES = "obstacles"  # There are other obstacles, which the plan does not know.
     JOINTS_STUCK = "joints stuck"
     TIME_JUMPED = "time jumped"  # The schedule does not cover the time of the states.
     REACHED = "reached"
@@ -140,6 +141,10 @@ _TRANSITION_RULES: tuple[tuple[Iterable[Phase], Event, Iterable[Phase]], ...] = 
     ([Phase.EXECUTING], Event.NEW_GOAL, [Phase.BRAKING]),
     ([Phase.EXECUTING], Event.TRACKING_ERROR, [Phase.BRAKING]),
     ([Phase.BRAKING], Event.AT_REST, [Phase.IDLE, *_REST_PHASES]),
+    # Obstacles that come, move or go.
+    ([Phase.PLANNING], Event.OBSTACLES, _REST_PHASES),
+    ([Phase.REPLANNING, Phase.TAKING_OVER], Event.OBSTACLES, [Phase.EXECUTING]),
+    ([Phase.EXECUTING], Event.OBSTACLES, [Phase.BRAKING]),
     # Teleoperation.
     ([Phase.IDLE], Event.TWIST, [Phase.TELEOPERATING]),
     ([Phase.TELEOPERATING], Event.AT_REST, [Phase.IDLE, Phase.MEASURING]),
@@ -355,9 +360,8 @@ class Executive:
         if link not in self._followers:
             config = self.config
             options = config.options.get(ResolvedRateGait.name, ResolvedRateOptions())
-            clearance = Clearance.wanted(self._robot.description, config.clearance)
             self._followers[link] = TwistFollower(
-                self._robot, link, options, config.control_period, clearance
+                self._robot, link, options, config.control_period, self._worker.clearance
             )
         return self._followers[link]
 
@@ -465,6 +469,60 @@ class Executive:
         self._robot, self._worker = robot, worker
         self._average = StateAverage(robot, self.config.averaging, self.config.rest_tolerance)
         self._tracker.use_robot(robot)
+
+    def use_obstacles(self, make_worker: Callable[[], PlanningWorker]) -> None:
+        """Plan around other obstacles from now on.
+
+        A plan that is being made is made again. Where the rest of the present schedule comes too
+        near, the joints brake, and the remaining motion is planned again.
+
+        Parameters
+        ----------
+        make_worker
+            Returns the worker that knows the obstacles; called when no plan is made any more.
+        """
+        self._drop_plan()
+        self._worker.close()
+        self._worker = make_worker()
+        self._followers.clear()
+        if self._teleoperation is not None:
+            link = self._teleoperation.follower.link
+            self._teleoperation.follower = self._follower_of(link)
+        active = self._active_goal
+        match self.phase:
+            case Phase.PLANNING:
+                if active is not None:
+                    active.next_plan = PlanReason.REPLAN
+                self._average.restart()
+                self._change_phase(Event.OBSTACLES, self._phase_at_rest())
+            case Phase.REPLANNING | Phase.TAKING_OVER:
+                self._change_phase(Event.OBSTACLES, Phase.EXECUTING)
+        if self.phase is Phase.EXECUTING and active is not None:
+            clause = self._nears_obstacles(active)
+            if clause:
+                message = (
+                    f"{sentence_case(clause)}: the joints brake, and the remaining motion is "
+                    "planned again."
+                )
+                self._add_notice(Severity.WARNING, message)
+                self._add_status(PlannerState.EXECUTING, message, active.identified, active)
+                self._brake_for_replan(Event.OBSTACLES)
+
+    def _nears_obstacles(self, active: ActiveGoal) -> str:
+        """Return the clause that says where the rest of a schedule comes too near; else nothing."""
+        clearance, schedule = self._worker.clearance, active.schedule
+        if clearance is None or not clearance.has_obstacles:
+            return ""
+        period = self.config.control_period
+        begins = active.ends_at - schedule.duration
+        first = min(max(int((self._stamp_ns / 1e9 - begins) / period), 0), schedule.ticks)
+        ticks = np.arange(first, schedule.ticks + 1, dtype=float)
+        base = schedule.path.at(period * ticks)
+        try:
+            found = clearance.approaches(schedule.positions[first:], base=BasePoses(*base))
+        except PlanningError as refusal:
+            return str(refusal).removesuffix(".")
+        return clearance.clause(found[0], period) if found else ""
 
     def _plan_again(self, message: str) -> None:
         self._average.forget()

@@ -13,7 +13,7 @@ import numpy as np
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState
@@ -148,6 +148,8 @@ class PlanningWorker:
         The method with all joints; None: the one that the configuration names.
     long_work
         Returns the context in which a plan is made at once.
+    described
+        The robot among its present obstacles; None: as the model describes it.
 
     Raises
     ------
@@ -161,15 +163,18 @@ class PlanningWorker:
         config: PlannerConfig,
         method: GaitMethod | None = None,
         long_work: Callable[[], AbstractContextManager[None]] = nullcontext,
+        described: RobotDescription | None = None,
     ) -> None:
         self._robot, self._config, self._long_work = robot, config, long_work
+        self.clearance = Clearance.wanted(described or robot.description, config.clearance)
+        """Distances that plans keep; None: any."""
         self._method = method or build_method(
             config.method,
             robot,
             config.control_period,
             config.integration_step,
             config.method_options,
-            Clearance.wanted(robot.description, config.clearance),
+            self.clearance,
         )
         self._remaining_joints: tuple[PlanningTask, GaitMethod] | None = None
         """The latest method without stuck joints, and its task."""
@@ -259,7 +264,7 @@ class PlanningWorker:
             method=config.method,
             options=config.method_options,
             required=task.required,
-            clearance=Clearance.wanted(self._robot.description, config.clearance),
+            clearance=self.clearance,
         )
         self._remaining_joints = task, method
         return method
