@@ -21,13 +21,19 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.model.description import Array, Inertia, Pose
-from spacerobot_ros.model.rotations import hat, matrix_from_quaternion
+from spacerobot_ros.model.description import Array, Inertia, Pose, RobotDescription
+from spacerobot_ros.model.rotations import (
+    hat,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotvec_from_quaternion,
+)
 from spacerobot_ros.model.space_robot import SpaceRobot
 
 
@@ -103,6 +109,44 @@ _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True)
+class TargetBody:
+    """A rigid body that can be captured.
+
+    Attributes
+    ----------
+    inertia
+        Mass properties in the frame T of its root link.
+    grapple
+        Pose of the grapple frame G in T.
+    """
+
+    inertia: Inertia
+    grapple: Pose
+
+    @classmethod
+    def of(cls, target: RobotDescription, grapple_frame: str) -> TargetBody:
+        """Return the body of a description, with a link of it as grapple frame.
+
+        Raises
+        ------
+        RobotDescriptionError
+            Its joints move, or it has no such link.
+        """
+        if target.joint_names:
+            raise RobotDescriptionError(
+                f"The target '{target.name}' has joints that move "
+                f"({', '.join(target.joint_names)}); a target is one rigid body: make them fixed."
+            )
+        if grapple_frame not in target.frames:
+            raise RobotDescriptionError(
+                f"The target '{target.name}' has no link '{grapple_frame}' to be grasped at; it "
+                f"has {', '.join(target.frames)}: set parameter 'target.grapple_frame', or add the "
+                "link."
+            )
+        return cls(target.bodies[0].inertia, target.frames[grapple_frame][1])
+
+
+@dataclass(frozen=True)
 class RobotMotion:
     """A state of motion of a robot.
 
@@ -157,6 +201,38 @@ class BodyMotion:
         """
         moving = self.at(Pose(r=inertia.com))
         return inertia.mass * moving.v, self.R_WT @ inertia.about_com @ self.R_WT.T @ self.omega
+
+
+_Motion = TypeVar("_Motion", bound="RelativeMotion")
+
+
+@dataclass(frozen=True)
+class RelativeMotion:
+    """The motion of one frame relative to another.
+
+    Attributes
+    ----------
+    distance, angle
+        Between the origins (m) and the attitudes (rad) of the two frames.
+    speed, rate
+        Of the origin of one relative to that of the other (m/s), and of their rotation (rad/s).
+    """
+
+    distance: float
+    angle: float
+    speed: float
+    rate: float
+
+    @classmethod
+    def between(cls: type[_Motion], first: BodyMotion, second: BodyMotion) -> _Motion:
+        """Return the relative motion of two frames."""
+        turn = quaternion_from_matrix(first.R_WT.T @ second.R_WT)
+        return cls(
+            float(np.linalg.norm(second.r_WT - first.r_WT)),
+            float(np.linalg.norm(rotvec_from_quaternion(turn))),
+            float(np.linalg.norm(second.v - first.v)),
+            float(np.linalg.norm(second.omega - first.omega)),
+        )
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,9 @@ from spacerobot_ros.model.grasp import (
     BodyMotion,
     Impact,
     Payload,
+    RelativeMotion,
     RobotMotion,
+    TargetBody,
     frame_motion,
     grasp_impact,
     joined_momenta,
@@ -33,7 +35,6 @@ from spacerobot_ros.model.grasp import (
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_from_matrix,
-    rotvec_from_quaternion,
     unit_quaternion,
 )
 from spacerobot_ros.model.urdf import parse_robot
@@ -64,17 +65,10 @@ def load_target(config: TargetConfig) -> RobotDescription | None:
             target = load_robot(robot_file(config.robot))
     except (ParameterError, RobotDescriptionError) as error:
         raise ParameterError(f"The target is refused: {error}") from error
-    if target.joint_names:
-        raise ParameterError(
-            f"The target '{target.name}' has joints that move ({', '.join(target.joint_names)}); a "
-            "target is one rigid body: make them fixed."
-        )
-    if config.grapple_frame not in target.frames:
-        raise ParameterError(
-            f"The target '{target.name}' has no link '{config.grapple_frame}' to be grasped at; it "
-            f"has {', '.join(target.frames)}: set parameter 'target.grapple_frame', or add the "
-            "link."
-        )
+    try:
+        TargetBody.of(target, config.grapple_frame)
+    except RobotDescriptionError as error:
+        raise ParameterError(str(error)) from None
     return target
 
 
@@ -148,33 +142,8 @@ class Target:
         )
 
 
-@dataclass(frozen=True)
-class Approach:
-    """The motion of the grapple frame relative to the end-effector.
-
-    Attributes
-    ----------
-    distance, angle
-        Between the origins (m) and the attitudes (rad) of the two frames.
-    speed, rate
-        Of the origin of one relative to that of the other (m/s), and of their rotation (rad/s).
-    """
-
-    distance: float
-    angle: float
-    speed: float
-    rate: float
-
-    @classmethod
-    def between(cls, end_effector: BodyMotion, grapple: BodyMotion) -> Approach:
-        """Return the approach of two frames."""
-        turn = quaternion_from_matrix(end_effector.R_WT.T @ grapple.R_WT)
-        return cls(
-            float(np.linalg.norm(grapple.r_WT - end_effector.r_WT)),
-            float(np.linalg.norm(rotvec_from_quaternion(turn))),
-            float(np.linalg.norm(grapple.v - end_effector.v)),
-            float(np.linalg.norm(grapple.omega - end_effector.omega)),
-        )
+class Approach(RelativeMotion):
+    """The motion of the grapple frame relative to the end-effector."""
 
     def misses(self, limits: CaptureConfig) -> list[str]:
         """Return a clause for each quantity beyond its limit; empty: a capture is possible."""

@@ -1,0 +1,338 @@
+"""The approach to a target: when the end-effector sets out, and the reference that it follows.
+
+The reference is a path relative to the grapple frame, which moves as the target's torque-free
+motion predicts (:mod:`spacerobot_ros.control.target_motion`). From where the end-effector is held
+the path leads to a standoff; there the end-effector moves with the grapple frame for a while, then
+closes in along a straight line of that frame. At contact both have the same pose and velocity.
+
+The robot sets out at the earliest time at which the whole reference keeps the limits of references,
+and at which the arm follows it, the base at its place, within joint limits and joint rates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacerobot_ros.control.limits import MotionLimits
+from spacerobot_ros.control.outputs import AXES
+from spacerobot_ros.control.state import ControlState, PoseReference
+from spacerobot_ros.control.target_motion import (
+    FrameMotion,
+    RelativeMotionOverTime,
+    RelativePath,
+    TorqueFreeMotion,
+)
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotvec_from_quaternion,
+)
+from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.parameters import parameter
+
+_SAMPLE_PERIOD = 0.25
+"""Time between two samples of a reference whose limits are checked, s."""
+
+_START_PERIOD = 1.0
+"""Time between two start times that are tried, s."""
+
+_SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 2.0, 1.25, 90.0
+"""Shortest duration of a path to the standoff, ratio of two that are tried, and the longest, s."""
+
+_REACHED = 1e-3
+"""Distance of an end-effector from its reference (m, rad) below which the arm reaches it."""
+
+_MAX_ITERATIONS = 30
+_DAMPING = 0.02
+_LONGEST_TURN = 0.2
+"""Iterations of inverse kinematics, their damping, and the largest step of a joint, m or rad."""
+
+_RATE_SHARE = 0.9
+"""Share of the joint rates that the path of an arm may take."""
+
+
+@dataclass(frozen=True)
+class ApproachOptions:
+    """Where and how an end-effector approaches a target."""
+
+    grapple_frame: str = parameter("grapple", "link of the target that the end-effector is to meet")
+    standoff: tuple[float, ...] = parameter(
+        (-0.3, 0.0, 0.0),
+        "position of the end-effector in the grapple frame before it closes in, along the axis of "
+        "the grasp",
+        unit="m",
+        minimum=-100.0,
+        maximum=100.0,
+        length=3,
+    )
+    standoff_time: float = parameter(
+        3.0, "time at the standoff, moving with the grapple frame", unit="s", minimum=0.0
+    )
+    closing_speed: float = parameter(
+        0.05,
+        "largest speed of the end-effector relative to the grapple frame as it closes in",
+        unit="m/s",
+        minimum=1e-4,
+    )
+    horizon: float = parameter(
+        120.0, "time within which the robot has to set out", unit="s", minimum=0.0, maximum=3600.0
+    )
+    patience: float = parameter(
+        3.0, "time at contact within which the target has to be captured", unit="s", minimum=0.0
+    )
+    timeout: float = parameter(
+        0.5, "age of the target's odometry at which the target is lost", unit="s", minimum=0.0
+    )
+
+
+@dataclass(frozen=True)
+class ApproachPlan:
+    """The times of an approach, s since the state that it was planned in, and its paths.
+
+    Attributes
+    ----------
+    start
+        When the end-effector sets out.
+    outward, closing
+        Its paths relative to the grapple frame: to the standoff, and from there to contact.
+    standoff_time
+        Time at the standoff, s.
+    """
+
+    start: float
+    outward: RelativePath
+    closing: RelativePath
+    standoff_time: float
+
+    @property
+    def closes_at(self) -> float:
+        """When the end-effector leaves the standoff."""
+        return self.start + self.outward.duration + self.standoff_time
+
+    @property
+    def contact(self) -> float:
+        """When the end-effector has the pose of the grapple frame."""
+        return self.closes_at + self.closing.duration
+
+    def relative(self, times: Array) -> RelativeMotionOverTime:
+        """Return the motion relative to the grapple frame at times (K,) from the start on."""
+        out = self.outward.at(times - self.start)
+        inward = self.closing.at(np.maximum(times - self.closes_at, 0.0))
+        late = (times >= self.closes_at)[:, np.newaxis]
+        names = ("x", "xdot", "xddot", "phi", "phidot", "phiddot")
+        return RelativeMotionOverTime(
+            *(np.where(late, getattr(inward, name), getattr(out, name)) for name in names)
+        )
+
+
+class ArmReach:
+    """Whether an arm follows motions of its end-effector while the base stays where it is.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    link
+        Link of the end-effector.
+    axes
+        Axes of the end-effector that are controlled.
+    state
+        The present state.
+    rates
+        Largest rates of the joints (n,).
+    """
+
+    def __init__(
+        self, robot: SpaceRobot, link: str, axes: tuple[str, ...], state: ControlState, rates: Array
+    ) -> None:
+        self._robot, self._link, self._rates = robot, link, rates
+        self._rows = [AXES.index(axis) for axis in axes]
+        self._r_WB, self._R_WB = state.r_WB.copy(), matrix_from_quaternion(state.quaternion_WB)
+        self._q = state.q.copy()
+
+    def distance(self, motion: FrameMotion, k: int) -> float:
+        """Return the distance (m or rad) that remains to the k-th pose, from the present shape."""
+        return self._solve(self._q, motion, k)[1]
+
+    def follows(self, motion: FrameMotion, period: float) -> str:
+        """Return why the arm does not follow a motion from its present shape; empty: it does.
+
+        ``period`` is the time between two poses of the motion, s.
+        """
+        q = self._q
+        for k in range(len(motion.r)):
+            before = q
+            q, distance = self._solve(q, motion, k)
+            if distance > _REACHED:
+                return f"the end-effector stays {distance:.3g} m or rad away from it"
+            rate = np.abs(q - before) / period
+            share = rate / (_RATE_SHARE * self._rates)
+            if k and share.max(initial=0.0) > 1.0:
+                worst = int(share.argmax())
+                return (
+                    f"joint '{self._robot.joint_names[worst]}' would move at {rate[worst]:.3g}/s, "
+                    f"of {self._rates[worst]:.3g}/s"
+                )
+        return ""
+
+    def _solve(self, q: Array, motion: FrameMotion, k: int) -> tuple[Array, float]:
+        """Return the shape nearest to a pose, from a shape on, and the distance that remains."""
+        lower, upper = self._robot.lower, self._robot.upper
+        distance = np.inf
+        for _ in range(_MAX_ITERATIONS):
+            error, J = self._error(q, motion, k)
+            distance = float(np.abs(error).max())
+            if distance < 0.1 * _REACHED:
+                break
+            step = J.T @ np.linalg.solve(J @ J.T + _DAMPING**2 * np.eye(len(error)), error)
+            step *= min(1.0, _LONGEST_TURN / max(float(np.abs(step).max()), 1e-12))
+            q = np.clip(q + step, lower, upper)
+        return q, distance
+
+    def _error(self, q: Array, motion: FrameMotion, k: int) -> tuple[Array, Array]:
+        robot, R_WB = self._robot, self._R_WB
+        R_BE, r_BE = robot.link_pose(self._link, q)
+        R_WE = R_WB @ R_BE
+        turn = rotvec_from_quaternion(quaternion_from_matrix(R_WE.T @ motion.R[k]))
+        error = np.concatenate([motion.r[k] - self._r_WB - R_WB @ r_BE, R_WE @ turn])
+        J = robot.jacobian(self._link, q)
+        # With the base at rest the centre of mass moves against the base's part of its Jacobian.
+        fixed = J[:, 6:] - J[:, :3] @ robot.jacobian(robot.base_link, q)[:3, 6:]
+        J_W = np.vstack([R_WB @ fixed[:3], R_WB @ fixed[3:]])
+        return error[self._rows], J_W[self._rows]
+
+
+def plan_approach(
+    target: TorqueFreeMotion,
+    held: PoseReference,
+    options: ApproachOptions,
+    limits: MotionLimits,
+    reach: ArmReach,
+    axes: tuple[str, ...],
+) -> ApproachPlan:
+    """Return the approach that begins earliest.
+
+    Parameters
+    ----------
+    target
+        Predicted motion of the target.
+    held
+        Reference of the end-effector until it sets out; one that moves sets out at once.
+    options, limits
+        The standoff, and the limits of references in W.
+    reach
+        The arm.
+    axes
+        Axes of the end-effector that are controlled.
+
+    Raises
+    ------
+    PlanningError
+        There is none within the horizon: the message says which limit stands against it.
+    """
+    moving = bool(held.velocity.any() or held.angular_velocity.any())
+    starts = [0.0] if moving else np.arange(0.0, options.horizon + 1e-9, _START_PERIOD).tolist()
+    failure = _Failure()
+    for start in starts:
+        for plan in _plans(target, held, options, limits, start):
+            times = np.arange(plan.start, plan.contact + _SAMPLE_PERIOD, _SAMPLE_PERIOD)
+            motion = target.grapple(times).carrying(plan.relative(times))
+            excess, sentence = _excess(motion, limits, axes)
+            failure.note(excess, sentence)
+            if excess > 1.0:
+                continue
+            distance = reach.distance(motion, -1)
+            if distance > _REACHED:
+                failure.out_of_reach(distance, plan.contact)
+                break  # A longer path meets the target later, which other start times do, too.
+            why = reach.follows(motion, _SAMPLE_PERIOD)
+            if not why:
+                return plan
+            failure.unfollowed(why, plan.contact)
+    raise PlanningError(failure.message(options.horizon))
+
+
+def _plans(
+    target: TorqueFreeMotion,
+    held: PoseReference,
+    options: ApproachOptions,
+    limits: MotionLimits,
+    start: float,
+) -> Iterator[ApproachPlan]:
+    """Yield approaches that set out at a time, with longer and longer paths."""
+    begin = RelativeMotionOverTime.between(target.grapple([start]), FrameMotion.of_reference(held))
+    standoff = np.array(options.standoff)
+    length = float(np.linalg.norm(standoff))
+    duration = max(
+        15 / 8 * length / min(options.closing_speed, limits.speed),
+        (10 / 3**0.5 * length / limits.acceleration) ** 0.5,
+        _SAMPLE_PERIOD,
+    )
+    closing = RelativePath.from_rest(standoff, np.zeros(3), duration)
+    outward = _SHORTEST_PATH
+    while outward < _LONGEST_PATH:
+        path = RelativePath(begin, standoff, outward)
+        yield ApproachPlan(start, path, closing, options.standoff_time)
+        outward *= _PATH_RATIO
+
+
+def _excess(motion: FrameMotion, limits: MotionLimits, axes: tuple[str, ...]) -> tuple[float, str]:
+    """Return the largest share of a limit that a motion takes, and a clause about it."""
+    linear = any(not axis.startswith("r") for axis in axes)
+    angular = any(axis.startswith("r") for axis in axes)
+    shares = [(0.0, "")]
+    for values, name, unit, counts in (
+        (motion.v, "speed", "m/s", linear),
+        (motion.a, "acceleration", "m/s^2", linear),
+        (motion.omega, "angular_speed", "rad/s", angular),
+        (motion.alpha, "angular_acceleration", "rad/s^2", angular),
+    ):
+        largest, limit = float(np.linalg.norm(values, axis=1).max()), getattr(limits, name)
+        if counts:
+            shares.append(
+                (largest / limit, f"{largest:.3g} {unit}, and 'motion.{name}' is {limit:.3g}")
+            )
+    return max(shares)
+
+
+class _Failure:
+    """The reasons why start times were not taken, and the best of each kind."""
+
+    def __init__(self) -> None:
+        self._excess, self._limit = np.inf, ""
+        self._distance, self._nearest_at = np.inf, 0.0
+        self._why, self._tried_at = "", 0.0
+
+    def note(self, excess: float, limit: str) -> None:
+        if excess < self._excess:
+            self._excess, self._limit = excess, limit
+
+    def out_of_reach(self, distance: float, contact: float) -> None:
+        if distance < self._distance:
+            self._distance, self._nearest_at = distance, contact
+
+    def unfollowed(self, why: str, contact: float) -> None:
+        self._why, self._tried_at = why, contact
+
+    def message(self, horizon: float) -> str:
+        if self._excess > 1.0:
+            return (
+                "The target moves too fast to be met: the end-effector's reference would need "
+                f"{self._limit}."
+            )
+        within = f"within the next {horizon:g} s"
+        if self._why:
+            return (
+                f"The target cannot be met {within}: with contact at {self._tried_at:.4g} s, "
+                f"{self._why}."
+            )
+        return (
+            f"The target is out of reach {within}: at best, with contact at "
+            f"{self._nearest_at:.4g} s, the end-effector stays {self._distance:.3g} m or rad away "
+            "from its grapple frame while the base holds its place."
+        )

@@ -1,0 +1,321 @@
+"""The motion of a free target, and of a frame that closes in on it, predicted over time.
+
+A target free of force and torque moves its centre of mass at constant velocity and keeps its
+angular momentum ``L_W`` about it, so that its attitude obeys Euler's equations,
+
+    omega_T = I^-1 R_WT' L_W,    dR_WT/dt = R_WT hat(omega_T).
+
+All quantities are arrays over times (K,): positions (K, 3) and attitudes (K, 3, 3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.control.state import PoseReference
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.grasp import BodyMotion, TargetBody
+from spacerobot_ros.model.rotations import (
+    hat,
+    matrices_from_quaternions,
+    quaternion_from_matrix,
+    quaternion_multiply,
+    quaternions_from_rotvecs,
+    rotvec_from_quaternion,
+)
+
+_STEP_ANGLE = 0.02
+"""Rotation of the target in one Runge-Kutta step, rad."""
+
+_LONGEST_STEP = 1.0
+"""Longest Runge-Kutta step, s."""
+
+_SMALL_ANGLE = 1e-3
+"""Angle below which functions of an angle are series, rad."""
+
+
+@dataclass(frozen=True)
+class FrameMotion:
+    """Motion of a frame in W at some times (K,).
+
+    Attributes
+    ----------
+    R, r
+        Attitude (K, 3, 3) and position (K, 3), m.
+    v, omega
+        Velocity (K, 3), m/s, and angular velocity (K, 3), rad/s.
+    a, alpha
+        Accelerations (K, 3), m/s^2 and rad/s^2.
+    """
+
+    R: Array
+    r: Array
+    v: Array
+    omega: Array
+    a: Array
+    alpha: Array
+
+    @classmethod
+    def of_reference(cls, pose: PoseReference) -> FrameMotion:
+        """Return a reference as the motion at one time."""
+        numbers = (pose.velocity, pose.angular_velocity, pose.acceleration)
+        return cls(
+            matrices_from_quaternions(pose.quaternion[np.newaxis]),
+            pose.position[np.newaxis],
+            *(each[np.newaxis] for each in (*numbers, pose.angular_acceleration)),
+        )
+
+    def reference(self, k: int = 0) -> PoseReference:
+        """Return the motion at the k-th time as a reference."""
+        return PoseReference(
+            self.r[k],
+            quaternion_from_matrix(self.R[k]),
+            self.v[k],
+            self.omega[k],
+            self.a[k],
+            self.alpha[k],
+        )
+
+    def body_motion(self, k: int = 0) -> BodyMotion:
+        """Return the motion at the k-th time without accelerations."""
+        return BodyMotion(self.R[k], self.r[k], self.v[k], self.omega[k])
+
+    def carrying(self, path: RelativeMotionOverTime) -> FrameMotion:
+        """Return the motion of a frame that moves relative to this one."""
+        R, omega, alpha = self.R, self.omega, self.alpha
+        arm, v_rel, a_rel = (_turned(R, each) for each in (path.x, path.xdot, path.xddot))
+        w_rel, wdot_rel = _turned(R, path.w), _turned(R, path.wdot)
+        return FrameMotion(
+            R @ matrices_from_quaternions(quaternions_from_rotvecs(path.phi)),
+            self.r + arm,
+            self.v + np.cross(omega, arm) + v_rel,
+            omega + w_rel,
+            self.a
+            + np.cross(alpha, arm)
+            + np.cross(omega, np.cross(omega, arm))
+            + 2 * np.cross(omega, v_rel)
+            + a_rel,
+            alpha + np.cross(omega, w_rel) + wdot_rel,
+        )
+
+
+@dataclass(frozen=True)
+class RelativeMotionOverTime:
+    """Motion of a frame E relative to a frame G at some times (K,), in G.
+
+    Attributes
+    ----------
+    x, xdot, xddot
+        Position (K, 3), m, and its rates.
+    phi, phidot, phiddot
+        Rotation vector (K, 3) of ``R_GE``, rad, and its rates.
+    """
+
+    x: Array
+    xdot: Array
+    xddot: Array
+    phi: Array
+    phidot: Array
+    phiddot: Array
+
+    @property
+    def w(self) -> Array:
+        """Angular velocity (K, 3) of E relative to G, rad/s: ``J(phi) phidot``, with the left
+        Jacobian of SO(3).
+        """
+        B, C, _, _ = _jacobian_terms(self.phi, self.phidot)
+        first = np.cross(self.phi, self.phidot)
+        return np.asarray(self.phidot + B * first + C * np.cross(self.phi, first))
+
+    @property
+    def wdot(self) -> Array:
+        """Angular acceleration (K, 3) of E relative to G, rad/s^2."""
+        phi, phidot, phiddot = self.phi, self.phidot, self.phiddot
+        B, C, B_rate, C_rate = _jacobian_terms(phi, phidot)
+        first, second = np.cross(phi, phidot), np.cross(phi, phiddot)
+        twice = np.cross(phi, first)
+        return np.asarray(
+            phiddot
+            + B_rate * first
+            + B * second
+            + C_rate * twice
+            + C * (np.cross(phidot, first) + np.cross(phi, second))
+        )
+
+    @classmethod
+    def between(cls, frame: FrameMotion, moving: FrameMotion) -> RelativeMotionOverTime:
+        """Return the motion of ``moving`` relative to ``frame``, both at one time (K = 1)."""
+        R, omega = frame.R[0], frame.omega[0]
+        arm = moving.r[0] - frame.r[0]
+        v = moving.v[0] - frame.v[0] - np.cross(omega, arm)
+        a = moving.a[0] - frame.a[0] - np.cross(frame.alpha[0], arm)
+        a = a - np.cross(omega, np.cross(omega, arm)) - 2 * np.cross(omega, v)
+        w_W = moving.omega[0] - omega
+        wdot = R.T @ (moving.alpha[0] - frame.alpha[0] - np.cross(omega, w_W))
+        phi = rotvec_from_quaternion(quaternion_from_matrix(R.T @ moving.R[0]))
+        J = _left_jacobian(phi)
+        phidot = np.linalg.solve(J, R.T @ w_W)
+        zero = np.zeros((1, 3))
+        x, xdot, xddot = ((R.T @ each)[np.newaxis] for each in (arm, v, a))
+        without = cls(x, xdot, xddot, phi[np.newaxis], phidot[np.newaxis], zero)
+        phiddot = np.linalg.solve(J, wdot - without.wdot[0])
+        return cls(x, xdot, xddot, without.phi, without.phidot, phiddot[np.newaxis])
+
+
+def _left_jacobian(phi: Array) -> Array:
+    B, C, _, _ = _jacobian_terms(phi[np.newaxis], phi[np.newaxis])
+    cross = hat(phi)
+    return np.asarray(np.eye(3) + B * cross + C * cross @ cross)
+
+
+def _jacobian_terms(phi: Array, phidot: Array) -> tuple[Array, Array, Array, Array]:
+    """Return ``(1 - cos t) / t^2`` and ``(t - sin t) / t^3`` (K, 1) of the angle t, and their
+    rates.
+    """
+    t = np.linalg.norm(phi, axis=1, keepdims=True)
+    small = t < _SMALL_ANGLE
+    t = np.where(small, 1.0, t)
+    along = np.sum(phi * phidot, axis=1, keepdims=True)
+    sine, versine = np.sin(t), 1 - np.cos(t)
+    B = np.where(small, 0.5, versine / t**2)
+    C = np.where(small, 1 / 6, (t - sine) / t**3)
+    B_rate = np.where(small, -1 / 12, (t * sine - 2 * versine) / t**4)
+    C_rate = np.where(small, -1 / 60, (t * versine - 3 * (t - sine)) / t**5)
+    return B, C, B_rate * along, C_rate * along
+
+
+class RelativePath:
+    """A path of a frame E relative to a frame G, from a motion to rest in a pose.
+
+    Position and rotation vector are polynomials of fifth order in time.
+
+    Parameters
+    ----------
+    start
+        The motion at the beginning (K = 1).
+    position
+        (3,) where it ends, m; the attitudes of E and G are then equal.
+    duration
+        Time from beginning to end, s.
+    """
+
+    def __init__(self, start: RelativeMotionOverTime, position: Array, duration: float) -> None:
+        self.duration = duration
+        self._end = np.concatenate([position, np.zeros(3)])
+        y = np.concatenate([start.x[0], start.phi[0]])
+        rate = np.concatenate([start.xdot[0], start.phidot[0]])
+        acceleration = np.concatenate([start.xddot[0], start.phiddot[0]])
+        self._coefficients = _quintic_to_rest(y, rate, acceleration, self._end, duration)
+
+    @classmethod
+    def from_rest(cls, start: Array, end: Array, duration: float) -> RelativePath:
+        """Return the path between two positions (3,), at rest at both, in the attitude of G."""
+        zero = np.zeros((1, 3))
+        motion = RelativeMotionOverTime(start[np.newaxis], zero, zero, zero, zero, zero)
+        return cls(motion, end, duration)
+
+    def at(self, times: npt.ArrayLike) -> RelativeMotionOverTime:
+        """Return the motion at times (K,), s since the beginning; at rest after the end."""
+        t = np.minimum(np.asarray(times, dtype=float), self.duration)
+        powers = t[:, np.newaxis] ** np.arange(6)
+        parts = []
+        c = self._coefficients
+        for _ in range(3):
+            parts.append(powers[:, : len(c)] @ c)
+            c = c[1:] * np.arange(1, len(c))[:, np.newaxis]
+        rested = np.asarray(times, dtype=float) >= self.duration
+        parts[0][rested], parts[1][rested], parts[2][rested] = self._end, 0.0, 0.0
+        y, ydot, yddot = parts
+        return RelativeMotionOverTime(
+            y[:, :3], ydot[:, :3], yddot[:, :3], y[:, 3:], ydot[:, 3:], yddot[:, 3:]
+        )
+
+
+def _quintic_to_rest(y: Array, rate: Array, acceleration: Array, end: Array, T: float) -> Array:
+    """Return the coefficients (6, m) of the polynomials that come to rest at ``end`` after T s."""
+    d, v, a = end - y, rate * T, acceleration * T**2
+    scaled = [
+        y,
+        v,
+        a / 2,
+        10 * d - 6 * v - 1.5 * a,
+        -15 * d + 8 * v + 1.5 * a,
+        6 * d - 3 * v - 0.5 * a,
+    ]
+    return np.array([c / T**i for i, c in enumerate(scaled)])
+
+
+class TorqueFreeMotion:
+    """The motion of a free target from a measured state on.
+
+    Parameters
+    ----------
+    body
+        The target.
+    motion
+        The state of the frame of its root link.
+    """
+
+    def __init__(self, body: TargetBody, motion: BodyMotion) -> None:
+        self._body = body
+        inertia, R = body.inertia, motion.R_WT
+        self._arm = R @ inertia.com
+        self._r, self._v = motion.r_WT + self._arm, motion.v + np.cross(motion.omega, self._arm)
+        self._L = R @ inertia.about_com @ R.T @ motion.omega
+        self._inverse = np.linalg.inv(inertia.about_com)
+        fastest = float(np.linalg.norm(self._L) * np.linalg.eigvalsh(self._inverse)[-1])
+        self._step = min(_LONGEST_STEP, _STEP_ANGLE / fastest if fastest > 0 else _LONGEST_STEP)
+        self._nodes = [quaternion_from_matrix(R)]
+
+    def grapple(self, times: npt.ArrayLike) -> FrameMotion:
+        """Return the motion of the grapple frame at times (K,), s since the measured state."""
+        t = np.asarray(times, dtype=float)
+        R = matrices_from_quaternions(self._quaternions(t))
+        inertia, grapple = self._body.inertia, self._body.grapple
+        omega_T = self._rates(R)
+        spin = np.cross(omega_T, omega_T @ inertia.about_com)
+        omega, alpha = _turned(R, omega_T), _turned(R, -spin @ self._inverse)
+        arm = R @ (grapple.r - inertia.com)
+        return FrameMotion(
+            R @ grapple.R,
+            self._r + t[:, np.newaxis] * self._v + arm,
+            self._v + np.cross(omega, arm),
+            omega,
+            np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm)),
+            alpha,
+        )
+
+    def _rates(self, R: Array) -> Array:
+        """Return the angular velocities (K, 3) in T at attitudes (K, 3, 3)."""
+        return np.asarray((self._L @ R) @ self._inverse)
+
+    def _quaternions(self, t: Array) -> Array:
+        index = np.floor(t / self._step).astype(int)
+        while len(self._nodes) <= index.max(initial=0):
+            last = self._nodes[-1][np.newaxis]
+            self._nodes.append(self._advance(last, np.array([self._step]))[0])
+        nodes = np.array(self._nodes)[index]
+        return self._advance(nodes, t - index * self._step)
+
+    def _advance(self, q: Array, h: Array) -> Array:
+        """Return quaternions (K, 4) after steps (K,), s, by Runge-Kutta 4."""
+        h = h[:, np.newaxis]
+        k1 = self._derivative(q)
+        k2 = self._derivative(q + h / 2 * k1)
+        k3 = self._derivative(q + h / 2 * k2)
+        k4 = self._derivative(q + h * k3)
+        q = q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
+
+    def _derivative(self, q: Array) -> Array:
+        unit = q / np.linalg.norm(q, axis=1, keepdims=True)
+        omega_T = self._rates(matrices_from_quaternions(unit))
+        return quaternion_multiply(q, np.hstack([omega_T / 2, np.zeros((len(q), 1))]))
+
+
+def _turned(R: Array, vectors: Array) -> Array:
+    """Return vectors (K, 3) turned by matrices (K, 3, 3)."""
+    return np.asarray(np.einsum("kij,kj->ki", R, vectors))
