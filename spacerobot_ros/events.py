@@ -42,6 +42,12 @@ class EventKind(str, Enum):
     RELEASED = "released"
     """The robot has released the target."""
 
+    APPROACH_STARTED = "approach_started"
+    """The end-effector has a way to the target."""
+    DETUMBLE_STARTED = "detumble_started"
+    """The robot is brought to rest with the target that it holds."""
+    DETUMBLED = "detumbled"
+
     WHEEL_NEAR_LIMIT = "wheel_near_limit"
     """A reaction wheel comes near its largest rate."""
     WHEEL_SATURATED = "wheel_saturated"

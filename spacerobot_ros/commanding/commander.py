@@ -99,6 +99,9 @@ class StateDecoder(Protocol):
     def base(self, odom: Any) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an odom or base reference, or raise CommandError."""
 
+    def target(self, odom: Any) -> tuple[Array, Array]:
+        """Return pose (7,) and twist (6,) of an odom of the target, or raise CommandError."""
+
     def joint_reference(self, message: Any) -> tuple[Array, Array]:
         """Return positions and rates (n,) of a joint reference, or raise CommandError."""
 
@@ -139,6 +142,8 @@ class ArrayDecoder:
         assert odom.pose is not None
         assert odom.twist is not None
         return odom.pose, odom.twist
+
+    target = base
 
     def joint_reference(self, message: StateArrays) -> tuple[Array, Array]:
         """Return positions and rates."""
@@ -187,6 +192,8 @@ class Commander(ABC):
         self._described: SpaceRobot | None = None
         """The robot as it is described, without a body that it holds."""
         self._payload = ""
+        self._held: Payload | None = None
+        """The body that the robot holds, as far as its text is one."""
         self._goal_file = GoalFile(config.resume_file, goal_keys)
         self._goal_ids = GoalIds()
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
@@ -438,8 +445,12 @@ class Commander(ABC):
 
     def _with_payload(self, robot: SpaceRobot) -> SpaceRobot:
         """Return the robot with the body that it holds according to the plant's status."""
+        self._held = None
         try:
-            return Payload.from_text(self._payload).attached_to(robot) if self._payload else robot
+            if self._payload:
+                held = Payload.from_text(self._payload)
+                robot, self._held = held.attached_to(robot), held
+            return robot
         except RobotDescriptionError as error:
             self.host.log("error", f"plant/status: {error}")
             return robot

@@ -9,20 +9,25 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
-from spacerobot_ros.commanding.plant_state import Pairing, PlantChange
+from spacerobot_ros.commanding.plant_state import Pairing, PlantChange, Stamped
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
 from spacerobot_ros.control.reference import HeldVelocityReference
+from spacerobot_ros.control.servicing import Task
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.times import SECOND
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
 """Topics of references for a controller; states wait for each topic that has a publisher."""
+
+TARGET_ODOMETRY = "target/odom"
+"""Topic of the measured motion of the target; states wait for it where a task needs it."""
 
 # Constants save the slow look-up of enum members for every state.
 _ACTIVE = Activity.ACTIVE
@@ -49,6 +54,10 @@ class ControllerCommander(Commander):
         super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
         self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
+        self._target: RobotDescription | None = None
+        """The target, as it is described."""
+        self._target_odometry: Stamped | None = None
+        """The latest odometry of the target, until it is read."""
 
     def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
@@ -63,6 +72,10 @@ class ControllerCommander(Commander):
         """Answer states from now on, each with the references that have a publisher."""
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):
             self.states.require(topic, required=self.host.has_publisher(topic))
+        approaches = Task.APPROACH in Task.parsed(self.config.tasks)
+        self.states.require(
+            TARGET_ODOMETRY, required=approaches and self.host.has_publisher(TARGET_ODOMETRY)
+        )
         super().activate()
 
     def dump_momentum(self) -> tuple[bool, str]:
@@ -70,6 +83,32 @@ class ControllerCommander(Commander):
         if self.executive is None or not self.active:
             return False, "The controller is not active, or has no robot yet."
         return self.executive.dump_momentum()
+
+    def request(self, task: Task) -> tuple[bool, str]:
+        """Do a task without a goal after it; return whether it is accepted, and a sentence."""
+        if self.executive is None or not self.active:
+            return False, "The controller is not active, or has no robot yet."
+        if self.plant.blocked:
+            return False, self.plant.blocked
+        self.executive.request(task)
+        return True, f"The task '{task.value}' begins; controller/status tells its course."
+
+    def use_target(self, target: RobotDescription) -> None:
+        """Take the description of the target."""
+        self._target = target
+        if self.executive is not None:
+            frame = self.config.target.grapple_frame
+            self.executive.servicing.target.describe(target, frame)
+
+    def receive_target(self, stamp_ns: int, message: Any) -> None:
+        """Take odometry of the target, for which states wait while a task needs it."""
+        needed = self.executive is not None and self.executive.servicing.needs_target
+        if needed:
+            self._target_odometry = Stamped(stamp_ns, message)
+            self.states.put_required(TARGET_ODOMETRY, stamp_ns, message)
+            self.answer()
+        else:
+            self.states.require(TARGET_ODOMETRY, required=False)
 
     def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Take a reference, and answer its state if complete."""
@@ -96,12 +135,15 @@ class ControllerCommander(Commander):
             lambda message: self.host.log("error", message),
             self.host.report_event,
         )
+        self.executive.servicing.hold(self._held)
+        if self._target is not None:
+            self.use_target(self._target)
         self.effort = np.zeros(robot.n)
         self._held_velocities = HeldVelocityReference(self.config.control_period)
 
     def _change_masses(self, robot: SpaceRobot) -> None:
         assert self.executive is not None
-        self.executive.use_controller(build_controller(robot, self.config))
+        self.executive.use_controller(build_controller(robot, self.config), self._held)
 
     def _stop_executive(self) -> None:
         assert self.executive is not None
@@ -177,6 +219,7 @@ class ControllerCommander(Commander):
                 pose, twist = decoder.base(states.odom)
                 measured = ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
             now = stamp / SECOND
+            self._read_target(decoder)
             result = executive.command(now, measured, q, qdot, self._reference(decoder))
         except (CommandError, NotFiniteError) as error:
             self._log_fault("state", f"The state is refused: {error}")
@@ -185,6 +228,13 @@ class ControllerCommander(Commander):
         if send:
             self.host.send_command(stamp)
         executive.evaluate(now, result)
+
+    def _read_target(self, decoder: StateDecoder) -> None:
+        """Read the latest odometry of the target."""
+        if self._target_odometry is not None:
+            assert self.executive is not None
+            (stamp_ns, message), self._target_odometry = self._target_odometry, None
+            self.executive.servicing.target.measure(stamp_ns / SECOND, *decoder.target(message))
 
     def _reference(self, decoder: StateDecoder) -> Reference | None:
         """Return the external reference for this state; None without external references."""

@@ -11,6 +11,7 @@ and at which the arm follows it, the base at its place, within joint limits and 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -18,6 +19,7 @@ import numpy as np
 
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.outputs import AXES
+from spacerobot_ros.control.reference import quintic_duration
 from spacerobot_ros.control.state import ControlState, PoseReference
 from spacerobot_ros.control.target_motion import (
     FrameMotion,
@@ -38,10 +40,13 @@ from spacerobot_ros.parameters import parameter
 _SAMPLE_PERIOD = 0.25
 """Time between two samples of a reference whose limits are checked, s."""
 
+_COARSE = 8
+"""Samples from one to the next where most references are refused."""
+
 _START_PERIOD = 1.0
 """Time between two start times that are tried, s."""
 
-_SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 2.0, 1.25, 90.0
+_SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 4.0, 1.4, 60.0
 """Shortest duration of a path to the standoff, ratio of two that are tried, and the longest, s."""
 
 _REACHED = 1e-3
@@ -236,13 +241,26 @@ def plan_approach(
         There is none within the horizon: the message says which limit stands against it.
     """
     moving = bool(held.velocity.any() or held.angular_velocity.any())
-    starts = [0.0] if moving else np.arange(0.0, options.horizon + 1e-9, _START_PERIOD).tolist()
-    failure = _Failure()
-    for start in starts:
-        for plan in _plans(target, held, options, limits, start):
-            times = np.arange(plan.start, plan.contact + _SAMPLE_PERIOD, _SAMPLE_PERIOD)
-            motion = target.grapple(times).carrying(plan.relative(times))
-            excess, sentence = _excess(motion, limits, axes)
+    starts = np.arange(0.0, 0.0 if moving else options.horizon, _START_PERIOD)
+    standoff, closing = np.array(options.standoff), _closing_path(options, limits)
+    at_rest, failure = FrameMotion.of_reference(held), _Failure()
+    longest = _LONGEST_PATH + options.standoff_time + closing.duration + 2 * _SAMPLE_PERIOD
+    samples = round((options.horizon + longest) / _SAMPLE_PERIOD)
+    grapple = target.grapple(_SAMPLE_PERIOD * np.arange(samples))
+    for start in [0.0] if moving else starts.tolist():
+        first = round(start / _SAMPLE_PERIOD)
+        begin = RelativeMotionOverTime.between(grapple.part(first, first + 1), at_rest)
+        for duration in _outward_durations():
+            outward = RelativePath(begin, standoff, duration)
+            plan = ApproachPlan(start, outward, closing, options.standoff_time)
+            last = first + math.ceil((plan.contact - start) / _SAMPLE_PERIOD) + 1
+            # Few samples refuse most of the paths.
+            for every in (_COARSE, 1):
+                times = _SAMPLE_PERIOD * np.arange(first, last, every)
+                motion = grapple.part(first, last, every).carrying(plan.relative(times))
+                excess, sentence = _excess(motion, limits, axes)
+                if excess > 1.0:
+                    break
             failure.note(excess, sentence)
             if excess > 1.0:
                 continue
@@ -257,28 +275,20 @@ def plan_approach(
     raise PlanningError(failure.message(options.horizon))
 
 
-def _plans(
-    target: TorqueFreeMotion,
-    held: PoseReference,
-    options: ApproachOptions,
-    limits: MotionLimits,
-    start: float,
-) -> Iterator[ApproachPlan]:
-    """Yield approaches that set out at a time, with longer and longer paths."""
-    begin = RelativeMotionOverTime.between(target.grapple([start]), FrameMotion.of_reference(held))
+def _closing_path(options: ApproachOptions, limits: MotionLimits) -> RelativePath:
+    """Return the path from the standoff to contact, at rest beside the grapple frame at both."""
     standoff = np.array(options.standoff)
-    length = float(np.linalg.norm(standoff))
-    duration = max(
-        15 / 8 * length / min(options.closing_speed, limits.speed),
-        (10 / 3**0.5 * length / limits.acceleration) ** 0.5,
-        _SAMPLE_PERIOD,
-    )
-    closing = RelativePath.from_rest(standoff, np.zeros(3), duration)
-    outward = _SHORTEST_PATH
-    while outward < _LONGEST_PATH:
-        path = RelativePath(begin, standoff, outward)
-        yield ApproachPlan(start, path, closing, options.standoff_time)
-        outward *= _PATH_RATIO
+    length, speed = float(np.linalg.norm(standoff)), min(options.closing_speed, limits.speed)
+    duration = max(quintic_duration(length, speed, limits.acceleration), _SAMPLE_PERIOD)
+    return RelativePath.from_rest(standoff, np.zeros(3), duration)
+
+
+def _outward_durations() -> Iterator[float]:
+    """Yield durations of paths to the standoff, s."""
+    duration = _SHORTEST_PATH
+    while duration < _LONGEST_PATH:
+        yield duration
+        duration *= _PATH_RATIO
 
 
 def _excess(motion: FrameMotion, limits: MotionLimits, axes: tuple[str, ...]) -> tuple[float, str]:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from spacerobot_ros.control.approach import ApproachOptions
+from spacerobot_ros.control.detumbling import DetumbleOptions
 from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import MotionLimits
@@ -94,5 +96,12 @@ class ControllerConfig(CommanderConfig):
     status_period: float = parameter(
         1.0, "simulated time between status messages", unit="s", minimum=0.01
     )
+    tasks: str = parameter(
+        "",
+        "what is done before a goal is pursued, in this order, separated by spaces: 'approach' of "
+        "the target until it is captured, 'detumble' the robot that holds it; '': nothing",
+    )
+    target: ApproachOptions = group(ApproachOptions())
+    detumble: DetumbleOptions = group(DetumbleOptions())
     gains: Gains = group(Gains())
     options: Mapping[str, Any] = registered(LAWS)

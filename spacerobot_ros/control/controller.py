@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import Enum
 
 import casadi as ca
 import numpy as np
 
+from spacerobot_ros.control.approach import ArmReach
 from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.detumbling import Detumbling
 from spacerobot_ros.control.estimator import DeadReckoning
 from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
 from spacerobot_ros.control.laws.law import ControlLaw, Gains
@@ -28,6 +30,7 @@ from spacerobot_ros.control.state import (
 from spacerobot_ros.control.wheels import WheelControl
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.wheels import ReactionWheels
 
@@ -100,6 +103,7 @@ class CoordinatedController:
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
         self.coming_to_rest = False
         """Whether the robot is being brought to rest, at any pose."""
+        self._to_rest: Callable[[ControlState], Actuation] = rates.to_rest
 
     def reset(self) -> None:
         """Drop goals and measurements; the next state counts as the first."""
@@ -162,9 +166,36 @@ class CoordinatedController:
         self.profile = None
         self.set_goals(time, state)
 
-    def come_to_rest(self) -> None:
-        """Bring the whole robot to rest, at any pose, until there is a new goal or reference."""
+    def come_to_rest(self, law: Callable[[ControlState], Actuation] | None = None) -> None:
+        """Bring the whole robot to rest, at any pose, until there is a new goal or reference.
+
+        ``law`` returns the command for a state, not limited; None: that of the joint rate limits.
+        """
         self.coming_to_rest = True
+        self._to_rest = law or self.joint_rate_limits.to_rest
+
+    def detumbling(self, payload: Payload | None, torque_limit: float) -> Detumbling:
+        """Return the law that brings the robot to rest by its thrusters, wheels and joints.
+
+        ``payload`` is the body that it holds, ``torque_limit`` the largest torque of its grasp, N
+        m; 0: no limit.
+        """
+        torque, wheels = self._limits.torque, self.wheels
+        if wheels is not None:
+            torque += wheels.torque_in_every_direction
+        force, period = self._limits.force, self._control_period
+        return Detumbling(self.law.robot, payload, force, torque, torque_limit, period)
+
+    def arm_reach(self, state: ControlState) -> ArmReach:
+        """Return the reach of the end-effector from a state."""
+        selection = self.law.outputs.selection
+        rates = self.joint_rate_limits.rates
+        axes, link = selection.end_effector, selection.end_effector_link
+        return ArmReach(self.law.robot, link, axes, state, rates)
+
+    def reference_at(self, time: float, state: ControlState) -> Reference:
+        """Return the present reference; before the first one, the pose of the robot at rest."""
+        return self._present_reference(time, state)
 
     def shift_time(self, seconds: float) -> None:
         """Shift the start of the reference by a jump of time (s)."""
@@ -174,6 +205,16 @@ class CoordinatedController:
         """Track an external reference at the next command; the profile serves all other groups."""
         self._followed = reference
         self.coming_to_rest = False
+
+    @property
+    def followed_end_effector(self) -> PoseReference | None:
+        """External reference of the end-effector; None: the profile's."""
+        return self._followed.end_effector
+
+    @property
+    def has_thrusters(self) -> bool:
+        """Whether a force acts on the base."""
+        return self._limits.force > 0.0
 
     def command(
         self, time: float, measured: ControlState | None, q: Array, qdot: Array
@@ -202,7 +243,7 @@ class CoordinatedController:
             # The law is always evaluated, for its errors and status.
             commanded = self.law.command(state, self._reference_at(time))
             if self.coming_to_rest:
-                commanded = self.joint_rate_limits.to_rest(state)
+                commanded = self._to_rest(state)
         if state is not None:
             periods = self._periods_held(time)
             result = self.apply_limits(state, commanded, periods)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,11 +12,13 @@ from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
+from spacerobot_ros.control.servicing import Progress, Servicing, Task, TaskState
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
 from spacerobot_ros.times import SECOND
@@ -76,6 +79,8 @@ class ControlExecutive:
         self._config = config
         self._report, self._warn, self._report_event = report, warn, report_event
         self._file = goal_file if goal_file is not None else GoalFile("", GOAL_KEYS)
+        self.servicing = Servicing(config)
+        """The tasks before goals, with the target; the owner tells it the body that is held."""
         self._longest_gap = max(_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS * config.control_period)
         self.reset()
 
@@ -99,6 +104,11 @@ class ControlExecutive:
         self._goal_state = self._reported_state = ControllerState.HOLDING
         self._goal_id = ""
         self._monitor = GoalMonitor()
+        self.servicing.end()
+        self._after_tasks: dict[str, IdentifiedGoal] = {}
+        """The goals that are pursued after tasks."""
+        self._requested: tuple[Task, ...] | None = None
+        """Tasks that were requested without a goal, and wait for the next measured state."""
         self._error_bounds: Array | None = None
         """Errors (m,) of the outputs beyond which control is lost."""
         self._guided = False
@@ -110,6 +120,7 @@ class ControlExecutive:
     def configure(self, config: ControllerConfig) -> None:
         """Use other tolerances, times and gains from the next state on."""
         self._config = config
+        self.servicing.configure(config)
         self.controller.set_gains(config.gains)
 
     @property
@@ -150,6 +161,10 @@ class ControlExecutive:
             )
         self._pending.pop(key, None)
         self._pending[key] = goal
+
+    def request(self, task: Task) -> None:
+        """Do a task from the next measured state on, without a goal after it."""
+        self._requested = (task,)
 
     def refuse(self, message: str, goal_id: str = "") -> None:
         """Report the refusal of a goal; an earlier goal is still pursued."""
@@ -216,19 +231,25 @@ class ControlExecutive:
 
     def plant_reset(self) -> None:
         """Begin the goal anew at the next measured state; without a goal, hold its pose."""
+        self.servicing.end()
+        if self._goal_state is ControllerState.TRACKING and self._after_tasks:
+            self._pending = {**self._after_tasks, **self._pending}
         if self._goal_state is ControllerState.TRACKING:
             self._begin_anew = True
         else:
             self._hold_here = True
 
-    def use_controller(self, controller: CoordinatedController) -> None:
+    def use_controller(
+        self, controller: CoordinatedController, payload: Payload | None = None
+    ) -> None:
         """Control by another controller of the same outputs: the robot's masses have changed.
 
         The goal begins anew at the next measured state; without a goal the robot holds where it
-        held.
+        held. ``payload`` is the body that the robot holds from now on.
         """
         controller.continue_for(self.controller)
         self.controller = controller
+        self.servicing.hold(payload)
         self._begin_anew = self._goal_state is ControllerState.TRACKING
 
     def _give_up(self, message: str) -> None:
@@ -236,6 +257,10 @@ class ControlExecutive:
         pursued = self._pending or self._goal_state is ControllerState.TRACKING
         # A decided goal stays decided: an abort without an undecided goal has no goal id.
         self._goal_id = self._latest_id() if pursued else ""
+        self._requested = None
+        if self.servicing.task is not None:
+            self.servicing.end()
+            self.controller.follow(Reference())
         self._pending.clear()
         self._abort_message = message
         self._file.delete()
@@ -269,6 +294,7 @@ class ControlExecutive:
             # After a jump of time, the goal continues as before the jump.
             jump = time - self._time
             self.controller.shift_time(jump)
+            self.servicing.restart()
             self._monitor.shift_time(jump)
             self._next_report += jump
         self._time = time
@@ -288,8 +314,8 @@ class ControlExecutive:
                 self._error_bounds = None
             self._begin_anew = False
             too_fast = self.controller.coming_to_rest and self._monitor.fast_states
-            if self._pending and not too_fast:
-                self._begin_goals(time, measured)
+            if not too_fast:
+                self._pursue(time, measured)
             self._watch_rates(qdot)
         if reference is not None:
             self.controller.follow(reference)
@@ -314,7 +340,8 @@ class ControlExecutive:
                 self._next_report = time
         if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
             self._watch_errors()
-        if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
+        pursued = self._goal_state is ControllerState.TRACKING and self.servicing.task is None
+        if self.controller.mode is Mode.MEASURED and pursued:
             at_rest = self.controller.reference_at_rest(time)
             errors = self.controller.errors()
             decision = self._monitor.decide_by_errors(time, at_rest, errors, self._config)
@@ -381,15 +408,74 @@ class ControlExecutive:
             self._goal_state, self._goal_id = ControllerState.HOLDING, ""
         self._abort_requested = self._hold_here = False
 
-    def _begin_goals(self, time: float, state: ControlState) -> None:
-        """Start towards the pending goals."""
+    def _pursue(self, time: float, state: ControlState) -> None:
+        """Go on with the tasks before the pending goals, and start towards the goals after them."""
+        servicing = self.servicing
+        if self._requested is not None:
+            self._begin_tasks(time, self._requested)
+            self._requested = None
+        elif self._pending and servicing.task is None:
+            if not servicing.before_goals:
+                self._begin_goals(time, state)
+                return
+            self._begin_tasks(time, servicing.before_goals)
+        if servicing.task is None:
+            return
+        progress = servicing.step(time, state, self.controller)
+        for event in servicing.events():
+            self._report_event(replace(event, goal_id=self._goal_id))
+            self._next_report = time
+        match progress.state:
+            case TaskState.ACTIVE:
+                pass
+            case TaskState.DONE if self._pending:
+                self._begin_goals(time, state, carried=True)
+            case TaskState.DONE:
+                self._goal_state = ControllerState.REACHED
+                self._report_decision(
+                    EventKind.GOAL_REACHED, self._message(self._goal_state), self._goal_state
+                )
+            case TaskState.REFUSED | TaskState.FAILED:
+                self._end_tasks(time, state, progress)
+
+    def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
+        """Start with the tasks before a goal, or with requested ones."""
+        self.servicing.begin(tasks)
+        self._goal_id = self._latest_id() if self._pending else ""
+        if self._pending:
+            self._report_acceptance()
+        self._goal_state = ControllerState.TRACKING
+        self._monitor.begin(time)
+        self._next_report, self._error_bounds = time, None
+        self._save(self._pending)
+
+    def _end_tasks(self, time: float, state: ControlState, progress: Progress) -> None:
+        """Give up the tasks, and the goals after them, and hold the measured pose."""
+        goal_id = self._latest_id() if self._pending else self._goal_id
+        self._give_up(progress.message)
+        self._goal_id = goal_id
+        self.controller.hold_here(time, state)
+        if progress.state is TaskState.REFUSED:
+            self._goal_state, self._goal_id = ControllerState.HOLDING, ""
+            self.refuse(progress.message, goal_id)
+        else:
+            self._report_abort()
+
+    def _begin_goals(self, time: float, state: ControlState, *, carried: bool = False) -> None:
+        """Start towards the pending goals.
+
+        After tasks, a goal of the base alone takes the end-effector with what it holds along.
+        """
         self._goal_id = self._latest_id()
+        self._after_tasks = dict(self._pending) if carried else {}
         goals = {key: pending.goal for key, pending in self._pending.items()}
         self._pending.clear()
         poses = {key: PoseReference(goal.position, goal.quaternion) for key, goal in goals.items()}
         shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
         if self.controller.wheels is not None:
             shapes = [shape[self.controller.wheels.wheels.other] for shape in shapes]
+        if carried and self.controller.law.outputs.selection.end_effector:
+            poses.setdefault(END_EFFECTOR, self._carried_pose(state, poses[BASE_GOAL_KEY]))
         self.controller.set_goals(
             time,
             state,
@@ -397,15 +483,30 @@ class ControlExecutive:
             end_effector=poses.get(END_EFFECTOR),
             joints=shapes[0] if shapes else None,
         )
-        message, goal_id = "The goal is accepted.", self._goal_id
-        self._report_event(Event(EventKind.GOAL_ACCEPTED, message, goal_id=goal_id))
+        if not carried:
+            self._report_acceptance()
         self._goal_state = ControllerState.TRACKING
         self._monitor.begin(time)
         self._next_report, self._error_bounds = time, None
+        self._save(self._goals_to_save())
+
+    def _report_acceptance(self) -> None:
+        message, goal_id = "The goal is accepted.", self._goal_id
+        self._report_event(Event(EventKind.GOAL_ACCEPTED, message, goal_id=goal_id))
+
+    def _save(self, goals: Mapping[str, IdentifiedGoal]) -> None:
         try:
-            self._file.save(self._goals_to_save())
+            self._file.save(goals)
         except ParameterError as error:
             self._warn(f"{error} The goal is pursued, but not resumed after a restart.")
+
+    def _carried_pose(self, state: ControlState, base: PoseReference) -> PoseReference:
+        """Return the pose of the end-effector with the base in its goal, and the shape as now."""
+        link = self.controller.law.outputs.selection.end_effector_link
+        there = replace(state, r_WB=base.position, quaternion_WB=base.quaternion)
+        pose = Reference.present(self.controller.law.robot, there, link).end_effector
+        assert pose is not None
+        return pose
 
     def _goals_to_save(self) -> dict[str, IdentifiedGoal]:
         """Return the goals of all controlled poses, to resume with."""
@@ -428,7 +529,9 @@ class ControlExecutive:
 
     def _publish(self, state: ControllerState, message: str, goal_id: str | None = None) -> None:
         about = self._goal_id if goal_id is None else goal_id
-        self._report(ControllerStatus(state, message, about, self._command_report))
+        task = self.servicing.task
+        name = "" if task is None else task.value
+        self._report(ControllerStatus(state, message, about, self._command_report, name))
 
     def _report_decision(
         self, kind: EventKind, message: str, state: ControllerState, goal_id: str | None = None
@@ -442,6 +545,8 @@ class ControlExecutive:
             case ControllerState.HOLDING:
                 away = self.controller.distance_from_reference()
                 return f"Holding; {away} from the reference."
+            case ControllerState.TRACKING if self.servicing.task is not None:
+                return self.servicing.message
             case ControllerState.TRACKING:
                 away = self.controller.distance_from_reference()
                 return f"Flying to the goal; {away} from the reference."

@@ -203,7 +203,7 @@ class JointRateLimits:
         """Largest rates (n,); infinite: no limit."""
         self._robot = robot
         self._control_period = control_period
-        self._rest_rate = min(_REST_RATE, _REST_RATE_PER_PERIOD / control_period)
+        self._rest_rate = decay_rate(control_period)
         self._dynamics = BufferedFunction(_joint_dynamics(robot))
         self._per_rate = 1 / (_SLOW_RATE_SHARE * self.rates)
         self._inverse = (1 / self.rates).tolist()
@@ -296,6 +296,11 @@ class JointRateLimits:
             Js, _, _ = self._evaluate_dynamics(ControlState(zero, zero, zero, zero, q, np.zeros(n)))
             largest = np.maximum(largest, np.diag(np.linalg.inv(Js)))
         return largest
+
+
+def decay_rate(control_period: float) -> float:
+    """Return the decay rate (1/s) of the motion of a robot that is brought to rest."""
+    return min(_REST_RATE, _REST_RATE_PER_PERIOD / control_period)
 
 
 def _bearable_push_share(wanted: Array, pushed: Array, effort: Array) -> float:

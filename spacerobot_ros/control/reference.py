@@ -124,14 +124,14 @@ class QuinticReference(ReferenceProfile):
         if goal.joints is not None and start.joints is not None:
             self._joints = goal.joints.q - start.joints.q
         needs = [
-            _quintic_duration(float(abs(d)), limits.joint_speed, limits.joint_acceleration)
+            quintic_duration(float(abs(d)), limits.joint_speed, limits.joint_acceleration)
             for d in self._joints
         ]
         for line in (self._base, self._end_effector):
             if line is not None:
-                needs.append(_quintic_duration(line.length, limits.speed, limits.acceleration))
+                needs.append(quintic_duration(line.length, limits.speed, limits.acceleration))
                 needs.append(
-                    _quintic_duration(line.angle, limits.angular_speed, limits.angular_acceleration)
+                    quintic_duration(line.angle, limits.angular_speed, limits.angular_acceleration)
                 )
         self.duration = max(needs, default=0.0)
 
@@ -283,7 +283,7 @@ class _PoseLine:
         )
 
 
-def _quintic_duration(distance: float, speed: float, acceleration: float) -> float:
+def quintic_duration(distance: float, speed: float, acceleration: float) -> float:
     """Return the shortest duration (s) of a quintic over a distance within its limits."""
     return max(
         _QUINTIC_PEAK_RATE * distance / speed,

@@ -100,18 +100,23 @@ class ControllerStatus:
         Id of the goal of this status; empty: no goal, or one without an id.
     command
         Report on the last command; None before the first.
+    task
+        What is done before the goal is pursued: ``approach`` or ``detumble``; empty: nothing.
     """
 
     state: ControllerState
     message: str = ""
     goal_id: str = ""
     command: CommandReport | None = None
+    task: str = ""
 
     def to_values(self) -> dict[str, str]:
         """Return the status as the key-value pairs of a DiagnosticStatus; numbers have 6 digits."""
         values = {"state": self.state.value}
         if self.goal_id:
             values["goal_id"] = self.goal_id
+        if self.task:
+            values["task"] = self.task
         if self.command is not None:
             values["law"] = self.command.law
             values["singular"] = str(self.command.singular).lower()
@@ -151,7 +156,7 @@ class ControllerStatus:
                     dumping=values.get("dumping") == "true",
                 )
             state = ControllerState(values["state"])
-            return cls(state, message, values.get("goal_id", ""), command)
+            return cls(state, message, values.get("goal_id", ""), command, values.get("task", ""))
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"This is no status of a controller: {error}.") from error
 

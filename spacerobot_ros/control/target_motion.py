@@ -10,7 +10,7 @@ All quantities are arrays over times (K,): positions (K, 3) and attitudes (K, 3,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,7 @@ from spacerobot_ros.model.rotations import (
     rotvec_from_quaternion,
 )
 
-_STEP_ANGLE = 0.02
+_STEP_ANGLE = 0.05
 """Rotation of the target in one Runge-Kutta step, rad."""
 
 _LONGEST_STEP = 1.0
@@ -78,6 +78,11 @@ class FrameMotion:
             self.a[k],
             self.alpha[k],
         )
+
+    def part(self, first: int, last: int, every: int = 1) -> FrameMotion:
+        """Return the motion at times from the first up to the last, which is not included."""
+        chosen = slice(first, last, every)
+        return FrameMotion(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
     def body_motion(self, k: int = 0) -> BodyMotion:
         """Return the motion at the k-th time without accelerations."""

@@ -199,6 +199,13 @@ class WheelControl:
         """Number of independent axes of the wheels in use."""
         return self._allocate.rank
 
+    @property
+    def torque_in_every_direction(self) -> float:
+        """Largest torque that the wheels in use give about every axis, N m; 0: not about all."""
+        if self.rank < 3:
+            return 0.0
+        return self._allocate.within(self.wheels.torque[self._used])
+
     # -- measurements -------------------------------------------------------------------------
 
     def observe(

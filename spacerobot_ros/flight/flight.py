@@ -267,6 +267,17 @@ class Flight:
                 return {"time_s": event.time_s, **capture_values(event.about)}
         return {} if self.target is None else {"captured": False}
 
+    @cached_property
+    def detumbling(self) -> dict[str, float]:
+        """The first detumbling after a capture, by the keys of ``spacerobot run --json``; empty:
+        there was none.
+        """
+        for event in self.events:
+            if event.kind is EventKind.DETUMBLED:
+                numbers = {name: float(text) for name, text in event.about.items()}
+                return {"time_s": event.time_s or 0.0, **numbers}
+        return {}
+
     @property
     def control_period(self) -> float:
         """Duration of a tick, s."""
@@ -472,6 +483,8 @@ class Flight:
                 summary["end_effector_attitude_error_rad"] = measures.end_effector_error.angle
         if self.capture:
             summary["capture"] = self.capture
+        if self.detumbling:
+            summary["detumbling"] = self.detumbling
         if self.propellant is not None:
             summary["propellant_kg"] = self.propellant
         if self.clearance is not None:

@@ -26,7 +26,11 @@ from enum import Enum
 import numpy as np
 
 from spacerobot_ros.commanding.commander import ArrayDecoder, Commander, StateArrays
-from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerCommander
+from spacerobot_ros.commanding.controller import (
+    JOINT_REFERENCE,
+    TARGET_ODOMETRY,
+    ControllerCommander,
+)
 from spacerobot_ros.commanding.goal_follower import GoalFollower, Status
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.plant_state import Stamped
@@ -215,6 +219,8 @@ class _Host:
         pass
 
     def has_publisher(self, topic: str) -> bool:
+        if topic == TARGET_ODOMETRY:
+            return self.flight.has_target
         return topic == "odom" or (topic == JOINT_REFERENCE and self.flight.has_planner)
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
@@ -256,6 +262,8 @@ class _LockstepFlight:
                 scenario.controller, _Host(self, self._send_actuation)
             )
             self._controller.use_robot(robots.controller, ArrayDecoder())
+            if self._plant.capturing is not None:
+                self._controller.use_target(self._plant.capturing.target.description)
         self._commanders = [commanders[name] for name in scenario.commanders]
 
     # -- the flight ---------------------------------------------------------------------------
@@ -309,6 +317,11 @@ class _LockstepFlight:
         return self._planner is not None
 
     @property
+    def has_target(self) -> bool:
+        """Whether there is a target."""
+        return self._plant.capturing is not None
+
+    @property
     def _time(self) -> float:
         return self._tick * self._period_ns / SECOND
 
@@ -346,6 +359,9 @@ class _LockstepFlight:
             q, qdot = q.copy(), qdot.copy()
         pose, twist = quantities["measured_pose"], quantities["measured_twist"]
         state = StateArrays(now, q, qdot, pose, twist)
+        if self._controller is not None and "target_pose" in quantities:
+            pose, twist = quantities["target_pose"], quantities["target_twist"]
+            self._controller.receive_target(now, StateArrays(now, q, qdot, pose, twist))
         for commander in self._commanders:
             if not self._reported.sensors.dropout:
                 commander.take_odom(now, state)

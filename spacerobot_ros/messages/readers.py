@@ -386,7 +386,9 @@ class MessageDecoder:
     def __init__(self, joint_names: Sequence[str]) -> None:
         self._joints = JointReader(joint_names, ["position", "velocity"], measured=True)
         self._references = JointReader(joint_names, ["position", "velocity"])
-        self._odom = TemplateReader(ODOMETRY, {_POSE_PATH: 7, _TWIST_PATH: 6})
+        self._odom, self._target = (
+            TemplateReader(ODOMETRY, {_POSE_PATH: 7, _TWIST_PATH: 6}) for _ in range(2)
+        )
         self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
         self.require, self.accept = self._joints.require, self._joints.accept
 
@@ -394,6 +396,11 @@ class MessageDecoder:
         """Return pose (7,) and twist (6,) of an Odometry."""
         self._odom.accept(odom)
         return self._odom.floats(_POSE_PATH), self._odom.floats(_TWIST_PATH)
+
+    def target(self, odom: bytes) -> tuple[Array, Array]:
+        """Return pose (7,) and twist (6,) of an Odometry of the target."""
+        self._target.accept(odom)
+        return self._target.floats(_POSE_PATH), self._target.floats(_TWIST_PATH)
 
     def joint_reference(self, message: bytes) -> tuple[Array, Array]:
         """Return positions and rates (n,) of a JointState; a quantity that it lacks is 0."""

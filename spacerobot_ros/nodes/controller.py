@@ -9,16 +9,20 @@ from typing import Any, ClassVar
 from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from spacerobot_ros.commanding.controller import (
     BASE_REFERENCE,
     JOINT_REFERENCE,
+    TARGET_ODOMETRY,
     ControllerCommander,
 )
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.executive import END_EFFECTOR
+from spacerobot_ros.control.servicing import Task
+from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.messages.readers import (
     WRENCH,
@@ -27,8 +31,9 @@ from spacerobot_ros.messages.readers import (
     joint_template,
 )
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.commander import CommanderNode
-from spacerobot_ros.nodes.common.node import STREAM, described_robot
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.times import first_time_ns, stamp_bytes
@@ -63,6 +68,14 @@ class CoordinatedControlNode(CommanderNode):
         self._base_wrench = self.send_raw(WrenchStamped, "base_wrench")
         self.listen("controller/status")
         self.create_service(Trigger, "~/dump_momentum", self._on_dump_momentum)
+        for task in Task:
+            self.create_service(Trigger, f"~/{task.value}", partial(self._on_task, task))
+        self.create_subscription(
+            String, "target/robot_description", self._on_target_description, LATCHED
+        )
+        self._inputs[TARGET_ODOMETRY] = self.create_subscription(
+            Odometry, TARGET_ODOMETRY, self._on_target, STREAM, raw=True
+        )
         self.take_goals("goal_pose")
         self.take_goals("end_effector/goal_pose", END_EFFECTOR)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
@@ -99,6 +112,21 @@ class CoordinatedControlNode(CommanderNode):
     def _on_dump_momentum(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = self.commander.dump_momentum()
         return response
+
+    def _on_task(
+        self, task: Task, _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        response.success, response.message = self.commander.request(task)
+        return response
+
+    def _on_target(self, raw: bytes) -> None:
+        self.commander.receive_target(first_time_ns(raw), raw)
+
+    def _on_target_description(self, message: String) -> None:
+        try:
+            self.commander.use_target(parse_robot(message.data))
+        except SpaceRobotError as error:
+            self.get_logger().error(f"target/robot_description: {error}")
 
     # -- outputs ------------------------------------------------------------------------------
 

@@ -1,0 +1,207 @@
+"""Detumbling: a robot that has captured a target is brought to rest, its grasp not overloaded.
+
+The torque ``n`` about the centre of mass changes the angular momentum ``L`` of robot and target by
+no more than ``n_max``; so no control brings it to zero in less than ``|L0| / n_max``. A torque of
+that size against ``L`` takes exactly this time, and leaves the direction of ``L`` in W unchanged.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from spacerobot_ros.control.limits import decay_rate
+from spacerobot_ros.control.state import Actuation, ControlState
+from spacerobot_ros.model.compilation import BufferedFunction, dense_function
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.space_robot import SpaceRobot
+from spacerobot_ros.parameters import parameter
+
+
+@dataclass(frozen=True)
+class DetumbleOptions:
+    """The load on a grasp while a robot is brought to rest, and when it is at rest."""
+
+    grapple_torque_limit: float = parameter(
+        0.0, "largest torque of the grasp on the target; 0: no limit", unit="N m", minimum=0.0
+    )
+    rate: float = parameter(
+        0.002,
+        "largest rate of the base and of the joints at rest",
+        unit="rad/s or m/s",
+        minimum=1e-9,
+    )
+    speed: float = parameter(
+        0.002, "largest speed of the centre of mass at rest", unit="m/s", minimum=1e-9
+    )
+    settle_time: float = parameter(1.0, "time for which it is to be at rest", unit="s", minimum=0.0)
+
+
+def shortest_detumbling(momentum: float, torque: float) -> float:
+    """Return ``|L0| / n_max``, s: no torque of that size detumbles in less time.
+
+    Parameters
+    ----------
+    momentum
+        Angular momentum about the centre of mass, N m s.
+    torque
+        Largest torque, N m; infinite: any.
+    """
+    if momentum == 0.0 or math.isinf(torque):
+        return 0.0
+    return momentum / torque if torque > 0.0 else math.inf
+
+
+def largest_share(start: Array, change: Array, limit: float) -> float:
+    """Return the largest share ``s`` in [0, 1] with ``|start + s change| <= limit``.
+
+    Where there is none, the share with the least norm.
+    """
+    square, along = float(change @ change), float(start @ change)
+    if square == 0.0:
+        return 1.0
+    inside = along**2 - square * (float(start @ start) - limit**2)
+    if inside < 0.0:
+        return min(max(-along / square, 0.0), 1.0)
+    root = math.sqrt(inside)
+    lowest, highest = (-along - root) / square, (-along + root) / square
+    if highest < 0.0 or lowest > 1.0:
+        return 0.0 if highest < 0.0 else 1.0
+    return min(highest, 1.0)
+
+
+@dataclass(frozen=True)
+class GraspLoad:
+    """The wrench of a grasp on the body that it holds."""
+
+    payload: Payload
+    function: BufferedFunction
+
+    @classmethod
+    def of(cls, robot: SpaceRobot, payload: Payload) -> GraspLoad:
+        """Return the load of the grasp of a robot, whose model has the body."""
+        return cls(payload, BufferedFunction(_grasp_wrench(robot, payload)))
+
+    def at(self, state: ControlState, z: Array, zdot: Array) -> Array:
+        """Return force over torque (6,) at the end-effector, base components.
+
+        Parameters
+        ----------
+        state
+            The state.
+        z, zdot
+            Velocities ``[v_cm; omega; qdot]`` (6 + n,), base components, and their rates.
+        """
+        return self.function(state.q, z, zdot)[0]
+
+
+def _grasp_wrench(robot: SpaceRobot, payload: Payload) -> ca.Function:
+    """Return ``(q, z, zdot) -> wrench``, by Newton and Euler."""
+    N = 6 + robot.n
+    q, z, zdot = ca.SX.sym("q", robot.n), ca.SX.sym("z", N), ca.SX.sym("zdot", N)
+    J = robot.function(f"jacobian:{payload.link}", compile=False)(q)
+    R_BL, _ = robot.function("link_poses", compile=False)(q)
+    index = robot.link_names.index(payload.link)
+    R = R_BL[:, 3 * index : 3 * index + 3]
+    twist = J @ z
+    # The rate of the twist in B, whose axes turn with the base.
+    rate = J @ zdot + ca.jtimes(twist, q, z[6:])
+    omega_WB, v, omega = z[3:6], twist[:3], twist[3:]
+    a = rate[:3] + ca.cross(omega_WB, v)
+    alpha = rate[3:] + ca.cross(omega_WB, omega)
+    inertia = payload.inertia
+    c, about = R @ inertia.com, R @ inertia.about_com @ R.T
+    force = inertia.mass * (a + ca.cross(alpha, c) + ca.cross(omega, ca.cross(omega, c)))
+    torque = about @ alpha + ca.cross(omega, about @ omega) + ca.cross(c, force)
+    inputs = {"q": q, "z": z, "zdot": zdot}
+    return dense_function("grasp_wrench", inputs, {"wrench": ca.vertcat(force, torque)})
+
+
+class Detumbling:
+    """Brings a robot to rest with a limited torque at its grasp.
+
+    Angular momentum is removed first, by the largest torque against it, then linear momentum by the
+    thrust that the torque leaves; joints are braked. All three decay together where the grasp would
+    be loaded beyond its limit: the whole demand is lowered.
+
+    Parameters
+    ----------
+    robot
+        The model, with the body that the robot holds; a gyrostat, where there are wheels.
+    payload
+        That body; None: there is no grasp whose torque is limited.
+    force, torque
+        Largest force of the thrusters, N, and torque on the base, N m; infinite: any.
+    torque_limit
+        Largest torque of the grasp, N m; 0: no limit.
+    control_period
+        Time for which a command is held, s.
+    """
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        payload: Payload | None,
+        force: float,
+        torque: float,
+        torque_limit: float,
+        control_period: float,
+    ) -> None:
+        self._robot, self._rate = robot, decay_rate(control_period)
+        self._force, self.torque = force, torque
+        self._limit = torque_limit or math.inf
+        self._grasp = None if payload is None else GraspLoad.of(robot, payload)
+        self.largest_grasp_torque = 0.0
+        """Largest torque of the grasp that a command asked for, N m."""
+
+    def angular_momentum(self, state: ControlState) -> Array:
+        """Return the angular momentum (3,) about the centre of mass, N m s, base components."""
+        H = self._robot.inertia_matrix(state.q)
+        return np.asarray(H[3:6, 3:6] @ state.omega_WB_B + H[3:6, 6:] @ state.qdot)
+
+    def velocity(self, state: ControlState) -> Array:
+        """Return the velocity (3,) of the centre of mass, m/s, base components."""
+        J = self._robot.jacobian(self._robot.base_link, state.q)
+        return np.asarray(state.v_WB_B - J[:3, 3:6] @ state.omega_WB_B - J[:3, 6:] @ state.qdot)
+
+    def command(self, state: ControlState) -> Actuation:
+        """Return the wrench of the base and the joint efforts."""
+        robot, r = self._robot, self._rate
+        H, J = robot.inertia_matrix(state.q), robot.jacobian(robot.base_link, state.q)
+        v_cm = self.velocity(state)
+        z = np.concatenate([v_cm, state.omega_WB_B, state.qdot])
+        C = robot.bias(state.q, v_cm, state.omega_WB_B, state.qdot)
+        # A force at the base turns the robot about its centre of mass, too.
+        to_cm = J[:3, 3:6].T
+        n = _within(-r * self.angular_momentum(state), self.torque)
+        f = _within(-r * robot.total_mass * v_cm, self._force)
+        f = f * largest_share(n, -(to_cm @ f), self.torque) if f.any() else f
+        wanted = np.concatenate([f, n, -r * state.qdot])
+
+        def accelerations(share: float) -> Array:
+            zdot = np.concatenate([np.zeros(6), share * wanted[6:]])
+            rest = share * wanted[:6] - C[:6] - H[:6, 6:] @ zdot[6:]
+            zdot[:6] = np.linalg.solve(H[:6, :6], rest)
+            return zdot
+
+        share = 1.0
+        if self._grasp is not None:
+            free = self._grasp.at(state, z, accelerations(0.0))[3:].copy()
+            change = self._grasp.at(state, z, accelerations(1.0))[3:] - free
+            share = largest_share(free, change, self._limit) if self._limit < math.inf else 1.0
+            loaded = float(np.linalg.norm(free + share * change))
+            self.largest_grasp_torque = max(self.largest_grasp_torque, loaded)
+        zdot = accelerations(share)
+        force = share * f
+        torque = share * n - to_cm @ force
+        tau = H[6:] @ zdot + C[6:] - J[:3, 6:].T @ force
+        return Actuation(np.concatenate([force, torque]), tau)
+
+
+def _within(vector: Array, limit: float) -> Array:
+    size = float(np.linalg.norm(vector))
+    return vector if size <= limit else vector * (limit / size)

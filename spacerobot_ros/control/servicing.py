@@ -1,0 +1,415 @@
+"""Tasks before a goal: the approach to a target until it is captured, and detumbling after it.
+
+A task works on the controller's references, state by state, until it is done or has failed. An
+approach gives the reference of the end-effector; detumbling replaces the law until the robot rests.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from spacerobot_ros.control.approach import ApproachPlan, plan_approach
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.controller import CoordinatedController
+from spacerobot_ros.control.detumbling import Detumbling, shortest_detumbling
+from spacerobot_ros.control.state import ControlState, Reference
+from spacerobot_ros.control.target_motion import TorqueFreeMotion
+from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.grasp import (
+    BodyMotion,
+    Payload,
+    RelativeMotion,
+    RobotMotion,
+    TargetBody,
+    frame_motion,
+)
+from spacerobot_ros.model.rotations import matrix_from_quaternion
+
+_PREDICTION_SLACK = 0.02
+"""Distance (m) and angle (rad) of a target from its predicted motion beyond which the approach is
+planned anew."""
+
+
+class Task(str, Enum):
+    """What a controller does with a target before it pursues a goal."""
+
+    APPROACH = "approach"
+    """Bring the end-effector to the grapple frame, until the target is captured."""
+    DETUMBLE = "detumble"
+    """Bring the robot to rest, whatever it holds."""
+
+    @classmethod
+    def parsed(cls, text: str) -> tuple[Task, ...]:
+        """Return the tasks of a text, separated by spaces.
+
+        Raises
+        ------
+        ParameterError
+            There is no such task.
+        """
+        known = [task.value for task in cls]
+        for name in text.split():
+            if name not in known:
+                raise ParameterError(
+                    f"Parameter 'tasks' names '{name}'; the tasks are {' and '.join(known)}."
+                )
+        return tuple(cls(name) for name in text.split())
+
+
+class TaskState(Enum):
+    """The state of the present task after a state of the robot."""
+
+    ACTIVE = "active"
+    DONE = "done"
+    REFUSED = "refused"
+    """It cannot begin."""
+    FAILED = "failed"
+    """It was given up on the way."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The state of a task, with a sentence where it is refused or has failed."""
+
+    state: TaskState
+    message: str = ""
+
+
+_ACTIVE, _DONE = Progress(TaskState.ACTIVE), Progress(TaskState.DONE)
+
+
+class MeasuredTarget:
+    """The target as it was measured last.
+
+    Attributes
+    ----------
+    body
+        The body; None: it is not described.
+    why_unknown
+        Why the body is not known; empty: nothing was received.
+    motion, time
+        Motion of its root link, and the time of the measurement, s; None before the first one.
+    """
+
+    def __init__(self) -> None:
+        self.body: TargetBody | None = None
+        self.why_unknown = ""
+        self.motion: BodyMotion | None = None
+        self.time = -math.inf
+
+    def describe(self, target: RobotDescription, grapple_frame: str) -> None:
+        """Take the description of the target."""
+        try:
+            self.body, self.why_unknown = TargetBody.of(target, grapple_frame), ""
+        except RobotDescriptionError as error:
+            self.body, self.why_unknown = None, str(error)
+
+    def measure(self, time: float, pose: Array, twist: Array) -> None:
+        """Take pose (7,) and twist (6,), in its own frame, of its root link at a time, s."""
+        R = matrix_from_quaternion(pose[3:])
+        self.motion = BodyMotion(R, pose[:3].copy(), R @ twist[:3], R @ twist[3:])
+        self.time = time
+
+
+class Approach:
+    """One approach: it is planned in its first state, and again where the target leaves its way.
+
+    Parameters
+    ----------
+    target
+        The target, which is measured while the approach goes on.
+    config
+        Parameters of the controller.
+    """
+
+    def __init__(self, target: MeasuredTarget, config: ControllerConfig) -> None:
+        self.target, self.config = target, config
+        self.events: list[Event] = []
+        self._plan: ApproachPlan | None = None
+        self._predicted: TorqueFreeMotion | None = None
+        self._planned_at = 0.0
+        self._began: float | None = None
+        self._far: RelativeMotion | None = None
+        self._remaining = math.inf
+        """Time until contact, s."""
+
+    def step(self, time: float, state: ControlState, controller: CoordinatedController) -> Progress:
+        """Give the controller the reference of a state."""
+        options = self.config.target
+        target, link = self.target, controller.law.outputs.selection.end_effector_link
+        if not controller.law.outputs.selection.end_effector:
+            return self._ended(f"the law '{controller.law.name}' controls no end-effector")
+        self._began = time if self._began is None else self._began
+        if target.motion is None or target.body is None:
+            if not target.why_unknown and time - self._began < options.timeout:
+                return _ACTIVE
+            why = target.why_unknown.rstrip(".") or (
+                "nothing is received on 'target/odom' and 'target/robot_description'"
+            )
+            return self._ended(f"the target is not known: {why}")
+        age = time - target.time
+        if age > options.timeout:
+            return self._ended(f"the target is lost: its odometry is {age:.3g} s old")
+        if self._plan is not None and self._strays(time, target.motion):
+            self._plan = None
+        if self._plan is None:
+            try:
+                self._make_plan(time, state, controller, target.body, target.motion)
+            except PlanningError as error:
+                why = str(error).rstrip(".")
+                return self._ended(f"{why[0].lower()}{why[1:]}")
+        assert self._plan is not None
+        plan, now = self._plan, time - self._planned_at
+        grapple = TorqueFreeMotion(target.body, target.motion).grapple([max(age, 0.0)])
+        motion = RobotMotion(
+            np.concatenate([state.r_WB, state.quaternion_WB]),
+            np.concatenate([state.v_WB_B, state.omega_WB_B]),
+            state.q,
+            state.qdot,
+        )
+        hand = frame_motion(controller.law.robot, link, motion)
+        self._far = RelativeMotion.between(hand, grapple.body_motion())
+        if now > plan.contact + options.patience:
+            return self._ended(
+                f"the target is missed: at contact the end-effector is {self._miss}, and nothing "
+                f"captured it within {options.patience:g} s"
+            )
+        if now >= plan.start:
+            moving = grapple.carrying(plan.relative(np.array([now])))
+            controller.follow(Reference(end_effector=moving.reference()))
+        self._remaining = plan.contact - now
+        return _ACTIVE
+
+    @property
+    def message(self) -> str:
+        """Sentence on the approach."""
+        if self._far is None:
+            return "Approaching the target."
+        left = self._remaining
+        when = f"contact in {left:.3g} s" if left > 0 else "in contact"
+        return f"Approaching the target: the end-effector is {self._miss}; {when}."
+
+    @property
+    def _miss(self) -> str:
+        far = self._far
+        assert far is not None
+        return (
+            f"{far.distance:.3g} m, {far.angle:.3g} rad, {far.speed:.3g} m/s and {far.rate:.3g} "
+            "rad/s from the grapple frame"
+        )
+
+    def _ended(self, why: str) -> Progress:
+        if self._predicted is None:
+            return Progress(TaskState.REFUSED, f"The approach is refused: {why}.")
+        return Progress(TaskState.FAILED, f"The approach is given up: {why}.")
+
+    def _strays(self, time: float, measured: BodyMotion) -> bool:
+        """Whether the target is away from its predicted motion."""
+        assert self._predicted is not None
+        assert self.target.body is not None
+        expected = self._predicted.grapple([self.target.time - self._planned_at]).body_motion()
+        off = RelativeMotion.between(expected, measured.at(self.target.body.grapple))
+        return off.distance > _PREDICTION_SLACK or off.angle > _PREDICTION_SLACK
+
+    def _make_plan(
+        self,
+        time: float,
+        state: ControlState,
+        controller: CoordinatedController,
+        body: TargetBody,
+        measured: BodyMotion,
+    ) -> None:
+        held = controller.followed_end_effector
+        held = held or controller.reference_at(time, state).end_effector
+        assert held is not None
+        axes = controller.law.outputs.selection.end_effector
+        target = TorqueFreeMotion(body, measured)
+        plan = plan_approach(
+            target,
+            held,
+            self.config.target,
+            self.config.motion,
+            controller.arm_reach(state),
+            axes,
+        )
+        self._plan, self._predicted, self._planned_at = plan, target, time
+        message = (
+            f"The end-effector sets out at {time + plan.start:.4g} s, closes in at "
+            f"{time + plan.closes_at:.4g} s, and meets the target at {time + plan.contact:.4g} s."
+        )
+        about = {
+            "starts_s": f"{time + plan.start:.9g}",
+            "closes_s": f"{time + plan.closes_at:.9g}",
+            "contact_s": f"{time + plan.contact:.9g}",
+        }
+        self.events.append(Event(EventKind.APPROACH_STARTED, message, about=about))
+
+
+class DetumblingTask:
+    """Detumbling until the robot has been at rest for the settling time.
+
+    Parameters
+    ----------
+    payload
+        The body that the robot holds; None: none.
+    config
+        Parameters of the controller.
+    """
+
+    def __init__(self, payload: Payload | None, config: ControllerConfig) -> None:
+        self.payload, self.config = payload, config
+        self.events: list[Event] = []
+        self._law: Detumbling | None = None
+        self._began = self._momentum = self._fastest = 0.0
+        self._at_rest_since: float | None = None
+
+    def step(self, time: float, state: ControlState, controller: CoordinatedController) -> Progress:
+        """Have the controller bring the robot to rest."""
+        options = self.config.detumble
+        if self._law is None:
+            self._begin(time, state, controller)
+        assert self._law is not None
+        rates = [
+            float(np.linalg.norm(state.omega_WB_B)),
+            float(np.abs(state.qdot).max(initial=0.0)),
+        ]
+        self._fastest = max(rates)
+        speed = float(np.linalg.norm(self._law.velocity(state)))
+        if self._fastest > options.rate or (controller.has_thrusters and speed > options.speed):
+            self._at_rest_since = None
+        elif self._at_rest_since is None:
+            self._at_rest_since = time
+        if self._at_rest_since is not None and time - self._at_rest_since >= options.settle_time:
+            self._end(self._at_rest_since)
+            return _DONE
+        limit = self.config.time_limit
+        if limit and time - self._began > limit:
+            return Progress(
+                TaskState.FAILED,
+                f"The robot is not at rest after {limit:g} s: it still turns at "
+                f"{self._fastest:.3g} rad/s, its centre of mass moves at {speed:.3g} m/s.",
+            )
+        return _ACTIVE
+
+    @property
+    def message(self) -> str:
+        """Sentence on the motion that is left."""
+        return f"Detumbling: base and joints turn at {self._fastest:.3g} rad/s."
+
+    def _begin(self, time: float, state: ControlState, controller: CoordinatedController) -> None:
+        limit = self.config.detumble.grapple_torque_limit
+        self._law = controller.detumbling(self.payload, limit)
+        self._began = time
+        self._momentum = float(np.linalg.norm(self._law.angular_momentum(state)))
+        controller.come_to_rest(self._law.command)
+        bound = shortest_detumbling(self._momentum, self._law.torque)
+        message = (
+            f"The robot is brought to rest: {self._momentum:.4g} N m s take {bound:.4g} s at least."
+        )
+        self.events.append(Event(EventKind.DETUMBLE_STARTED, message))
+
+    def _end(self, at_rest: float) -> None:
+        law = self._law
+        assert law is not None
+        took, bound = at_rest - self._began, shortest_detumbling(self._momentum, law.torque)
+        message = (
+            f"The robot came to rest in {took:.4g} s; the shortest time for {self._momentum:.4g} "
+            f"N m s is {bound:.4g} s, and the grasp took up to {law.largest_grasp_torque:.4g} N m."
+        )
+        about = {
+            "took_s": f"{took:.9g}",
+            "shortest_s": f"{bound:.9g}",
+            "angular_momentum_Nms": f"{self._momentum:.9g}",
+            "largest_torque_Nm": f"{law.torque:.9g}",
+            "grasp_torque_Nm": f"{law.largest_grasp_torque:.9g}",
+        }
+        self.events.append(Event(EventKind.DETUMBLED, message, about=about))
+
+
+class Servicing:
+    """The tasks of a controller: those before its goals, and those that are requested.
+
+    Parameters
+    ----------
+    config
+        Parameters of the controller.
+    """
+
+    def __init__(self, config: ControllerConfig) -> None:
+        self.before_goals = Task.parsed(config.tasks)
+        self._config = config
+        self.target = MeasuredTarget()
+        self.payload: Payload | None = None
+        """The body that the robot holds."""
+        self._left: list[Task] = []
+        self._present: Approach | DetumblingTask | None = None
+        self._events: list[Event] = []
+
+    def configure(self, config: ControllerConfig) -> None:
+        """Use other times from the next task on."""
+        self._config = config
+
+    @property
+    def task(self) -> Task | None:
+        """The present task."""
+        return self._left[0] if self._left else None
+
+    @property
+    def needs_target(self) -> bool:
+        """Whether measurements of the target are used, or will be."""
+        return Task.APPROACH in (self._left or self.before_goals) and self.payload is None
+
+    @property
+    def message(self) -> str:
+        """Sentence on the present task."""
+        return "" if self._present is None else self._present.message
+
+    def begin(self, tasks: Sequence[Task]) -> None:
+        """Begin with the first task at the next state."""
+        self._left, self._present = list(tasks), None
+
+    def restart(self) -> None:
+        """Begin the present task anew."""
+        self._present = None
+
+    def end(self) -> None:
+        """Give up the tasks that are left."""
+        self._left, self._present = [], None
+
+    def hold(self, payload: Payload | None) -> None:
+        """Take over the body that the robot holds from now on."""
+        self.payload = payload
+        self._present = None if self.task is Task.DETUMBLE else self._present
+
+    def step(self, time: float, state: ControlState, controller: CoordinatedController) -> Progress:
+        """Work on the present task; DONE with the last one."""
+        while self._left:
+            if self.task is not Task.APPROACH or self.payload is None:
+                if self._present is None:
+                    self._present = self._made(self._left[0])
+                progress = self._present.step(time, state, controller)
+                self._events += self._present.events
+                self._present.events.clear()
+                if progress.state is not TaskState.DONE:
+                    return progress
+            self._left, self._present = self._left[1:], None
+            controller.follow(Reference())
+            controller.hold_here(time, state)
+        return _DONE
+
+    def events(self) -> list[Event]:
+        """Return the events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def _made(self, task: Task) -> Approach | DetumblingTask:
+        if task is Task.APPROACH:
+            return Approach(self.target, self._config)
+        return DetumblingTask(self.payload, self._config)
