@@ -51,7 +51,12 @@ def reach(rates: float = 1.0, axes: tuple[str, ...] = ("x", "y")) -> ArmReach:
 
 
 def plan(motion: TorqueFreeMotion, **changes: Any) -> ApproachPlan:
-    given: dict[str, Any] = {"options": OPTIONS, "limits": LIMITS, "reach": reach(), "axes": ("x", "y")}
+    given: dict[str, Any] = {
+        "options": OPTIONS,
+        "limits": LIMITS,
+        "reach": reach(),
+        "axes": ("x", "y"),
+    }
     given |= changes
     return plan_approach(motion, given.pop("held", HELD), **given)
 
