@@ -68,8 +68,8 @@ class CoordinatedControlNode(CommanderNode):
         self._base_wrench = self.send_raw(WrenchStamped, "base_wrench")
         self.listen("controller/status")
         self.create_service(Trigger, "~/dump_momentum", self._on_dump_momentum)
-        for task in Task:
-            self.create_service(Trigger, f"~/{task.value}", partial(self._on_task, task))
+        self.create_service(Trigger, "~/approach", partial(self._on_task, Task.APPROACH))
+        self.create_service(Trigger, "~/detumble", partial(self._on_task, Task.DETUMBLE))
         self.create_subscription(
             String, "target/robot_description", self._on_target_description, LATCHED
         )
