@@ -70,11 +70,11 @@ def test_a_duration_is_the_shortest_within_both_limits() -> None:
     """The peaks of rate and acceleration by sampling: one of them is at its limit."""
     u = np.linspace(0.0, 1.0, 20001)
     for distance, speed, acceleration in ((0.7, 0.1, 9.0), (0.7, 50.0, 0.2)):
-        T = reference._quintic_duration(distance, speed, acceleration)
+        T = reference.quintic_duration(distance, speed, acceleration)
         _, rates, accelerations = reference._quintic(u, T)
         shares = distance * rates.max() / speed, distance * accelerations.max() / acceleration
         assert max(shares) == pytest.approx(1.0, rel=1e-6)
-    assert reference._quintic_duration(0.0, 1.0, 1.0) == 0.0
+    assert reference.quintic_duration(0.0, 1.0, 1.0) == 0.0
 
 
 def test_a_profile_lasts_as_long_as_its_slowest_part() -> None:
