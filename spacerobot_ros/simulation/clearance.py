@@ -98,9 +98,15 @@ class ClearanceMonitor:
         self._touching: frozenset[LinkPair] = frozenset()
 
     @classmethod
-    def of(cls, robot: RobotDescription, links: tuple[str, ...]) -> ClearanceMonitor | None:
+    def of(
+        cls,
+        robot: RobotDescription,
+        links: tuple[str, ...],
+        before: ClearanceMonitor | None = None,
+    ) -> ClearanceMonitor | None:
         """Return the monitor of a robot; None: none of its links could touch.
 
+        ``before`` is that among other obstacles, whose contacts go on or end.
         It is None, too, where the package coal is not installed, which the log says.
         """
         geometry = CollisionGeometry(robot)
@@ -109,7 +115,10 @@ class ClearanceMonitor:
         if not geometry.exact:
             _LOG.warning("The plant measures no clearance without the package coal.")
             return None
-        return cls(geometry, links)
+        monitor = cls(geometry, links)
+        if before is not None:
+            monitor._touching = before._touching
+        return monitor
 
     def measure(
         self, link_R: Array, link_r: Array, pose: Array, time_s: float

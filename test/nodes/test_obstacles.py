@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
+import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nodes.test_end_effector_goals import ATTITUDE, NAMES, PLACE, START, URDF, flight_of, place
+from nodes.test_verified_flights import Flight as RecordedFlight
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from support.hand_motion import end_of_motion
 from support.planner_flight import values_of
 from support.ros_harness import Harness
+
+from spacerobot_ros.flight.reading import open_flight_bag, read_flight
+from spacerobot_ros.flight.verification import verify_bag
+from spacerobot_ros.report import write_report
 
 LATCHED = QoSProfile(
     depth=1,
@@ -72,3 +83,40 @@ def test_obstacles_that_come_in_flight_stop_it_and_may_go_again(harness: Harness
     assert values_of(flight.wait("reached"))["goal_id"] == "2.000000000"
     flight.ticks(21)
     assert "second_is" not in values_of(probe.last("clearance"))
+
+
+@pytest.mark.slow
+def test_a_bag_whose_obstacles_changed_is_verified_and_reported(
+    harness: Harness, tmp_path: Path
+) -> None:
+    names = ["slider_1", "slider_2", "slider_3"]
+
+    def answer(tick: int) -> Sequence[Any]:
+        if tick in (13, 37):
+            obstacles.publish(box_at(np.array([0.01 * tick, 0.0, 0.2])))
+        flight.recorder.scan()
+        return [JointState(name=names, velocity=[0.1, -0.05, 0.02])]
+
+    plant = {"robot": "sliding_masses", "tick_rate": 20.0, "linear_momentum": [0.1, 0.0, -0.2]}
+    flight = RecordedFlight(harness, tmp_path / "flown.mcap", plant, answer)
+    obstacles = flight.probe.create_publisher(String, "obstacles", LATCHED)
+
+    def heard() -> bool:
+        flight.recorder.scan()
+        return "/obstacles" in flight.recorder.topics
+
+    harness.spin_until(heard, "the recorder hears obstacles")
+    path = flight.fly()
+    result = verify_bag(path)
+    assert result.difference is None
+    assert result.largest < 1e-12
+    bag = open_flight_bag(path)
+    assert bag.obstacles_change
+    world = bag.obstacles[-1][1]
+    assert world is not None
+    np.testing.assert_allclose(world.frames["crate"][1].r, [0.37, 0.0, 0.2])
+    assert read_flight(bag).clearance is None
+    distances = [values_of(message) for _, message in bag.messages("clearance")]
+    assert {each.get("second") for each in distances if "second_is" in each} == {"crate"}
+    write_report(path, tmp_path / "report.html")
+    assert "/obstacle 0 crate" in (tmp_path / "report.html").read_text("utf-8")

@@ -335,6 +335,8 @@ ACTIONS: dict[str, Callable[[Loop], object]] = {
     "partial": lambda loop: setattr(stub_of(loop), "partial", not stub_of(loop).partial),
     "overshoot": lambda loop: setattr(stub_of(loop), "overshoot", 0.3),
     "wrong path": lambda loop: setattr(stub_of(loop), "wrong_path", 0.1),
+    "obstacles near": obstacles(near=True),
+    "obstacles far": obstacles(near=False),
     "strict": lambda loop: loop.set(position_tolerance=1e-9, max_corrections=1),
 }
 

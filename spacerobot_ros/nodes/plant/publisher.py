@@ -478,7 +478,8 @@ class ClearancePublisher:
 
         ``before`` is the publisher among those so far, whose topic goes on.
         """
-        monitor = ClearanceMonitor.of(described, tuple(plant.robot.link_names))
+        links = tuple(plant.robot.link_names)
+        monitor = ClearanceMonitor.of(described, links, None if before is None else before._monitor)
         if monitor is None:
             return None
         return cls(node, plant, monitor, None if before is None else before._stream)
