@@ -20,6 +20,7 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, waypoint_counts
 from spacerobot_ros.planning.methods.registry import METHODS, method_options
+from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait, _RemainingProgress
 from spacerobot_ros.planning.methods.resolved_rate import JointPath, PathProgress, ResolvedRateGait
 
 Array = npt.NDArray[np.float64]
@@ -271,3 +272,48 @@ def test_statuses_tell_the_number_of_waypoints() -> None:
     values = status.to_values()
     assert values["waypoints_of_hand"] == "12"
     assert PlannerStatus.from_values(values).end_effector_waypoints == {"hand": 12}
+
+
+# -- as far as possible -------------------------------------------------------------------------
+
+
+def test_a_path_is_followed_until_shortly_before_a_limit(start: Array) -> None:
+    corner, beyond = start + WAY[1], start + WAY[1] + np.array([0.6, 2.5, -0.4])
+    path: Any = {"end_effector_path": [corner, beyond], "start": STATE, "control_period": PERIOD}
+    with pytest.raises(
+        PlanningError, match=r" after [\d.]+ of 2\.7\d* m of the (line|path) of 'end_"
+    ):
+        plan("three_joint_arm", **path)
+    schedule = plan("three_joint_arm", **path, as_far_as_possible=1)
+    assert str(schedule.notes["stopped"]).count(" m of the ") == 1
+    progress = schedule.progress
+    assert isinstance(progress, PathProgress)
+    done, whole = float(progress.along[-1]), float(progress.route.along[-1])
+    assert progress.route.along[1] < done < whole
+    end = poses("three_joint_arm", schedule.positions, HAND)[HAND][0]
+    wanted = progress.route.after(done).positions[0]
+    np.testing.assert_allclose(end, wanted, atol=1e-6)
+    # From there the rest is refused with the same reason: the goal is given up.
+    base = schedule.path
+    state = RobotState(base.position[-1], base.quaternion[-1], schedule.positions[-1])
+    method = method_of(as_far_as_possible=1)
+    request = PlanRequest(state, schedule.goal, NEAR, correction=True, previous=schedule)
+    with pytest.raises(PlanningError, match=r"optimal may reach"):
+        method.plan(request)
+
+
+def test_without_stuck_joints_the_rest_of_the_path_is_planned(flown: GaitSchedule) -> None:
+    method: Any = SimpleNamespace(
+        _names=["auto"], _is_stuck=np.array([False, True, False]), _stuck={"shoulder_pitch": 0.2}
+    )
+    names, previous = RemainingJointsGait._methods_to_try(method, flown)
+    assert names == ["auto"]
+    assert previous is not None
+    assert previous.progress is flown.progress
+    np.testing.assert_array_equal(previous.positions, flown.positions[:, [0, 2]])
+    again = replace(
+        flown, progress=_RemainingProgress(frozenset({"elbow"}), "auto", flown.progress)
+    )
+    assert RemainingJointsGait._methods_to_try(method, again)[1] is not None
+    other = replace(flown, progress=_RemainingProgress(frozenset({"elbow"}), "auto", None))
+    assert RemainingJointsGait._methods_to_try(method, other) == (["auto"], None)
