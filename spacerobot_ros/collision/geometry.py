@@ -21,7 +21,14 @@ import numpy.typing as npt
 from spacerobot_ros.collision.distances import DistanceFunction, distance_function
 from spacerobot_ros.collision.rounded_box import RoundedBox, nearest_points
 from spacerobot_ros.errors import MeshError
-from spacerobot_ros.model.description import Array, JointKind, Pose, RobotDescription, Shape
+from spacerobot_ros.model.description import (
+    Array,
+    Joint,
+    JointKind,
+    Pose,
+    RobotDescription,
+    Shape,
+)
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
 from spacerobot_ros.model.rotations import matrices_from_quaternions
@@ -35,6 +42,9 @@ _HALF_RANGE = {JointKind.PRISMATIC: 1.0}
 
 _WORLD = -1
 """Index of the body of obstacles."""
+
+_COAXIAL = 1e-9
+"""Largest distance (m) and tilt (rad) from the axis of a joint of a body of revolution about it."""
 
 _FAR_AWAY = 1e9
 """Distance of obstacles where the pose of the base is not known, m: they are not looked at."""
@@ -344,12 +354,14 @@ class CollisionGeometry:
         """Return how far solids move against each other: at most ``reaches @ |dtheta|`` (P,), m.
 
         ``reaches`` (P, m) is the largest distance of a point of the pair from each of the moving
-        joints at any of the shapes (N, n), for joints between the two; zero for others. Of pairs
-        with obstacles, the distances (P,) from the base are returned, too; zero for others.
+        joints at any of the shapes (N, n), for joints between the two; zero for others, and for a
+        joint that turns a body of revolution, such as a reaction wheel, about its own axis. Of
+        pairs with obstacles, the distances (P,) from the base are returned, too; zero for others.
         """
         bodies = self.robot.bodies
         travel = np.abs(self.moving_positions(shapes)).max(axis=0)
         reach = np.zeros((len(self.solids), len(bodies) - 1))
+        carried = np.zeros(reach.shape, dtype=np.bool_)
         from_base = np.zeros(len(self.solids))
         for number, solid in enumerate(self.solids):
             if solid.is_obstacle:
@@ -362,18 +374,34 @@ class CollisionGeometry:
                 body = bodies[index]
                 assert body.joint is not None
                 slides = body.joint.kind is JointKind.PRISMATIC
-                reach[number, index - 1] = 1.0 if slides else far
+                carried[number, index - 1] = True
+                spins = index == solid.body and _spins_in_place(solid, pose, body.joint)
+                reach[number, index - 1] = 1.0 if slides else far * (not spins)
                 far += float(np.linalg.norm(body.origin.r)) + slides * travel[index - 1]
                 index = body.parent
             from_base[number] = far
         first, second = reach[self.pairs[:, 0]], reach[self.pairs[:, 1]]
-        apart = np.where((first > 0) & (second > 0), 0.0, first + second)
+        together = carried[self.pairs[:, 0]] & carried[self.pairs[:, 1]]
+        apart = np.where(together, 0.0, first + second)
         return apart, np.where(self.with_obstacles, from_base[self.pairs[:, 0]], 0.0)
 
     def moving_positions(self, shapes: Array) -> Array:
         """Return the positions (N, m) of all moving joints at shapes (N, n), m or rad."""
         G, b = self.robot.coupling
         return np.asarray(shapes @ G.T + b)
+
+
+def _spins_in_place(solid: Solid, link_pose: Pose, joint: Joint) -> bool:
+    """Whether a solid is a body of revolution about the axis of a joint that turns it.
+
+    ``link_pose`` is the pose of its link in the frame of the joint's body.
+    """
+    if joint.kind is JointKind.PRISMATIC or solid.shape.kind not in ("cylinder", "sphere"):
+        return False
+    placed = link_pose @ solid.shape.pose
+    beside = float(np.linalg.norm(np.cross(joint.axis, placed.r)))
+    tilted = float(np.linalg.norm(np.cross(joint.axis, placed.R[:, 2])))
+    return beside < _COAXIAL and (solid.shape.kind == "sphere" or tilted < _COAXIAL)
 
 
 def _in_world(obstacle: Solid, pose: Pose) -> Solid:
