@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.urdf_text import without_collisions
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair
 from spacerobot_ros.collision import distances as distances_module
@@ -203,7 +204,7 @@ def test_distances_are_those_of_pinocchio(name: str) -> None:
 def test_without_coal_distances_are_bounds(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    robot = load_robot(robot_file("surveyor"))
+    robot = parse_robot(without_collisions(load_robot(robot_file("surveyor")).urdf))
     exact = CollisionGeometry(robot)
     monkeypatch.setitem(sys.modules, "coal", None)
     distances_module._coal.cache_clear()
@@ -242,3 +243,32 @@ def test_a_robot_without_shapes_has_no_pairs() -> None:
     assert len(geometry.pairs) == 0
     assert geometry.nearest(np.zeros(2)) is None
     assert geometry.notes == ()
+
+
+def test_the_collision_shapes_of_surveyor_are_its_parts_and_leave_the_arm_its_room() -> None:
+    """All corners of its meshes are in one of the solids."""
+    robot = load_robot(robot_file("surveyor"))
+    drawn = CollisionGeometry(parse_robot(without_collisions(robot.urdf)))
+    solids = CollisionGeometry(robot).solids
+    for mesh in drawn.solids:
+        assert mesh.vertices is not None
+        beyond = np.full(len(mesh.vertices), np.inf)
+        for solid in solids:
+            if solid.link == mesh.link:
+                at = (mesh.vertices - solid.shape.pose.r) @ solid.shape.pose.R
+                if solid.shape.kind == "box":
+                    away = np.abs(at) - np.array(solid.shape.size) / 2
+                else:
+                    radius, length = solid.shape.size
+                    away = np.column_stack(
+                        [np.hypot(at[:, 0], at[:, 1]) - radius, np.abs(at[:, 2]) - length / 2]
+                    )
+                beyond = np.minimum(beyond, away.max(axis=1))
+        assert beyond.max() < 1e-3, mesh.link
+    # The hull of the bus and its dish would touch the arm; they are 5 cm apart.
+    q = np.array([1.57, -0.77, 1.3, 0.19])
+    hull, found = drawn.nearest(q), CollisionGeometry(robot).nearest(q)
+    assert hull is not None
+    assert found is not None
+    assert hull[0] < 0.0
+    assert found[0] == pytest.approx(0.05, abs=1e-4)

@@ -46,8 +46,11 @@ class Distances:
         self._model = pinocchio.buildModelFromUrdf(path)
         # Paths of meshes begin with the name of the package, whatever the folder's name is.
         (packages / "spacerobot_ros").symlink_to(share_directory())
+        simple = "<collision>" in Path(path).read_text()
+        kinds = pinocchio.GeometryType
+        kind = kinds.COLLISION if simple else kinds.VISUAL
         self._solids = pinocchio.buildGeomFromUrdf(
-            self._model, path, pinocchio.GeometryType.VISUAL, package_dirs=[str(packages)]
+            self._model, path, kind, package_dirs=[str(packages)]
         )
         for each in self._solids.geometryObjects:
             if hasattr(each.geometry, "buildConvexHull"):

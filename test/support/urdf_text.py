@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import numpy.typing as npt
 
@@ -21,3 +23,8 @@ def link(name: str, mass: float, inertia: Array, com: Array) -> str:
 
 def numbers(values: npt.ArrayLike) -> str:
     return " ".join(f"{value:.17g}" for value in np.asarray(values))
+
+
+def without_collisions(urdf: str) -> str:
+    """Return a URDF whose links have no shapes but those that are drawn."""
+    return re.sub(r"<collision>.*?</collision>", "", urdf, flags=re.DOTALL)

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.spatial import ConvexHull
+from support.urdf_text import without_collisions
 
 from spacerobot_ros.collision.drawn import collision_visuals
 from spacerobot_ros.control.thrusters import find_thrusters
@@ -299,7 +300,7 @@ def test_other_obstacles_take_the_place_of_those_of_the_robot(server: Any) -> No
 
 def test_collision_shapes_are_shown_on_request(server: Any) -> None:
     server.scene.reset()
-    robot = load_robot(robot_file("surveyor"))
+    robot = parse_robot(without_collisions(load_robot(robot_file("surveyor")).urdf))
     page = Page(server, ViewerConfig())
     page.show_robot(robot)
     assert page._drawing is not None
