@@ -240,6 +240,7 @@ def commander(**changes: Any) -> Any:
         effort=np.zeros(2),
         wrench=np.zeros(6),
         _log_fault=lambda *words: done.append(words),
+        _read_target=lambda decoder: None,
     )  # fmt: skip
     vars(made).update(changes)
     return made
@@ -440,3 +441,15 @@ def test_references_of_others_have_a_base_or_joints(
     whole: Any = [[0, 1, 2], [3, 4, 5, 6], [10, 11, 12], [13, 14, 15]]
     assert found.base == (None if base is None else whole)
     assert found.joints == (None if joints is None else "shape and rates")
+
+
+def test_the_latest_odometry_of_the_target_is_read_once() -> None:
+    measured: list[Any] = []
+    target = SimpleNamespace(measure=lambda *given: measured.append(given))
+    made = commander(executive=SimpleNamespace(servicing=SimpleNamespace(target=target)))
+    decoder: Any = SimpleNamespace(target=lambda message: (f"pose of {message}", "twist"))
+    made._target_odometry = (2_500_000_000, "message")
+    for _ in range(2):
+        ControllerCommander._read_target(made, decoder)
+    assert measured == [(2.5, "pose of message", "twist")]
+    assert made._target_odometry is None
