@@ -356,6 +356,8 @@ class _ControlledLanes:
             return "the plant refuses commands beyond limits"
         if nominal_robots(scenario).controller.description.wheel_names:
             return "the robot has reaction wheels, which engine 'flights' flies"
+        if scenario.controller.tasks:
+            return "its controller has tasks before goals, which engine 'flights' does"
         for dispersion in campaign.dispersions:
             name = dispersion.name
             own = name.startswith("coordinated_control.") and not name.startswith(_GAIN_PREFIX)

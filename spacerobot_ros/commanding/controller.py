@@ -58,6 +58,8 @@ class ControllerCommander(Commander):
         """The target, as it is described."""
         self._target_odometry: Stamped | None = None
         """The latest odometry of the target, until it is read."""
+        self._awaits_target = False
+        """Whether states wait for odometry of the target."""
 
     def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
@@ -73,9 +75,7 @@ class ControllerCommander(Commander):
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):
             self.states.require(topic, required=self.host.has_publisher(topic))
         approaches = Task.APPROACH in Task.parsed(self.config.tasks)
-        self.states.require(
-            TARGET_ODOMETRY, required=approaches and self.host.has_publisher(TARGET_ODOMETRY)
-        )
+        self._await_target(needed=approaches and self.host.has_publisher(TARGET_ODOMETRY))
         super().activate()
 
     def dump_momentum(self) -> tuple[bool, str]:
@@ -102,13 +102,17 @@ class ControllerCommander(Commander):
 
     def receive_target(self, stamp_ns: int, message: Any) -> None:
         """Take odometry of the target, for which states wait while a task needs it."""
-        needed = self.executive is not None and self.executive.servicing.needs_target
-        if needed:
-            self._target_odometry = Stamped(stamp_ns, message)
+        if self.executive is not None and self.executive.servicing.needs_target:
+            self._target_odometry, self._awaits_target = Stamped(stamp_ns, message), True
             self.states.put_required(TARGET_ODOMETRY, stamp_ns, message)
             self.answer()
-        else:
-            self.states.require(TARGET_ODOMETRY, required=False)
+        elif self._awaits_target:
+            self._await_target(needed=False)
+
+    def _await_target(self, *, needed: bool) -> None:
+        """Set whether states wait for odometry of the target."""
+        self._awaits_target = needed
+        self.states.require(TARGET_ODOMETRY, required=needed)
 
     def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Take a reference, and answer its state if complete."""
@@ -228,6 +232,8 @@ class ControllerCommander(Commander):
         if send:
             self.host.send_command(stamp)
         executive.evaluate(now, result)
+        if self._awaits_target and not executive.servicing.needs_target:
+            self._await_target(needed=False)
 
     def _read_target(self, decoder: StateDecoder) -> None:
         """Read the latest odometry of the target."""

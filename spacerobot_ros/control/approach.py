@@ -49,6 +49,9 @@ _START_PERIOD = 1.0
 _SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 4.0, 1.4, 60.0
 """Shortest duration of a path to the standoff, ratio of two that are tried, and the longest, s."""
 
+_CLOSING_SHARE = 0.5
+"""Share of the largest acceleration for closing in; the grapple frame's own takes the rest."""
+
 _REACHED = 1e-3
 """Distance of an end-effector from its reference (m, rad) below which the arm reaches it."""
 
@@ -279,7 +282,8 @@ def _closing_path(options: ApproachOptions, limits: MotionLimits) -> RelativePat
     """Return the path from the standoff to contact, at rest beside the grapple frame at both."""
     standoff = np.array(options.standoff)
     length, speed = float(np.linalg.norm(standoff)), min(options.closing_speed, limits.speed)
-    duration = max(quintic_duration(length, speed, limits.acceleration), _SAMPLE_PERIOD)
+    acceleration = _CLOSING_SHARE * limits.acceleration
+    duration = max(quintic_duration(length, speed, acceleration), _SAMPLE_PERIOD)
     return RelativePath.from_rest(standoff, np.zeros(3), duration)
 
 
@@ -305,7 +309,7 @@ def _excess(motion: FrameMotion, limits: MotionLimits, axes: tuple[str, ...]) ->
         largest, limit = float(np.linalg.norm(values, axis=1).max()), getattr(limits, name)
         if counts:
             shares.append(
-                (largest / limit, f"{largest:.3g} {unit}, and 'motion.{name}' is {limit:.3g}")
+                (largest / limit, f"{largest:.4g} {unit}, and 'motion.{name}' is {limit:.3g}")
             )
     return max(shares)
 

@@ -105,6 +105,11 @@ def test_a_goal_of_end_effectors_is_not_flown_in_lanes() -> None:
             False,
             "the plant refuses commands beyond limits",
         ),
+        (
+            {"set": {"coordinated_control.tasks": "detumble"}},
+            False,
+            "its controller has tasks before goals, which engine 'flights' does",
+        ),
     ],
 )
 def test_which_controlled_campaigns_are_flown_in_lanes(

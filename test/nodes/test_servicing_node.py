@@ -1,0 +1,58 @@
+"""The controller's node hears of a target, and does tasks on request."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from nav_msgs.msg import Odometry
+from rclpy.lifecycle import TransitionCallbackReturn
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from support.control_loop import TICK_NS, Loop
+from support.ros_harness import Harness
+
+from spacerobot_ros.nodes.common.node import LATCHED
+from spacerobot_ros.resources import share_directory
+
+BLOCK = (share_directory() / "config" / "targets" / "block.urdf").read_text()
+
+
+def asked(loop: Loop, task: str) -> Any:
+    client = loop.probe.create_client(Trigger, f"control/{task}")
+    return loop.harness.call(client, Trigger.Request())
+
+
+def test_tasks_are_done_on_request(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    loop = Loop(harness, activate=False)
+    odom = loop.probe.create_publisher(Odometry, "target/odom", 10)
+    described = loop.probe.create_publisher(String, "target/robot_description", LATCHED)
+    described.publish(String(data=BLOCK))
+    harness.connect()
+    assert asked(loop, "approach").success is False
+    assert loop.node.trigger_activate() is TransitionCallbackReturn.SUCCESS
+    loop.answer()
+    assert asked(loop, "approach").success is True
+
+    def answer() -> None:
+        state = Odometry(child_frame_id="block")
+        stamp = divmod((loop.tick + 1) * TICK_NS, 10**9)
+        state.header.stamp.sec, state.header.stamp.nanosec = stamp
+        state.pose.pose.position.x, state.pose.pose.position.y = 1.9, -0.6
+        state.pose.pose.orientation.w = 1.0
+        odom.publish(state)
+        harness.settle(loop.probe)
+        loop.answer()
+
+    answer()  # From now on states wait for the target.
+    assert loop.wait_for("tracking").message == "Approaching the target."
+    answer()
+    answer()
+    status = loop.wait_for("tracking")
+    assert loop.status["task"] == "approach"
+    # The handle is 0.3 m on this side of the block.
+    assert "Approaching the target: the end-effector is 0.502 m" in status.message, status
+    assert asked(loop, "detumble").message.startswith("The task 'detumble' begins")
+    answer()
+    harness.spin_until(lambda: loop.status.get("task") == "detumble", "the task")
