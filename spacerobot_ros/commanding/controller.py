@@ -27,7 +27,7 @@ JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
 """Topics of references for a controller; states wait for each topic that has a publisher."""
 
 TARGET_ODOMETRY = "target/odom"
-"""Topic of the measured motion of the target; states wait for it where a task needs it."""
+"""Topic of the measured motion of the target."""
 
 # Constants save the slow look-up of enum members for every state.
 _ACTIVE = Activity.ACTIVE
@@ -58,8 +58,6 @@ class ControllerCommander(Commander):
         """The target, as it is described."""
         self._target_odometry: Stamped | None = None
         """The latest odometry of the target, until it is read."""
-        self._awaits_target = False
-        """Whether states wait for odometry of the target."""
 
     def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
@@ -74,8 +72,6 @@ class ControllerCommander(Commander):
         """Answer states from now on, each with the references that have a publisher."""
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):
             self.states.require(topic, required=self.host.has_publisher(topic))
-        approaches = Task.APPROACH in Task.parsed(self.config.tasks)
-        self._await_target(needed=approaches and self.host.has_publisher(TARGET_ODOMETRY))
         super().activate()
 
     def dump_momentum(self) -> tuple[bool, str]:
@@ -101,18 +97,12 @@ class ControllerCommander(Commander):
             self.executive.servicing.target.describe(target, frame)
 
     def receive_target(self, stamp_ns: int, message: Any) -> None:
-        """Take odometry of the target, for which states wait while a task needs it."""
-        if self.executive is not None and self.executive.servicing.needs_target:
-            self._target_odometry, self._awaits_target = Stamped(stamp_ns, message), True
-            self.states.put_required(TARGET_ODOMETRY, stamp_ns, message)
-            self.answer()
-        elif self._awaits_target:
-            self._await_target(needed=False)
+        """Take odometry of the target, which is read with the next state while a task needs it.
 
-    def _await_target(self, *, needed: bool) -> None:
-        """Set whether states wait for odometry of the target."""
-        self._awaits_target = needed
-        self.states.require(TARGET_ODOMETRY, required=needed)
+        No state waits for it: the motion since the last one is predicted.
+        """
+        if self.executive is not None and self.executive.servicing.needs_target:
+            self._target_odometry = Stamped(stamp_ns, message)
 
     def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Take a reference, and answer its state if complete."""
@@ -232,8 +222,6 @@ class ControllerCommander(Commander):
         if send:
             self.host.send_command(stamp)
         executive.evaluate(now, result)
-        if self._awaits_target and not executive.servicing.needs_target:
-            self._await_target(needed=False)
 
     def _read_target(self, decoder: StateDecoder) -> None:
         """Read the latest odometry of the target."""

@@ -28,7 +28,6 @@ import numpy as np
 from spacerobot_ros.commanding.commander import ArrayDecoder, Commander, StateArrays
 from spacerobot_ros.commanding.controller import (
     JOINT_REFERENCE,
-    TARGET_ODOMETRY,
     ControllerCommander,
 )
 from spacerobot_ros.commanding.goal_follower import GoalFollower, Status
@@ -219,8 +218,6 @@ class _Host:
         pass
 
     def has_publisher(self, topic: str) -> bool:
-        if topic == TARGET_ODOMETRY:
-            return self.flight.has_target
         return topic == "odom" or (topic == JOINT_REFERENCE and self.flight.has_planner)
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
@@ -315,11 +312,6 @@ class _LockstepFlight:
     def has_planner(self) -> bool:
         """Whether there is a planner, whose reference a controller tracks."""
         return self._planner is not None
-
-    @property
-    def has_target(self) -> bool:
-        """Whether there is a target."""
-        return self._plant.capturing is not None
 
     @property
     def _time(self) -> float:

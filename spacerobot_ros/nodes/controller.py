@@ -73,9 +73,7 @@ class CoordinatedControlNode(CommanderNode):
         self.create_subscription(
             String, "target/robot_description", self._on_target_description, LATCHED
         )
-        self._inputs[TARGET_ODOMETRY] = self.create_subscription(
-            Odometry, TARGET_ODOMETRY, self._on_target, STREAM, raw=True
-        )
+        self.create_subscription(Odometry, TARGET_ODOMETRY, self._on_target, STREAM, raw=True)
         self.take_goals("goal_pose")
         self.take_goals("end_effector/goal_pose", END_EFFECTOR)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):

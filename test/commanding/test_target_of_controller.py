@@ -11,7 +11,7 @@ from support.executive_loop import planar_manipulator
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.commanding.commander import ArrayDecoder, StateArrays
-from spacerobot_ros.commanding.controller import TARGET_ODOMETRY, ControllerCommander
+from spacerobot_ros.commanding.controller import ControllerCommander
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.servicing import Task
@@ -36,7 +36,7 @@ class Rig:
     def __init__(self, **settings: Any) -> None:
         self.commands: list[int] = []
         self.statuses: list[Status] = []
-        self.publishers = {"odom", TARGET_ODOMETRY}
+        self.publishers = {"odom"}
         given = {"tick_rate": 100.0, "status_period": 0.01, **settings}
         self.commander = ControllerCommander(configured(ControllerConfig, given), self)
 
@@ -77,13 +77,13 @@ class Rig:
         self.commander.receive_joints(tick * TICK, state)
 
 
-def test_states_wait_for_the_target_where_an_approach_is_a_task() -> None:
+def test_the_latest_odometry_of_the_target_is_read_with_a_state_that_waits_for_none() -> None:
     rig = Rig(tasks="approach")
     rig.begin()
     rig.commander.use_target(TARGET)
-    rig.state(1)
-    assert rig.commands == []
+    rig.target(0)
     rig.target(1)
+    rig.state(1)
     assert rig.commands == [1]
     executive = rig.commander.executive
     assert executive is not None
@@ -93,18 +93,18 @@ def test_states_wait_for_the_target_where_an_approach_is_a_task() -> None:
     assert measured.motion is not None
     np.testing.assert_allclose(measured.motion.r_WT, [1.9, -0.6, 0.0])
     np.testing.assert_allclose(measured.motion.omega, [0.0, 0.0, 0.002])
-    rig.target(2)
     rig.state(2)
     assert rig.commands == [1, 2]
 
 
-def test_they_do_not_wait_without_an_approach_nor_with_the_target_in_hand() -> None:
+def test_a_target_is_measured_for_an_approach_alone() -> None:
     rig = Rig(tasks="detumble")
     rig.begin()
     rig.target(1)
     rig.state(1)
-    rig.state(2)
-    assert rig.commands == [1, 2]
+    executive = rig.commander.executive
+    assert executive is not None
+    assert executive.servicing.target.motion is None
     rig = Rig(tasks="approach")
     rig.begin()
     rig.target(1)
@@ -117,8 +117,7 @@ def test_they_do_not_wait_without_an_approach_nor_with_the_target_in_hand() -> N
     assert executive.servicing.payload.inertia.mass == 10.0
     rig.target(2)
     rig.state(2)
-    rig.state(3)
-    assert rig.commands == [1, 2, 3]
+    assert executive.servicing.target.time == pytest.approx(0.01)
     rig.commander.receive_plant_status(PlantStatus(PlantState.RUNNING))
     assert executive.servicing.payload is None
 
@@ -170,3 +169,16 @@ def test_the_goal_waits_for_its_tasks() -> None:
     last = rig.statuses[-1]
     assert (last.state.value, last.goal_id) == ("tracking", "0.000000007")
     assert last.task == "approach"  # type: ignore[union-attr]
+
+
+def test_a_target_that_is_not_heard_of_any_more_is_lost() -> None:
+    rig = Rig(**{"tasks": "approach", "target.timeout": 0.025})
+    rig.begin()
+    rig.commander.use_target(TARGET)
+    rig.commander.receive_goal("base", 0, 7, lambda: Goal.checked([0.1, 0.0, 0.0], UPRIGHT))
+    rig.target(1)
+    for tick in range(1, 5):
+        rig.state(tick)
+    assert rig.statuses[-1].state.value == "aborted"
+    assert "the target is lost: its odometry is 0.03 s old" in rig.statuses[-1].message
+    assert rig.commands == [1, 2, 3, 4]

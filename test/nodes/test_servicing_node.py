@@ -45,7 +45,7 @@ def test_tasks_are_done_on_request(harness: Harness, monkeypatch: pytest.MonkeyP
         harness.settle(loop.probe)
         loop.answer()
 
-    answer()  # From now on states wait for the target.
+    answer()  # From now on the target is heard of.
     assert loop.wait_for("tracking").message == "Approaching the target."
     answer()
     answer()
