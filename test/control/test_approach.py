@@ -29,7 +29,7 @@ BODY = TargetBody(
     Inertia(10.0, np.array([0.05, -0.02, 0.0]), np.diag([1.0, 1.5, 2.0])), Pose(r=GRAPPLE)
 )
 OPTIONS = ApproachOptions(
-    standoff=(-0.2, 0.05, 0.0), standoff_time=1.5, closing_speed=0.05, horizon=6.0
+    standoff=(-0.2, 0.05, 0.0), standoff_time=1.5, closing_speed=0.05, horizon=3.0
 )
 LIMITS = MotionLimits(speed=0.3, acceleration=0.1, angular_speed=0.3, angular_acceleration=0.1)
 HELD = PoseReference(TIP, UPRIGHT)
@@ -110,7 +110,7 @@ def test_the_hand_waits_until_a_target_that_comes_nearer_is_within_reach() -> No
 def test_a_target_out_of_reach_is_refused_with_the_distance_that_is_left() -> None:
     """The arm's links are a metre long, and its shoulder is 0.5 m from the base's centre."""
     said = refusal(target((3.0, 0.0), rate=0.0))
-    assert_one_sentence(said, "out of reach within the next 6 s", "while the base holds")
+    assert_one_sentence(said, "out of reach within the next 3 s", "while the base holds")
     (left,) = re.findall(r"stays ([\d.]+) m or rad", said)
     assert float(left) == pytest.approx(0.5, abs=0.01)
     (contact,) = re.findall(r"contact at ([\d.]+) s", said)
@@ -153,7 +153,7 @@ def test_rotation_counts_only_where_it_is_controlled() -> None:
 
 def test_joints_that_are_too_slow_are_named() -> None:
     said = refusal(target((1.7, -0.5)), reach=reach(0.005))
-    assert_one_sentence(said, "The target cannot be met within the next 6 s", "of 0.005/s")
+    assert_one_sentence(said, "The target cannot be met within the next 3 s", "of 0.005/s")
     assert re.search(r"joint '(shoulder|elbow)' would move at 0\.0\d+/s", said)
 
 
