@@ -184,6 +184,8 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	$(FLY) two_hands
 	$(FLY) strut --set plant.world=config/worlds/strut.urdf --set planner.world=config/worlds/strut.urdf
 	$(FLY) capture --set plant.target.robot=config/targets/block.urdf
+	$(FLY) servicing --set plant.target.robot=config/targets/satellite.urdf \
+	    --set plant.tick_rate=10 --set coordinated_control.tick_rate=10
 
 # What mkdocs prints of its theme's successor is no warning of the build.
 .PHONY: docs

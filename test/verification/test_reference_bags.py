@@ -84,7 +84,7 @@ def test_every_reader_reads_every_message(name: str) -> None:
         assert summary.statistics.message_count == len(own)
         assert {record.name for record in reader.iter_metadata()} >= {"rosbag2", "scenario"}
         attached = ["robot_description.urdf"]
-        if name == "capture":
+        if name in ("capture", "servicing"):
             attached.append("target.robot_description.urdf")
         assert [record.name for record in reader.iter_attachments()] == attached
         assert len(summary.chunk_indexes) == summary.statistics.chunk_count

@@ -41,7 +41,7 @@ def verify(path: Path) -> Result:
     return CliRunner().invoke(main, ["verify", str(path), "--engine", "mujoco"])
 
 
-LOADED = ("capture", "gravity_gradient")
+LOADED = ("capture", "gravity_gradient", "servicing")
 """Bags with a target, or with loads from outside, which MuJoCo does not model."""
 
 
