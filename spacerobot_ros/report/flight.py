@@ -302,6 +302,16 @@ class FlightReport:
         """The solids of the obstacles, each with the pose of its link in the world."""
         return () if self.robot is None else obstacle_visuals(self.robot.world, self._carried_mesh)
 
+    @property
+    def target(self) -> RobotDescription | None:
+        """The body that the robot captures; None: there is none."""
+        return self.flight.target
+
+    @property
+    def target_pose(self) -> Signal:
+        """Pose of the target (M, 7): position, m, and quaternion; empty without one."""
+        return Signal.empty(7) if self.target is None else self.signal("target_pose")
+
     # -- names --------------------------------------------------------------------
 
     @property

@@ -305,7 +305,7 @@ _FIELD_OF_VIEW = 30.0
 """Field of view of the camera, deg."""
 
 _AXIS_COLOURS = ("#d55e00", "#009e73", "#0072b2")
-WORLD, ROBOT = "/flight", "/flight/robot"
+WORLD, ROBOT, TARGET = "/flight", "/flight/robot", "/flight/target"
 
 
 def scene_of(flight: FlightReport) -> Scene | str:
@@ -318,10 +318,11 @@ def scene_of(flight: FlightReport) -> Scene | str:
     commands = _stage_commands(center, radius, flight.flat)
     commands += _robot_commands(drawn.robot, flight.meshes)
     commands += _obstacle_commands(flight)
+    commands += _target_commands(flight)
     commands += _path_commands(flight)
     ghosts = _goal_commands(flight, drawn.robot, radius)
     commands += ghosts
-    commands.append(_motion_command(flight, drawn, frames.indices))
+    commands.append(_motion_command(flight, drawn, frames.indices, radius))
     return Scene(commands, _time_spans(flight), _caption_text(flight, frames, radius, bool(ghosts)))
 
 
@@ -333,6 +334,7 @@ def _center_and_radius(flight: FlightReport, drawn: SolidRobot) -> tuple[Array, 
     targets = flight.targets if flight.position_counts else []
     clouds += [t.goal.position[np.newaxis] for t in (*targets, *flight.tool_targets)]
     clouds += [goal.position[np.newaxis] for goal in flight.link_goals.values()]
+    clouds.append(flight.target_pose.values[:, :3])
     points = np.concatenate(clouds)
     low, high = points.min(axis=0), points.max(axis=0)
     return (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
@@ -429,13 +431,33 @@ def _obstacle_commands(flight: FlightReport) -> list[Command]:
     return commands
 
 
+def _target_commands(flight: FlightReport) -> list[Command]:
+    """The target, whose pose the animation gives."""
+    if flight.target is None or not len(flight.target_pose):
+        return []
+    commands = [set_transform(TARGET, matrix_of(_pose_of(flight.target_pose.values[0])))]
+    for number, visual in enumerate(visuals_of(flight.target, {}, _MAX_MESH_FACES)):
+        path = f"{TARGET}/{number} {_node_name(visual.link)}"
+        commands.append(set_transform(path, matrix_of(flight.target.frames[visual.link][1])))
+        commands += solid(path, visual, obstacle_color(visual))
+    return commands
+
+
+def _pose_of(values: Array) -> Pose:
+    return Pose(matrix_from_quaternion(values[3:]), values[:3])
+
+
 def _faces_per_mesh(meshes: Mapping[str, TriangleMesh]) -> int:
     """Return the largest number of faces of a mesh, so that the page stays small."""
     return _MAX_MESH_FACES // max(len(meshes), 1)
 
 
-def _motion_command(flight: FlightReport, drawn: SolidRobot, indices: Indices) -> Command:
-    """The animation: position and quaternion of the base, and of every link that a joint moves."""
+def _motion_command(
+    flight: FlightReport, drawn: SolidRobot, indices: Indices, radius: float
+) -> Command:
+    """The animation: position and quaternion of the base, of every link that a joint moves, and of
+    the target.
+    """
     time, paths = flight.position.time[indices], _link_paths(drawn.robot)
     base = {"position": flight.position.values[indices], "quaternion": flight.quaternion[indices]}
     clips = [clip(ROBOT, time, base)]
@@ -446,7 +468,20 @@ def _motion_command(flight: FlightReport, drawn: SolidRobot, indices: Indices) -
         slides = joint.kind is JointKind.PRISMATIC
         moved = {"position": poses[:, :3]} if slides else {"quaternion": poses[:, 3:]}
         clips.append(clip(paths[joint.child], time, moved))
+    target = flight.target_pose
+    if len(target):
+        shown, _ = simplified(_in_tolerances(target, radius), _MAX_KEY_FRAMES)
+        moved = {"position": target.values[shown, :3], "quaternion": target.values[shown, 3:]}
+        clips.append(clip(TARGET, target.time[shown], moved))
     return set_animation(clips)
+
+
+def _in_tolerances(pose: Signal, radius: float) -> Signal:
+    """Return a pose (N, 7) over time in tolerances; a quaternion's numbers change by half as much
+    as the angle.
+    """
+    tolerances = np.repeat([_POSITION_TOLERANCE * radius, _ANGLE_TOLERANCE / 2], [3, 4])
+    return Signal(pose.time, pose.values / tolerances)
 
 
 def _path_commands(flight: FlightReport) -> list[Command]:
@@ -533,6 +568,7 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
         text += " and of the end-effector (orange)"
     text += "; the ghost is the goal" if ghosts else ""
     text += "; obstacles have the shapes by which distances are measured" * bool(flight.obstacles)
+    text += "; the target moves as target/odom says" * (flight.target is not None)
     text += (
         f". {len(frames.indices)} key frames of {len(flight.position)} recorded states; in between "
         "the motion is interpolated"
