@@ -12,13 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros import files
 from spacerobot_ros.campaign.statistics import influences
+from spacerobot_ros.collision.geometry import Solid, _in_world
 from spacerobot_ros.collision.rounded_box import RoundedBox
+from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.measures import METRICS
-from spacerobot_ros.model.description import Pose
+from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.nodes.viewer import node as viewer_node
 from spacerobot_ros.nodes.viewer.node import ViewerNode
 from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance
 from spacerobot_ros.planning.methods.square_path import SquarePathGait
+from spacerobot_ros.report import scene
 from spacerobot_ros.times import LATEST_NS, SECOND, first_time_ns
 from spacerobot_ros.viewer import content
 
@@ -110,3 +113,54 @@ def test_the_angle_about_the_axis_is_the_shorter_way(angle: float) -> None:
         request = PlanRequest(state, Goal(np.zeros(3), end), Tolerance(1e-3, 1e-3))
         found = SquarePathGait._requested_turn(made, request)
         assert found == pytest.approx(math.remainder(angle, 2 * math.pi))
+
+
+def test_vertices_of_an_obstacle_are_moved_with_its_pose() -> None:
+    shape = Shape("mesh", (1.0, 1.0, 1.0), Pose())
+    vertices = np.array([[0.1, 0.2, -0.3], [0.5, -0.1, 0.4], [0.0, 0.3, 0.2], [0.2, 0.2, 0.1]])
+    box = RoundedBox(Pose(r=np.array([0.2, 0.0, 0.1])), np.array([0.3, 0.2, 0.4]), 0.05)
+    R = Rotation.from_rotvec([0.3, -0.7, 0.4])
+    pose = Pose(R.as_matrix(), np.array([1.5, -0.4, 0.9]))
+    found = _in_world(Solid("rock", 0, shape, box, vertices), pose)
+    assert found.vertices is not None
+    np.testing.assert_allclose(found.vertices, R.apply(vertices) + pose.r)
+    np.testing.assert_allclose(found.enclosure.pose.r, R.apply([0.2, 0.0, 0.1]) + pose.r)
+    np.testing.assert_allclose(found.shape.pose.r, pose.r)
+    assert found.is_obstacle
+
+
+@pytest.mark.parametrize(
+    ("controls", "turned"),
+    [([0, 1, 2], False), ([3], True), ([4], True), ([5], True), ([0, 4], True)],
+)
+def test_the_goal_of_an_end_effector_has_axes_where_an_angle_counts(
+    controls: list[int], turned: bool
+) -> None:
+    goal = SimpleNamespace(position=np.array([0.3, 0.2, 0.1]), quaternion=np.array([0, 0, 0, 1.0]))
+    report: Any = SimpleNamespace(
+        goal=None,
+        tool_targets=[SimpleNamespace(goal=goal)],
+        link_goals={},
+        controls=lambda part: controls if part == "end_effector" else [],
+    )
+    robot: Any = None
+    commands = scene._goal_commands(report, robot, 2.0)
+    axes = [each["path"] for each in commands if each["path"].endswith(("/x", "/y", "/z"))]
+    assert len(set(axes)) == 3 * turned
+
+
+@pytest.mark.parametrize("lost", ["executive", "robot"])
+def test_twists_without_a_robot_are_told(lost: str) -> None:
+    told: list[Any] = []
+    made: Any = SimpleNamespace(
+        active=True,
+        plant=SimpleNamespace(blocked=""),
+        executive="executive",
+        robot="robot",
+        _log_fault=lambda *words: told.append(words),
+    )
+    setattr(made, lost, None)
+    PlannerCommander.receive_twist(made, "hand", "world", np.zeros(3), np.zeros(3))
+    ((key, sentence),) = told
+    assert key == "twist"
+    assert sentence.endswith("There is no robot on robot_description yet.")

@@ -1,0 +1,84 @@
+"""Rows of distances along an interval: the points that they are taken at, and their derivatives."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from spacerobot_ros.collision.rows import DistanceRows
+from spacerobot_ros.planning.methods.optimal.transcription import _distances
+
+N = 2
+
+
+def rows_of_links() -> DistanceRows:
+    q, multiplier = ca.SX.sym("q", N), ca.SX.sym("lambda")
+    d = ca.sin(q[0]) * q[1] + q[0] ** 2
+    return DistanceRows(
+        ca.Function("d", [q], [d]),
+        ca.Function("J", [q], [ca.jacobian(d, q)]),
+        ca.Function("H", [q, multiplier], [ca.hessian(multiplier * d, q)[0]]),
+    )
+
+
+def rows_of_obstacles() -> DistanceRows:
+    y, w, multiplier = ca.SX.sym("y", N + 4), ca.SX.sym("w", 12), ca.SX.sym("lambda")
+    d = y[0] * y[3] + ca.cos(y[1]) * y[5] * w[2] + w[11] * y[2] * y[4]
+    return DistanceRows(
+        ca.Function("d", [y, w], [d]),
+        ca.Function("J", [y, w], [ca.jacobian(d, y)]),
+        ca.Function("H", [y, w, multiplier], [ca.hessian(multiplier * d, y)[0]]),
+        of_obstacles=True,
+    )
+
+
+H, START = 0.4, np.array([0.3, -0.7])
+V, V_NEXT = np.array([0.5, -0.2]), np.array([-0.1, 0.6])
+X, X_NEXT = np.array([0.1, -0.2, 0.3, 0.9]), np.array([0.2, -0.1, 0.25, 0.92])
+WORLD = np.linspace(-1.0, 1.2, 12)
+LEAST = np.array([0.05, -0.3])
+# The variable s of a knot is q + h v / 2.
+Z = np.concatenate([[H], X, START + H * V / 2, V, X_NEXT, V_NEXT])
+P = np.concatenate([LEAST, WORLD])
+
+
+def by_hand(z: np.ndarray) -> np.ndarray:
+    """Return the rows at thirds of an interval in which velocities change linearly."""
+    h, X0, s, v, X1, v1 = z[0], z[1:5], z[5:7], z[7:9], z[9:13], z[13:]
+    found = []
+    for tau in (1 / 3, 2 / 3, 1.0):
+        t = tau * h
+        q = s - h * v / 2 + v * t + (v1 - v) / h * t**2 / 2
+        turn = (1 - tau) * X0 + tau * X1
+        y = np.concatenate([q, turn])
+        found.append(np.sin(q[0]) * q[1] + q[0] ** 2 - LEAST[0])
+        of_obstacle = y[0] * y[3] + np.cos(y[1]) * y[5] * WORLD[2] + WORLD[11] * y[2] * y[4]
+        found.append(of_obstacle - LEAST[1])
+    return np.array(found)
+
+
+def test_rows_are_those_of_the_shapes_between_the_knots() -> None:
+    block = _distances(N, [rows_of_links(), rows_of_obstacles()], 3)
+    np.testing.assert_allclose(block.values(Z, P).full().ravel(), by_hand(Z), atol=1e-13)
+    values, J = block.jacobian(Z, P)
+    np.testing.assert_allclose(values.full().ravel(), by_hand(Z), atol=1e-13)
+    step = 1e-6
+    differences = [(by_hand(Z + e) - by_hand(Z - e)) / (2 * step) for e in step * np.eye(len(Z))]
+    np.testing.assert_allclose(J.full(), np.column_stack(differences), atol=1e-8)
+
+
+def test_second_derivatives_are_those_of_differences() -> None:
+    block = _distances(N, [rows_of_links(), rows_of_obstacles()], 3)
+    multipliers = np.array([0.7, -1.2, 0.4, 2.0, -0.6, 1.1])
+
+    def gradient(z: np.ndarray) -> np.ndarray:
+        return np.asarray(block.jacobian(z, P)[1].full().T @ multipliers)
+
+    step = 1e-6
+    expected = np.column_stack(
+        [(gradient(Z + e) - gradient(Z - e)) / (2 * step) for e in step * np.eye(len(Z))]
+    )
+    upper = block.hessian(Z, P, multipliers).full()
+    np.testing.assert_allclose(np.triu(upper), np.triu(expected), atol=1e-8)
+    assert np.abs(np.tril(upper, -1)).max() == pytest.approx(0.0, abs=1e-12)
