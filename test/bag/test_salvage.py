@@ -78,6 +78,7 @@ def whole_chunks(content: bytes, length: int) -> int:
     return total
 
 
+@pytest.mark.slow
 def test_whatever_was_cut_off_the_rest_is_saved(bag: Path, tmp_path: Path) -> None:
     whole = bag.read_bytes()
     everything = Content(bag).messages

@@ -55,6 +55,7 @@ def rows(folder: Path) -> list[dict[str, Any]]:
     return [{k: v for k, v in row.items() if not k.startswith(("wall_", "plan_"))} for row in table]
 
 
+@pytest.mark.slow
 def test_a_campaign_that_is_ended_goes_on_where_it_was(tmp_path: Path) -> None:
     """Every draw once, with the same numbers as without the break."""
     whole = run_campaign(small(), tmp_path / "whole")

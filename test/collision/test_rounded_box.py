@@ -58,6 +58,7 @@ def test_the_bound_is_not_above_the_exact_distance(
     assert found <= max(true, 0.0) + 1e-5
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.tuples(SIZES, SIZES, SIZES), st.tuples(SIZES, SIZES, SIZES), PLACES, TURNS)
 def test_the_bound_of_boxes_that_are_apart_is_their_distance(

@@ -52,6 +52,7 @@ def test_shape_obeys_the_commanded_acceleration(name: str) -> None:
     np.testing.assert_array_equal(actuation.wrench_B, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spinning", [False, True])
 @pytest.mark.parametrize("name", ["planar_chain", "random_1"])
 def test_shape_follows_its_reference_and_momentum_stays(name: str, spinning: bool) -> None:

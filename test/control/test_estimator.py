@@ -42,6 +42,7 @@ def difference(one: ControlState, other: ControlState) -> float:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_true_model_follows_the_plant(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -62,6 +63,7 @@ def test_true_model_follows_the_plant(seed: int) -> None:
     assert estimator.elapsed == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_measured_joints_need_no_joint_efforts(seed: int) -> None:
     """Momentum and measured joints place the base, whatever drives the joints."""
@@ -103,6 +105,7 @@ def fly_blind(believed: SpaceRobot, *, joints: bool) -> float:
     return float(np.abs(law.error).max())
 
 
+@pytest.mark.slow
 def test_manoeuvre_without_inertial_measurements() -> None:
     true = load("planar_manipulator")
     assert fly_blind(true, joints=False) < 0.004

@@ -38,6 +38,7 @@ from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLa
 from spacerobot_ros.control.outputs import AXES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_fewer_outputs_keep_their_error_dynamics(seed: int) -> None:
     """Operational space: what is left free does not show in the outputs, however it is used."""

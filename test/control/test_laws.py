@@ -61,6 +61,7 @@ def test_sign_of_a_quaternion_does_not_matter(name: str) -> None:
     np.testing.assert_allclose(one.wrench_B, other.wrench_B, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", INVERTIBLE)
 @pytest.mark.parametrize("degrees", [179.9, 180.0, 180.1])
 def test_half_a_turn_of_the_spacecraft(name: str, degrees: float) -> None:
@@ -118,6 +119,7 @@ def test_registry_and_options() -> None:
                     law(robot, built.outputs.selection, PLANAR_GAINS, options)
 
 
+@pytest.mark.slow
 def test_compiled_law_gives_the_numbers_of_the_interpreted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -21,6 +21,7 @@ def robot() -> SpaceRobot:
     return SpaceRobot.from_file(URDF)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize(("force", "torque"), [(0.5, 10.0), (5.0, 0.2)])
 def test_a_rigid_robot_is_accelerated_by_half_the_thrust(

@@ -76,6 +76,7 @@ def flown(
     return flight
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", INVERTIBLE)
 def test_both_poses_are_reached(name: str) -> None:
     robot, profile = load("servicer"), profile_of("quintic")

@@ -76,6 +76,7 @@ def test_damping_sets_in_smoothly() -> None:
     assert size(undamped, 1e-5) > 1e5 > 100 * size(law, 1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", INVERTIBLE)
 @pytest.mark.parametrize("elbow", [0.0, 0.05])
 def test_flight_out_of_a_singularity(name: str, elbow: float) -> None:
@@ -95,6 +96,7 @@ def out_of_reach(name: str) -> Flight:
     return fly(plant_of(robot, stretched(0.8)), law, lambda _: goal, 20.0, rate=100.0, every=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", INVERTIBLE)
 def test_goal_out_of_reach_is_approached_and_held_quietly(name: str) -> None:
     flight = out_of_reach(name)

@@ -156,6 +156,7 @@ def test_seeds_repeat_a_flight_and_change_it() -> None:
     )
 
 
+@pytest.mark.slow
 def test_arrays_are_copies() -> None:
     flight = fly("faults/stuck_slider", parameters=QUICK)
     assert not np.shares_memory(flight.q, fly("faults/stuck_slider", parameters=QUICK).q)

@@ -78,6 +78,7 @@ def test_tasks_are_the_same_every_time_and_of_all_kinds() -> None:
         assert turn.magnitude() == pytest.approx(one.size)
 
 
+@pytest.mark.slow
 def test_a_long_search_finds_the_positions_that_shapes_bring() -> None:
     """The position of a shape is within reach; one far beyond the longest arm is not."""
     robot = SpaceRobot.from_file(Path(robot_file("seven_joint_arm")))

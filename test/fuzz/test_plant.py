@@ -114,6 +114,7 @@ class Sender:
             assert rig.now_ns > end
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("actuation", ["velocity", "effort"])
 def test_a_lockstep_plant(actuation: str, harness: Harness) -> None:
     rig = Rig(harness, {"actuation": actuation, "latched_faults": ""})

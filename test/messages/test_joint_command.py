@@ -155,6 +155,7 @@ def test_a_robot_without_joints_takes_an_empty_message() -> None:
 # -- commands of a plant ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("actuation", ["velocity", "effort"])
 def test_a_command_that_does_not_name_all_joints_is_malformed(actuation: Any) -> None:
     config = PlantConfig(actuation=actuation, command_timeout=0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mcap.records import Schema
@@ -69,6 +70,7 @@ def test_a_schedule_is_serialised_as_rclpy_would(
     check_trajectory(message, schedule, stamp_ns, frame)
 
 
+@pytest.mark.slow
 @few
 @given(schedules(), st.integers(0, 2**31 * 10**9 - 1), st.text("lmnop", max_size=9))
 @example(THREE, 0, "base_link")
@@ -85,6 +87,7 @@ def test_other_readers_take_a_serialised_schedule(
     check_trajectory(decode(raw), schedule, stamp_ns, frame)
 
 
+@pytest.mark.slow
 def test_a_long_schedule_is_whole() -> None:
     # The gait of paper 1 has 98,001 points.
     rng = np.random.default_rng(4)

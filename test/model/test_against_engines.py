@@ -94,6 +94,7 @@ def test_bias_from_force_free_motion(case: Case, engine: Oracle) -> None:
     assert_agrees(C, -case.robot.inertia_matrix(m.q) @ z0ddot)
 
 
+@pytest.mark.slow
 def test_forward_dynamics(case: Case, engine: Oracle) -> None:
     m = case.motion
     z0ddot = case.robot.forward_dynamics(
@@ -137,6 +138,7 @@ def test_link_poses_of_many_shapes_without_compilation(case: Case, engine: Oracl
             assert_agrees(r[k, 0, i], r_expected)
 
 
+@pytest.mark.slow
 def test_link_jacobians(case: Case, engine: Oracle) -> None:
     for link in case.robot.link_names:
         assert_agrees(case.robot.jacobian(link, case.motion.q), engine.jacobian(link, case.motion))
@@ -195,6 +197,7 @@ def test_compiled_and_interpreted_numbers_agree(
         assert interpreted.function(name).class_name() != "External"
 
 
+@pytest.mark.slow
 def test_compiled_numbers_agree_with_the_engines(compiled_code: Path) -> None:
     case = random_case(0)
     robot, m = SpaceRobot(case.robot.description), case.motion

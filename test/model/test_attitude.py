@@ -157,6 +157,7 @@ def test_unit_quaternion_refuses_what_is_no_rotation(q: list[float]) -> None:
         unit_quaternion(q)
 
 
+@pytest.mark.slow
 @repeatable
 @given(st.lists(st.tuples(quaternions(), quaternions()), min_size=1, max_size=5))
 def test_many_attitudes_at_once_are_what_they_are_one_by_one(

@@ -105,6 +105,7 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_object_is_made_anew(
     damage: str, cache: Path, caplog: pytest.LogCaptureFixture

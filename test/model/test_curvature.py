@@ -103,6 +103,7 @@ def square(q: Array, i: int, j: int, side: float, *, centred: bool) -> list[Arra
     return [q, *loop, q] if centred else loop
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("centred", "order"), [(False, 3), (True, 4)])
 @pytest.mark.parametrize("pair", [(0, 1), (2, 0)])
 @pytest.mark.parametrize("seed", SEEDS[:2])

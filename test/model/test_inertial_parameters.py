@@ -43,6 +43,7 @@ def drawn(robot: RobotDescription, rng: np.random.Generator) -> InertialParamete
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", some_fast(range(2), 1))
 def test_numbers_given_as_an_argument_are_those_compiled_in(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -73,6 +73,7 @@ def test_no_private_method_of_rclpy_is_replaced(kind: type, rclpy_attributes: se
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_parameter_of_rclpy_does_not_end_a_recording(harness: Harness, tmp_path: Path) -> None:
     """``ros2 param set /recorder use_sim_time false`` while it records."""
     stack = Stack(harness, tmp_path / "flight.mcap")

@@ -190,6 +190,7 @@ def test_a_bad_goal_is_refused_and_the_earlier_one_goes_on(
     loop.wait_for("tracking")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("group", "settings"),
     [

@@ -57,6 +57,7 @@ def assert_met(flight: FaultFlight, status: DiagnosticStatus) -> None:
 # -- noise ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", some_fast({str(k): k for k in range(5)}, "0"))
 def test_noisy_poses_are_averaged_and_the_goal_is_met(harness: Harness, seed: int) -> None:
     flight = sliders(harness, averaging=25, **NOISE, **{"sensors.seed": seed})
@@ -265,6 +266,7 @@ CONTROLLED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("faults", some_fast(CONTROLLED, "no pose for a while"))
 def test_control_holds_in_spite_of(harness: Harness, faults: tuple[str, ...]) -> None:
     flight = FaultFlight(

@@ -37,6 +37,7 @@ def test_a_command_of_the_right_stamp_steps_exactly_once(harness: Harness) -> No
     assert rig.diagnosed("commands", "refused") == 2
 
 
+@pytest.mark.slow
 def test_time_is_a_whole_number_of_ticks(harness: Harness) -> None:
     rig = Rig(harness, {"tick_rate": 3.0})
     for k in range(1, 5):

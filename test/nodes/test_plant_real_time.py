@@ -63,6 +63,7 @@ def test_a_command_without_stamp_means_now(harness: Harness) -> None:
     assert rig.diagnosed("commands", "refused") == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("offset_s", "word"), [(-2, "old"), (3, "ahead"), (10**9, "ahead")])
 def test_real_time_refuses_commands_from_another_time(
     harness: Harness, offset_s: int, word: str

@@ -232,6 +232,7 @@ def test_motors_bring_the_joints_to_rest_when_their_commander_falls_silent(
     np.testing.assert_allclose(rig.probe.last("momentum").data[:6], momentum, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_latched_fault_ends_thrust_and_brakes_joints(harness: Harness) -> None:
     rig = Rig(harness, {**REALTIME, **ARM_MOVES, "real_time_factor": 2.0})
     thrust = rig.probe.create_publisher(WrenchStamped, "base_wrench", 10)

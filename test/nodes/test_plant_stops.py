@@ -160,6 +160,7 @@ def test_a_goal_on_file_is_not_resumed_while_the_plant_is_latched(
     assert not np.any(place(flight))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ahead", [1e6, 3.0, -0.5])
 def test_a_state_of_another_time_does_not_end_a_flight(harness: Harness, ahead: float) -> None:
     flight = Flight(harness, {**SLOW, "max_corrections": 0})

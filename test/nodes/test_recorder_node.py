@@ -134,6 +134,7 @@ def test_named_objects_of_a_file_are_metadata_and_the_wait_for_a_clock_is_as_giv
     assert {name: metadata[name] for name in about} == about
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", ["lz4", "none"])
 def test_compression_is_chosen(harness: Harness, tmp_path: Path, compression: str) -> None:
     stack = Stack(harness, tmp_path / "flight.mcap", compression=compression)
@@ -181,6 +182,7 @@ def test_chosen_topics_carry_simulated_time_without_the_clock_among_them(
 # -- when it records --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_topic_that_appears_in_flight_is_recorded(stack: Stack) -> None:
     stack.fly()
     stack.stop()

@@ -453,6 +453,7 @@ def command(bag: Path, domain: int, *options: str) -> Iterator[subprocess.Popen[
             process.kill()
 
 
+@pytest.mark.slow
 def test_the_command_loses_nothing_and_ends_with_the_bag(
     harness: Harness, bag: Path, ros_domain: int
 ) -> None:

@@ -96,6 +96,7 @@ def record_states(
     return read_bag(bag)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "robot", [pytest.param("servicer", marks=pytest.mark.slow), "sliding_masses"]
 )

@@ -258,6 +258,7 @@ def test_a_planner_that_plans_is_busy_and_not_silent(
     assert flight.events("node_silent") == []
 
 
+@pytest.mark.slow
 def test_an_active_node_that_compiles_is_busy_and_not_silent(
     harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -82,6 +82,7 @@ def around(nominal: NominalShape, areas: Array) -> Array:
 # -- first order ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("areas", [(1, 0.7, 0.5), (-0.6, 1, 0.8), (1, 0, 0), (0, -1, 0.4)])
 @pytest.mark.parametrize("seed", [None, 3])
 def test_small_loops_turn_the_base_by_the_curvature_matrix(
@@ -179,6 +180,7 @@ def test_the_prediction_is_what_the_plant_does(arm: SpaceRobot) -> None:
     assert schedule.notes["predicted_attitude_error"] == pytest.approx(left.magnitude(), abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cycles", [1, 4])
 def test_cycles_planned_ahead_are_the_same_cycles(arm: SpaceRobot, cycles: int) -> None:
     goal = goal_of(turned(2, -3, 4))

@@ -71,6 +71,7 @@ def nearest_of(geometry: CollisionGeometry, positions: Array) -> float:
     return min(float(geometry.distances(p, poses).min()) for p in range(len(geometry.pairs)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [0.03, pytest.param(0.01, marks=pytest.mark.slow)])
 def test_optimal_goes_round_a_contact(arm: SpaceRobot, distance: float) -> None:
     goal = (0.09, -0.26, -0.21), np.zeros(3)
@@ -152,6 +153,7 @@ def test_a_goal_shape_in_collision_is_refused(arm: SpaceRobot) -> None:
     assert refusal.value.proof is Proof.COLLISION
 
 
+@pytest.mark.slow
 def test_loops_of_three_joints_shrink(arm: SpaceRobot) -> None:
     goal = (0.1, -0.05, 0.08), (0.0, -np.pi / 4, np.pi / 2)
     clearance = Clearance(arm.description, 0.01)

@@ -68,6 +68,7 @@ def assert_within_limits(robot: SpaceRobot, schedule: GaitSchedule) -> None:
     assert np.all((q >= robot.lower - 1e-8) & (q <= robot.upper + 1e-8))
 
 
+@pytest.mark.slow
 def test_a_position_is_reached_with_the_base_free() -> None:
     r, _ = beside("three_joint_arm", ARM, np.array([-0.7, -0.2, 1.9]), "end_effector")
     schedule = plan("three_joint_arm", end_effector_position=r, start=at_rest(ARM), **QUICK)
@@ -282,6 +283,7 @@ def test_a_cached_plan_is_that_of_the_same_goal_alone(
     assert "from_cache" not in planned(r + np.array([0.0, 0.0, 1e-3])).notes
 
 
+@pytest.mark.slow
 def test_a_motion_takes_another_goal_without_a_stop() -> None:
     robot = robot_of("three_joint_arm")
     r, _ = beside("three_joint_arm", ARM, np.array([-0.7, -0.2, 1.9]), "end_effector")

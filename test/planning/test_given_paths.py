@@ -57,6 +57,7 @@ def flown(start: Array) -> GaitSchedule:
 # -- plans --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_hand_keeps_to_the_lines_within_the_tolerance(
     start: Array, flown: GaitSchedule
 ) -> None:

@@ -114,6 +114,7 @@ def first_order_brackets(robot: SlidingRobot, z: Array) -> Array:
     return w
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sliders", "seed"), [(4, 0), (4, 3), (4, 5), (5, 1), (5, 3), (5, 9)])
 def test_the_turn_is_made_by_the_best_triple_of_sliders(sliders: int, seed: int) -> None:
     robot, state, goal, _ = random_case(sliders, seed)

@@ -41,6 +41,7 @@ def refusal_of(robot: SlidingRobot, state: RobotState, goal: Goal, **options: An
 # -- limits -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(derandomize=True, deadline=None, max_examples=15)
 @given(
     seed=st.integers(0, 10_000),

@@ -56,6 +56,7 @@ def deviations(path: BasePath, predicted: BasePath) -> Array:
     return np.hstack([path.position - predicted.position, turns.as_rotvec()])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("ticks", [40, 300, 950])
 def test_sensitivities_are_those_of_integrated_paths(name: str, ticks: int) -> None:
@@ -69,6 +70,7 @@ def test_sensitivities_are_those_of_integrated_paths(name: str, ticks: int) -> N
     np.testing.assert_allclose(found, expected, atol=0.05 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_half_of_a_path_tells_where_it_ends() -> None:
     """Masses wrong by a tenth, poses with noise of a milliradian, and where it begins as well."""
     robot = robot_of("three_joint_arm")

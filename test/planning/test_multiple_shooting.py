@@ -77,6 +77,7 @@ def test_a_solution_from_moving_joints_turns_the_base_as_momentum_says(arm: Spac
     assert (attitude.inv() * TURN).magnitude() <= 2e-3
 
 
+@pytest.mark.slow
 def test_a_solution_keeps_inequalities_of_shape_velocity_and_acceleration(arm: SpaceRobot) -> None:
     """A bound on the power of the first joint at the ends of the intervals."""
     free = solved(arm)

@@ -100,6 +100,7 @@ def test_any_sliders_meet_position_and_attitude(sliders: int) -> None:
     assert_within(schedule, 0.7, 1.4)
 
 
+@pytest.mark.slow
 def test_an_arm_turns_its_base_about_three_axes() -> None:
     turn = Rotation.from_rotvec([0.2, -0.3, 0.25])
     urdf = FOLDER / "three_joint_arm.urdf"
@@ -156,6 +157,7 @@ def test_position_and_attitude_of_an_arm_that_can_reach_both() -> None:
     assert not np.allclose(schedule.positions[-1], ARM_START, atol=0.05)
 
 
+@pytest.mark.slow
 def test_least_effort_takes_the_time_it_is_given_and_less_acceleration() -> None:
     turn = [0.1, -0.1, 0.2]
     fast = plan("three_joint_arm", rotvec=turn, start=ARM_START, **QUICK)

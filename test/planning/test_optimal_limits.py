@@ -61,6 +61,7 @@ def chain(links: int) -> str:
 # -- on the way -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_base_turns_no_faster_than_it_may(arm: SpaceRobot) -> None:
     turn = [0.2, -0.1, 0.3]
     slow = of_arm(arm, turn, max_base_rate=0.12)
@@ -70,6 +71,7 @@ def test_the_base_turns_no_faster_than_it_may(arm: SpaceRobot) -> None:
     assert reached(slow, turn) <= 1e-6
 
 
+@pytest.mark.slow
 def test_an_axis_stays_out_of_a_cone(arm: SpaceRobot) -> None:
     turn = [0.0, 0.0, 0.6]
 
@@ -83,6 +85,7 @@ def test_an_axis_stays_out_of_a_cone(arm: SpaceRobot) -> None:
     assert reached(away, turn) <= 1e-6
 
 
+@pytest.mark.slow
 def test_joints_stay_out_of_a_box(arm: SpaceRobot) -> None:
     turn, far = [0.2, -0.1, 0.3], 1e9
     assert of_arm(arm, turn).positions[:, 1].max() > 0.0
@@ -150,6 +153,7 @@ def test_a_plan_is_the_same_on_a_busy_machine(
     assert "cut_short" not in quiet.notes
 
 
+@pytest.mark.slow
 def test_a_plan_is_the_same_with_compiled_functions_and_without(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -227,6 +231,7 @@ def test_two_links_turn_but_not_in_place() -> None:
         plan(SpaceRobot.from_urdf(chain(1)), rotvec=[0, 0, 0.3], **QUICK)
 
 
+@pytest.mark.slow
 def test_a_goal_that_takes_too_long_is_refused(arm: SpaceRobot) -> None:
     with pytest.raises(
         PlanningError, match=r"No manoeuvre to the goal was found from 2 start\(s\)"

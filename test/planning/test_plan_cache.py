@@ -110,6 +110,7 @@ class Trap:
         return open, (self.path, "w")
 
 
+@pytest.mark.slow
 def test_a_plan_is_flown_again_as_it_was(
     robot: SpaceRobot, made: tuple[GaitSchedule, Path], cache: Cache
 ) -> None:

@@ -39,6 +39,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_library_gives_the_first_guesses(library: Path) -> None:
     without, with_it = of_chain(), of_chain(library=str(library))
     assert with_it.positions.tobytes() == of_chain(library=str(library)).positions.tobytes()

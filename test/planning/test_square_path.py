@@ -50,6 +50,7 @@ def test_the_curvature_in_the_plane_of_two_joints(branched: bool) -> None:
         np.testing.assert_allclose(K, robot.curvature(psi)[3:, i, j], atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "links", "branched"),
     [(1, 3, False), (2, 3, True), (3, 4, False), (4, 4, True), (5, 5, True), (6, 6, True)],
@@ -98,6 +99,7 @@ def test_the_phase_does_not_depend_on_the_ticks(chain: SpaceRobot) -> None:
     assert turns(closed_forms, coarse.positions).sum() == pytest.approx(np.pi / 2, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_pair_with_the_smallest_square_goes_round() -> None:
     case = random_case(21, 4, 0.8)
     best = planner(case.robot).plan(case.state, case.goal).notes

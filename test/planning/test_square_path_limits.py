@@ -31,6 +31,7 @@ from spacerobot_ros.model import SpaceRobot
 Array = npt.NDArray[np.float64]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 def test_limits_are_kept_or_the_goal_is_refused_with_the_reason(seed: int) -> None:
     rng = np.random.default_rng(seed)

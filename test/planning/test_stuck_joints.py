@@ -76,6 +76,7 @@ def test_two_stuck_joints_are_both_found() -> None:
     assert set(watched(ramp, lambda _: [0.0, 0.0, 1.0])) == {0, 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gait", [ramp, swing])
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.8])
 def test_a_slow_joint_is_not_stuck(gait: Callable[[float], Array], share: float) -> None:
@@ -86,6 +87,7 @@ def test_a_joint_that_is_not_commanded_is_not_stuck() -> None:
     assert watched(ramp, from_time(0.0, 2)) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gait", [ramp, swing])
 @pytest.mark.parametrize("band", [0.0, 8e-3])
 def test_noise_makes_no_joint_stuck(gait: Callable[[float], Array], band: float) -> None:

@@ -30,6 +30,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tell(tmp_path_factory.mktemp("paper") / "flight.mcap", story)
 
 
+@pytest.mark.slow
 def test_text_in_a_pdf_can_be_read_and_edited(bag: Path, tmp_path: Path) -> None:
     made = write_figures(bag, tmp_path, ["pose", "joints"], width=120.0)
     assert made == {name: tmp_path / f"{name}.pdf" for name in ("pose", "joints")}

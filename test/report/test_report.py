@@ -111,6 +111,7 @@ def flown(folder: Path, story: Story) -> Page:
     return report_of(folder, story)
 
 
+@pytest.mark.slow
 def test_says_what_was_flown(flown: Page) -> None:
     for words in ("test_flight", "A flight & more", "lie_bracket", "test_robot", "3 joints"):
         assert words in flown.text
@@ -320,6 +321,7 @@ def test_the_goal_of_a_status_is_found_by_its_id(tmp_path: Path) -> None:
     assert "This is no status." in page.text
 
 
+@pytest.mark.slow
 def test_cut_short_right_after_the_start(tmp_path: Path) -> None:
     statuses = [(0.0, "Flying a gait.", EXECUTING | goal_value())]
     page = report_of(tmp_path, Story(still(count=1), statuses, goals=[(0.0, *GOAL)]))
@@ -341,6 +343,7 @@ def test_what_is_missing_is_left_out(tmp_path: Path, topics: tuple[str, ...]) ->
     assert "The bag holds no robot description" in page.text
 
 
+@pytest.mark.slow
 def test_a_robot_without_shapes_and_with_odd_names(tmp_path: Path) -> None:
     bare = re.sub(r"<visual>.*?</visual>", "", urdf_of(2), flags=re.DOTALL)
     story = Story(still(2), urdf=bare.replace("joint_", "a$^_b$" * 8), name="a$^_b$" * 8)

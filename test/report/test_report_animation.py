@@ -176,6 +176,7 @@ def test_meshes_that_a_bag_carries_are_drawn(tmp_path: Path) -> None:
     assert len(geometries[1]) == len(geometries[0]) + 1
 
 
+@pytest.mark.slow
 def test_without_the_viewer_a_sentence_says_so(
     bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

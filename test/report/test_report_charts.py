@@ -71,6 +71,7 @@ def chart(window: Browser, number: int, expression: str) -> Any:
     return window.evaluate(f"(chart => {expression})(flightCharts.charts[{number}])")
 
 
+@pytest.mark.slow
 @with_browser
 def test_charts_have_the_numbers_of_the_bag(window: Browser, flight: FlightReport) -> None:
     assert window.evaluate("flightCharts.charts.length") == 9

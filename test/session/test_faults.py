@@ -44,6 +44,7 @@ def test_every_scenario_is_here() -> None:
     assert files == {*EXPECTED, KILLED}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=[] if n in FAST else pytest.mark.slow) for n in EXPECTED]
 )

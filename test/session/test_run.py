@@ -119,6 +119,7 @@ def test_momentum_against_the_momentum_in_motion(result: RunResult) -> None:
     assert result.summary["angular_momentum_drift"] <= 1e-12 * base_angular
 
 
+@pytest.mark.slow
 def test_every_message_opens_with_other_libraries(result: RunResult) -> None:
     """rosbags and mcap-ros2-support decode the same messages, every one of them."""
     path = Path(result.summary["bag"])
@@ -198,6 +199,7 @@ def test_without_a_compiler_the_numbers_are_the_same(
         np.testing.assert_allclose(again.summary[key], result.summary[key], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_corrections_follow_until_the_tolerance_is_met(tmp_path: Path) -> None:
     """A base heavier than the planner believes leaves an error, which the next plans remove."""
     scenario = short(attitude_tolerance=1e-3, position_tolerance=1e-6, max_corrections=3)

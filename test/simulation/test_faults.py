@@ -203,6 +203,7 @@ def test_faults_are_active_from_their_start_until_before_their_end() -> None:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [30, 50, 60, 7])
 def test_times_of_faults_are_exact_where_a_tick_is_no_decimal_number(rate: int) -> None:
     """A fault from a to b is active in the ticks k with a <= k / rate < b, as fractions.
@@ -390,6 +391,7 @@ def test_a_held_joint_is_like_one_that_is_fixed_in_the_urdf() -> None:
     assert held.q[2] == place
 
 
+@pytest.mark.slow
 def test_a_joint_can_jam_on_its_stop_while_another_meets_its_own() -> None:
     text = urdf("sliding_masses")
     robot = robot_of(text)

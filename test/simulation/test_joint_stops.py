@@ -127,6 +127,7 @@ def test_spin_keeps_the_slider_out_until_effort_draws_it_in() -> None:
 # -- many joints ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", some_fast(range(4), 0))
 def test_stops_change_no_momentum_and_only_take_energy(seed: int) -> None:
     robot, rng = random_robot(seed), np.random.default_rng(200 + seed)
@@ -153,6 +154,7 @@ def test_stops_change_no_momentum_and_only_take_energy(seed: int) -> None:
     assert plant.momentum[6] < before[6]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_energy_of_an_arrival_is_carnots(seed: int) -> None:
     """A joint on its stop moves outwards; momentum, shape and attitude are those of before."""
@@ -183,6 +185,7 @@ def test_energy_of_an_arrival_is_carnots(seed: int) -> None:
     np.testing.assert_allclose(plant.momentum[:6], before[:6], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_held_joint_feels_no_work_and_the_others_move_as_if_welded() -> None:
     """Servicer, its first joint pushed against its stop: a robot with that joint fixed."""
     urdf = (Path(__file__).parents[2] / "urdf" / "servicer.urdf").read_text(encoding="utf-8")

@@ -178,6 +178,7 @@ def test_small_librations_have_the_period_of_the_textbook() -> None:
 # -- the table --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_friction_slows_every_motion_down_alike() -> None:
     """Friction on every body by its momentum: the free motion, in the time (1 - exp(-d t))/d."""
     friction, t = 0.8, 0.9

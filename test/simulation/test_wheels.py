@@ -32,6 +32,7 @@ def test_a_wheel_at_its_largest_rate_gets_no_faster(plant: EffortPlant) -> None:
     assert (plant.effort_limited - counted).tolist() == [1, 2, 0, 1]
 
 
+@pytest.mark.slow
 def test_a_wheel_at_its_largest_rate_is_braked(plant: EffortPlant) -> None:
     plant.reset()
     plant.step([-0.4, 0.4, 0.0, 0.0])

@@ -153,6 +153,7 @@ def effort_limits(urdf: str) -> dict[str, float]:
     return limits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     some_fast(list(FLIGHTS), "planar, saturated"),

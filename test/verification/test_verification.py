@@ -95,6 +95,7 @@ def test_an_altered_thrust_is_found(tmp_path: Path, topic: str, field: str) -> N
     assert difference.recorded - difference.expected == pytest.approx(1e-6, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_another_robot_is_found(tmp_path: Path) -> None:
     text = b'<mass value="10"/>', b'<mass value="10.01"/>'
     difference = verify_bag(altered(BAG, tmp_path / "b.mcap", urdf=text)).difference
