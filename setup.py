@@ -68,6 +68,7 @@ setup(
         NAME: [
             "py.typed",
             "batch/*.hpp",
+            "collision/*.c",
             "report/*.css",
             "report/*.js",
             "report/*.mplstyle",

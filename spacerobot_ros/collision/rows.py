@@ -28,7 +28,7 @@ from spacerobot_ros.model import symbolic_rotations
 from spacerobot_ros.model.description import Array, JointKind, Pose, RobotDescription
 from spacerobot_ros.model.kinematics import joint_positions
 
-_SHARPNESS_OF_MINIMUM, _SHARPNESS_OF_FACES = 300.0, 150.0
+SHARPNESS_OF_MINIMUM, SHARPNESS_OF_FACES = 300.0, 150.0
 """Sharpness of smooth minima over balls and of smooth maxima over faces, 1/m."""
 
 _SLENDER = 0.35
@@ -50,12 +50,12 @@ _MOST_POINTS, _THIN = 3, 0.1
 """Points of a grid along an edge of a box at most, and the ratio of an edge to the longest below
 which there is one."""
 
-_AWAY_FROM_ZERO = 1e-10
+AWAY_FROM_ZERO = 1e-10
 """Added below square roots, m^2: their derivative is infinite at zero."""
 
 
 @dataclass(frozen=True)
-class _Form:
+class Form:
     """The form of a solid in rows: a rounded box in the frame of its link, and balls in it.
 
     ``balls`` are the middles (K, 3), m, in the frame of the link, of balls of ``radius``.
@@ -67,10 +67,12 @@ class _Form:
 
     @property
     def is_rod(self) -> bool:
+        """Whether the box is a rod: it has a length alone."""
         return bool(np.count_nonzero(self.box.half) < 2)
 
     @classmethod
-    def of(cls, solid: Solid) -> _Form:
+    def of(cls, solid: Solid) -> Form:
+        """Return the form of a solid."""
         shape = solid.shape
         if shape.kind == "cylinder" and shape.size[1] >= _SHORT * shape.size[0]:
             radius, length = shape.size
@@ -99,7 +101,7 @@ class _Form:
         return cls(box, _moved(box.pose, points[surface]), radius)
 
     @classmethod
-    def _rod(cls, box: RoundedBox) -> _Form:
+    def _rod(cls, box: RoundedBox) -> Form:
         longest = int(np.argmax(box.half))
         half = box.half[longest]
         count = int(np.clip(np.ceil(2 * half / (_SPACING * box.radius + 1e-9)), 0, _MOST_BALLS - 1))
@@ -115,9 +117,9 @@ class _Form:
             beyond = [
                 ca.fmax(ca.fabs(local[i]) - half[i], 0.0) if half[i] else local[i] for i in range(3)
             ]
-            return ca.sqrt(ca.sumsqr(ca.vertcat(*beyond)) + _AWAY_FROM_ZERO) - self.box.radius
+            return ca.sqrt(ca.sumsqr(ca.vertcat(*beyond)) + AWAY_FROM_ZERO) - self.box.radius
         faces = ca.vertcat(local - ca.DM(half), -local - ca.DM(half))
-        return -_smooth_minimum(-faces, _SHARPNESS_OF_FACES) - self.box.radius
+        return -_smooth_minimum(-faces, SHARPNESS_OF_FACES) - self.box.radius
 
 
 def _moved(pose: Pose, points: Array) -> Array:
@@ -184,11 +186,13 @@ class DistanceRows:
         y, w, multiplier = ca.SX.sym("y", n + 4), ca.SX.sym("w", 12), ca.SX.sym("lambda")
         q, X = y[:n], y[n:]
         link, obstacle = (geometry.solids[i] for i in geometry.pairs[pair])
-        R_BL, r_BL = _pose_of_link(robot, link, _chain(robot, link.body), joint_positions(robot, q))
+        R_BL, r_BL = _pose_of_link(
+            robot, link, chain_of(robot, link.body), joint_positions(robot, q)
+        )
         R_X = symbolic_rotations.matrix_from_quaternion(X / ca.norm_2(X))
         of_link = R_X @ R_BL, R_X @ (r_BL - center_of_mass(q))
         of_world = ca.reshape(w[:9], 3, 3), w[9:]
-        d = _smooth_distance((_Form.of(link), _Form.of(obstacle)), [of_link, of_world])
+        d = _smooth_distance((Form.of(link), Form.of(obstacle)), [of_link, of_world])
         hessian = ca.hessian(multiplier * d, y)[0]
         return cls(
             ca.Function("distances", [y, w], [ca.cse(d)]),
@@ -206,23 +210,23 @@ def world_values(R_0W: Array, r_0W: Array) -> Array:
 
 
 def _row(robot: RobotDescription, first: Solid, second: Solid, q: ca.SX) -> ca.SX:
-    forms = _Form.of(first), _Form.of(second)
+    forms = Form.of(first), Form.of(second)
     return _smooth_distance(forms, _relative_poses(robot, first, second, q))
 
 
-def _smooth_distance(forms: tuple[_Form, _Form], poses: Sequence[tuple[ca.SX, ca.SX]]) -> ca.SX:
+def _smooth_distance(forms: tuple[Form, Form], poses: Sequence[tuple[ca.SX, ca.SX]]) -> ca.SX:
     """Return about the distance of two forms, whose links are at poses in one frame, m."""
     values = []
-    for balls, field in _roles(*forms):
+    for balls, field in roles_of(*forms):
         R_a, r_a = poses[balls]
         R_b, r_b = poses[field]
         for point in forms[balls].balls:
             x = R_b.T @ (r_a + R_a @ ca.DM(point) - r_b)
             values.append(forms[field].field(x) - forms[balls].radius)
-    return _smooth_minimum(ca.vertcat(*values), _SHARPNESS_OF_MINIMUM)
+    return _smooth_minimum(ca.vertcat(*values), SHARPNESS_OF_MINIMUM)
 
 
-def _roles(first: _Form, second: _Form) -> list[tuple[int, int]]:
+def roles_of(first: Form, second: Form) -> list[tuple[int, int]]:
     """Return which of two forms are balls and which are fields."""
     if first.is_rod and second.is_rod:
         return [(0, 1)] if len(first.balls) <= len(second.balls) else [(1, 0)]
@@ -237,7 +241,7 @@ def _relative_poses(
 ) -> list[tuple[ca.SX, ca.SX]]:
     """Return the poses of the links of two solids in the last body that carries both."""
     theta = joint_positions(robot, q)
-    chains = [_chain(robot, each.body) for each in (first, second)]
+    chains = [chain_of(robot, each.body) for each in (first, second)]
     common = len([1 for a, b in zip(*chains, strict=False) if a == b])
     return [
         _pose_of_link(robot, solid, chain[common:], theta)
@@ -265,7 +269,7 @@ def _pose_of_link(
     return R @ ca.sparsify(ca.DM(pose.R)), r + R @ ca.DM(pose.r)
 
 
-def _chain(robot: RobotDescription, body: int) -> list[int]:
+def chain_of(robot: RobotDescription, body: int) -> list[int]:
     """Return the bodies from the base out to one."""
     chain = []
     while body >= 0:

@@ -43,6 +43,9 @@ _COMMON_FLAGS = ("-fPIC", "-shared", "-ffp-contract=off")
 
 _COMPILER_FLAGS = ("-O1", *_COMMON_FLAGS)
 
+_SOURCE_FLAGS = ("-O2", *_COMMON_FLAGS)
+"""Flags for C that was written by hand: short, with loops."""
+
 _LONG_FUNCTION_FLAGS = ("-O0", *_COMMON_FLAGS)
 """Flags for functions of ten thousands of operations: a tenth of the time to compile, half
 the speed, still seven times that of the virtual machine."""
@@ -183,6 +186,47 @@ def compiled(function: ca.Function) -> ca.Function:
     except _CompilationError as reason:
         _warn_of_virtual_machine(reason)
         return function
+
+
+def compiled_functions(source: str, tried: Sequence[ca.Function]) -> list[ca.Function] | None:
+    """Return functions of a C source, compiled, tried and cached like single functions.
+
+    Parameters
+    ----------
+    source
+        C, which has the functions ``tried`` by their names with CasADi's interface.
+    tried
+        The same functions for the virtual machine, at least near the values at which they are
+        tried.
+
+    Returns
+    -------
+    :
+        Those of the source, in the same order; None: compiling is off, or impossible, with a
+        warning.
+
+    Raises
+    ------
+    ParameterError
+        ``SPACEROBOT_COMPILE_TIMEOUT`` is not a number of seconds.
+    """
+    compiler = c_compiler()
+    if compiler is None:
+        return None
+    name = tried[0].name()
+    key = _hash_text(f"{_platform_key(compiler, _SOURCE_FLAGS)}\n{source}")
+
+    def load(path: str) -> list[ca.Function]:
+        return [ca.external(each.name(), path) for each in tried]
+
+    if kept := Cache(cache_directory()).load(_object_file_name(name, key), key):
+        with suppress(RuntimeError):
+            return load(str(kept[0]))
+    try:
+        return _make_object(name, key, _CompilerCall(source, compiler, _SOURCE_FLAGS), tried, load)
+    except _CompilationError as reason:
+        _warn_of_virtual_machine(reason)
+        return None
 
 
 @lru_cache

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
 from spacerobot_ros.collision import Approach, BasePoses
+from spacerobot_ros.collision.compiled_rows import CompiledRows
 from spacerobot_ros.collision.rows import DistanceRows, world_values
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -58,10 +60,15 @@ class DistanceLibrary:
                 self._rows[pair] = self._derive(pair)
         return [self._rows[pair] for pair in pairs]
 
+    @cached_property
+    def _compiled(self) -> CompiledRows | None:
+        return CompiledRows.of(self.clearance.geometry)
+
     def _derive(self, pair: int) -> DistanceRows:
         geometry = self.clearance.geometry
         if not geometry.with_obstacles[pair]:
-            return DistanceRows.of(geometry, [pair])
+            compiled = self._compiled
+            return compiled.rows(pair) if compiled else DistanceRows.of(geometry, [pair])
         center_of_mass = self._robot.function("center_of_mass", compile=False)
         return DistanceRows.from_obstacles(geometry, pair, center_of_mass)
 

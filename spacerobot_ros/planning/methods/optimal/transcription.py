@@ -317,41 +317,36 @@ def _distances(n: int, pairs: Sequence[DistanceRows], instants: int) -> Block:
     h, s, v, v_next = ca.MX.sym("h"), *(ca.MX.sym(name, n) for name in ("s", "v", "v+"))
     X, X_next = ca.MX.sym("X", 4), ca.MX.sym("X+", 4)
     z, least = ca.vertcat(h, X, s, v, X_next, v_next), ca.MX.sym("least", len(pairs))
-    world = ca.MX.sym("world", 12 if any(rows.of_obstacles for rows in pairs) else 0)
+    turning = any(rows.of_obstacles for rows in pairs)
+    world = ca.MX.sym("world", 12 if turning else 0)
     multipliers = ca.MX.sym("lambda", least.numel() * instants)
     values, jacobian, hessian = [], [], ca.MX(z.numel(), z.numel())
-    unit, unit_X = ca.DM.eye(n), ca.DM.eye(4)
+    size = n + 4 if turning else n
     of_instants = ca.vertsplit(multipliers, least.numel())
     for number, by_row in enumerate(of_instants, 1):
         tau = number / instants
         # The point is s + h (b v + c v+).
         b, c = tau - 1 / 2 - tau**2 / 2, tau**2 / 2
-        point = s + h * (b * v + c * v_next)
+        along = b * v + c * v_next
+        point = s + h * along
         turned = ca.vertcat(point, (1 - tau) * X + tau * X_next)
-        P = ca.vertcat(
-            ca.horzcat(
-                *(b * v + c * v_next, ca.MX(n, 4), unit, b * h * unit),
-                *(ca.MX(n, 4), c * h * unit),
-            ),
-            ca.horzcat(
-                *(ca.MX(4, 1), (1 - tau) * unit_X, ca.MX(4, 2 * n)),
-                *(tau * unit_X, ca.MX(4, n)),
-            ),
-        )
-        slopes, curvature = [], ca.MX(n + 4, n + 4)
+        slopes, curvature = [], ca.MX(size, size)
         for row, (rows, multiplier) in enumerate(zip(pairs, ca.vertsplit(by_row), strict=True)):
             at = (turned, world) if rows.of_obstacles else (point,)
             J, H = rows.jacobian(*at), rows.hessian(*at, multiplier)
-            if not rows.of_obstacles:
+            if turning and not rows.of_obstacles:
                 J, H = ca.horzcat(J, ca.MX(1, 4)), ca.diagcat(H, ca.MX(4, 4))
             values.append(rows.values(*at) - least[row])
             slopes.append(J)
             curvature += H
         J = ca.vertcat(*slopes)
-        jacobian.append(J @ P)
         slope = (J[:, :n].T @ by_row).T
         bend = ca.horzcat(ca.MX(1, 5 + n), b * slope, ca.MX(1, 4), c * slope)
-        hessian += ca.triu(P.T @ curvature @ P)
+        # How [point; turn] moves with z: by a column, and by multiples of units.
+        weights = (b * h, c * h)
+        jacobian.append(_moved_columns(J, along, weights, tau, n))
+        half = _moved_columns(curvature, along, weights, tau, n)
+        hessian += ca.triu(_moved_columns(half.T, along, weights, tau, n))
         hessian += ca.vertcat(bend, ca.MX(z.numel() - 1, z.numel()))
     z_p, J = [z, ca.vertcat(least, world)], ca.vertcat(*jacobian)
     return Block(
@@ -359,6 +354,18 @@ def _distances(n: int, pairs: Sequence[DistanceRows], instants: int) -> Block:
         ca.Function("distances_jac", z_p, [ca.vertcat(*values), J]),
         ca.Function("distances_hess", [*z_p, multipliers], [hessian]),
     )
+
+
+def _moved_columns(
+    A: ca.MX, along: ca.MX, weights: tuple[ca.MX, ca.MX], tau: float, n: int
+) -> ca.MX:
+    """Return ``A P``, where P is the derivative of a point of an interval, and of the turn there if
+    A has columns for it, with respect to ``[h; X; s; v; X+; v+]``.
+    """
+    q, by_step = A[:, :n], A[:, :n] @ along
+    X = A[:, n:] if A.size2() > n else ca.MX(A.size1(), 4)
+    b, c = weights
+    return ca.horzcat(by_step, (1 - tau) * X, q, b * q, tau * X, c * q)
 
 
 def _path(
