@@ -126,10 +126,12 @@ class Composites:
     ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre. ``S[j]`` (6,) is
     the motion of a unit rate of the joint that carries body j, ``P[j]`` (6,) the momentum of its
     composite (both zero for the base); ``rotational`` (3, 3) is the system's rotational inertia.
+    ``composite[k]`` is the inertia of body k and of all bodies that it carries.
     """
 
     kin: TreeKinematics
     J: tuple[ca.SX, ...]
+    composite: tuple[SpatialInertia, ...]
     S: tuple[ca.SX, ...]
     P: tuple[ca.SX, ...]
     rotational: ca.SX
@@ -186,7 +188,7 @@ def composites(kin: TreeKinematics) -> Composites:
         S[k] = _joint_motion(kin, k)
         P[k] = composite[k] @ S[k]
         composite[kin.parent(k)] += composite[k]
-    return Composites(kin, J, tuple(S), tuple(P), rotational(composite[0].J))
+    return Composites(kin, J, tuple(composite), tuple(S), tuple(P), rotational(composite[0].J))
 
 
 @dataclass(frozen=True)

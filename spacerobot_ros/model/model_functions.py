@@ -53,6 +53,7 @@ from spacerobot_ros.model.inertial_parameters import (
 )
 from spacerobot_ros.model.integration import attitude_step, repeat_step, runge_kutta_step
 from spacerobot_ros.model.kinematics import tree_kinematics
+from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 
 
@@ -144,6 +145,7 @@ class ModelFunctions:
         return {
             "center_of_mass": lambda: self._shape_function("center_of_mass", self._kin.r_BC_B),
             "locked_inertia": self._locked_inertia,
+            "momentum_derivatives": self._momentum_derivatives,
             "link_poses": self._link_poses,
             "inertia_matrix": lambda: self._shape_function("inertia_matrix", self._inertia.H_plus),
             "bias": self._bias,
@@ -187,6 +189,13 @@ class ModelFunctions:
 
     def _locked_inertia(self) -> ca.Function:
         return self._shape_function("locked_inertia", self._inertia.D, self._inertia.D_q)
+
+    def _momentum_derivatives(self) -> ca.Function:
+        symbols = [self._kin.q, *(ca.SX.sym(k, d) for k, d in (("omega", 3), ("qdot", self.n)))]
+        symbols.append(ca.SX.sym("eta", 3))
+        found = momentum_derivatives(self._inertia, *symbols[1:])
+        results = [found.by_q, found.by_q_q, found.by_q_qdot, found.by_q_omega]
+        return ca.Function("momentum_derivatives", symbols, ca.cse(results))
 
     def _link_poses(self) -> ca.Function:
         frames = [self._kin.frame(link) for link in self.link_names]

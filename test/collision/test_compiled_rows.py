@@ -6,47 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.branched_robot import branched_robot
 
 from spacerobot_ros.collision import CollisionGeometry, compiled_rows
 from spacerobot_ros.collision.compiled_rows import CompiledRows
 from spacerobot_ros.collision.rows import DistanceRows
 from spacerobot_ros.model import compilation, load_robot
-from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.resources import robot_file
-
-_LINK = """<link name="{name}"><inertial><origin xyz="0.1 0 0"/><mass value="2"/>
-  <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.2" iyz="0" izz="0.3"/></inertial>
-  <visual><origin xyz="{at}" rpy="0.3 -0.2 0.5"/><geometry>{shape}</geometry></visual></link>"""
-
-_JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>
-  <origin xyz="{at}" rpy="0.4 -0.7 1.1"/><axis xyz="0.6 0 0.8"/>
-  <limit lower="-2" upper="1.5" effort="9" velocity="1"/>{mimic}</joint>"""
-
-
-def tree(folder: Path) -> RobotDescription:
-    """Return a robot with a slider, a joint that follows another one, and all kinds of solids."""
-    links = {
-        "base": ("0 0 0.1", '<box size="0.5 0.4 0.3"/>'),
-        "a1": ("0.2 0 0", '<cylinder radius="0.05" length="0.4"/>'),
-        "a2": ("0.1 0.2 0", '<box size="0.3 0.2 0.25"/>'),
-        "a3": ("0 0 0.2", '<sphere radius="0.08"/>'),
-        "b1": ("0 0.1 0.2", '<box size="0.06 0.3 0.25"/>'),
-        "b2": ("0.2 0.1 0", '<cylinder radius="0.06" length="0.5"/>'),
-    }
-    joints = [
-        ("b_slide", "prismatic", "base", "b1", "0.1 0.5 0", ""),
-        ("a_turn", "revolute", "base", "a1", "0.4 0 0.1", ""),
-        ("a_slide", "prismatic", "a1", "a2", "0.5 0.1 0", ""),
-        ("a_follow", "revolute", "a2", "a3", "0.3 0 0.2", "a_turn"),
-        ("b_turn", "revolute", "b1", "b2", "0 0.4 0.1", ""),
-    ]
-    text = "".join(_LINK.format(name=k, at=at, shape=shape) for k, (at, shape) in links.items())
-    for name, kind, parent, child, at, leader in joints:
-        mimic = f'<mimic joint="{leader}" multiplier="-0.7" offset="0.2"/>' if leader else ""
-        text += _JOINT.format(name=name, kind=kind, parent=parent, child=child, at=at, mimic=mimic)
-    path = folder / "tree.urdf"
-    path.write_text(f'<robot name="tree">{text}</robot>', encoding="utf-8")
-    return load_robot(path)
 
 
 def compare(geometry: CollisionGeometry, pairs: list[int], shapes: int) -> None:
@@ -75,7 +41,7 @@ def compare(geometry: CollisionGeometry, pairs: list[int], shapes: int) -> None:
 
 @pytest.mark.skipif(compilation.c_compiler() is None, reason="no C compiler")
 def test_values_and_derivatives_are_those_of_casadi(tmp_path: Path) -> None:
-    geometry = CollisionGeometry(tree(tmp_path))
+    geometry = CollisionGeometry(branched_robot(tmp_path))
     assert len(geometry.pairs) > 6
     compare(geometry, list(range(len(geometry.pairs))), 3)
 
@@ -90,7 +56,7 @@ def test_pairs_of_robots_have_the_rows_of_casadi(name: str) -> None:
 
 def test_without_a_compiler_there_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    assert CompiledRows.of(CollisionGeometry(tree(tmp_path))) is None
+    assert CompiledRows.of(CollisionGeometry(branched_robot(tmp_path))) is None
 
 
 def test_wrong_functions_are_not_used(
@@ -105,4 +71,4 @@ def test_wrong_functions_are_not_used(
     wrong.write_text(right.replace("field->gradient[i] = ", "field->gradient[i] = -"), "utf-8")
     assert wrong.read_text("utf-8") != right
     monkeypatch.setattr(compiled_rows, "_SOURCE", wrong)
-    assert CompiledRows.of(CollisionGeometry(tree(tmp_path))) is None
+    assert CompiledRows.of(CollisionGeometry(branched_robot(tmp_path))) is None

@@ -43,6 +43,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cached_function, source_hash
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
 from spacerobot_ros.model.symbolic_rotations import (
     quaternion_from_small_rotvec,
     quaternion_multiply,
@@ -223,7 +224,10 @@ def _cached_interval(
     q, X, direction = ca.SX.sym("q", robot.n), ca.SX.sym("X", 4), ca.SX.sym("d", 3)
     on_knots = constraints.symbolic(q, X, direction)
     facts = [
-        source_hash(__name__, solve_positive_definite.__module__, quaternion_multiply.__module__),
+        source_hash(
+            *(__name__, momentum_derivatives.__module__),
+            *(solve_positive_definite.__module__, quaternion_multiply.__module__),
+        ),
         robot.equations_key,
         float(constraints.imposed_base_rate).hex(),
         ca.Function("on_knots", [q, X, direction], [on_knots]).serialize(),
@@ -436,18 +440,20 @@ def _rotation_derivative_functions(
     By differentiating ``D w + D_q u = 0``, or l on the right, once and twice.
     """
     q, u, impulse = (ca.SX.sym(name, k) for name, k in _rotation_symbols(robot, drifting))
-    w, mu = ca.SX.sym("w", 3), ca.SX.sym("mu", 3)
+    w, mu, eta = (ca.SX.sym(name, 3) for name in ("w", "mu", "eta"))
     point = ca.vertcat(q, u, impulse)
     D, D_q = robot.function("locked_inertia", compile=False)(q)
     of_joints = D_q @ u - impulse if drifting else D_q @ u
-    at = -solve_positive_definite(D, of_joints)
-    momentum = D @ w + of_joints
-    W = -solve_positive_definite(D, ca.jacobian(momentum, point))
-    eta, adjoint = ca.SX.sym("eta", 3), -solve_positive_definite(D, mu)
-    weighted = ca.dot(eta, momentum)
-    mixed = ca.jacobian(ca.gradient(weighted, w), point).T @ W
-    hessian = ca.hessian(weighted, point)[0] + mixed + mixed.T
-    W, hessian = ca.substitute([W, hessian], [w, eta], [at, adjoint])
+    derivatives = robot.function("momentum_derivatives", compile=False)
+    by_q, by_q_q, by_q_u, by_q_w = derivatives(q, w, u, eta)
+    of_impulse = -ca.SX.eye(3)[:, : impulse.numel()]
+    W = -solve_positive_definite(D, ca.horzcat(by_q, D_q, of_impulse))
+    rest = point.numel() - robot.n
+    mixed = ca.vertcat(by_q_w, ca.SX(rest, 3)) @ W
+    by_q_rest = ca.horzcat(by_q_u, ca.SX(robot.n, rest - robot.n))
+    plain = ca.blockcat([[by_q_q, by_q_rest], [by_q_rest.T, ca.SX(rest, rest)]])
+    at, adjoint = -solve_positive_definite(D, of_joints), -solve_positive_definite(D, mu)
+    W, hessian = ca.substitute([W, plain + mixed + mixed.T], [w, eta], [at, adjoint])
     return (
         ca.Function("rotation_jac", [point], [W]),
         ca.Function("rotation_hess", [point, mu], [hessian]),
