@@ -8,14 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.interface_package import build_tf2_msgs
+from support.interface_package import TF2_MSGS, with_interfaces
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.slow
-def test_frames_on_the_real_topic_are_those_of_odom_and_pinocchio(tmp_path: Path) -> None:
-    environment = {**os.environ, **build_tf2_msgs(tmp_path)}
+def test_frames_on_the_real_topic_are_those_of_odom_and_pinocchio() -> None:
+    environment = {**os.environ, **with_interfaces(TF2_MSGS)}
     run = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-rs",
          "test/nodes/test_transforms.py"],

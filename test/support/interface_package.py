@@ -1,46 +1,140 @@
-"""tf2_msgs, which is not among ROS's wheels, built from its one message with their generators."""
+"""Interface packages that are not among ROS's wheels, built with the wheels' generators."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
+import tempfile
 import venv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+ROOT = Path(__file__).resolve().parents[2]
+
 _GENERATORS = (
     "ament-cmake", "ament-cmake-gmock", "ament-cmake-gtest", "ament-cmake-include-directories",
-    "ament-cmake-pytest", "ament-cmake-ros", "ament-package", "geometry-msgs",
+    "ament-cmake-pytest", "ament-cmake-ros", "ament-package", "common-interfaces",
     "python-cmake-module", "rclpy[fastrtps]", "rosidl-core-generators", "rosidl-default-generators",
 )  # fmt: skip
 
 _CMAKE = """
 cmake_minimum_required(VERSION 3.8)
-project(tf2_msgs)
+project({name})
 find_package(ament_cmake REQUIRED)
-find_package(geometry_msgs REQUIRED)
 find_package(rosidl_default_generators REQUIRED)
-rosidl_generate_interfaces(${PROJECT_NAME} "msg/TFMessage.msg" DEPENDENCIES geometry_msgs)
+{found}
+rosidl_generate_interfaces(${{PROJECT_NAME}} {files} DEPENDENCIES {depends})
 ament_package()
 """
 
 _MANIFEST = """<?xml version="1.0"?>
 <package format="3">
-  <name>tf2_msgs</name><version>0.0.0</version><description>One message.</description>
+  <name>{name}</name><version>0.0.0</version><description>Interfaces.</description>
   <maintainer email="a@b.org">a</maintainer><license>BSD</license>
   <buildtool_depend>ament_cmake</buildtool_depend>
-  <depend>geometry_msgs</depend>
+  {depends}
   <member_of_group>rosidl_interface_packages</member_of_group>
 </package>
 """
 
 
-def build_tf2_msgs(folder: Path) -> dict[str, str]:
-    """Build and install the package below a folder; return the environment that has it."""
-    tools, source, prefix = folder / "tools", folder / "tf2_msgs", folder / "install"
+@dataclass(frozen=True)
+class InterfacePackage:
+    """Name and files, by path, of a package."""
+
+    name: str
+    files: Mapping[str, str]
+
+    @classmethod
+    def of(
+        cls, name: str, interfaces: Mapping[str, str], depends: Sequence[str]
+    ) -> InterfacePackage:
+        """Return a package of interface files."""
+        cmake = _CMAKE.format(
+            name=name,
+            found="\n".join(f"find_package({each} REQUIRED)" for each in depends),
+            files=" ".join(f'"{path}"' for path in interfaces),
+            depends=" ".join(depends),
+        )
+        named = "".join(f"<depend>{each}</depend>" for each in depends)
+        manifest = _MANIFEST.format(name=name, depends=named)
+        return cls(name, {**interfaces, "CMakeLists.txt": cmake, "package.xml": manifest})
+
+
+TF2_MSGS = InterfacePackage.of(
+    "tf2_msgs",
+    {"msg/TFMessage.msg": "geometry_msgs/TransformStamped[] transforms\n"},
+    ["geometry_msgs"],
+)
+
+NAV2_MSGS = InterfacePackage.of(
+    "nav2_msgs",
+    {
+        "action/NavigateToPose.action": """\
+geometry_msgs/PoseStamped pose
+string behavior_tree
+---
+uint16 NONE=0
+uint16 UNKNOWN=9000
+uint16 FAILED_TO_LOAD_BEHAVIOR_TREE=9001
+uint16 TF_ERROR=9002
+uint16 error_code
+string error_msg
+---
+geometry_msgs/PoseStamped current_pose
+builtin_interfaces/Duration navigation_time
+builtin_interfaces/Duration estimated_time_remaining
+int16 number_of_recoveries
+float32 distance_remaining
+"""
+    },
+    ["builtin_interfaces", "geometry_msgs"],
+)
+"""The action of nav2_msgs that the nodes serve, with the fields of ROS 2 Jazzy."""
+
+SPACEROBOT_MSGS = InterfacePackage(
+    "spacerobot_msgs",
+    {
+        str(path.relative_to(ROOT / "spacerobot_msgs")): path.read_text(encoding="utf-8")
+        for path in sorted((ROOT / "spacerobot_msgs").rglob("*"))
+        if path.is_file()
+    },
+)
+"""The project's own package, with its own files."""
+
+
+def with_interfaces(*packages: InterfacePackage) -> dict[str, str]:
+    """Build packages, or find them built; return the environment variables that have them."""
+    text = repr((sys.version, _GENERATORS, packages))
+    cache = Path(tempfile.gettempdir()) / f"spacerobot-interfaces-{os.getuid()}"
+    prefix = cache / hashlib.sha256(text.encode()).hexdigest()[:16]
+    if not prefix.exists():
+        cache.mkdir(mode=0o700, exist_ok=True)
+        assert cache.stat().st_uid == os.getuid()
+        with tempfile.TemporaryDirectory(dir=cache) as folder:
+            _build(packages, Path(folder))
+            shutil.rmtree(prefix, ignore_errors=True)
+            (Path(folder) / "install").rename(prefix)
+    (module,) = prefix.glob("lib/python3*/site-packages")
+    # The wheels have set their folder of libraries for this process, and do so once.
+    libraries = [str(prefix / "lib"), os.environ.get("LD_LIBRARY_PATH", ""), f"{sys.prefix}/lib"]
+    return {
+        "AMENT_PREFIX_PATH": f"{prefix}:{sys.prefix}",
+        "PYTHONPATH": f"{module}:{os.environ.get('PYTHONPATH', '')}",
+        "LD_LIBRARY_PATH": ":".join(libraries),
+    }
+
+
+def _build(packages: Sequence[InterfacePackage], folder: Path) -> None:
+    """Build and install packages into ``install`` below a folder."""
+    tools, prefix = folder / "tools", folder / "install"
     venv.create(tools, with_pip=True)
     python = str(tools / "bin" / "python3")
     wheels = [f"ros-jazzy-{name}" for name in _GENERATORS]
@@ -58,31 +152,22 @@ def build_tf2_msgs(folder: Path) -> dict[str, str]:
                 paths = [new if p.startswith("/opt/") and p.endswith(old) else p for p in paths]
             words[i] = ";".join(paths)
         file.write_text('"'.join(words))
-    (source / "msg").mkdir(parents=True)
-    (source / "msg" / "TFMessage.msg").write_text("geometry_msgs/TransformStamped[] transforms\n")
-    (source / "CMakeLists.txt").write_text(_CMAKE)
-    (source / "package.xml").write_text(_MANIFEST)
     found = {
         "AMENT_PREFIX_PATH": str(tools),
         "CMAKE_PREFIX_PATH": str(tools),
         "LD_LIBRARY_PATH": str(tools / "lib"),
         "PATH": f"{tools / 'bin'}:{os.environ['PATH']}",
     }
-    build = str(folder / "build")
     options = [f"-DCMAKE_INSTALL_PREFIX={prefix}", "-DBUILD_TESTING=OFF"]
     options.append(f"-DPython3_EXECUTABLE={python}")
-    _run("cmake", "-S", str(source), "-B", build, *options, **found)
-    _run("cmake", "--build", build, **found)
-    _run("cmake", "--install", build, **found)
-    (module,) = prefix.glob("lib/python3*/site-packages")
-    return {
-        "AMENT_PREFIX_PATH": f"{prefix}:{sys.prefix}",
-        "PYTHONPATH": f"{module}:{os.environ.get('PYTHONPATH', '')}",
-        # The wheels have set theirs for this process, and do so once.
-        "LD_LIBRARY_PATH": ":".join(
-            [str(prefix / "lib"), os.environ.get("LD_LIBRARY_PATH", ""), f"{sys.prefix}/lib"]
-        ),
-    }
+    for package in packages:
+        source, build = folder / "src" / package.name, str(folder / "build" / package.name)
+        for path, text in package.files.items():
+            (source / path).parent.mkdir(parents=True, exist_ok=True)
+            (source / path).write_text(text, encoding="utf-8")
+        _run("cmake", "-S", str(source), "-B", build, *options, **found)
+        _run("cmake", "--build", build, **found)
+        _run("cmake", "--install", build, **found)
 
 
 def _run(*words: str, **environment: str) -> None:
