@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from spacerobot_ros.lazy import lazy_names
 from spacerobot_ros.version import __version__
 
 if TYPE_CHECKING:
@@ -17,13 +17,15 @@ if TYPE_CHECKING:
 __all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag"]
 
 
-_MODULES = {
-    "fly": "spacerobot_ros.flight.api",
-    "load_scenario": "spacerobot_ros.scenario",
-    "plan": "spacerobot_ros.flight.api",
-    "read_bag": "spacerobot_ros.bag",
-}
-"""Module of each public name, imported on first use so that importing the package stays fast."""
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "fly": "spacerobot_ros.flight.api",
+        "load_scenario": "spacerobot_ros.scenario",
+        "plan": "spacerobot_ros.flight.api",
+        "read_bag": "spacerobot_ros.bag",
+    },
+)
 
 _MIN_SHARED_MEMORY = 16 * 2**10
 """Smallest free shared memory, bytes: with less, loading ROS ends the process."""
@@ -43,9 +45,3 @@ def _warn_of_full_shared_memory() -> None:
 
 
 _warn_of_full_shared_memory()
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import math
 import os
@@ -860,3 +861,25 @@ def test_what_is_said_of_a_signal() -> None:
     assert str(termination.Terminated(signal.SIGUSR1)) == "Terminated."
     assert termination.termination() is None
     assert parameters.Value is not None
+
+
+@pytest.mark.parametrize(
+    "package", ["spacerobot_ros", "spacerobot_ros.nodes", "spacerobot_ros.planning"]
+)
+def test_packages_have_the_names_that_they_list(package: str) -> None:
+    """Names are imported when they are used first; others are refused as by any module."""
+    module = importlib.import_module(package)
+    for name in module.__all__:
+        assert getattr(module, name) is not None
+    with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'plann'"):
+        module.plann  # noqa: B018
+
+
+def test_a_plant_node_imports_no_planner_and_no_page() -> None:
+    """It begins in half of the time."""
+    script = "import sys, spacerobot_ros.nodes.plant.node; print(*sys.modules)"
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    loaded = set(found.stdout.split())
+    assert "spacerobot_ros.simulation.velocity_plant" in loaded
+    for module in ("planning.methods", "planning.execution", "viewer", "bag", "commanding"):
+        assert f"spacerobot_ros.{module}" not in loaded

@@ -9,9 +9,9 @@ from __future__ import annotations
 import itertools
 import re
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, fromstring
-from xml.sax.saxutils import quoteattr
 
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import RobotDescription
@@ -89,7 +89,7 @@ def _with_pairs(urdf: str, pairs: frozenset[frozenset[str]]) -> str:
 def _elements(pairs: frozenset[frozenset[str]]) -> list[str]:
     named = sorted((min(pair), max(pair)) for pair in pairs)
     return [
-        f"  <disable_collisions link1={quoteattr(first)} link2={quoteattr(second)}/>\n"
+        f'  <disable_collisions link1="{escape(first)}" link2="{escape(second)}"/>\n'
         for first, second in named
     ]
 

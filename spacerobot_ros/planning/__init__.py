@@ -1,11 +1,18 @@
 """Planning: from a goal to a gait, by one of several methods."""
 
-from spacerobot_ros.planning.api import plan
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from spacerobot_ros.lazy import lazy_names
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
-from spacerobot_ros.planning.methods.registry import METHODS, build_method, method_options
+
+if TYPE_CHECKING:
+    from spacerobot_ros.planning.api import plan
+    from spacerobot_ros.planning.methods.registry import METHODS, build_method, method_options
 
 __all__ = [
     "METHODS",
@@ -25,3 +32,14 @@ __all__ = [
     "method_options",
     "plan",
 ]
+
+# The methods take as long to import as everything else that a plant needs.
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "METHODS": "spacerobot_ros.planning.methods.registry",
+        "build_method": "spacerobot_ros.planning.methods.registry",
+        "method_options": "spacerobot_ros.planning.methods.registry",
+        "plan": "spacerobot_ros.planning.api",
+    },
+)

@@ -16,7 +16,6 @@ from rclpy.timer import Timer
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from spacerobot_ros.bag.salvage import last_state
 from spacerobot_ros.errors import (
     CommandError,
     ParameterError,
@@ -307,6 +306,8 @@ class PlantNode(FlightNode):
                 "A plant with a target does not go on from a bag: leave out 'resume_bag' or "
                 "'target.robot'."
             )
+        from spacerobot_ros.bag.salvage import last_state  # Few plants begin from a bag.
+
         state = last_state(path, self.get_namespace().rstrip("/"))
         if state.joint_names != list(robot.joint_names):
             raise ParameterError(
