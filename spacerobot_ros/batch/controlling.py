@@ -222,14 +222,10 @@ class BatchController:
         actuation, lowered = self.controller.limits_expression(omega, q, qdot, results["actuation"])
         exact = ca.logic_or(lowered, ca.logic_not(law.defined(results)))
         largest = dict.fromkeys(("position", "attitude", "joints"), ca.SX(0))
+        for kind, places in law.outputs.selection.distances:
+            largest[kind] = ca.fmax(largest[kind], ca.norm_2(results["error"][list(places)]))
         error_share, rate_share = ca.SX(0), ca.SX(0)
-        for error, bound, kind in zip(
-            ca.vertsplit(results["error"]),
-            ca.vertsplit(bounds),
-            law.outputs.selection.kinds,
-            strict=True,
-        ):
-            largest[kind] = ca.fmax(largest[kind], ca.fabs(error))
+        for error, bound in zip(ca.vertsplit(results["error"]), ca.vertsplit(bounds), strict=True):
             error_share = ca.fmax(error_share, ca.fabs(error) / bound)
         limits = self.controller.joint_rate_limits.rates
         for rate, limit in zip(ca.vertsplit(qdot), limits, strict=True):

@@ -88,6 +88,7 @@ class CoordinatedController:
     ) -> None:
         self.wheels = wheels
         self.law, self._kinds = law, law.outputs.selection.kinds
+        self._distances = law.outputs.selection.distances
         self._limits, self.joint_rate_limits = limits, rates
         self._profile_type, self._motion = profile, motion
         self._control_period, self._estimation_time = control_period, estimation_time
@@ -311,9 +312,9 @@ class CoordinatedController:
 
     def errors(self) -> Errors:
         """Return the errors of the last command's outputs from the reference."""
-        worst = {"position": 0.0, "attitude": 0.0, "joints": 0.0}
-        for kind, error in zip(self._kinds, self.law.error.tolist(), strict=True):
-            worst[kind] = max(worst[kind], abs(error))
+        worst, error = {"position": 0.0, "attitude": 0.0, "joints": 0.0}, self.law.error.tolist()
+        for kind, places in self._distances:
+            worst[kind] = max(worst[kind], math.hypot(*[error[i] for i in places]))
         return Errors(**worst)
 
     def distance_from_reference(self) -> OutputDistance:

@@ -64,25 +64,26 @@ class OutputSelection:
         poses = ("attitude" if axis.startswith("r") else "position" for axis in axes)
         return (*poses, *("joints" for _ in self.joints))
 
+    @property
+    def distances(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
+        """The outputs that make up one distance, angle or error of a joint: kind and places."""
+        count = len(self.base)
+        found: list[tuple[str, tuple[int, ...]]] = []
+        for axes, first in (self.base, 0), (self.end_effector, count):
+            for kind, turns in ("position", False), ("attitude", True):
+                places = [first + i for i, x in enumerate(axes) if x.startswith("r") is turns]
+                if places:
+                    found.append((kind, tuple(places)))
+        first = count + len(self.end_effector)
+        return (*found, *(("joints", (first + i,)) for i in range(len(self.joints))))
+
     def distance(self, errors: Array) -> OutputDistance:
         """Return the distance that errors (m,) of the outputs amount to."""
-        count = len(self.base)
-        joints = errors[count + len(self.end_effector) :]
-        poses = (self.base, errors), (self.end_effector, errors[count:])
-
-        def largest(rotations: bool) -> float:
-            sizes = [
-                float(np.linalg.norm(errors[: len(axes)][chosen]))
-                for axes, errors in poses
-                if any(chosen := [axis.startswith("r") is rotations for axis in axes])
-            ]
-            return max(sizes, default=math.nan)
-
-        return OutputDistance(
-            position=largest(rotations=False),
-            attitude=largest(rotations=True),
-            joints=float(np.abs(joints).max(initial=0.0)) if self.joints else math.nan,
-        )
+        largest = dict.fromkeys(("position", "attitude", "joints"), math.nan)
+        for kind, places in self.distances:
+            size = float(np.linalg.norm(errors[list(places)]))
+            largest[kind] = max(size, largest[kind]) if largest[kind] >= 0 else size
+        return OutputDistance(**largest)
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -33,7 +33,9 @@ _QUINTIC_PEAK_ACCELERATION = 10 / math.sqrt(3)
 
 @dataclass(frozen=True)
 class Errors:
-    """Largest errors of the outputs: of positions (m), attitudes (rad) and joints (m or rad)."""
+    """Largest errors of the outputs: distances of positions (m), angles of attitudes (rad), and of
+    single joints (m or rad).
+    """
 
     position: float
     attitude: float

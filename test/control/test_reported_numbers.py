@@ -71,6 +71,28 @@ def test_the_distance_of_poses_is_the_larger_one_in_the_axes_that_are_controlled
     assert str(joints) == "0.5 at the joints"
 
 
+def test_outputs_of_one_distance_are_grouped_by_frame_and_kind() -> None:
+    selection = OutputSelection(("x", "rz", "y"), ("rx", "z", "ry"), ("elbow", "wrist"), "tip")
+    assert selection.distances == (
+        *(("position", (0, 2)), ("attitude", (1,)), ("position", (4,)), ("attitude", (3, 5))),
+        *(("joints", (6,)), ("joints", (7,))),
+    )
+    assert OutputSelection(base=("rz",)).distances == (("attitude", (0,)),)
+
+
+@pytest.mark.parametrize(("tolerance", "state"), [(0.049, "tracking"), (0.051, "reached")])
+def test_a_goal_is_reached_by_the_distance_and_not_by_each_of_its_components(
+    tolerance: float, state: str
+) -> None:
+    loop = ExecutiveLoop(settle_time=0.02, position_tolerance=tolerance)
+    loop.place = np.array([0.27, 0.44, 0.0])  # 0.03 and -0.04 m off
+    loop.aim(base=goal_at([0.3, 0.4, 0.0]), end_effector=goal_at(TIP + loop.place))
+    loop.answer(8)
+    assert loop.state == state
+    errors = loop.executive.controller.errors()
+    assert (errors.position, errors.attitude) == pytest.approx((0.05, 0.0))
+
+
 def test_the_time_without_a_base_is_reported() -> None:
     loop = ExecutiveLoop(estimation_time=1.0)
     loop.answer(2)
