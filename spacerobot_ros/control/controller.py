@@ -32,7 +32,6 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.model.wheels import ReactionWheels
 
 _BRAKE_RATE = 2.0
 """Decay rate of joint motion when the base is no longer known, 1/s."""
@@ -435,8 +434,7 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
         force = torque = 0.0
     wheels = None
     if robot.description.wheel_names:
-        found = ReactionWheels.of(robot.description)
-        wheels = WheelControl(found, config.wheels, config.control_period, torque)
+        wheels = WheelControl(robot, config.wheels, config.control_period, torque)
         robot = wheels.gyrostat
     link = robot.description.end_effector(config.end_effector_frame)
     chosen = OutputSelection(

@@ -19,6 +19,7 @@ from spacerobot_ros.control.state import PoseReference
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import BodyMotion, TargetBody
 from spacerobot_ros.model.rotations import (
+    cross,
     hat,
     matrices_from_quaternions,
     quaternion_from_matrix,
@@ -92,18 +93,18 @@ class FrameMotion:
         """Return the motion of a frame that moves relative to this one."""
         R, omega, alpha = self.R, self.omega, self.alpha
         arm, v_rel, a_rel = (_turned(R, each) for each in (path.x, path.xdot, path.xddot))
-        w_rel, wdot_rel = _turned(R, path.w), _turned(R, path.wdot)
+        w_rel, wdot_rel = (_turned(R, each) for each in path.rotation)
         return FrameMotion(
             R @ matrices_from_quaternions(quaternions_from_rotvecs(path.phi)),
             self.r + arm,
-            self.v + np.cross(omega, arm) + v_rel,
+            self.v + cross(omega, arm) + v_rel,
             omega + w_rel,
             self.a
-            + np.cross(alpha, arm)
-            + np.cross(omega, np.cross(omega, arm))
-            + 2 * np.cross(omega, v_rel)
+            + cross(alpha, arm)
+            + cross(omega, cross(omega, arm))
+            + 2 * cross(omega, v_rel)
             + a_rel,
-            alpha + np.cross(omega, w_rel) + wdot_rel,
+            alpha + cross(omega, w_rel) + wdot_rel,
         )
 
 
@@ -127,53 +128,49 @@ class RelativeMotionOverTime:
     phiddot: Array
 
     @property
-    def w(self) -> Array:
-        """Angular velocity (K, 3) of E relative to G, rad/s: ``J(phi) phidot``, with the left
-        Jacobian of SO(3).
-        """
-        B, C, _, _ = _jacobian_terms(self.phi, self.phidot)
-        first = np.cross(self.phi, self.phidot)
-        return np.asarray(self.phidot + B * first + C * np.cross(self.phi, first))
+    def rotation(self) -> tuple[Array, Array]:
+        """Angular velocity (K, 3), rad/s, and acceleration (K, 3), rad/s^2, of E relative to G.
 
-    @property
-    def wdot(self) -> Array:
-        """Angular acceleration (K, 3) of E relative to G, rad/s^2."""
+        The velocity is ``J(phi) phidot``, with the left Jacobian of SO(3).
+        """
         phi, phidot, phiddot = self.phi, self.phidot, self.phiddot
         B, C, B_rate, C_rate = _jacobian_terms(phi, phidot)
-        first, second = np.cross(phi, phidot), np.cross(phi, phiddot)
-        twice = np.cross(phi, first)
-        return np.asarray(
+        first, second = cross(phi, phidot), cross(phi, phiddot)
+        twice = cross(phi, first)
+        w = phidot + B * first + C * twice
+        wdot = (
             phiddot
             + B_rate * first
             + B * second
             + C_rate * twice
-            + C * (np.cross(phidot, first) + np.cross(phi, second))
+            + C * (cross(phidot, first) + cross(phi, second))
         )
+        return np.asarray(w), np.asarray(wdot)
 
     @classmethod
     def between(cls, frame: FrameMotion, moving: FrameMotion) -> RelativeMotionOverTime:
         """Return the motion of ``moving`` relative to ``frame``, both at one time (K = 1)."""
         R, omega = frame.R[0], frame.omega[0]
         arm = moving.r[0] - frame.r[0]
-        v = moving.v[0] - frame.v[0] - np.cross(omega, arm)
-        a = moving.a[0] - frame.a[0] - np.cross(frame.alpha[0], arm)
-        a = a - np.cross(omega, np.cross(omega, arm)) - 2 * np.cross(omega, v)
+        v = moving.v[0] - frame.v[0] - cross(omega, arm)
+        a = moving.a[0] - frame.a[0] - cross(frame.alpha[0], arm)
+        a = a - cross(omega, cross(omega, arm)) - 2 * cross(omega, v)
         w_W = moving.omega[0] - omega
-        wdot = R.T @ (moving.alpha[0] - frame.alpha[0] - np.cross(omega, w_W))
+        wdot = R.T @ (moving.alpha[0] - frame.alpha[0] - cross(omega, w_W))
         phi = rotvec_from_quaternion(quaternion_from_matrix(R.T @ moving.R[0]))
         J = _left_jacobian(phi)
         phidot = np.linalg.solve(J, R.T @ w_W)
         zero = np.zeros((1, 3))
         x, xdot, xddot = ((R.T @ each)[np.newaxis] for each in (arm, v, a))
         without = cls(x, xdot, xddot, phi[np.newaxis], phidot[np.newaxis], zero)
-        phiddot = np.linalg.solve(J, wdot - without.wdot[0])
+        phiddot = np.linalg.solve(J, wdot - without.rotation[1][0])
         return cls(x, xdot, xddot, without.phi, without.phidot, phiddot[np.newaxis])
 
 
 def _left_jacobian(phi: Array) -> Array:
     B, C, _, _ = _jacobian_terms(phi[np.newaxis], phi[np.newaxis])
-    cross = hat(phi)
-    return np.asarray(np.eye(3) + B * cross + C * cross @ cross)
+    phi_hat = hat(phi)
+    return np.asarray(np.eye(3) + B * phi_hat + C * phi_hat @ phi_hat)
 
 
 def _jacobian_terms(phi: Array, phidot: Array) -> tuple[Array, Array, Array, Array]:
@@ -268,7 +265,7 @@ class TorqueFreeMotion:
         self._body = body
         inertia, R = body.inertia, motion.R_WT
         self._arm = R @ inertia.com
-        self._r, self._v = motion.r_WT + self._arm, motion.v + np.cross(motion.omega, self._arm)
+        self._r, self._v = motion.r_WT + self._arm, motion.v + cross(motion.omega, self._arm)
         self._L = R @ inertia.about_com @ R.T @ motion.omega
         self._inverse = np.linalg.inv(inertia.about_com)
         fastest = float(np.linalg.norm(self._L) * np.linalg.eigvalsh(self._inverse)[-1])
@@ -281,15 +278,15 @@ class TorqueFreeMotion:
         R = matrices_from_quaternions(self._quaternions(t))
         inertia, grapple = self._body.inertia, self._body.grapple
         omega_T = self._rates(R)
-        spin = np.cross(omega_T, omega_T @ inertia.about_com)
+        spin = cross(omega_T, omega_T @ inertia.about_com)
         omega, alpha = _turned(R, omega_T), _turned(R, -spin @ self._inverse)
         arm = R @ (grapple.r - inertia.com)
         return FrameMotion(
             R @ grapple.R,
             self._r + t[:, np.newaxis] * self._v + arm,
-            self._v + np.cross(omega, arm),
+            self._v + cross(omega, arm),
             omega,
-            np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm)),
+            cross(alpha, arm) + cross(omega, cross(omega, arm)),
             alpha,
         )
 
@@ -307,6 +304,8 @@ class TorqueFreeMotion:
 
     def _advance(self, q: Array, h: Array) -> Array:
         """Return quaternions (K, 4) after steps (K,), s, by Runge-Kutta 4."""
+        if not h.any():
+            return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
         h = h[:, np.newaxis]
         k1 = self._derivative(q)
         k2 = self._derivative(q + h / 2 * k1)

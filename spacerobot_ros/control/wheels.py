@@ -18,6 +18,7 @@ from spacerobot_ros.control.state import Actuation, ControlState, Reference
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import cross
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import parameter
@@ -126,10 +127,10 @@ class WheelControl:
 
     Parameters
     ----------
-    wheels
-        The wheels.
+    robot
+        The robot.
     options
-        Their parameters.
+        Parameters of its wheels.
     control_period
         Time between two commands, s.
     thruster_torque
@@ -143,12 +144,13 @@ class WheelControl:
 
     def __init__(
         self,
-        wheels: ReactionWheels,
+        robot: SpaceRobot,
         options: WheelOptions,
         control_period: float,
         thruster_torque: float,
     ) -> None:
-        self.wheels, self._options = wheels, options
+        self.wheels = wheels = ReactionWheels.of(robot.description)
+        self._options = options
         self._period, self._thruster_torque = control_period, thruster_torque
         self._used = np.ones(len(wheels), dtype=np.bool_)
         for name in options.excluded.split():
@@ -163,7 +165,7 @@ class WheelControl:
                 f"Parameter 'wheels.dump_rate' is {options.dump_rate:g}, but 'use_thrusters' is "
                 "false: momentum is dumped to thrusters alone; set it to 0."
             )
-        self.gyrostat = SpaceRobot(wheels.gyrostat)
+        self.gyrostat = robot.derived(wheels.gyrostat)
         """The robot that the laws control."""
         self._allocate = self._make_allocation()
         self.reset()
@@ -256,7 +258,7 @@ class WheelControl:
         The torque ``omega x A h`` of turning the spins with the base is compensated for.
         """
         A = self.wheels.axes_B
-        gyroscopic = np.cross(self._omega, A @ self.wheels.spins(self._omega, self.rates))
+        gyroscopic = cross(self._omega, A @ self.wheels.spins(self._omega, self.rates))
         if self.dumping:
             self.torque = self._dumping_torques()
         else:

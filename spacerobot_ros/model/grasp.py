@@ -29,6 +29,7 @@ import numpy.typing as npt
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import Array, Inertia, Pose, RobotDescription
 from spacerobot_ros.model.rotations import (
+    cross,
     hat,
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -192,7 +193,7 @@ class BodyMotion:
         """Return the motion of a frame that is fixed to the body, with this pose in T."""
         arm = self.R_WT @ frame.r
         return BodyMotion(
-            self.R_WT @ frame.R, self.r_WT + arm, self.v + np.cross(self.omega, arm), self.omega
+            self.R_WT @ frame.R, self.r_WT + arm, self.v + cross(self.omega, arm), self.omega
         )
 
     def momenta(self, inertia: Inertia) -> tuple[Array, Array]:
@@ -333,7 +334,7 @@ def joined_momenta(
     share = masses[0] / (masses[0] + masses[1])
     relative = share * second[:3] - (1.0 - share) * first[:3]
     return np.concatenate(
-        [first[:3] + second[:3], first[3:] + second[3:] + np.cross(arm, relative)]
+        [first[:3] + second[:3], first[3:] + second[3:] + cross(arm, relative)]
     )
 
 
@@ -348,7 +349,7 @@ def parted_momenta(
     linear = together[:3] - second[:3]
     relative = share * second[:3] - (1.0 - share) * linear
     arm = centers[1] - centers[0]
-    return np.concatenate([linear, together[3:] - second[3:] - np.cross(arm, relative)])
+    return np.concatenate([linear, together[3:] - second[3:] - cross(arm, relative)])
 
 
 def _velocities(motion: RobotMotion) -> Array:

@@ -6,6 +6,7 @@ A quaternion or matrix named ``R_WB`` turns vectors given in B into vectors give
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,29 @@ def hat(a: npt.ArrayLike) -> Array:
     """Return the skew matrix (3, 3) with ``hat(a) @ b == cross(a, b)``."""
     x, y, z = np.asarray(a, dtype=float)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return the cross products (..., 3) of vectors (..., 3), as ``numpy.cross`` in less time."""
+    if a.ndim == b.ndim == 1:
+        ax, ay, az = a.tolist()
+        bx, by, bz = b.tolist()
+        return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    x = ay * bz - az * by
+    product = np.empty((*x.shape, 3))
+    product[..., 0] = x
+    product[..., 1] = az * bx - ax * bz
+    product[..., 2] = ax * by - ay * bx
+    return product
+
+
+def _components(quaternion: npt.ArrayLike) -> Any:
+    """Return the numbers x, y, z and w of a quaternion, or their arrays (...) of many (4, ...)."""
+    values = np.asarray(quaternion, dtype=float)
+    # Arithmetic of Python's numbers is the same to the last bit, and several times faster.
+    return values.tolist() if values.ndim == 1 else values
 
 
 def matrix_about_axis(axis: npt.ArrayLike, angle: float) -> Array:
@@ -41,7 +65,7 @@ def matrix_from_rpy(rpy: npt.ArrayLike) -> Array:
 
 def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Array:
     """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
-    x, y, z, w = np.asarray(quaternion, dtype=float)
+    x, y, z, w = _components(quaternion)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -53,7 +77,9 @@ def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Array:
 
 def matrices_from_quaternions(quaternions: Array) -> Array:
     """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    return np.moveaxis(matrix_from_quaternion(np.moveaxis(quaternions, -1, 0)), (0, 1), (-2, -1))
+    axes = tuple(range(quaternions.ndim))
+    matrices = matrix_from_quaternion(quaternions.transpose(axes[-1], *axes[:-1]))
+    return matrices.transpose(*(axis + 1 for axis in axes[1:]), 0, 1)
 
 
 def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
@@ -61,8 +87,8 @@ def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
 
     Either may be many, (N, 4); so is the product then.
     """
-    ax, ay, az, aw = np.asarray(a, dtype=float).T
-    bx, by, bz, bw = np.asarray(b, dtype=float).T
+    ax, ay, az, aw = _components(np.asarray(a, dtype=float).T)
+    bx, by, bz, bw = _components(np.asarray(b, dtype=float).T)
     return np.array(
         [
             aw * bx + ax * bw + ay * bz - az * by,

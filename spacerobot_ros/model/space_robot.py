@@ -90,6 +90,15 @@ class SpaceRobot:
         """Return the robot with the mass properties of a description of the same structure."""
         return SpaceRobot(description, self._build)
 
+    def derived(self, description: RobotDescription) -> SpaceRobot:
+        """Return the robot of a description that was made of this one's, such as its gyrostat.
+
+        Where this robot shares its compiled functions with robots that differ in mass properties
+        alone, so does that one.
+        """
+        shared = None if self._p is None else SymbolicModels.of(description)
+        return SpaceRobot(description, shared)
+
     @cached_property
     def inertial(self) -> InertialParameters:
         """Mass properties of the bodies."""

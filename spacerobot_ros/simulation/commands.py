@@ -486,7 +486,7 @@ class _JointBrakes:
         self._efforts = np.zeros(robot.n)
         if robot.description.wheel_names:
             wheels = ReactionWheels.of(robot.description)
-            robot, self._braked = SpaceRobot(wheels.gyrostat), wheels.other
+            robot, self._braked = robot.derived(wheels.gyrostat), wheels.other
         outputs = ComputedTorqueLaw.default_outputs(robot, "")
         # The reference is always the present shape, so only the damping acts.
         self._law = ComputedTorqueLaw(robot, outputs, Gains.uniform(1.0, rate)) if robot.n else None

@@ -41,7 +41,7 @@ TENDER = ReactionWheels.of(SpaceRobot.from_file(robot_file("tender")).descriptio
 
 
 def control(thruster_torque: float = 1.0, **options: object) -> WheelControl:
-    return WheelControl(WHEELS, configured(WheelOptions, options), PERIOD, thruster_torque)
+    return WheelControl(ROBOT, configured(WheelOptions, options), PERIOD, thruster_torque)
 
 
 def observe(wheels: WheelControl, rates: list[float], omega: tuple[float, ...] = (0, 0, 0)) -> None:
