@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from operator import attrgetter
 
 import numpy as np
 
@@ -29,6 +30,40 @@ class Outcome(str, Enum):
     ABORTED = "aborted"
     INTERRUPTED = "interrupted"
     """The flight ended before the goal was decided."""
+
+
+@dataclass(frozen=True)
+class CaptureMeasures:
+    """The measures of a flight to a target; NaN where there is none, or what did not take place.
+
+    Attributes
+    ----------
+    captured
+        Whether the target was captured.
+    placed
+        Whether it was held when the goal was reached.
+    time
+        Time of the first capture, s.
+    distance
+        Distance of the end-effector from the grapple frame at that time, m; without a capture, the
+        smallest in the flight.
+    impulse, angular_impulse
+        Norms of the impulse, N s, and of its moment at the end-effector, N m s.
+    joint_impulse
+        Largest impulse of the grasp along the coordinate of a joint, N m s or N s.
+    detumbling_time, detumbling_bound
+        Time in which the robot with the target came to rest, and the shortest possible, s.
+    """
+
+    captured: float = math.nan
+    placed: float = math.nan
+    time: float = math.nan
+    distance: float = math.nan
+    impulse: float = math.nan
+    angular_impulse: float = math.nan
+    joint_impulse: float = math.nan
+    detumbling_time: float = math.nan
+    detumbling_bound: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +99,8 @@ class Measures:
     clearance
         Smallest distance between two links, m, negative where they touch: the depth. Infinite of a
         robot without pairs that could touch, NaN where it was not measured.
+    capture
+        Measures of the flight to a target.
     """
 
     outcome: Outcome
@@ -83,6 +120,7 @@ class Measures:
     plan_time: float = math.nan
     wall_time: float = math.nan
     clearance: float = math.nan
+    capture: CaptureMeasures = CaptureMeasures()
 
 
 def momentum_change(momenta: Array, reference: Array) -> Array:
@@ -177,6 +215,8 @@ class Metric:
         Whether ``<name>.<joint>`` is the number of a joint, and the name itself the worst of all.
     smallest_is_worst
         Whether the smallest number is the worst.
+    yes_or_no
+        Whether it is 1 for yes and 0 for no.
     """
 
     unit: str
@@ -184,6 +224,13 @@ class Metric:
     evaluate: Callable[[Measures, RobotDescription], float | Array]
     by_joint: bool = False
     smallest_is_worst: bool = False
+    yes_or_no: bool = False
+
+
+def _capture_metric(name: str, unit: str, description: str, *, yes_or_no: bool = False) -> Metric:
+    """Return the metric of a field of :class:`CaptureMeasures`."""
+    evaluate = attrgetter(f"capture.{name}")
+    return Metric(unit, description, lambda m, _: float(evaluate(m)), yes_or_no=yes_or_no)
 
 
 def _error_metric(error: str, part: str, unit: str, description: str) -> Metric:
@@ -261,6 +308,32 @@ METRICS: dict[str, Metric] = {
         "depth of a contact",
         lambda m, _: m.clearance,
         smallest_is_worst=True,
+    ),
+    "captured": _capture_metric(
+        "captured", "", "whether the target was captured, 1 or 0", yes_or_no=True
+    ),
+    "placed": _capture_metric(
+        "placed", "", "whether the goal was reached with the target, 1 or 0", yes_or_no=True
+    ),
+    "capture_time_s": _capture_metric("time", "s", "time of the capture"),
+    "capture_distance_m": _capture_metric(
+        "distance",
+        "m",
+        "distance of the end-effector from the grapple frame at the capture; without one, the "
+        "smallest",
+    ),
+    "capture_impulse_Ns": _capture_metric("impulse", "N s", "impulse of the capture"),
+    "capture_angular_impulse_Nms": _capture_metric(
+        "angular_impulse", "N m s", "its moment at the end-effector"
+    ),
+    "capture_joint_impulse": _capture_metric(
+        "joint_impulse", "N m s or N s", "its largest part along the coordinate of a joint"
+    ),
+    "detumbling_time_s": _capture_metric(
+        "detumbling_time", "s", "time in which robot and target came to rest"
+    ),
+    "detumbling_bound_s": _capture_metric(
+        "detumbling_bound", "s", "shortest time that the torques allow for it"
     ),
 }
 """Every metric by its name."""

@@ -26,6 +26,7 @@ from spacerobot_ros.measures import metric_names
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.resources import is_path, robot_file
 from spacerobot_ros.scenario import load_scenario, scenario_text
+from spacerobot_ros.simulation.capture import load_target
 from spacerobot_ros.version import __version__
 
 DRAW_PREFIX = "draw."
@@ -351,4 +352,10 @@ def self_contained(campaign: Campaign) -> Campaign:
                 robot = load_robot(robot_file(config.robot))
             text = {"robot_description": config.described(robot).urdf, "robot": "", "world": ""}
             scenario = scenario.with_overrides(node, text)
+    floating = scenario.plant.target
+    if is_path(floating.robot) and not floating.robot_description:
+        target = load_target(floating)
+        assert target is not None
+        text = {"target.robot_description": target.urdf, "target.robot": ""}
+        scenario = scenario.with_overrides("plant", text)
     return replace(campaign, scenario=scenario)

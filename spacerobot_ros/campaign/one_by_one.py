@@ -91,9 +91,14 @@ def robots_of(flight: DrawnFlight) -> Robots:
     robots = nominal_robots(scenario)
     if "planner" in scenario.commanders:
         robots = replace(robots, method=_method_of_planner(robots.planner, scenario.planner))
-    if flight.inertial is None:
+    weighing = plant_robot(flight)
+    if flight.inertial is not None:
+        weighing = weighing.with_inertial(flight.inertial)
+    elif flight.weighs_target:
+        # Robots that share their functions have targets that share them, too.
+        weighing = weighing.with_masses_of(weighing.description)
+    else:
         return robots
-    weighing = plant_robot(flight).with_inertial(flight.inertial)
     return replace(robots, plant=weighing)
 
 

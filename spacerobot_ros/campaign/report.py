@@ -31,7 +31,7 @@ from spacerobot_ros.campaign.statistics import (
     sobol_indices,
 )
 from spacerobot_ros.files import write_output
-from spacerobot_ros.measures import METRICS, Outcome
+from spacerobot_ros.measures import METRICS, Metric, Outcome
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.report.figures import FAINT, INK, PALETTE, PictureFormat, drawing, picture_of
 from spacerobot_ros.report.page_parts import facts, figure, html_page, table, tiles
@@ -46,8 +46,8 @@ _MESSAGES_SHOWN = 4
 _MAX_BADNESS = 100.0
 """Distance from a bound at which the order of the worst flights saturates, standard deviations."""
 
-_MAX_PLOTS = 6
-"""Largest number of metrics with a histogram."""
+_MAX_PLOTS = 9
+"""Largest number of metrics with a histogram, and of drivers with a plot."""
 
 Flags = npt.NDArray[np.bool_]
 
@@ -56,7 +56,11 @@ _QUANTILES_SHOWN = (0.01, 0.5, 0.99)
 
 _TEXT_COLUMNS = ("outcome", "reason", "engine", "fallback", "versions")
 
-_MAIN_METRICS = ("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "propellant_kg")
+_MAIN_METRICS = (
+    *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "propellant_kg"),
+    *("capture_time_s", "capture_distance_m", "capture_impulse_Ns"),
+    *("detumbling_time_s", "detumbling_bound_s"),
+)
 
 
 @dataclass(frozen=True)
@@ -144,7 +148,22 @@ class Results:
         """Metrics of the report: those with a criterion, and the main ones that have values."""
         names = [criterion.metric for criterion in self.campaign.criteria]
         names += [name for name in _MAIN_METRICS if name not in names]
-        return [name for name in names if np.isfinite(self.columns[name]).any()]
+        return [name for name in names if np.isfinite(self.columns.get(name, np.nan)).any()]
+
+    @property
+    def distributed_metrics(self) -> list[str]:
+        """Metrics of the report that are not just yes or no."""
+        return [name for name in self.shown_metrics if not _metric(name).yes_or_no]
+
+    @property
+    def shares(self) -> dict[str, Share]:
+        """Shares of the flights with a yes, by name of the metric."""
+        found = {}
+        for name, metric in METRICS.items():
+            values = self.columns.get(name)
+            if metric.yes_or_no and values is not None and np.isfinite(values).any():
+                found[name] = share(int((values == 1.0).sum()), len(self))
+        return found
 
     def metrics(self) -> dict[str, Array]:
         """Return the columns of the metrics of the report."""
@@ -204,6 +223,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     title = f"Campaign {results.campaign.name}"
     write_output(path, html_page(title, _page_body(results), MADE_BY))
     lines = [f"success     {results.success}"]
+    lines += [f"{name:<11} {each}" for name, each in results.shares.items()]
     lines += [f"note        {results.bias}"] if results.bias else []
     lines += [f"required    {c}: {results.requirement_share(c)}" for c in results.campaign.criteria]
     lines += [
@@ -248,10 +268,14 @@ def figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figu
     return figure, axes[:count]
 
 
+def _metric(name: str) -> Metric:
+    return METRICS[name.partition(".")[0]]
+
+
 def metric_label(metric: str) -> str:
     """Return the name of a metric with its unit, unless the name has it."""
-    unit = METRICS[metric.partition(".")[0]].unit
-    named = metric.endswith(("_m", "_rad", "_s", "_kg", "_N", "_Nm"))
+    unit = _metric(metric).unit
+    named = metric.endswith(("_m", "_rad", "_s", "_kg", "_N", "_Nm", "_Ns", "_Nms"))
     return f"{metric}, {unit}" if unit and not named else metric
 
 
@@ -300,16 +324,16 @@ def _facts_section(results: Results) -> str:
 
 
 def _success_section(results: Results) -> str:
-    success = results.success
-    low, high = success.exact
     wall = float(np.nansum(results.columns["wall_time_s"]))
-    rows = [
-        ("success", f"{100 * success.value:.4g} %", f"{success.count} of {success.total}"),
-        ("95 % interval (Wilson)", _share_cells(success)[1], ""),
-        ("95 % interval (Clopper-Pearson)", f"{100 * low:.4g} to {100 * high:.4g} %", ""),
-        ("flown", f"{wall:.4g} s", "of workers' time"),
-    ]
-    return tiles(rows)
+    rows = []
+    for name, found in {"success": results.success, **results.shares}.items():
+        low, high = found.exact
+        rows += [
+            (name, f"{100 * found.value:.4g} %", f"{found.count} of {found.total}"),
+            ("95 % interval (Wilson)", _share_cells(found)[1], ""),
+            ("95 % interval (Clopper-Pearson)", f"{100 * low:.4g} to {100 * high:.4g} %", ""),
+        ]
+    return tiles([*rows, ("flown", f"{wall:.4g} s", "of workers' time")])
 
 
 def _criteria_section(results: Results) -> str:
@@ -348,10 +372,11 @@ def _outcomes_section(results: Results) -> str:
 
 
 def _percentiles_section(results: Results) -> str:
-    if not results.shown_metrics:
+    if not results.distributed_metrics:
         return '<p class="missing">No flight has any metric.</p>'
     rows = []
-    for name, values in results.metrics().items():
+    for name in results.distributed_metrics:
+        values = results.columns[name]
         there = values[np.isfinite(values)]
         numbers = [there.min(), *percentiles(values), there.max(), there.mean(), there.std()]
         rows.append([metric_label(name), *(f"{x:.4g}" for x in numbers)])
@@ -360,7 +385,7 @@ def _percentiles_section(results: Results) -> str:
 
 
 def _histograms_section(results: Results) -> str:
-    names = results.shown_metrics[:_MAX_PLOTS]
+    names = results.distributed_metrics[:_MAX_PLOTS]
     if not names:
         return ""
     figure, axes = figure_with_axes(len(names), 2)
@@ -460,13 +485,13 @@ def _convergence_section(results: Results) -> str:
     )
     axes[0].plot(at, [s.value for s in shares], color=PALETTE[0])
     axes[0].set_ylabel("success, with 95 % interval")
-    for i, name in enumerate(results.shown_metrics[:3]):
+    for i, name in enumerate(results.distributed_metrics[:3]):
         values = results.columns[name]
         final = percentiles(values)[PERCENTILES.index(95.0)] or 1.0
         line = [percentiles(values[:k])[PERCENTILES.index(95.0)] / final for k in at]
         axes[1].plot(at, line, color=PALETTE[i], label=name)
     axes[1].set_ylabel("95 percentile over its last value")
-    if results.shown_metrics:
+    if results.distributed_metrics:
         axes[1].legend(fontsize=7, frameon=False)
     for panel in axes:
         panel.set_xlabel("flights")

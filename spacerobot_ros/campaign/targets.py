@@ -21,6 +21,7 @@ from spacerobot_ros.parameters import Parameter, declared, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file, suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario
+from spacerobot_ros.simulation.capture import load_target
 from spacerobot_ros.simulation.faults import FAULT_KINDS
 
 AXES = ("x", "y", "z")
@@ -39,6 +40,8 @@ KINDS_OF_TARGETS = (
     ("mass, mass.BODY, mass.*", "factor on mass and inertia of all bodies alike, of one, of each"),
     ("inertia, inertia.BODY, inertia.*", "factor on the inertia, likewise"),
     ("com.BODY.AXIS, com.*", "offset of a centre of mass in the frame of its body, m"),
+    ("target.mass, target.inertia", "factor on mass and inertia of the target, on its inertia"),
+    ("target.com.AXIS", "offset of its centre of mass in the frame of its root link, m"),
     ("goal.position.AXIS, goal.rotvec.AXIS", "offset of the goal, m; turn of it in its frame, rad"),
     ("end_effector_goal. ...", "likewise, of the end-effector"),
     ("initial.position.AXIS, initial.rotvec.AXIS", "likewise, of the base at the start"),
@@ -87,6 +90,8 @@ class DrawnFlight:
         (B,) factors of the bodies; the inertia goes with the mass, and with a factor of its own.
     com
         (B, 3) offsets of the centres of mass, m.
+    weighs_target
+        Whether the mass properties of the target are drawn.
     """
 
     scenario: Scenario
@@ -94,6 +99,7 @@ class DrawnFlight:
     mass: Array
     inertia: Array
     com: Array
+    weighs_target: bool = False
 
     @classmethod
     def of(cls, scenario: Scenario) -> DrawnFlight:
@@ -176,13 +182,16 @@ def targets_of(name: str, scenario: Scenario) -> list[Target]:
         return _mass_property_targets(kind, dot, rest, scenario)
     if kind == "com":
         return _center_targets(rest, scenario)
+    if kind == "target":
+        return [_floating_target(name, rest, scenario)]
     if kind in _POSE_TARGET_NAMES:
         return [_pose_target(name, kind, rest, scenario)]
     match = _FAULT_NAME_PATTERN.fullmatch(name)
     if match is not None:
         return [_fault_target(name, int(match[1]), match[2], scenario)]
     known = [f"{node}.{p.name}" for node in CONFIGS for p in declared(CONFIGS[node])]
-    known += ["mass", "inertia", "com", *_POSE_TARGET_NAMES, "faults[0].at", "faults[0].until"]
+    known += ["mass", "inertia", "com", "target.mass", "target.inertia", "target.com.x"]
+    known += [*_POSE_TARGET_NAMES, "faults[0].at", "faults[0].until"]
     kinds = "; ".join(names for names, _ in KINDS_OF_TARGETS)
     raise ParameterError(
         f"'{name}' is nothing that can be dispersed; there are {kinds}.{suggestion(name, known)}"
@@ -332,6 +341,34 @@ def _center_target(index: int, column: int, name: str) -> Target:
         return replace(flight, com=com)
 
     return Target(name, apply, "m", False, frozenset({name}))
+
+
+def _floating_target(name: str, part: str, scenario: Scenario) -> Target:
+    """Return a mass property of the body that floats beside the robot."""
+    if load_target(scenario.plant.target) is None:
+        raise ParameterError(
+            f"'{name}': there is no target: the scenario '{scenario.name}' has no "
+            "plant.target.robot."
+        )
+    known = ["mass", "inertia", *(f"com.{axis}" for axis in AXES)]
+    if part not in known:
+        names = [f"target.{each}" for each in known]
+        raise ParameterError(f"'{name}' is none of {', '.join(names)}.{suggestion(name, names)}")
+    column = AXES.index(part[-1]) if part.startswith("com") else -1
+
+    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
+        target = load_target(flight.scenario.plant.target)
+        assert target is not None
+        mass = np.array([float(drawn) if part == "mass" else 1.0])
+        inertia = np.array([float(drawn) if part in ("mass", "inertia") else 1.0])
+        offset = np.zeros((1, 3))
+        offset[0, column] = float(drawn) if column >= 0 else 0.0
+        parameters = InertialParameters.of(target).scaled(mass, inertia).shifted(offset)
+        parameters.require_physical([target.base_link])
+        text = {"target.robot_description": urdf_with(target, parameters)}
+        return replace(flight.with_overrides("plant", text), weighs_target=True)
+
+    return Target(name, apply, "m" if column >= 0 else "1", False, frozenset({name}))
 
 
 def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Target:

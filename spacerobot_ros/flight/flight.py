@@ -22,6 +22,7 @@ from spacerobot_ros.errors import PlanningError, RecordingError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.measures import (
+    CaptureMeasures,
     Measures,
     Outcome,
     flown_time,
@@ -32,6 +33,7 @@ from spacerobot_ros.measures import (
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import (
     attitude_error,
+    matrices_from_quaternions,
     matrix_from_quaternion,
     quaternion_from_matrix,
     rotvec_from_quaternion,
@@ -278,6 +280,52 @@ class Flight:
                 return {"time_s": event.time_s or 0.0, **numbers}
         return {}
 
+    @cached_property
+    def capture_measures(self) -> CaptureMeasures:
+        """The measures of the flight to the target; all are NaN where there is none."""
+        capture, detumbling = self.capture, self.detumbling
+        if not capture:
+            return CaptureMeasures()
+        time = capture.get("time_s") or math.nan
+        impulse = np.array(capture.get("impulse_Ns", [math.nan] * 6))
+        joints = np.abs(capture.get("joint_impulses_Nms", ()))
+        return CaptureMeasures(
+            captured=float(capture["captured"]),
+            placed=float(self.succeeded and self._holds_target),
+            time=time,
+            distance=self._capture_distance(time),
+            impulse=float(np.linalg.norm(impulse[:3])),
+            angular_impulse=float(np.linalg.norm(impulse[3:])),
+            joint_impulse=float(joints.max()) if joints.size else math.nan,
+            detumbling_time=detumbling.get("took_s", math.nan),
+            detumbling_bound=detumbling.get("shortest_s", math.nan),
+        )
+
+    @property
+    def _holds_target(self) -> bool:
+        """Whether the robot holds the target at the end."""
+        changes = (EventKind.CAPTURED, EventKind.RELEASED)
+        last = [event.kind for event in self.events if event.kind in changes][-1:]
+        return last == [EventKind.CAPTURED]
+
+    def _capture_distance(self, capture: float) -> float:
+        """Return the distance of the end-effector from the grapple frame at the time of a capture,
+        s; the smallest of the flight, where that is NaN. NaN where the flight does not have it.
+        """
+        config = self.scenario.plant
+        hand, body = self.signal("end_effector_pose"), self.signal("true_target_pose")
+        body = body if len(body) else self.signal("target_pose")
+        of_link = config.capture.end_effector in ("", config.end_effector_frame)
+        if self.target is None or not of_link or not len(hand) or len(hand) != len(body):
+            return math.nan
+        grapple = self.target.frames[config.target.grapple_frame][1].r
+        R_WT = matrices_from_quaternions(body.values[:, 3:])
+        gaps = body.values[:, :3] + R_WT @ grapple - hand.values[:, :3]
+        distances = np.linalg.norm(gaps, axis=1)
+        if math.isnan(capture):
+            return float(distances.min())
+        return float(distances[int(np.searchsorted(hand.time, capture - 1e-9))])
+
     @property
     def control_period(self) -> float:
         """Duration of a tick, s."""
@@ -413,6 +461,7 @@ class Flight:
             plan_time=self.plan_time,
             wall_time=self.wall_time,
             clearance=self._smallest_distance if clearance else math.nan,
+            capture=self.capture_measures,
         )
 
     @property

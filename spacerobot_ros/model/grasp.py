@@ -333,9 +333,7 @@ def joined_momenta(
     # About the common centre of mass only the motion of one relative to the other counts.
     share = masses[0] / (masses[0] + masses[1])
     relative = share * second[:3] - (1.0 - share) * first[:3]
-    return np.concatenate(
-        [first[:3] + second[:3], first[3:] + second[3:] + cross(arm, relative)]
-    )
+    return np.concatenate([first[:3] + second[:3], first[3:] + second[3:] + cross(arm, relative)])
 
 
 def parted_momenta(

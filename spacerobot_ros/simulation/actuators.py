@@ -491,7 +491,7 @@ def build_plant(
     if description is None:
         plant = dynamics(robot, start)
     else:
-        target = Target(description, config.target, control_period, step)
+        target = Target(description, config.target, control_period, step, robot)
         plant = CapturePlant(dynamics, robot, start, target, config)
     plant = with_thrusters(plant, control_period, config.thrusters, config.thrusters_excluded)
     return FaultyPlant(

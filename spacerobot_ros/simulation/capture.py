@@ -86,13 +86,18 @@ class Target:
     """
 
     def __init__(
-        self, description: RobotDescription, config: TargetConfig, period: float, step: float
+        self,
+        description: RobotDescription,
+        config: TargetConfig,
+        period: float,
+        step: float,
+        robot: SpaceRobot | None = None,
     ) -> None:
         self.description = description
         self.inertia = description.bodies[0].inertia
         self.grapple = description.frames[config.grapple_frame][1]
         try:
-            self._model = SpaceRobot(description)
+            self._model = robot.derived(description) if robot else SpaceRobot(description)
             quaternion = unit_quaternion(config.orientation or (0.0, 0.0, 0.0, 1.0))
         except RobotDescriptionError as error:
             raise ParameterError(f"The target is refused: {error}") from error

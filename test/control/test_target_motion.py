@@ -139,5 +139,5 @@ def test_small_and_large_turns_have_one_formula() -> None:
         RelativeMotionOverTime(zero, zero, zero, angle * direction, phidot, phiddot)
         for angle in (0.9999e-3, 1.0001e-3)
     ]
-    np.testing.assert_allclose(found[0].w, found[1].w, atol=1e-6)
-    np.testing.assert_allclose(found[0].wdot, found[1].wdot, atol=1e-6)
+    for before, after in zip(found[0].rotation, found[1].rotation, strict=True):
+        np.testing.assert_allclose(before, after, atol=1e-6)
