@@ -183,10 +183,18 @@ _TOPIC_TABLE = (
         "target/odom",
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "pose of the target's root link in the world, and its twist in its own frame: the truth, "
+        "measured pose of the target's root link in the world, and its twist in its own frame, "
         "whether it floats or is held",
         when="`target.robot` is set",
         state=_odometry("target"),
+    ),
+    Topic(
+        "target/odom_true",
+        _ODOMETRY_TYPE,
+        _PUBLISHED_BY_PLANT,
+        "the truth beside what target/odom then measures",
+        when="`target.sensors` err",
+        state=_odometry("true_target"),
     ),
     Topic(
         "odom_true",

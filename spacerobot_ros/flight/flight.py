@@ -60,8 +60,10 @@ _TRUE_QUANTITIES = ("pose", "twist", "q", "qdot", "effort", "momentum")
 """Quantities that are attributes of a flight."""
 
 _QUANTITY_SIZES = {
-    **dict.fromkeys(("pose", "momentum", "measured_pose", "end_effector_pose", "target_pose"), 7),
-    **dict.fromkeys(("twist", "measured_twist", "expected_momenta", "target_twist"), 6),
+    **dict.fromkeys(("pose", "momentum", "measured_pose", "end_effector_pose"), 7),
+    **dict.fromkeys(("target_pose", "true_target_pose"), 7),
+    **dict.fromkeys(("twist", "measured_twist", "expected_momenta"), 6),
+    **dict.fromkeys(("target_twist", "true_target_twist"), 6),
 }
 """Numbers per sample by quantity; other quantities have one number per joint."""
 
@@ -314,7 +316,7 @@ class Flight:
         """
         config = self.scenario.plant
         hand, body = self.signal("end_effector_pose"), self.signal("true_target_pose")
-        body = body if len(body) else self.signal("target_pose")
+        body = body or self.signal("target_pose")
         of_link = config.capture.end_effector in ("", config.end_effector_frame)
         if self.target is None or not of_link or not len(hand) or len(hand) != len(body):
             return math.nan
@@ -684,9 +686,10 @@ class FlightLog:
         self._propellant = np.zeros(1)
         true = {"pose": plant.pose, "twist": plant.twist, "q": plant.q, "qdot": plant.qdot}
         # Measurements of sensors without error are the true arrays.
-        unused = ("true_",) if reported.sensors.used else ("true_", "measured_")
+        unused = [f"true_{name}" for name in true]
+        unused += [] if reported.sensors.used else [f"measured_{name}" for name in true]
         sources = {
-            **{name: x for name, x in reported.quantities.items() if not name.startswith(unused)},
+            **{name: x for name, x in reported.quantities.items() if name not in unused},
             **true,
         }
         if self._thrusters is not None:
@@ -699,15 +702,18 @@ class FlightLog:
             for source in commands.sources
         }
         self._ticks_without_pose: list[int] = []
-        self._sensors = reported.sensors
+        self._ticks_without_target: list[int] = []
+        self._reported = reported
 
     def add_state(self, tick: int) -> None:
         """Add the present state."""
         if self._thrusters is not None:
             self._propellant[0] = self._thrusters.propellant
         np.concatenate(self._parts, out=self._states.next_row())
-        if self._sensors.dropout:
+        if self._reported.sensors.dropout:
             self._ticks_without_pose.append(tick)
+        if self._reported.misses_target:
+            self._ticks_without_target.append(tick)
 
     def add_command(self, topic: str, tick: int, values: Array) -> None:
         """Add a command."""
@@ -734,9 +740,12 @@ class FlightLog:
         count, ends = len(table), np.cumsum([source.size for source in self._parts])
         columns = np.split(table, ends[:-1], axis=1)
         states = {name: each.copy() for name, each in zip(self._sources, columns, strict=True)}
-        lost = np.zeros((count, 1))
-        lost[self._ticks_without_pose] = 1.0
-        states["pose_lost"] = lost
+        for name, ticks in {
+            "pose_lost": self._ticks_without_pose,
+            "target_lost": self._ticks_without_target,
+        }.items():
+            states[name] = np.zeros((count, 1))
+            states[name][ticks] = 1.0
         time: Array = np.arange(count) * self._period_ns / SECOND
         return Flight(
             scenario=scenario,

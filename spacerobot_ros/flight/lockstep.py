@@ -351,7 +351,8 @@ class _LockstepFlight:
             q, qdot = q.copy(), qdot.copy()
         pose, twist = quantities["measured_pose"], quantities["measured_twist"]
         state = StateArrays(now, q, qdot, pose, twist)
-        if self._controller is not None and "target_pose" in quantities:
+        measured = "target_pose" in quantities and not self._reported.misses_target
+        if self._controller is not None and measured:
             pose, twist = quantities["target_pose"], quantities["target_twist"]
             self._controller.receive_target(now, StateArrays(now, q, qdot, pose, twist))
         for commander in self._commanders:

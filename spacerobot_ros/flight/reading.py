@@ -228,7 +228,7 @@ class FlightBag:
                     makers[f"measured_{quantity}"] = partial(self.measured_signal, name, number)
         for name in (
             *("momentum", "end_effector_pose", "momentum_expected"),
-            *("base_wrench_realised", "thrusters", "target/odom"),
+            *("base_wrench_realised", "thrusters", "target/odom", "target/odom_true"),
         ):
             for field in TOPICS[name].state if self.series_of(name) else ():
                 makers[field.quantity] = partial(self.quantity, name, field)

@@ -86,7 +86,7 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
         thrusters = tuple(find_thrusters(config.thrusters, robot).names)
     clock = TOPICS["/clock"]
     yield _Stream(clock, stamps, stamped_copies(encode(clock.type), clock.type, stamps, {}))
-    lost = flight.quantities["pose_lost"][:, 0] > 0 if "pose_lost" in flight.quantities else None
+    lost = {name: flight.quantities.get(name) for name in ("pose_lost", "target_lost")}
     every = max(1, round(config.base_pose_period * SECOND / period))
     poses = {"odom", *(pose_topic(name).name for name in config.end_effectors)}
     for topic in state_topics(config.end_effectors):
@@ -102,8 +102,10 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
             if quantities[field.quantity].shape[1]
         }
         rows = np.ones(len(stamps), dtype=bool)
-        if topic.name in poses and lost is not None:
-            rows = ~lost
+        name = "target_lost" if topic.name == "target/odom" else "pose_lost"
+        missing = lost[name] if topic.name in (*poses, "target/odom") else None
+        if missing is not None:
+            rows = missing[:, 0] == 0
         if not topic.every_tick:
             rows = np.arange(len(stamps)) % every == 0
         chosen = {path: values[rows] for path, values in columns.items()}

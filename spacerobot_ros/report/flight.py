@@ -309,8 +309,10 @@ class FlightReport:
 
     @property
     def target_pose(self) -> Signal:
-        """Pose of the target (M, 7): position, m, and quaternion; empty without one."""
-        return Signal.empty(7) if self.target is None else self.signal("target_pose")
+        """True pose of the target (M, 7): position, m, and quaternion; empty without one."""
+        if self.target is None:
+            return Signal.empty(7)
+        return self.signal("true_target_pose") or self.signal("target_pose")
 
     # -- names --------------------------------------------------------------------
 

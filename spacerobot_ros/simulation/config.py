@@ -74,6 +74,51 @@ class SensorConfig:
 
 
 @dataclass(frozen=True)
+class TargetSensorConfig:
+    """Errors of target/odom: 1 sigma of its noise, biases, delay, loss and rate."""
+
+    position_noise: float = parameter(
+        0.0, "1 sigma an axis of target/odom", unit="m", minimum=0.0, maximum=_MAX_SENSOR_ERROR
+    )
+    attitude_noise: float = parameter(
+        0.0,
+        "likewise, a rotation vector in the frame of its root link",
+        unit="rad",
+        minimum=0.0,
+        maximum=_MAX_SENSOR_ERROR,
+    )
+    velocity_noise: float = parameter(
+        0.0, "likewise, of the twist", unit="m/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
+    )
+    angular_velocity_noise: float = parameter(
+        0.0, "likewise", unit="rad/s", minimum=0.0, maximum=_MAX_SENSOR_ERROR
+    )
+    position_bias: tuple[float, ...] = _bias_parameter(
+        (0.0, 0.0, 0.0), "of target/odom, in the frame of the root link, with which it turns", "m"
+    )
+    attitude_bias: tuple[float, ...] = _bias_parameter(
+        (0.0, 0.0, 0.0), "likewise, a rotation vector", "rad"
+    )
+    delay: float = parameter(
+        0.0,
+        "age of the state that target/odom carries, in whole ticks",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+    )
+    loss: float = parameter(
+        0.0, "share of the measurements that are lost, at random", minimum=0.0, maximum=1.0
+    )
+    rate: float = parameter(
+        0.0,
+        "measurements a second, with whole ticks between them; 0: one every tick",
+        unit="Hz",
+        minimum=0.0,
+        maximum=100000.0,
+    )
+
+
+@dataclass(frozen=True)
 class TargetConfig:
     """A body that floats beside the robot: its URDF, its grapple frame and its initial state."""
 
@@ -109,6 +154,8 @@ class TargetConfig:
         maximum=_MAX_INITIAL_VALUE,
         length=3,
     )
+
+    sensors: TargetSensorConfig = group(TargetSensorConfig())
 
     @property
     def given(self) -> bool:

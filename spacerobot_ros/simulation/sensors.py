@@ -17,7 +17,8 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
-from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
+from spacerobot_ros.simulation.capture import CapturePlant
+from spacerobot_ros.simulation.config import PlantConfig, SensorConfig, TargetSensorConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS, POSE_AXES, Fault
 from spacerobot_ros.topics import Topic, pose_topic, state_topics
 
@@ -149,6 +150,68 @@ class Sensors:
         self._past = deque(self._past, maxlen=self._delay + 1)
 
 
+class TargetSensors:
+    """Measurements of the motion of a target, with bias, noise, delay, loss and a rate.
+
+    ``pose`` (7,) and ``twist`` (6,) are the last measurement, arranged as those of the target.
+    Each call of :meth:`measure` takes the same amount of random numbers, from a stream of its own.
+
+    A delay begins with the state at its beginning: until it has passed, pose and twist stand still.
+
+    Parameters
+    ----------
+    capturing
+        The plant with the target.
+    config
+        The errors.
+    seed
+        Seed of the noise of all sensors.
+    control_period
+        Duration of a tick, s.
+    """
+
+    def __init__(
+        self,
+        capturing: CapturePlant,
+        config: TargetSensorConfig,
+        seed: int,
+        control_period: float,
+    ) -> None:
+        self._capturing, self._config = capturing, config
+        # Robot sensors have the stream of the seed itself, actuators that of its first child.
+        self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
+        self.pose, self.twist = capturing.target_pose.copy(), capturing.target_twist.copy()
+        self.used = config != TargetSensorConfig()
+        """Whether measurements differ from the truth."""
+        self.missing = False
+        """Whether there is no measurement in this tick."""
+        self._position_bias = np.array(config.position_bias or (0.0, 0.0, 0.0))
+        self._attitude_bias = np.array(config.attitude_bias or (0.0, 0.0, 0.0))
+        self._delay = round(config.delay / control_period)
+        self._every = max(1, round(1.0 / (config.rate * control_period))) if config.rate else 1
+        self._count = 0
+        self._past: deque[tuple[Array, Array]] = deque(maxlen=self._delay + 1)
+
+    def measure(self) -> None:
+        """Measure the present state of the target; does nothing without errors."""
+        if not self.used:
+            return
+        config, truth = self._config, self._capturing
+        errors, chance = self._rng.standard_normal(12), self._rng.random()
+        self._past.append((truth.target_pose.copy(), truth.target_twist.copy()))
+        self.missing = self._count % self._every != 0 or chance < config.loss
+        self._count += 1
+        if self.missing:
+            return
+        pose, twist = self._past[0]
+        turn = self._attitude_bias + config.attitude_noise * errors[3:6]
+        offset = matrix_from_quaternion(pose[3:]) @ self._position_bias
+        self.pose[:3] = pose[:3] + offset + config.position_noise * errors[:3]
+        self.pose[3:] = quaternion_multiply(pose[3:], quaternion_from_rotvec(turn))
+        self.twist[:3] = twist[:3] + config.velocity_noise * errors[6:9]
+        self.twist[3:] = twist[3:] + config.angular_velocity_noise * errors[9:]
+
+
 class ReportedState:
     """The state of a plant as its topics carry it: measured, and true.
 
@@ -163,6 +226,8 @@ class ReportedState:
     ----------
     sensors
         Sources of odom and joint_states.
+    target_sensors
+        Source of target/odom; None: there is no target.
     quantities
         Arrays by the names of :attr:`StateField.quantity`, which change in place. It is replaced by
         another dictionary when the sensors begin to err. Quantities that a plant does not have
@@ -187,6 +252,11 @@ class ReportedState:
         capturing = plant.capturing
         self.target = None if capturing is None else capturing.target.description
         """The target; None: there is none."""
+        self.target_sensors: TargetSensors | None = None
+        if capturing is not None:
+            self.target_sensors = TargetSensors(
+                capturing, config.target.sensors, config.sensors.seed, config.control_period
+            )
         self._sensors_used, self._loaded = self.sensors.used, plant.loads is not None
         self.quantities = self._quantities()
 
@@ -205,6 +275,11 @@ class ReportedState:
             return tuple(self._thrusters.table.names)
         return tuple(self._plant.robot.joint_names)
 
+    @property
+    def misses_target(self) -> bool:
+        """Whether the target is not measured in this tick."""
+        return self.target_sensors is not None and self.target_sensors.missing
+
     def update(self) -> bool:
         """Measure the present state of the plant.
 
@@ -214,6 +289,8 @@ class ReportedState:
             Whether :attr:`quantities` has been replaced.
         """
         self.sensors.measure()
+        if self.target_sensors is not None:
+            self.target_sensors.measure()
         if self._link is not None:
             plant = self._plant
             _place(self._end_effector_pose, plant.pose, plant.link_R, plant.link_r, self._link)
@@ -247,8 +324,16 @@ class ReportedState:
             quantities[pose_topic(name).state[0].quantity] = pose
         capturing = plant.capturing
         if capturing is not None:
-            quantities["target_pose"] = capturing.target_pose
-            quantities["target_twist"] = capturing.target_twist
+            assert self.target_sensors is not None
+            true = {
+                "target_pose": capturing.target_pose,
+                "target_twist": capturing.target_twist,
+            }
+            quantities |= true
+            if self.target_sensors.used:
+                quantities["target_pose"] = self.target_sensors.pose
+                quantities["target_twist"] = self.target_sensors.twist
+                quantities |= {f"true_{name}": values for name, values in true.items()}
         if plant.takes_wrench or self._loaded or capturing is not None:
             quantities["expected_momenta"] = plant.expected_momenta
         if self._sensors_used:

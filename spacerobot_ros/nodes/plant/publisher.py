@@ -289,6 +289,8 @@ def timing_status(name: str, real_time: RealTime) -> DiagnosticStatus:
 
 MARKER_ARRAY_TYPE = "visualization_msgs/msg/MarkerArray"
 
+_TARGET = "target/odom"
+
 _LONGEST_WAIT = 0.5
 """Longest wait for readers, wall s."""
 
@@ -338,6 +340,7 @@ class StatePublisher:
         ]
         poses = {"odom", *(pose_topic(name).name for name in self._config.end_effectors)}
         self._of_measured_pose = [template for topic, _, template in streams if topic.name in poses]
+        self._of_target = [template for topic, _, template in streams if topic.name == _TARGET]
 
     def publish_description(self) -> None:
         """Publish the URDFs of robot and target."""
@@ -350,7 +353,9 @@ class StatePublisher:
 
         ``all_topics``: those too that are not published in every tick.
         """
-        lost = self._of_measured_pose if self._state.sensors.dropout else ()
+        lost = self._of_measured_pose if self._state.sensors.dropout else []
+        if self._state.misses_target:
+            lost = [*lost, *self._of_target]
         stamp = stamp_bytes(time_ns)
         for output, template in self._all if all_topics else self._every_tick:
             if template not in lost:
