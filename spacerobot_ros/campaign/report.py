@@ -46,8 +46,8 @@ _MESSAGES_SHOWN = 4
 _MAX_BADNESS = 100.0
 """Distance from a bound at which the order of the worst flights saturates, standard deviations."""
 
-_MAX_PLOTS = 9
-"""Largest number of metrics with a histogram, and of drivers with a plot."""
+_MAX_HISTOGRAMS, _MAX_SCATTER_PLOTS = 9, 6
+"""Largest numbers of metrics with a histogram and of drivers with a plot."""
 
 Flags = npt.NDArray[np.bool_]
 
@@ -385,7 +385,7 @@ def _percentiles_section(results: Results) -> str:
 
 
 def _histograms_section(results: Results) -> str:
-    names = results.distributed_metrics[:_MAX_PLOTS]
+    names = results.distributed_metrics[:_MAX_HISTOGRAMS]
     if not names:
         return ""
     figure, axes = figure_with_axes(len(names), 2)
@@ -439,7 +439,7 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
 
 
 def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
-    chosen = list(found[:_MAX_PLOTS])
+    chosen = list(found[:_MAX_SCATTER_PLOTS])
     if not chosen:
         return ""
     figure, axes = figure_with_axes(len(chosen), 3, 2.4)

@@ -740,10 +740,10 @@ class FlightLog:
         count, ends = len(table), np.cumsum([source.size for source in self._parts])
         columns = np.split(table, ends[:-1], axis=1)
         states = {name: each.copy() for name, each in zip(self._sources, columns, strict=True)}
-        for name, ticks in {
-            "pose_lost": self._ticks_without_pose,
-            "target_lost": self._ticks_without_target,
-        }.items():
+        lost = {"pose_lost": self._ticks_without_pose}
+        if self._ticks_without_target:
+            lost["target_lost"] = self._ticks_without_target
+        for name, ticks in lost.items():
             states[name] = np.zeros((count, 1))
             states[name][ticks] = 1.0
         time: Array = np.arange(count) * self._period_ns / SECOND

@@ -7,20 +7,23 @@ period takes a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and wo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.model.compilation import BufferedFunction, compiled
+from spacerobot_ros.model.compilation import BufferedFunction, compilation_settings, compiled
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions, SymbolicModels
 from spacerobot_ros.model.urdf import load_robot, parse_robot
+
+_Made = TypeVar("_Made")
 
 _MIN_RELATIVE_INERTIA = 1e-6
 """Largest component of a joint that counts as zero in a motion without inertia."""
@@ -272,12 +275,26 @@ class SpaceRobot:
         """Return the model's functions as SX expressions for larger functions; see :meth:`view`."""
         return Composition(self._model, ca.SX)
 
-    def view(self, function: ca.Function) -> BufferedFunction:
+    def view(self, function: ca.Function, key: Hashable | None = None) -> BufferedFunction:
         """Compile a function of :meth:`expressions`, and return it with its own buffers.
 
-        The argument ``p``, if it has one, is set to this robot's mass properties.
+        The argument ``p``, if it has one, is set to this robot's mass properties. With a ``key``,
+        which no other function has, it is compiled as :meth:`made_once` says.
         """
-        return BufferedFunction(compiled(function), self._p)
+        if key is None:
+            return BufferedFunction(compiled(function), self._p)
+        code = self.made_once((key, *compilation_settings()), lambda: compiled(function))
+        return BufferedFunction(code, self._p)
+
+    def made_once(self, key: Hashable, make: Callable[[], _Made]) -> _Made:
+        """Return an object that is made of :meth:`expressions`, once per key for all robots that
+        share them: those with the same mass properties, or with these as an argument.
+        """
+        derived = self._model.derived
+        if key not in derived:
+            derived[key] = make()
+        made: _Made = derived[key]
+        return made
 
     @property
     def mass_arguments(self) -> dict[str, Array]:

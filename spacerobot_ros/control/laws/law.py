@@ -194,14 +194,32 @@ class ControlLaw(ABC):
         self.outputs = OutputVector(robot, accepted, thrust=thrust)
         self.options: Any = configured(self.Options, values_of(options or self.Options()))
         self.singular_value_threshold: float = self.options.singular_value_threshold
-        inputs = self._inputs()
+        inputs = {name: np.asarray(value) for name, value in self._inputs().items()}
+        key = (type(self), accepted, thrust, self.options)
+        self.function, self._has_integral = robot.made_once(
+            key, lambda: self._make_function(inputs)
+        )
+        self._function = robot.view(self.function, ("compiled", *key))
+        self._integral = np.zeros(self.outputs.m)
+        """Integral of the errors (m,), m s or rad s."""
+        names = self.function.name_in()[: self.function.n_in() - len(robot.mass_arguments)]
+        self._in = dict(zip(names, self._function.inputs, strict=True))
+        self._out = dict(zip(self.function.name_out(), self._function.outputs, strict=True))
+        for name, value in inputs.items():
+            self._in[name][:] = value
+        self.set_gains(gains)
+
+    def _make_function(self, inputs: Mapping[str, Array]) -> tuple[ca.Function, bool]:
+        """Return the law as expressions of state, reference, kp, kd, integral and its own inputs,
+        and whether it depends on the integral.
+        """
         symbols = {
             "state": self.outputs.state,
             "reference": self.outputs.reference,
             "kp": ca.SX.sym("kp", self.outputs.m),
             "kd": ca.SX.sym("kd", self.outputs.m),
             "integral": ca.SX.sym("integral", self.outputs.m),
-            **{name: ca.SX.sym(name, np.size(value)) for name, value in inputs.items()},
+            **{name: ca.SX.sym(name, value.size) for name, value in inputs.items()},
         }
         weights = self.outputs.model.inputs
         results = {
@@ -210,17 +228,9 @@ class ControlLaw(ABC):
             "J_z": self.outputs.J_z,
             **self._results(symbols),
         }
-        self._has_integral = ca.depends_on(results["actuation"], symbols["integral"])
-        self._integral = np.zeros(self.outputs.m)
-        """Integral of the errors (m,), m s or rad s."""
-        self.function = dense_function(f"law_{self.name}", symbols | weights, results)
-        """The law as expressions: of state, reference, kp, kd, integral and its own inputs."""
-        self._function = robot.view(self.function)
-        self._in = dict(zip(symbols, self._function.inputs, strict=True))
-        self._out = dict(zip(results, self._function.outputs, strict=True))
-        for name, value in inputs.items():
-            self._in[name][:] = value
-        self.set_gains(gains)
+        function = dense_function(f"law_{self.name}", symbols | weights, results)
+        has_integral = bool(ca.depends_on(results["actuation"], symbols["integral"]))
+        return function, has_integral
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
