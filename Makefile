@@ -103,6 +103,11 @@ attacks: $(STAMP)/test ## try files and words that were made to harm or mislead,
 reports: $(STAMP)/test ## fly every scenario, make its report, open it in Chromium at desktop and phone width
 	$(BIN)/python3 -m pytest -m slow -rP test/report/test_every_report.py
 
+DRAWS ?= 1000
+.PHONY: servicing-campaign
+servicing-campaign: $(STAMP)/test ## fly DRAWS draws of the campaign servicing; goes on where it was ended; see out/servicing-campaign
+	nice $(BIN)/spacerobot campaign examples/campaigns/servicing.yaml --flights $(DRAWS) --out out/servicing-campaign
+
 CLEAR_GOALS ?= 50
 .PHONY: clear-plans
 clear-plans: $(STAMP)/test ## plan CLEAR_GOALS random goals each of six robots with and without clearance, and list distances

@@ -288,7 +288,7 @@ class Flight:
         capture, detumbling = self.capture, self.detumbling
         if not capture:
             return CaptureMeasures()
-        time = capture.get("time_s") or math.nan
+        time = capture.get("time_s", math.nan)
         impulse = np.array(capture.get("impulse_Ns", [math.nan] * 6))
         joints = np.abs(capture.get("joint_impulses_Nms", ()))
         return CaptureMeasures(

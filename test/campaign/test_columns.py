@@ -16,7 +16,7 @@ from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.report import metric_label
 from spacerobot_ros.campaign.rows import Row
-from spacerobot_ros.measures import METRICS, Measures, Outcome
+from spacerobot_ros.measures import METRICS, CaptureMeasures, Measures, Outcome
 from spacerobot_ros.planning.core.goal import PoseError
 
 FLOWN = Measures(
@@ -37,6 +37,17 @@ FLOWN = Measures(
     plan_time=0.75,
     wall_time=1.5,
     clearance=-0.03125,
+    capture=CaptureMeasures(
+        captured=1.0,
+        placed=0.0,
+        time=30.5,
+        distance=0.0025,
+        impulse=0.375,
+        angular_impulse=0.0125,
+        joint_impulse=0.21875,
+        detumbling_time=2.75,
+        detumbling_bound=0.34375,
+    ),
 )
 """Of sliders that move 2.5 m to both sides, 0.7 m/s fast and with up to 50 N."""
 
@@ -69,6 +80,15 @@ EXPECTED: dict[str, dict[str, Any]] = {
     "effort_margin": {"": 0.6, ".slider_1": 0.6, ".slider_2": 0.9, ".slider_3": 0.7},
     "momentum_drift": {"momentum_drift": 3e-6},
     "clearance_m": {"clearance_m": -0.03125},
+    "captured": {"captured": 1.0},
+    "placed": {"placed": 0.0},
+    "capture_time_s": {"capture_time_s": 30.5},
+    "capture_distance_m": {"capture_distance_m": 0.0025},
+    "capture_impulse_Ns": {"capture_impulse_Ns": 0.375},
+    "capture_angular_impulse_Nms": {"capture_angular_impulse_Nms": 0.0125},
+    "capture_joint_impulse": {"capture_joint_impulse": 0.21875},
+    "detumbling_time_s": {"detumbling_time_s": 2.75},
+    "detumbling_bound_s": {"detumbling_bound_s": 0.34375},
 }
 """Each column, or the columns of the joints after the name that they have in common."""
 
@@ -90,6 +110,15 @@ UNITS = {
     "effort_margin": "",
     "momentum_drift": "kg m/s, kg m^2/s",
     "clearance_m": "m",
+    "captured": "",
+    "placed": "",
+    "capture_time_s": "s",
+    "capture_distance_m": "m",
+    "capture_impulse_Ns": "N s",
+    "capture_angular_impulse_Nms": "N m s",
+    "capture_joint_impulse": "N m s or N s",
+    "detumbling_time_s": "s",
+    "detumbling_bound_s": "s",
 }
 
 
@@ -145,7 +174,7 @@ def test_a_requirement_and_the_axis_of_a_metric_have_its_unit(metric: str) -> No
     line = str(Criterion(metric, -1.5, 2.25))
     assert line == f"{metric} at least -1.5 and at most 2.25 {unit}".rstrip()
     assert str(Criterion(metric, maximum=2.0)) == f"{metric} at most 2 {unit}".rstrip()
-    named = metric.rpartition("_")[2] in ("m", "rad", "s", "kg", "N", "Nm")
+    named = metric.rpartition("_")[2] in ("m", "rad", "s", "kg", "N", "Nm", "Ns", "Nms")
     assert metric_label(metric) == (f"{metric}, {unit}" if unit and not named else metric)
 
 

@@ -77,6 +77,38 @@ def test_a_report_of_flights_that_ended_early_says_that_late_ones_are_missing(
     assert sentence in unescape(page.read_text("utf-8"))
 
 
+def test_shares_of_captures_have_their_intervals(tmp_path: Path) -> None:
+    """Of 40 flights 40 approach, 30 capture and none places."""
+    made = campaign(flights=40, criteria={"captured": {"min": 1}})
+    folder = tmp_path / "dataset"
+    dataset = Dataset(folder)
+    dataset.begin(made)
+    for draw in Draws(made):
+        captured = float(draw.number >= 10)
+        metrics = {"position_error_m": 0.01, "captured": captured, "placed": 0.0}
+        metrics |= {"capture_impulse_Ns": 0.1 * draw.number if captured else math.nan}
+        ok = passes_criteria(made.criteria, "reached", metrics)
+        dataset.add([Row(draw, "reached", "Reached.", metrics, ok, "flights")])
+    dataset.close()
+    results = Results.of(folder)
+    assert list(results.shares) == ["captured", "placed"]
+    found = results.shares["captured"]
+    assert (found.count, found.total) == (30, 40)
+    exact = stats.binomtest(30, 40).proportion_ci(0.95, "exact")
+    assert found.exact == pytest.approx((exact.low, exact.high))
+    assert results.shares["placed"].count == 0
+    assert results.distributed_metrics == ["position_error_m", "capture_impulse_Ns"]
+    assert results.shown_metrics[0] == "captured"
+    lines = write_campaign_report(folder, tmp_path / "report.html")
+    assert lines[1].startswith("captured    75 % (30 of 40; 95 % interval ")
+    assert lines[2].startswith("placed      0 % (0 of 40; ")
+    page = (tmp_path / "report.html").read_text("utf-8")
+    low, high = (f"{100 * x:.4g}" for x in found.exact)
+    assert "<dt>captured</dt><dd>75 %<small>30 of 40</small></dd>" in page
+    assert f"<dd>{low} to {high} %</dd>" in page
+    assert "capture_impulse_Ns" in page
+
+
 def test_sobol_indices_are_those_of_a_function_that_is_known(tmp_path: Path) -> None:
     made = campaign(disperse=TURNS, sampler="saltelli", flights=512 * 5, seed=3)
     results = Results.of(filled(tmp_path, made, ishigami))

@@ -15,10 +15,11 @@ from spacerobot_ros.campaign.targets import (
     description_of,
     targets_of,
 )
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.scenario import Scenario
+from spacerobot_ros.simulation.capture import load_target
 
 FAULTS = [
     "joint_stuck slider_2 at 5 until 9",
@@ -142,6 +143,57 @@ def test_several_bodies_have_a_target_each_or_one_together(scenario: Scenario) -
         "com.mass_2.z",
     ]
     assert [t.name for t in targets_of("com.*.z", scenario)] == [f"com.{b}.z" for b in bodies]
+
+
+TUMBLER = """<robot name="tumbler">
+  <link name="hull"><inertial><origin xyz="0.1 -0.05 0.2"/><mass value="20"/>
+    <inertia ixx="1.5" iyy="2" izz="2.5" ixy="0.1" ixz="0" iyz="0"/></inertial></link>
+  <link name="grapple"/><joint name="mount" type="fixed"><parent link="hull"/>
+    <child link="grapple"/><origin xyz="0.4 0.3 -0.1"/></joint></robot>"""
+
+
+def test_the_target_weighs_otherwise(scenario: Scenario) -> None:
+    scenario = scenario.with_overrides("plant", {"target.robot_description": TUMBLER})
+    flight = DrawnFlight.of(scenario)
+    assert not flight.weighs_target
+    drawn = {"target.mass": 1.25, "target.inertia": 0.8, "target.com.y": 0.02}
+    units = {}
+    for name, value in drawn.items():
+        (target,) = targets_of(name, scenario)
+        flight, units[name] = target.apply(flight, value), target.unit
+        assert target.sets == {name}
+    assert units == {"target.mass": "1", "target.inertia": "1", "target.com.y": "m"}
+    assert flight.weighs_target
+    found = load_target(flight.scenario.plant.target)
+    assert found is not None
+    inertia = found.bodies[0].inertia
+    assert inertia.mass == pytest.approx(25.0)
+    np.testing.assert_allclose(inertia.com, [0.1, -0.03, 0.2])
+    expected = np.array([[1.5, 0.1, 0.0], [0.1, 2.0, 0.0], [0.0, 0.0, 2.5]])
+    np.testing.assert_allclose(inertia.about_com, expected, atol=1e-12)
+    np.testing.assert_allclose(found.frames["grapple"][1].r, [0.4, 0.3, -0.1])
+    (target,) = targets_of("target.com.z", scenario)
+    moved = load_target(target.apply(DrawnFlight.of(scenario), -0.5).scenario.plant.target)
+    assert moved is not None
+    np.testing.assert_allclose(moved.bodies[0].inertia.com, [0.1, -0.05, -0.3])
+    with pytest.raises(ParameterError) as caught:
+        targets_of("target.masss", scenario)
+    assert str(caught.value) == (
+        "'target.masss' is none of target.mass, target.inertia, target.com.x, target.com.y, "
+        "target.com.z. Did you mean 'target.mass'?"
+    )
+    (target,) = targets_of("target.mass", scenario)
+    with pytest.raises(RobotDescriptionError, match="hull"):
+        target.apply(DrawnFlight.of(scenario), -1.0)
+
+
+def test_a_target_is_needed_to_weigh_it(scenario: Scenario) -> None:
+    with pytest.raises(ParameterError) as caught:
+        targets_of("target.mass", scenario)
+    assert str(caught.value) == (
+        f"'target.mass': there is no target: the scenario '{scenario.name}' has no "
+        "plant.target.robot."
+    )
 
 
 def test_whole_numbers_stay_whole(scenario: Scenario) -> None:

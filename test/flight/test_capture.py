@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.bag.salvage import salvage_bag
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.events import EventKind
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.flight import Flight, Signal
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.reading import namespaces, read_run
@@ -63,6 +65,59 @@ def test_the_block_is_captured_at_once_and_brought_to_rest(flight: Flight) -> No
     assert flight.momentum_drift.max() < 1e-14
     assert flight.target is not None
     assert flight.target.name == "block"
+
+
+def test_a_capture_is_measured(flight: Flight, bag: Path) -> None:
+    """The block is caught at once, 0.3 m from its centre, and there is no detumbling."""
+    measures = flight.measures.capture
+    assert (measures.captured, measures.placed, measures.time) == (1.0, 1.0, 0.0)
+    assert measures.impulse == pytest.approx(math.hypot(0.110519, 0.065737), abs=1e-6)
+    assert measures.angular_impulse == pytest.approx(0.035296, abs=1e-6)
+    worst = np.abs(flight.capture["joint_impulses_Nms"]).max()
+    assert measures.joint_impulse == worst > 0.0
+    # By the published poses: the grapple frame is 0.3 m from the block's centre.
+    hand, block = flight.signal("end_effector_pose").values[0], flight.signal("target_pose")
+    frame = block.values[0, :3] + Rotation.from_quat(block.values[0, 3:]).apply([-0.3, 0.0, 0.0])
+    assert measures.distance == pytest.approx(np.linalg.norm(frame - hand[:3]), abs=1e-12)
+    assert measures.distance < 0.01
+    assert math.isnan(measures.detumbling_time)
+    assert math.isnan(measures.detumbling_bound)
+    of_bag = asdict(read_run(bag).measures.capture)
+    assert of_bag == pytest.approx(asdict(measures), rel=1e-12, nan_ok=True)
+
+
+def test_without_a_capture_the_nearest_distance_is_measured(flight: Flight) -> None:
+    """The end-effector does not come nearer than at the beginning, and the truth is measured."""
+    missed = replace(flight, events=flight.events[:2], series=dict(flight.series))
+    measures = missed.measures.capture
+    assert (measures.captured, measures.placed) == (0.0, 0.0)
+    assert math.isnan(measures.time)
+    assert math.isnan(measures.impulse)
+    assert measures.distance <= flight.measures.capture.distance
+    shifted = flight.signal("target_pose").values + np.array([0.0, 0.0, 0.7, 0, 0, 0, 0])
+    series = {**flight.series, "true_target_pose": Signal(flight.time, shifted)}
+    apart = replace(missed, series=series).measures.capture.distance
+    assert apart == pytest.approx(math.hypot(0.7, measures.distance), abs=1e-6)
+    released = Event(EventKind.RELEASED, "The target is released.", 0, 0.5)
+    let_go = replace(flight, events=(*flight.events, released)).measures.capture
+    assert (let_go.captured, let_go.placed) == (1.0, 0.0)
+
+
+def test_measured_targets_are_read_back_and_verified(tmp_path: Path) -> None:
+    """With the truth beside them, and gaps where nothing was measured."""
+    errors = {"position_noise": 0.004, "delay": 0.03, "loss": 0.25, "rate": 34.0}
+    values = {f"target.sensors.{name}": value for name, value in errors.items()}
+    scenario = load_scenario("capture").with_overrides("plant", values)
+    flown = fly_scenario(scenario, longest=0.4)
+    lost = flown.quantities["target_lost"][:, 0]
+    assert 0.6 < lost.mean() < 0.95
+    flown.save(tmp_path / "noisy.mcap")
+    recorded = read_run(tmp_path / "noisy.mcap")
+    seen, true = recorded.signal("target_pose"), recorded.signal("true_target_pose")
+    np.testing.assert_array_equal(seen.values, flown.signal("target_pose").values[lost == 0.0])
+    np.testing.assert_array_equal(true.values, flown.signal("true_target_pose").values)
+    assert len(true.time) == len(flown.time) > len(seen.time) > 3
+    assert verify_bag(tmp_path / "noisy.mcap").difference is None
 
 
 def test_the_bag_of_a_capture_verifies_and_reads_as_it_was_flown(flight: Flight, bag: Path) -> None:
