@@ -70,7 +70,8 @@ def test_sensors_without_errors_are_not_used() -> None:
     ],
 )
 def test_a_noise_is_that_of_its_quantity_alone(name: str, columns: slice, sigma: float) -> None:
-    seen = Seen(400, **{name: sigma})
+    error: dict[str, Any] = {name: sigma}
+    seen = Seen(400, **error)
     assert seen.sensors.used
     errors = seen.errors()
     assert errors[:, columns].std(axis=0) == pytest.approx([sigma] * 3, rel=0.15)
@@ -111,7 +112,7 @@ def test_measurements_are_lost_at_random() -> None:
 
 
 def test_a_seed_is_a_stream_of_its_own() -> None:
-    noisy = {"position_noise": 1.0, "loss": 0.4}
+    noisy: dict[str, Any] = {"position_noise": 1.0, "loss": 0.4}
     first, again, other = (Seen(30, seed, **noisy) for seed in (5, 5, 6))
     for one, two in zip(first.measured, again.measured, strict=True):
         assert (one is None) is (two is None)
@@ -129,7 +130,7 @@ def test_the_truth_is_published_beside_measurements(monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
     robot = SpaceRobot.from_file(robot_file("planar_manipulator"))
     block = str(share_directory() / "config" / "targets" / "block.urdf")
-    values = {"target.robot": block, "target.position": [3.0, 1.0, 2.0]}
+    values: dict[str, Any] = {"target.robot": block, "target.position": [3.0, 1.0, 2.0]}
     values |= {"target.sensors.position_bias": [0.5, 0.0, 0.0], "target.sensors.rate": 1e-3}
     config = configured(PlantConfig, values)
     plant = build_plant(robot, config)
