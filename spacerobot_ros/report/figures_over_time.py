@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.axes import Axes
 
-from spacerobot_ros.errors import sentence_case
+from spacerobot_ros.errors import RobotDescriptionError, sentence_case
+from spacerobot_ros.flight.captures import BUDGET_PARTS
 from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Array, Joint
 from spacerobot_ros.model.rotations import (
@@ -592,6 +593,32 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
         TraceGroup(Signal(time, energy), ["energy"], "kinetic energy", "J", [colour(2)]),
     ]
     return ReportFigure("momentum", "Momentum balance", caption, figure, groups, aside)
+
+
+def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
+    """Angular momentum of base, arm, wheels and all; None without wheels and without a capture."""
+    try:
+        budget = flight.momentum_budget
+    except RobotDescriptionError as error:
+        return f"The momentum budget is not drawn. {error}"
+    if not len(budget):
+        return None
+    parts = [
+        part
+        for part in BUDGET_PARTS
+        if part != "wheels" or (flight.robot is not None and flight.robot.wheel_names)
+    ]
+    columns = [BUDGET_PARTS.index(part) for part in parts]
+    signal = Signal(budget.time, budget.values[:, columns])
+    tints = [colour(column) for column in columns]
+    group = TraceGroup(signal, parts, "angular momentum", "N m s", tints)
+    caption = (
+        "Angular momentum about the centre of mass: of the base turning with its joints at rest; "
+        "of the arm, its joints relative to the base, with a body that it holds; "
+    )
+    caption += "of the wheels about their axes; " if "wheels" in parts else ""
+    caption += "and of all, which only loads from outside change (norms; vectors add up)"
+    return time_figure(flight, "momentum_budget", "Momentum budget", caption, [group])
 
 
 _CLEARANCE_STATES = 2000

@@ -13,6 +13,7 @@ import numpy as np
 from spacerobot_ros.collision.drawn import obstacle_visuals
 from spacerobot_ros.control.status import CommandReport, ControllerStatus
 from spacerobot_ros.errors import MeshError
+from spacerobot_ros.flight.captures import BUDGET_PARTS, momentum_budget_over_time
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.flight.flight import Flight, SentGoal, Signal, pose_error, reported_goal
 from spacerobot_ros.flight.reading import (
@@ -43,6 +44,9 @@ from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, r
 from spacerobot_ros.report.solids import SolidRobot
 from spacerobot_ros.scenario import COMMANDERS, Published
 from spacerobot_ros.times import SECOND
+
+_BUDGET_STATES = 2000
+"""States of a flight at which the momentum budget is evaluated."""
 
 _LINK_STATES = 2000
 """States of a flight at which the errors of links are evaluated."""
@@ -210,6 +214,22 @@ class FlightReport:
         values = balance.values.copy()
         values[:, :6] -= expected.values - expected.values[0]
         return Signal(balance.time, values)
+
+    @cached_property
+    def momentum_budget(self) -> Signal:
+        """Angular momentum (N, 4), N m s, of base, arm, wheels and all of them, at up to two
+        thousand states; empty unless the robot has wheels or captured a target.
+
+        Raises
+        ------
+        RobotDescriptionError
+            The described robot has no positive inertia.
+        """
+        robot, captured = self.robot, self.flight.capture.get("captured", False)
+        if robot is None or not (robot.wheel_names or captured):
+            return Signal.empty(len(BUDGET_PARTS))
+        found = momentum_budget_over_time(self.flight, _BUDGET_STATES)
+        return _shift_time(found, self.bag.began)
 
     @cached_property
     def tool(self) -> Signal:

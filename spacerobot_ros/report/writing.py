@@ -30,6 +30,7 @@ from spacerobot_ros.report.figures_over_time import (
     efforts_figure,
     errors_figure,
     link_errors_figure,
+    momentum_budget_figure,
     momentum_figure,
     pose_figure,
     position_figure,
@@ -81,6 +82,7 @@ FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
     "twist": twist_figure,
     "clearance": clearance_figure,
     "momentum": momentum_figure,
+    "momentum_budget": momentum_budget_figure,
     "path": path_figure,
 }
 """The figures of :func:`write_figures`, by name."""
@@ -101,6 +103,7 @@ _REPORT_FIGURES = (
     twist_figure,
     clearance_figure,
     momentum_figure,
+    momentum_budget_figure,
 )
 
 

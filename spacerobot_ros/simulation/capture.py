@@ -307,7 +307,7 @@ class CapturePlant(WrappedPlant):
         target: Target,
         config: PlantConfig,
     ) -> None:
-        self.link = _end_effector_of(robot.description, config)
+        self.link = capturing_link(robot.description, config)
         self._link_index = robot.link_names.index(self.link)
         self._alone = build(robot, initial)
         super().__init__(self._alone)
@@ -548,7 +548,14 @@ def capture_in(plant: Plant) -> CapturePlant | None:
     return plant if isinstance(plant, CapturePlant) else None
 
 
-def _end_effector_of(robot: RobotDescription, config: PlantConfig) -> str:
+def capturing_link(robot: RobotDescription, config: PlantConfig) -> str:
+    """Return the name of the link that captures targets.
+
+    Raises
+    ------
+    ParameterError
+        The robot has no such link.
+    """
     link = robot.end_effector(config.capture.end_effector or config.end_effector_frame)
     if link not in robot.frames:
         missing = f"has no link '{link}'" if link else "has no link 'end_effector'"

@@ -32,6 +32,9 @@ SILENT_AFTER = 1.0
 _NEAR_LIMIT_SHARE = 0.05
 """Distance from a limit below which a joint is marked, as a share of its range."""
 
+_FAST_WHEEL, _FULL_WHEEL = 0.8, 0.98
+"""Shares of the largest rate of a wheel from which it is marked amber, and red."""
+
 _MAX_NAME_LENGTH = 21
 """Characters shown of the name of a joint."""
 
@@ -311,6 +314,46 @@ def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:
     expected = first if momenta.expected is None else momenta.expected
     linear, angular = momentum_change(momenta.actual, expected).tolist()
     return linear, angular
+
+
+MOMENTUM_PARTS = ("base", "arm", "wheels", "sum")
+"""Parts of the momentum budget, in the order of the page."""
+
+
+def momentum_budget(state: StackState) -> dict[str, float]:
+    """Return the angular momentum of each part as controller/status has it, N m s; empty: it has
+    none, or its controller is offline.
+    """
+    control = state.controller
+    if control is None or control.command is None or "controller" in state.absent:
+        return {}
+    found = control.command.momentum
+    complete = set(MOMENTUM_PARTS) <= set(found)
+    return {part: found[part] for part in MOMENTUM_PARTS} if complete else {}
+
+
+def momentum_html(state: StackState) -> str:
+    """Return the momentum budget, and the rate of each wheel as a share of its largest one."""
+    budget = momentum_budget(state)
+    control = state.controller
+    if not budget or control is None or control.command is None:
+        return ""
+    command = control.command
+    rows = [
+        (escape(part), f"{_format_decimals(value, 3)} N m s", "") for part, value in budget.items()
+    ]
+    for name, share in command.wheels.items():
+        level = 2 if abs(share) >= _FULL_WHEEL else 1 if abs(share) >= _FAST_WHEEL else 0
+        title = f'<span title="{escape(name)}">{escape(shortened(name))}</span>'
+        bar = _bar_html((1.0 + share) / 2, level)
+        rows.append((title, f"{_format_decimals(100 * share, 0)} %", bar))
+    cells = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+    dumping = _line_html("The momentum of the wheels is being dumped.", 1)
+    style = "border-spacing:4px 2px;white-space:nowrap;font-size:.9em"
+    return padded(
+        "<b>Angular momentum</b>"
+        f'<table style="{style}">{cells}</table>{dumping if command.dumping else ""}'
+    )
 
 
 def has_tool(state: StackState) -> bool:

@@ -254,6 +254,9 @@ class Plots:
             # In millionths, because axis labels have three decimals.
             units = ("1e-6 kg m/s", "1e-6 kg m²/s")
             self._momentum = _Plot(gui, "Momentum drift", units, 1.0)
+            self._budget_text = gui.add_html("")
+            self._budget = _Plot(gui, "Momentum budget (N m s)", content.MOMENTUM_PARTS, 0.01)
+            self._budget.handle.visible = False
         self._joint_tab = self._tab_group.add_tab("Shape")
         self._shape: _Plot | None = None
         self._first: Array | None = None
@@ -261,8 +264,9 @@ class Plots:
     def show_robot(self, robot: RobotDescription | None) -> None:
         """Start over with another robot."""
         self._first = None
-        for plot in (self._error, self._tool, self._momentum):
+        for plot in (self._error, self._tool, self._momentum, self._budget):
             plot.clear()
+        self._budget.handle.visible = False
         self._show_links({})
         if self._shape is not None:
             self._shape.handle.remove()
@@ -291,8 +295,18 @@ class Plots:
                 self._first = state.momenta.actual
             drift = content.momentum_drift(state.momenta, self._first)
             self._momentum.history.add(time_s, 1e6 * np.array(drift))
+        budget = content.momentum_budget(state)
+        if budget:
+            self._budget.handle.visible = True
+            self._budget.history.add(time_s, list(budget.values()))
         if self._shape is not None:
             self._shape.history.add(time_s, measured.q)
+
+    def show_budget(self, state: StackState) -> None:
+        """Show the present momentum budget of a robot with wheels."""
+        text = content.momentum_html(state)
+        if text != self._budget_text.content:
+            self._budget_text.content = text
 
     def _show_links(self, errors: Mapping[Part, content.GoalDistance]) -> None:
         """Have one plot for each link with an error, and none for others."""
@@ -308,7 +322,8 @@ class Plots:
 
     def draw(self) -> None:
         """Redraw the curves."""
-        for plot in (self._error, self._tool, *self._links.values(), self._momentum, self._shape):
+        always = (self._error, self._tool, self._momentum, self._budget)
+        for plot in (*always, *self._links.values(), self._shape):
             if plot is not None:
                 plot.draw()
 
@@ -629,6 +644,7 @@ class Page:
         self._bar.visible = content.time_to_go(state) is not None
         self._bar.value = round(100 * content.progress(state), 1)
         self.faults.show(state)
+        self._plots.show_budget(state)
         self._log.draw()
         has_tool = content.has_tool(state)
         if has_tool and state.measured is not None and not self.editor.has_tool:

@@ -140,6 +140,22 @@ def test_a_recording_is_moved_in_time(ros_domain: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(chromium() is None, reason="no Chromium to open the page with")
+def test_the_momentum_budget_of_a_recording_is_seen(ros_domain: int, tmp_path: Path) -> None:
+    bag = ROOT / "bags" / "wheels.mcap"
+    with viewed(ros_domain, tmp_path, "replay", str(bag)) as (process, url):
+        with browser(tmp_path / "profile") as window:
+            page = Page(window, url)
+            page.wait_for_text("Replay ended")
+            page.press("Plots")
+            page.press("Momentum")
+            page.wait_for_text("Angular momentum", "base", "arm", "wheels", "sum", "N m s")
+            page.wait_for_text("Momentum budget (N m s)", "wheel_plus_x")
+            assert window.complaints == []
+        assert ended(process, ros_domain) < 4.0
+
+
+@pytest.mark.slow
 def test_a_stack_and_its_viewer_end_together(ros_domain: int, tmp_path: Path) -> None:
     words = ("up", "sliding_masses", "--processes", "--rate", "4")
     with viewed(ros_domain, tmp_path, *words) as (process, _):

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.collision import LinkPair
-from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.kinematics import ForwardKinematics
@@ -226,6 +226,53 @@ def test_momenta_are_compared_with_what_they_should_be() -> None:
     assert content.momentum_drift(alone, first) == pytest.approx((math.sqrt(5), math.sqrt(50)))
     pushed = Momenta(actual, actual - [0, 0, 2, 0, 3, 0], 0.0)
     assert content.momentum_drift(pushed, first) == pytest.approx((2.0, 3.0))
+
+
+def controlled(**report: Any) -> StackState:
+    command = CommandReport("model_based", False, 1.0, 0.0, 0.0, 0.0, 0.0, **report)
+    return replace(STATE, controller=ControllerStatus(ControllerState.TRACKING, command=command))
+
+
+def test_the_momentum_budget_is_that_of_the_controller() -> None:
+    parts = {"wheels": 1.25, "sum": 3.0, "arm": 0.5, "base": 2.0006}
+    shares = {"fast": -0.8, "full": 0.98, "slow": 0.79}
+    state = controlled(momentum=parts, wheels=shares)
+    assert list(content.momentum_budget(state).items()) == [
+        ("base", 2.0006),
+        ("arm", 0.5),
+        ("wheels", 1.25),
+        ("sum", 3.0),
+    ]
+    text = content.momentum_html(state)
+    rows = [re.findall("<td>(.*?)</td>", row) for row in text.split("<tr>")[1:]]
+    assert rows[:4] == [
+        ["base", "2.001 N m s", ""],
+        ["arm", "0.500 N m s", ""],
+        ["wheels", "1.250 N m s", ""],
+        ["sum", "3.000 N m s", ""],
+    ]
+    assert [row[1] for row in rows[4:]] == ["-80 %", "98 %", "79 %"]
+    assert [row[0] for row in rows[4:]] == [f'<span title="{n}">{n}</span>' for n in shares]
+    places, colours = ("left:10%", "left:99%", "left:90%"), ("#c98a00", "#d23c3c", "#2a9d5c")
+    for row, place, tint in zip(rows[4:], places, colours, strict=True):
+        assert place in row[2]
+        assert tint in row[2]
+    assert "dumped" not in text
+    dumping = controlled(momentum=parts, wheels=shares, dumping=True)
+    assert "The momentum of the wheels is being dumped." in content.momentum_html(dumping)
+
+
+def test_without_a_momentum_budget_there_is_no_panel() -> None:
+    parts = dict.fromkeys(("base", "arm", "wheels", "sum"), 1.0)
+    lost = replace(controlled(momentum=parts), absent=frozenset({"controller"}))
+    incomplete = controlled(momentum={"base": 1.0, "sum": 1.0})
+    silent = replace(STATE, controller=ControllerStatus(ControllerState.HOLDING))
+    for state in (STATE, silent, lost, incomplete, controlled()):
+        assert content.momentum_budget(state) == {}
+        assert content.momentum_html(state) == ""
+    evil = controlled(momentum=parts, wheels={"<b>": 0.1})
+    assert "<b>x" not in content.momentum_html(evil)
+    assert "&lt;b&gt;" in content.momentum_html(evil)
 
 
 def test_faults_are_written_for_the_plant() -> None:

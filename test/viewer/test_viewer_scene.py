@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull
 from support.urdf_text import without_collisions
 
 from spacerobot_ros.collision.drawn import collision_visuals
+from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
@@ -179,6 +180,30 @@ def test_rounding_is_no_peak_and_numbers_of_a_flight_are_seen(server: Any) -> No
     assert plots._shape is not None
     ends = plots._shape.handle.scales["y"]["range"]
     assert (ends["min"]["soft"], ends["max"]["soft"]) == (-0.01, 0.01)
+
+
+def test_the_momentum_budget_is_plotted_while_a_controller_reports_it(server: Any) -> None:
+    server.gui.reset()
+    plots, zeros = Plots(server.gui), np.zeros(3)
+    robot = load_robot(robot_file("sliding_masses"))
+    plots.show_robot(robot)
+    handle = plots._budget.handle
+    assert not handle.visible
+    parts = {"base": 0.5, "arm": 0.25, "wheels": 2.0, "sum": 1.75}
+    command = CommandReport("model_based", False, 1.0, 0.0, 0.0, 0.0, 0.0, momentum=parts)
+    status = ControllerStatus(ControllerState.TRACKING, command=command)
+    for time_s, controller in ((1.0, None), (2.0, status)):
+        measured = Measured(time_s, np.eye(7)[6], zeros, zeros, zeros)
+        state = StackState(measured, controller=controller)
+        plots.add(state, {})
+        plots.show_budget(state)
+        assert handle.visible is (controller is not None)
+        assert ("2.000 N m s" in plots._budget_text.content) is (controller is not None)
+    plots.draw()
+    assert [series["label"] for series in handle.series[1:]] == list(parts)
+    assert [column.tolist() for column in handle.data] == [[2.0], [0.5], [0.25], [2.0], [1.75]]
+    plots.show_robot(robot)
+    assert not handle.visible
 
 
 def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
