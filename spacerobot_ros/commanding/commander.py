@@ -13,6 +13,13 @@ from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
 from typing import Any, Literal, Protocol
 
+from spacerobot_ros.commanding.fly_to import (
+    FlyTo,
+    FlyToClient,
+    FlyToGoals,
+    GoalErrors,
+    Progress,
+)
 from spacerobot_ros.commanding.goal_follower import Status, decision_event
 from spacerobot_ros.commanding.plant_state import (
     PlantChange,
@@ -30,11 +37,18 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
-from spacerobot_ros.planning.execution.goal_file import GoalFile, GoalIds, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    BASE_GOAL_KEY,
+    GoalFile,
+    GoalIds,
+    IdentifiedGoal,
+)
 from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.times import SECOND
 
 _STANDSTILL_TIME = 0.005
 """Wall time (s) without an answer after which only the last waiting state is answered."""
@@ -198,6 +212,7 @@ class Commander(ABC):
         self._goal_ids = GoalIds()
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
         """Goals that were received before the robot's description."""
+        self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
         self._answer_time = clock()
         self._ignored_reported, self._next_report = 0, 0.0
         self._fault_log_times: dict[str, float] = {}
@@ -252,6 +267,7 @@ class Commander(ABC):
         if self.activity is not Activity.INACTIVE and self.executive is not None:
             self._stop_executive()
         self.activity, self._waiting_goals = Activity.INACTIVE, {}
+        self._fly_to.settle((), "Aborted: this node was deactivated.")
 
     # -- goals --------------------------------------------------------------------------------
 
@@ -277,10 +293,7 @@ class Commander(ABC):
         goal_id = self._goal_ids.of(sec, nanosec)
         try:
             goal = read()
-            if not self.active:
-                raise PlanningError(f"The goal is refused: this node is {self.activity.value}.")
-            if self.plant.blocked:
-                raise PlanningError(self.plant.blocked)
+            self._require_free()
         except PlanningError as error:
             self._refuse_goal(str(error), goal_id)
             return None
@@ -288,22 +301,69 @@ class Commander(ABC):
         self._accept_goal(key, accepted)
         return accepted
 
-    def abort(self) -> str | None:
+    def receive_fly_to(
+        self, goal_id: str, read: Callable[[], FlyTo], client: FlyToClient
+    ) -> IdentifiedGoal | None:
+        """Accept or refuse the goal of an action; its client is told its course and its result.
+
+        Parameters
+        ----------
+        goal_id
+            Id of the goal in statuses, which no other goal has.
+        read
+            Returns the goal, or raises PlanningError with the message of the refusal.
+        client
+            Who waits for the result.
+
+        Returns
+        -------
+        IdentifiedGoal | None
+            The goal, None where it is refused.
+        """
+        try:
+            self._require_free()
+            request = read()
+        except PlanningError as error:
+            self._fly_to.begin(goal_id, client, None)
+            self._refuse_goal(str(error), goal_id)
+            return None
+        self._fly_to.begin(goal_id, client, request)
+        tolerance = request.tolerance_or(self._default_tolerance())
+        accepted = IdentifiedGoal(request.goal, goal_id, tolerance, resumes=False)
+        self._accept_goal(BASE_GOAL_KEY, accepted)
+        return accepted
+
+    def cancel_fly_to(self, goal_id: str) -> None:
+        """Abort the goal of an action; one that is about to be replaced ends when it is."""
+        self._fly_to.request_abort(goal_id)
+        self._abort_fly_to()
+
+    def abort(self, why: str = "on request") -> str | None:
         """Give up all goals; return the message of the answer, None without a goal."""
         if self._waiting_goals:
-            message = "Aborted on request, before the robot was known."
+            message = f"Aborted {why}, before the robot was known."
             self._abort_waiting(message)
             return message
-        answer = self._abort_goal() if self.active else None
+        answer = self._abort_goal(why) if self.active else None
         self._goal_file.delete()
         return answer
 
+    def _require_free(self) -> None:
+        """Raise PlanningError where no goal is taken now."""
+        if not self.active:
+            raise PlanningError(f"The goal is refused: this node is {self.activity.value}.")
+        if self.plant.blocked:
+            raise PlanningError(self.plant.blocked)
+
     def _accept_goal(self, key: str, goal: IdentifiedGoal) -> None:
+        self._fly_to.accepted(goal.goal_id)
         if self.executive is None:
             self._waiting_goals[key] = goal
             self._report_waiting_goal(goal, "The goal waits for a robot on robot_description.")
         else:
             self._submit_goal(key, goal)
+        if self._fly_to:
+            self._fly_to.settle(self._pursued())
 
     def _refuse_goal(self, message: str, goal_id: str) -> None:
         self._publish_decision(self._make_status("refused", message, goal_id))
@@ -323,9 +383,79 @@ class Commander(ABC):
             self.host.report_event(event)
 
     def _publish_status(self, status: Status) -> None:
+        # What a goal replaces ends before it begins: the last status is that of the present goal.
+        if self._fly_to:
+            self._fly_to.settle(self._pursued() | {status.goal_id})
         self.host.publish_status(status)
+        self._fly_to.take(status)
         if status.state.decided and self.config.stop_when_decided and self.active:
             self.activity = Activity.DECIDED
+
+    # -- goals of actions ---------------------------------------------------------------------
+
+    def _pursued(self) -> set[str]:
+        """Return the ids of the goals that are pursued, or wait to be."""
+        pursued = {goal.goal_id for goal in self._waiting_goals.values()}
+        if self.active and self.executive is not None:
+            pursued |= self.executive.pursued
+        return pursued
+
+    def _watch_fly_to(self) -> None:
+        """Tell the clients of actions the course of their goals after a state."""
+        self._fly_to.advance(self.stamps.now_ns, self._progress)
+        self._abort_fly_to()
+        self._fly_to.settle(self._pursued())
+
+    def _abort_fly_to(self) -> None:
+        """Give up all goals where the client of one, or its time limit, asks for it."""
+        why = self._fly_to.to_abort(self._pursued())
+        if why:
+            self.abort(why)
+
+    def _report_aborted(self, goal_id: str, message: str) -> Status:
+        """Publish that a goal of an action has been aborted, by the reason for a later goal."""
+        status = self._make_status("aborted", message, goal_id)
+        self.host.publish_status(status)
+        event = decision_event(status)
+        assert event is not None
+        self.host.report_event(event)
+        return status
+
+    def _progress(self, goal_id: str, goal: Goal, begun_ns: int) -> Progress:
+        phase, remaining = "waiting", None
+        if self.executive is not None:
+            phase, remaining = self.executive.progress(goal_id)
+        now = self.stamps.now_ns
+        elapsed, errors = (now - begun_ns) / SECOND, self._goal_errors(goal)
+        return Progress(phase, remaining, elapsed, now, self._base_pose(), errors)
+
+    def _goal_errors(self, goal: Goal) -> GoalErrors:
+        """Return the errors of the last measured state to a goal; NaN where nothing is known."""
+        pose = self._base_pose()
+        if pose is None or self.robot is None or self._decoder is None:
+            return GoalErrors()
+        try:
+            return GoalErrors.between(self.robot, pose, self._decoder.q, goal)
+        except PlanningError:  # It is refused: the robot lacks a link.
+            return GoalErrors()
+
+    def _base_pose(self) -> Array | None:
+        """Return the last measured pose (7,) of the base; None where it is not known."""
+        odom, decoder = self.states.odom, self._decoder
+        # Before the first joints, there is no shape of the robot either.
+        if odom is None or decoder is None or self.states.joints is None:
+            return None
+        try:
+            return decoder.base(odom)[0].copy()
+        except CommandError:
+            return None
+
+    def _default_tolerance(self) -> Tolerance:
+        """Return the largest errors of a reached goal that has none of its own."""
+        config = self.config
+        return Tolerance(
+            config.position_tolerance, config.attitude_tolerance, config.joint_tolerance
+        )
 
     # -- states -------------------------------------------------------------------------------
 
@@ -340,6 +470,8 @@ class Commander(ABC):
             self._answer_last_state(Stamped(stamp_ns, joints))
         elif self._is_of_robot(joints) and self.stamps.admits(stamp_ns, joints):
             self.take_joints(stamp_ns, joints)
+        if self._fly_to:
+            self._watch_fly_to()
         self._answer_time = self._clock()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
@@ -495,8 +627,8 @@ class Commander(ABC):
         """Give a goal to the executive."""
 
     @abstractmethod
-    def _abort_goal(self) -> str | None:
-        """Abort the executive's goals; return the reaction of the robot as a message."""
+    def _abort_goal(self, why: str) -> str | None:
+        """Abort the executive's goals for a reason; return the robot's reaction as a message."""
 
     @abstractmethod
     def answer(self) -> None:

@@ -164,10 +164,10 @@ class ControllerCommander(Commander):
         else:
             self.executive.refuse(message, goal_id)
 
-    def _abort_goal(self) -> str | None:
+    def _abort_goal(self, why: str) -> str | None:
         if self.executive is None:
             return None
-        self.executive.abort()
+        self.executive.abort(why)
         return "The robot holds where it is."
 
     def _react_to_change(self, change: PlantChange) -> None:

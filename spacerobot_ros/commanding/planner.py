@@ -178,6 +178,14 @@ class PlannerCommander(Commander):
         self.executive.use_robot(robot, worker)
         self._pass_on_outputs()
 
+    def _pursued(self) -> set[str]:
+        pursued = super()._pursued()
+        if self.executive is not None:
+            # A status that waits for its publication tells the end of its own goal.
+            outputs = self.executive.outputs
+            pursued |= {each.goal_id for each in outputs if isinstance(each, PlannerStatus)}
+        return pursued
+
     def _stop_executive(self) -> None:
         assert self.executive is not None
         commands = self.statistics.commands_published
@@ -246,10 +254,10 @@ class PlannerCommander(Commander):
         )
         self._publish_status(status)
 
-    def _abort_goal(self) -> str | None:
+    def _abort_goal(self, why: str) -> str | None:
         if self.executive is None:
             return None
-        message = self.executive.abort()
+        message = self.executive.abort(why)
         self._pass_on_outputs()
         return message
 

@@ -309,6 +309,11 @@ class CoordinatedController:
         """Whether the reference has reached its goal at ``time`` (s)."""
         return self.profile is not None and time - self._began >= self.profile.duration
 
+    @property
+    def reference_ends(self) -> float | None:
+        """Time at which the reference reaches its goal, s; None without a reference."""
+        return None if self.profile is None else self._began + self.profile.duration
+
     def errors(self) -> Errors:
         """Return the errors of the last command's outputs from the reference."""
         worst, error = {"position": 0.0, "attitude": 0.0, "joints": 0.0}, self.law.error.tolist()

@@ -19,7 +19,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.planning.core.goal import Goal
+from spacerobot_ros.planning.core.goal import Goal, Tolerance
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
 from spacerobot_ros.times import SECOND
 
@@ -76,7 +76,9 @@ class ControlExecutive:
         report_event: Callable[[Event], None] = lambda event: None,
     ) -> None:
         self.controller = controller
-        self._config = config
+        self._config = self._goal_config = config
+        self._goal_tolerance: Tolerance | None = None
+        """Tolerances of the present goal; None: those of the parameters."""
         self._report, self._warn, self._report_event = report, warn, report_event
         self._file = goal_file if goal_file is not None else GoalFile("", GOAL_KEYS)
         self.servicing = Servicing(config)
@@ -105,6 +107,8 @@ class ControlExecutive:
         self._goal_id = ""
         self._monitor = GoalMonitor()
         self.servicing.end()
+        self._resumes = True
+        """Whether the present goal is saved in the file of goals."""
         self._after_tasks: dict[str, IdentifiedGoal] = {}
         """The goals that are pursued after tasks."""
         self._requested: tuple[Task, ...] | None = None
@@ -120,6 +124,7 @@ class ControlExecutive:
     def configure(self, config: ControllerConfig) -> None:
         """Use other tolerances, times and gains from the next state on."""
         self._config = config
+        self._take_tolerance(self._goal_tolerance)
         self.servicing.configure(config)
         self.controller.set_gains(config.gains)
 
@@ -136,16 +141,70 @@ class ControlExecutive:
 
     # -- goals --------------------------------------------------------------------------------
 
+    @property
+    def pursued(self) -> frozenset[str]:
+        """Ids of the goals that are pursued or wait, also those whose abort is not reported yet."""
+        present = self._abort_requested or self._goal_state is ControllerState.TRACKING
+        waiting = frozenset(goal.goal_id for goal in self._pending.values())
+        return waiting | {self._goal_id} if present else waiting
+
+    def progress(self, goal_id: str) -> tuple[str, float | None]:
+        """Return the work that is done for a goal, and the predicted time until its end, s.
+
+        None: there is no prediction.
+        """
+        task, ends = self.servicing.task, self.controller.reference_ends
+        if task is not None:
+            return task.value, None
+        if goal_id != self._goal_id or self._time is None or ends is None:
+            return "waiting", None
+        return self.state.value, max(0.0, ends - self._time) + self._config.settle_time
+
     def submit(self, key: str, goal: IdentifiedGoal) -> None:
         """Accept a goal of the ``base`` or the ``end_effector``, pursued from the next state on.
 
-        The other one keeps its goal.
+        The other one keeps its goal. A goal that names an end-effector is for both, or for that.
 
         Raises
         ------
         PlanningError
             The law does not control it, or the goal's shape has another number of joints.
         """
+        parts = self._parts_of(goal) if goal.goal.end_effectors else {key: goal}
+        for part, each in parts.items():
+            self._require_controlled(part, each)
+        for part, each in parts.items():
+            self._pending.pop(part, None)
+            self._pending[part] = each
+
+    def _parts_of(self, identified: IdentifiedGoal) -> dict[str, IdentifiedGoal]:
+        """Return the goals of the base and the end-effector by their keys."""
+        law, goal = (
+            self.controller.law,
+            identified.goal.for_robot(self.controller.law.robot.description),
+        )
+        link = law.outputs.selection.end_effector_link
+        parts = {}
+        if goal.base:
+            pose = Goal(goal.position, goal.quaternion, goal.joint_positions)
+            parts[BASE_GOAL_KEY] = replace(identified, goal=pose)
+        for each in goal.end_effectors:
+            if each.link != link:
+                raise PlanningError(
+                    f"The goal is for '{each.link}', which the law '{law.name}' does not control"
+                    f"{f'; it controls {link!r}' if link else ''}."
+                )
+            if each.quaternion is None:
+                raise PlanningError(
+                    f"The goal of '{each.link}' is a position alone; the controller takes a pose: "
+                    "give it an orientation, too."
+                )
+            pose = Goal(each.position, each.quaternion, goal.joint_positions)
+            parts[END_EFFECTOR] = replace(identified, goal=pose)
+        return parts
+
+    def _require_controlled(self, key: str, goal: IdentifiedGoal) -> None:
+        """Raise PlanningError where the law does not control the goal's part of the robot."""
         law = self.controller.law
         if not getattr(law.outputs.selection, key):
             raise PlanningError(
@@ -159,8 +218,6 @@ class ControlExecutive:
                 f"The goal has a shape of {len(shape)} joints; robot "
                 f"'{law.robot.description.name}' has {n}."
             )
-        self._pending.pop(key, None)
-        self._pending[key] = goal
 
     def request(self, task: Task) -> None:
         """Do a task from the next measured state on, without a goal after it."""
@@ -188,9 +245,9 @@ class ControlExecutive:
                 f"Parameter 'resume_file' holds goals of another robot or law: {error}"
             ) from error
 
-    def abort(self) -> None:
+    def abort(self, why: str = "on request") -> None:
         """Give up every goal; the robot holds the pose of the next measured state."""
-        self._give_up("Aborted on request; the robot holds.")
+        self._give_up(f"Aborted {why}; the robot holds.")
         self._abort_requested = True
 
     def plant_stopped(
@@ -344,7 +401,7 @@ class ControlExecutive:
         if self.controller.mode is Mode.MEASURED and pursued:
             at_rest = self.controller.reference_at_rest(time)
             errors = self.controller.errors()
-            decision = self._monitor.decide_by_errors(time, at_rest, errors, self._config)
+            decision = self._monitor.decide_by_errors(time, at_rest, errors, self._goal_config)
             if decision != Decision.NONE:
                 self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
                 self._file.delete()
@@ -469,6 +526,8 @@ class ControlExecutive:
         self._goal_id = self._latest_id()
         self._after_tasks = dict(self._pending) if carried else {}
         goals = {key: pending.goal for key, pending in self._pending.items()}
+        self._resumes = all(pending.resumes for pending in self._pending.values())
+        self._take_tolerance(next(reversed(self._pending.values())).tolerance)
         self._pending.clear()
         poses = {key: PoseReference(goal.position, goal.quaternion) for key, goal in goals.items()}
         shapes = [g.joint_positions for g in goals.values() if g.joint_positions is not None]
@@ -489,6 +548,17 @@ class ControlExecutive:
         self._monitor.begin(time)
         self._next_report, self._error_bounds = time, None
         self._save(self._goals_to_save())
+
+    def _take_tolerance(self, tolerance: Tolerance | None) -> None:
+        """Use the tolerances of a goal instead of those of the parameters, if it has any."""
+        self._goal_tolerance, self._goal_config = tolerance, self._config
+        if tolerance is not None:
+            self._goal_config = replace(
+                self._config,
+                position_tolerance=tolerance.position,
+                attitude_tolerance=tolerance.attitude,
+                joint_tolerance=tolerance.shape,
+            )
 
     def _report_acceptance(self) -> None:
         message, goal_id = "The goal is accepted.", self._goal_id
@@ -516,7 +586,9 @@ class ControlExecutive:
             shape = self.controller.wheels.shape(shape)
         poses = {BASE_GOAL_KEY: goal.base, END_EFFECTOR: goal.end_effector}
         return {
-            key: IdentifiedGoal(Goal(pose.position, pose.quaternion, shape), self._goal_id)
+            key: IdentifiedGoal(
+                Goal(pose.position, pose.quaternion, shape), self._goal_id, resumes=self._resumes
+            )
             for key, pose in poses.items()
             if pose is not None and getattr(selection, key)
         }

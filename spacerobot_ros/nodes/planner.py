@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from copy import deepcopy
 from dataclasses import replace
 from threading import Thread
 from typing import Any, ClassVar
@@ -25,7 +24,12 @@ from spacerobot_ros.messages.readers import MessageDecoder, joint_template
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.nodes.common.commander import CommanderNode
-from spacerobot_ros.nodes.common.messages import goal_markers, goal_of, path_poses, shape_of
+from spacerobot_ros.nodes.common.messages import (
+    end_effector_goal,
+    goal_markers,
+    path_poses,
+    shape_of,
+)
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
@@ -170,19 +174,11 @@ class PlannerNode(CommanderNode):
         """
         if key == BASE_GOAL_KEY:
             return super().read_goal(key, message)
-        orientation = message.pose.orientation
-        any_attitude = not any((orientation.x, orientation.y, orientation.z, orientation.w))
-        if any_attitude:
-            message = deepcopy(message)
-            message.pose.orientation.w = 1.0
         what, frame = f"The goal of the end-effector '{key}'", self.config.world_frame
-        pose = goal_of(message, frame, what, self._goal_shape(), self._pose_of)
-        aim = EndEffectorGoal(
-            "" if key == DEFAULT_END_EFFECTOR else key,
-            pose.position,
-            None if any_attitude else pose.quaternion,
-        )
-        return Goal.of_end_effectors([aim], joint_positions=pose.joint_positions)
+        aim = end_effector_goal(key, message, frame, what, self._pose_of)
+        if key == DEFAULT_END_EFFECTOR:
+            aim = replace(aim, link="")
+        return Goal.of_end_effectors([aim], joint_positions=self._goal_shape())
 
     def _goal_shape(self) -> Array | None:
         return self._shape

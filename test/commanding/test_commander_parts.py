@@ -411,9 +411,9 @@ def test_goals_are_submitted_resumed_and_aborted() -> None:
         ControllerCommander._resume_goals(made, {})
         assert made.done == [("resume", {})] * executive
         made.done.clear()
-        told = ControllerCommander._abort_goal(made)
+        told = ControllerCommander._abort_goal(made, "after a while")
         assert told == ("The robot holds where it is." if executive else None)
-        assert made.done == [("abort",)] * executive
+        assert made.done == [("abort", "after a while")] * executive
 
 
 @pytest.mark.parametrize("base", [None, "pose"])

@@ -219,7 +219,7 @@ def test_timers_that_are_destroyed_fire_no_more(monkeypatch: pytest.MonkeyPatch)
         raising=False,
     )  # fmt: skip
     node: Any = SimpleNamespace(_timers_alive={}, _fail=lambda what, error: done.append(what))
-    node._guarded = lambda call, what: FlightNode._guarded(node, call, what)
+    node.guarded = lambda call, what: FlightNode.guarded(node, call, what)
     first = FlightNode.create_timer(node, 0.25, lambda: fired.append(1))
     FlightNode.create_timer(node, 0.5, lambda: fired.append(1 // 0))
     for _, call in made:

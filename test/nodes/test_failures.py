@@ -149,7 +149,7 @@ def test_a_callback_that_was_queued_when_its_subscription_was_destroyed_is_no_fa
 ) -> None:
     node = harness.add(Fragile("fragile", context=harness.context))
     subscription = next(each for each in node.subscriptions if each.topic_name == "/joints")
-    queued = node._guarded(lambda _: subscription.handle.__enter__(), "a message on 'joints'")
+    queued = node.guarded(lambda _: subscription.handle.__enter__(), "a message on 'joints'")
     assert node.trigger_deactivate() is TransitionCallbackReturn.SUCCESS
     assert node.trigger_cleanup() is TransitionCallbackReturn.SUCCESS
     queued(None)

@@ -31,6 +31,7 @@ from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.shared_parameters import robot_from_text, robot_of
+from spacerobot_ros.nodes.common.fly_to import GoalActions, Surroundings
 from spacerobot_ros.nodes.common.messages import (
     KnownFrames,
     diagnostic_name,
@@ -76,12 +77,15 @@ class CommanderNode(FlightNode):
     """Commander of the node, created whenever the node is configured."""
 
     _statuses: Subscription | None = None
+    _goal_actions: GoalActions | None = None
+    """The doors of actions, once they are there."""
 
     # -- life ---------------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Create an inactive commander."""
+        """Create an inactive commander, and the servers of actions."""
         self.commander = self.make_commander()
+        self._goal_actions = GoalActions(self)
 
     @abstractmethod
     def make_commander(self) -> Commander:
@@ -139,6 +143,23 @@ class CommanderNode(FlightNode):
     def deactivate(self) -> None:
         """Drop all goals and stop sending commands."""
         self.commander.deactivate()
+
+    def destroy_node(self) -> None:
+        """Destroy the node with its action servers."""
+        if self._goal_actions is not None:
+            self._goal_actions.destroy()
+        super().destroy_node()
+
+    @property
+    def takes_goals(self) -> bool:
+        """Whether goals of actions are accepted or refused: the node is configured."""
+        return self._has_entities
+
+    def surroundings(self) -> Surroundings:
+        """Return the frames and joints that goals of actions are read with."""
+        robot = self.commander.robot
+        names = None if robot is None else robot.joint_names
+        return Surroundings(self.config.world_frame, names, self._pose_of)
 
     @property
     def simulated_time_s(self) -> float | None:
@@ -254,7 +275,7 @@ class CommanderNode(FlightNode):
         """Sequence number of the plant's last status; None: any number is accepted next."""
         self._doubted = False
         """Whether a status was received that another node may have published."""
-        receive = self._guarded(self._on_plant_status, "a message on 'plant/status'")
+        receive = self.guarded(self._on_plant_status, "a message on 'plant/status'")
         # The callback is guarded already, and rclpy inspects its signature.
         self._statuses = LifecycleNode.create_subscription(
             self,

@@ -26,6 +26,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.planning import BasePath, Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.times import SECOND, set_stamp
 
 _MARKER_TYPES = {
@@ -197,6 +198,30 @@ def goal_of(
         return goal
     moved = compose_poses(pose, np.concatenate([goal.position, goal.quaternion]))
     return Goal.checked(moved[:3], moved[3:], shape)
+
+
+def end_effector_goal(
+    link: str,
+    message: PoseStamped,
+    frame: str,
+    what: str,
+    pose_of: Callable[[str], Array | None] = lambda frame: None,
+) -> EndEffectorGoal:
+    """Return the goal of a link; an orientation of zeros asks for the position alone.
+
+    Raises
+    ------
+    PlanningError
+        It is no pose, or in a frame that is not known; ``what`` names it.
+    """
+    given = message.pose
+    o = given.orientation
+    any_attitude = not any((o.x, o.y, o.z, o.w))
+    if any_attitude:
+        message = PoseStamped(header=message.header)
+        message.pose.position, message.pose.orientation.w = given.position, 1.0
+    pose = goal_of(message, frame, what, None, pose_of)
+    return EndEffectorGoal(link, pose.position, None if any_attitude else pose.quaternion)
 
 
 def _pose_of_frame(

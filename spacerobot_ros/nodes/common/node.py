@@ -209,14 +209,14 @@ class FlightNode(LifecycleNode):
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
     ) -> Subscription:
         """Subscribe with a callback whose exceptions end in :meth:`on_failure`."""
-        guarded = self._guarded(callback, f"a message on '{topic}'")
+        guarded = self.guarded(callback, f"a message on '{topic}'")
         return super().create_subscription(msg_type, topic, guarded, *args, **kwargs)
 
     def create_timer(
         self, timer_period_sec: float, callback: Callable[[], Any], *args: Any, **kwargs: Any
     ) -> Timer:
         """Create a timer with a callback whose exceptions end in :meth:`on_failure`."""
-        guarded, alive = self._guarded(callback, "a timer"), [True]
+        guarded, alive = self.guarded(callback, "a timer"), [True]
 
         def fire() -> None:
             # The executor may still have a destroyed timer in its queue.
@@ -248,7 +248,9 @@ class FlightNode(LifecycleNode):
 
         return super().create_service(srv_type, srv_name, answer, *args, **kwargs)
 
-    def _guarded(self, callback: Callable[..., Any], what: str) -> Callable[..., None]:
+    def guarded(self, callback: Callable[..., Any], what: str) -> Callable[..., None]:
+        """Return a callback whose exceptions end in :meth:`on_failure`."""
+
         def guarded(*given: Any) -> None:
             try:
                 callback(*given)

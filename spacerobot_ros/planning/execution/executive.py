@@ -25,7 +25,7 @@ from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.goal import Controlled, PoseError, RobotState
+from spacerobot_ros.planning.core.goal import Controlled, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -365,10 +365,28 @@ class Executive:
             )
         return self._followers[link]
 
-    def abort(self) -> str | None:
+    @property
+    def pursued(self) -> frozenset[str]:
+        """Ids of the goals that are pursued, planned for, or wait to be."""
+        goals = (self._new_goal, self._planned_goal(), self._pursued_goal())
+        return frozenset(goal.goal_id for goal in goals if goal is not None)
+
+    def progress(self, goal_id: str) -> tuple[str, float | None]:
+        """Return the work that is done for a goal, and the time until its schedule ends, s.
+
+        None: no schedule leads to the goal yet.
+        """
+        active, planned = self._active_goal, self._planned_goal()
+        if active is not None and active.identified.goal_id == goal_id:
+            return self.phase.value, max(0.0, active.ends_at - self._stamp_ns / 1e9)
+        if planned is not None and planned.goal_id == goal_id:
+            return Phase.PLANNING.value, None
+        return Phase.MEASURING.value, None
+
+    def abort(self, why: str = "on request") -> str | None:
         """Give up all goals and come to rest.
 
-        Returns a message about the joints; None where nothing was done for any goal.
+        Returns a message about the joints; None where there is no goal.
         """
         goal_id, message = self._latest_goal_id(), "The joints rest."
         self._goal_file.delete()
@@ -380,15 +398,9 @@ class Executive:
                 self._new_goal, self._refused_twist_ns = None, self._stamp_ns
                 self._teleoperation.twist = None
                 message = "The joints brake."
-                aborted = PlannerStatus(
-                    PlannerState.TELEOPERATING, f"Aborted on request. {message}"
-                )
+                aborted = PlannerStatus(PlannerState.TELEOPERATING, f"Aborted {why}. {message}")
                 self.outputs.append(aborted)
                 return message
-            case Phase.MEASURING if self._active_goal is None:
-                self._new_goal = None
-                self._change_phase(Event.ABORTED, Phase.IDLE)
-                return None
             case Phase.MEASURING | Phase.PLANNING | Phase.EVALUATING:
                 self._change_phase(Event.ABORTED, Phase.IDLE)
             case Phase.EXECUTING | Phase.REPLANNING | Phase.TAKING_OVER | Phase.BRAKING:
@@ -398,7 +410,7 @@ class Executive:
                 self._change_phase(Event.ABORTED, Phase.BRAKING)
         self._forget_goals()
         self.outputs.append(
-            PlannerStatus(PlannerState.ABORTED, f"Aborted on request. {message}", goal_id=goal_id)
+            PlannerStatus(PlannerState.ABORTED, f"Aborted {why}. {message}", goal_id=goal_id)
         )
         return message
 
@@ -697,7 +709,7 @@ class Executive:
             return
         goal = active.identified.goal
         error = PoseError.between(state.position, state.quaternion, goal, state.q, self._robot)
-        if self.config.tolerance.admits(error, controls):
+        if self._tolerance_of(active.identified).admits(error, controls):
             message = f"The goal is reached: {describe_remaining_error(error, controls)}."
             self._add_status(PlannerState.REACHED, message, active.identified, active, error)
             self._end_goal(Event.REACHED)
@@ -820,7 +832,7 @@ class Executive:
         self._replan_ns = self._stamp_ns + round(self.config.replanning * 1e9)
         aim = self._tracker.path_check.shift_goal(
             active.identified.goal,
-            self.config.tolerance,
+            self._tolerance_of(active.identified),
             active.schedule.controls - {"shape"},
             late=active.ends_at - self._stamp_ns / 1e9 < _LATE_TIME_SHARE * active.manoeuvre_time,
         )
@@ -915,7 +927,7 @@ class Executive:
         request = PlanRequest(
             state,
             goal,
-            self.config.tolerance,
+            self._tolerance_of(job.identified),
             correction=job.reason in (PlanReason.CORRECTION, PlanReason.CONTINUATION),
             previous=None if active is None else active.schedule,
         )
@@ -1154,13 +1166,21 @@ class Executive:
 
     def _latest_goal(self) -> IdentifiedGoal | None:
         """Return the latest proposed goal that is not decided."""
-        plan = (
-            self._pending_plan.job
-            if isinstance(self._pending_plan, ReadyPlan)
-            else self._pending_plan
-        )
-        current = plan or self._active_goal
-        return self._new_goal or (None if current is None else current.identified)
+        return self._new_goal or self._planned_goal() or self._pursued_goal()
+
+    def _planned_goal(self) -> IdentifiedGoal | None:
+        """Return the goal of the requested or ready plan."""
+        plan = self._pending_plan
+        job = plan.job if isinstance(plan, ReadyPlan) else plan
+        return None if job is None else job.identified
+
+    def _pursued_goal(self) -> IdentifiedGoal | None:
+        """Return the goal that is executed or evaluated."""
+        return None if self._active_goal is None else self._active_goal.identified
+
+    def _tolerance_of(self, identified: IdentifiedGoal) -> Tolerance:
+        """Return the largest errors with which a goal is reached."""
+        return identified.tolerance or self.config.tolerance
 
     def _latest_goal_id(self) -> str:
         latest = self._latest_goal()

@@ -11,7 +11,7 @@ from typing import Any
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.files import UntrustedFileError, read_private, write_whole
-from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal, Goal
+from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal, Goal, Tolerance
 
 BASE_GOAL_KEY = "base"
 """Key of the goal of the base in the file."""
@@ -19,10 +19,25 @@ BASE_GOAL_KEY = "base"
 
 @dataclass(frozen=True)
 class IdentifiedGoal:
-    """A goal and its id in statuses; the id is empty if unknown."""
+    """A goal and its id in statuses.
+
+    Attributes
+    ----------
+    goal
+        The goal.
+    goal_id
+        Its id; empty if unknown.
+    tolerance
+        Its largest errors where it is reached; None: those of the commander's parameters.
+    resumes
+        Whether a restarted commander goes on with it. The client of an action is told that its
+        goal has ended when the commander stops, so nothing goes on.
+    """
 
     goal: Goal
     goal_id: str = ""
+    tolerance: Tolerance | None = None
+    resumes: bool = True
 
 
 class GoalIds:
@@ -61,7 +76,7 @@ class GoalFile:
         self._keys = keys
 
     def save(self, goals: Mapping[str, IdentifiedGoal]) -> None:
-        """Replace the content of the file by some goals, in one atomic step.
+        """Replace the content of the file by the goals that resume, in one atomic step.
 
         Raises
         ------
@@ -70,7 +85,11 @@ class GoalFile:
         """
         if self._path is None:
             return
-        text = json.dumps({key: _encode_goal(goal) for key, goal in goals.items()})
+        entries = {key: _encode_goal(goal) for key, goal in goals.items() if goal.resumes}
+        if not entries:
+            self.delete()
+            return
+        text = json.dumps(entries)
         try:
             # No fsync: a commander must not wait for the disk in flight.
             write_whole(self._path, text.encode(), durable=False)

@@ -1,0 +1,309 @@
+"""Goals of actions: their feedback, and which of them ends with which result; without ROS.
+
+A goal of an action is a goal like one of a topic: the commander gives it to its executive, and its
+statuses tell its course. :class:`FlyToGoals` knows which goals have a client that waits, and gives
+each exactly one result: that of the status that decides the goal.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, fields, replace
+from typing import Protocol
+
+from spacerobot_ros.commanding.goal_follower import Status
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.goal import Goal, PoseError, Tolerance
+from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.times import SECOND
+
+_NO_TOLERANCE = Tolerance(0.0, 0.0, 0.0)
+
+FEEDBACK_PERIOD_NS = SECOND // 5
+"""Shortest simulated time between two feedbacks of a goal, ns."""
+
+
+@dataclass(frozen=True)
+class FlyTo:
+    """A goal of an action.
+
+    Attributes
+    ----------
+    goal
+        Poses of the base and of end-effectors, and joint positions.
+    tolerance
+        Its largest errors; 0: that of the commander's parameters.
+    time_limit
+        Simulated time after which it is given up, s; 0: never.
+    """
+
+    goal: Goal
+    tolerance: Tolerance = _NO_TOLERANCE
+    time_limit: float = 0.0
+
+    @classmethod
+    def checked(cls, goal: Goal, tolerance: Tolerance, time_limit: float) -> FlyTo:
+        """Return the goal of an action with numbers that were received.
+
+        Raises
+        ------
+        PlanningError
+            A tolerance or the time limit is negative or not finite.
+        """
+        for name, value, unit in (
+            ("position tolerance", tolerance.position, "m"),
+            ("attitude tolerance", tolerance.attitude, "rad"),
+            ("joint tolerance", tolerance.shape, "m or rad"),
+            ("time limit", time_limit, "s"),
+        ):
+            if not 0 <= value < math.inf:
+                raise PlanningError(
+                    f"The {name} of the goal is {value:g} {unit}: give a finite number above 0, or "
+                    "0 for the parameter's."
+                )
+        return cls(goal, tolerance, time_limit)
+
+    def tolerance_or(self, default: Tolerance) -> Tolerance:
+        """Return its tolerances, where those that it leaves open are of a default."""
+        mine = self.tolerance
+        return Tolerance(
+            mine.position or default.position,
+            mine.attitude or default.attitude,
+            mine.shape or default.shape,
+        )
+
+
+@dataclass(frozen=True)
+class GoalErrors:
+    """Distance of a state from a goal; NaN for what the goal leaves open or nothing measures.
+
+    Attributes
+    ----------
+    position, attitude
+        Of the base, m and rad.
+    end_effector_position, end_effector_attitude
+        The largest of an end-effector, m and rad.
+    joints
+        The largest of a joint, m or rad.
+    """
+
+    position: float = math.nan
+    attitude: float = math.nan
+    end_effector_position: float = math.nan
+    end_effector_attitude: float = math.nan
+    joints: float = math.nan
+
+    @classmethod
+    def between(cls, robot: SpaceRobot, pose: Array, q: Array, goal: Goal) -> GoalErrors:
+        """Return the errors of a base pose (7,) and joint positions (n,) to a goal of the robot.
+
+        Raises
+        ------
+        GoalError
+            The goal is for a link that the robot does not have.
+        """
+        goal = goal.for_robot(robot.description)
+        error = PoseError.between(pose[:3], pose[3:], goal, q, robot)
+        turned = any(each.quaternion is not None for each in goal.end_effectors)
+        return cls(
+            error.distance if "position" in goal.base else math.nan,
+            error.angle if "attitude" in goal.base else math.nan,
+            error.farthest_end_effector if goal.end_effectors else math.nan,
+            error.most_turned_end_effector if turned else math.nan,
+            error.max_joint_error if goal.joint_positions is not None else math.nan,
+        )
+
+    def reported_by(self, status: Status) -> GoalErrors:
+        """Return the errors with those that a status reports in place of its own."""
+        if not isinstance(status, PlannerStatus):
+            return self
+        reported = {
+            "position": status.position_error_m,
+            "attitude": status.attitude_error_rad,
+            "end_effector_position": status.end_effector_position_error_m,
+            "end_effector_attitude": status.end_effector_attitude_error_rad,
+        }
+        # A status has an angle of zero where no attitude is asked for.
+        return replace(
+            self,
+            **{
+                name: value
+                for name, value in reported.items()
+                if value is not None and not math.isnan(getattr(self, name))
+            },
+        )
+
+    def values(self) -> dict[str, float]:
+        """Return the errors by their names."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Course of a goal, as feedback tells it.
+
+    Attributes
+    ----------
+    phase
+        The work that is done for it.
+    remaining_time
+        Predicted time until the present motion ends, s; None: there is no prediction.
+    elapsed_time
+        Time since the first state after it was sent, s.
+    stamp_ns
+        Stamp of the last state, ns.
+    pose
+        (7,) the measured pose of the base; None: not measured.
+    errors
+        Its errors.
+    """
+
+    phase: str
+    remaining_time: float | None
+    elapsed_time: float
+    stamp_ns: int
+    pose: Array | None
+    errors: GoalErrors
+
+
+@dataclass(frozen=True)
+class FlyToResult:
+    """Result of a goal: state and message of the status that decides it, and its errors."""
+
+    outcome: str
+    message: str
+    errors: GoalErrors
+
+
+class FlyToClient(Protocol):
+    """The client of one goal."""
+
+    def feedback(self, progress: Progress) -> None:
+        """Tell it the course of its goal."""
+
+    def end(self, result: FlyToResult) -> None:
+        """Tell it the result; called once, and last."""
+
+
+@dataclass
+class _Served:
+    """A goal with a client that waits for its result."""
+
+    client: FlyToClient
+    request: FlyTo | None
+    """None: it is refused."""
+    begun_ns: int | None = None
+    """Stamp of the first state after it was sent, ns."""
+    told_ns: int | None = None
+    """Stamp of the state at its last feedback, ns."""
+    give_up: str = ""
+    """Why it is to be given up; empty: it is not."""
+    aborted: bool = False
+    """Whether its abort was requested of the executive."""
+
+
+class FlyToGoals:
+    """The goals whose clients wait for a result.
+
+    Parameters
+    ----------
+    errors
+        Returns the errors of the last measured state to a goal.
+    report_aborted
+        Publishes that a goal of an id has been aborted, with a message, and returns this status.
+    """
+
+    def __init__(
+        self,
+        errors: Callable[[Goal], GoalErrors],
+        report_aborted: Callable[[str, str], Status],
+    ) -> None:
+        self._errors, self._report_aborted = errors, report_aborted
+        self._served: dict[str, _Served] = {}
+        """By goal id, in the order in which they came."""
+        self._accepted: list[str] = []
+        """Ids of the goals that were accepted and not refused, by action or by topic, in order."""
+
+    def __bool__(self) -> bool:
+        """Whether a client waits."""
+        return bool(self._served)
+
+    def begin(self, goal_id: str, client: FlyToClient, request: FlyTo | None) -> None:
+        """Serve a client from now on; ``request`` is None where its goal is refused."""
+        self._served[goal_id] = _Served(client, request)
+
+    def accepted(self, goal_id: str) -> None:
+        """Note the goal that was accepted last."""
+        self._accepted = [each for each in self._accepted if each in self._served]
+        self._accepted.append(goal_id)
+
+    def request_abort(self, goal_id: str, why: str = "on request") -> None:
+        """Have a goal given up with the next :meth:`to_abort`."""
+        served = self._served.get(goal_id)
+        if served is not None:
+            served.give_up = served.give_up or why
+
+    def to_abort(self, pursued: Collection[str]) -> str:
+        """Return why all goals are to be given up now; empty: they are not.
+
+        An abort gives up every goal. So one that is about to be replaced waits until it is
+        replaced, or until the goal that came later is refused.
+        """
+        for goal_id, served in self._served.items():
+            alone = self._accepted[-1:] == [goal_id] or set(pursued) <= {goal_id}
+            if served.give_up and not served.aborted and alone:
+                served.aborted = True
+                return served.give_up
+        return ""
+
+    def advance(self, now_ns: int, progress: Callable[[str, Goal, int], Progress]) -> None:
+        """Watch the time limits in a state of a stamp, and tell the clients the course.
+
+        ``progress`` returns the course of a goal by its id, its goal, and the stamp of its begin.
+        """
+        for goal_id, served in self._served.items():
+            if served.request is None:
+                continue
+            if served.begun_ns is None or now_ns < served.begun_ns:
+                served.begun_ns, served.told_ns = now_ns, None  # Also after a jump of time.
+            limit = served.request.time_limit
+            if limit and now_ns - served.begun_ns >= limit * SECOND:
+                self.request_abort(goal_id, f"after its time limit of {limit:g} s")
+            if served.told_ns is None or now_ns - served.told_ns >= FEEDBACK_PERIOD_NS:
+                served.told_ns = now_ns
+                served.client.feedback(progress(goal_id, served.request.goal, served.begun_ns))
+
+    def take(self, status: Status) -> None:
+        """End the goal that a status decides, if a client waits for it."""
+        if status.state.value == "refused" and status.goal_id in self._accepted:
+            self._accepted.remove(status.goal_id)
+        if status.state.decided:
+            self._end(status.goal_id, status)
+
+    def settle(self, pursued: Collection[str], why: str = "") -> None:
+        """End the goals that are pursued no more, and which no status has decided.
+
+        Parameters
+        ----------
+        pursued
+            Ids of the goals that are pursued, and of those that a status is about to decide.
+        why
+            The reason for goals that no later goal replaces.
+        """
+        for goal_id in [each for each in self._served if each not in pursued]:
+            message = why or "The goal is not pursued any more."
+            if not why and self._accepted[-1:] != [goal_id]:
+                message = f"Aborted: replaced by goal {self._accepted[-1]}."
+            self._end(goal_id, self._report_aborted(goal_id, message))
+
+    def _end(self, goal_id: str, status: Status) -> None:
+        served = self._served.pop(goal_id, None)
+        if served is None:
+            return
+        errors = GoalErrors()
+        if served.request is not None:
+            errors = self._errors(served.request.goal).reported_by(status)
+        served.client.end(FlyToResult(status.state.value, status.message, errors))

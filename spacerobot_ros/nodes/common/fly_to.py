@@ -1,0 +1,328 @@
+"""Goals as actions: the servers of a commander node, and the conversion of their messages.
+
+The types are found at run time: ``spacerobot_msgs/action/FlyTo`` of this project's own package of
+interfaces, and ``nav2_msgs/action/NavigateToPose``, each where it is installed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.clock import Clock, ClockType
+from rclpy.type_support import check_for_type_support
+
+from spacerobot_ros.commanding.fly_to import FlyTo, FlyToResult, Progress
+from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.nodes.common.messages import end_effector_goal, goal_message, goal_of, shape_of
+from spacerobot_ros.planning.core.goal import Goal, Tolerance
+from spacerobot_ros.times import SECOND
+
+_RESULT_TIMEOUT = 60
+"""Time for which a server keeps the result of a goal that has ended, s.
+
+Each kept goal makes the next ones slower.
+"""
+
+_NAV2_FAILURE = 9000
+"""NavigateToPose's error code of an unknown error, which says no more than that it has failed."""
+
+_OF_BASE = "The goal of the base"
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What the reader of a goal is told by its node.
+
+    Attributes
+    ----------
+    world_frame
+        Name of the frame of goals.
+    joint_names
+        Joints of the robot; None: there is no robot yet.
+    pose_of
+        Returns the pose (7,) of another frame in that of goals, None if it is not known.
+    """
+
+    world_frame: str
+    joint_names: Sequence[str] | None
+    pose_of: Callable[[str], Array | None]
+
+
+class GoalAction(ABC):
+    """A type of action by which goals come: its name, and the conversion of its messages.
+
+    Parameters
+    ----------
+    kind
+        Class of the type.
+    """
+
+    package: str
+    type_name: str
+    name: str
+    """Name of the server, below the node's."""
+
+    def __init__(self, kind: Any) -> None:
+        self.kind = kind
+
+    @abstractmethod
+    def read(self, request: Any, surroundings: Surroundings) -> FlyTo:
+        """Return the goal of a request.
+
+        Raises
+        ------
+        PlanningError
+            It is refused.
+        """
+
+    @abstractmethod
+    def feedback(self, progress: Progress, world_frame: str) -> Any:
+        """Return the course of a goal as a message."""
+
+    @abstractmethod
+    def result(self, result: FlyToResult) -> Any:
+        """Return a result as a message."""
+
+
+class FlyToAction(GoalAction):
+    """``spacerobot_msgs/action/FlyTo``: all that a goal may have."""
+
+    package, type_name, name = "spacerobot_msgs", "FlyTo", "~/fly_to"
+
+    def read(self, request: Any, surroundings: Surroundings) -> FlyTo:
+        """Return the goal of a request; see :meth:`GoalAction.read`."""
+        links, poses = list(request.end_effectors), list(request.end_effector_poses)
+        if len(links) != len(poses):
+            raise PlanningError(
+                f"The goal has {len(links)} end-effector(s) and {len(poses)} pose(s) for them: "
+                "give each its pose."
+            )
+        if not links and not request.base_pose:
+            raise PlanningError(
+                "The goal is empty: give it a pose of the base, or poses of end-effectors."
+            )
+        shape = None
+        if request.joint_positions.name:
+            if surroundings.joint_names is None:
+                raise PlanningError(
+                    "The goal has joint positions, and there is no robot on robot_description yet."
+                )
+            shape = shape_of(request.joint_positions, surroundings.joint_names)
+        goal, frame, pose_of = None, surroundings.world_frame, surroundings.pose_of
+        if request.base_pose:
+            goal = goal_of(request.base_pose[0], frame, _OF_BASE, shape, pose_of)
+        if links:
+            goal = Goal.of_end_effectors(
+                [
+                    end_effector_goal(
+                        link, pose, frame, f"The goal of the end-effector '{link}'", pose_of
+                    )
+                    for link, pose in zip(links, poses, strict=True)
+                ],
+                position=None if goal is None else goal.position,
+                quaternion=None if goal is None else goal.quaternion,
+                joint_positions=shape,
+            )
+        assert goal is not None
+        tolerance = Tolerance(
+            request.position_tolerance, request.attitude_tolerance, request.joint_tolerance
+        )
+        limit = request.time_limit
+        return FlyTo.checked(goal, tolerance, limit.sec + limit.nanosec / SECOND)
+
+    def feedback(self, progress: Progress, world_frame: str) -> Any:
+        """Return the course of a goal as a message."""
+        message = self.kind.Feedback(phase=progress.phase)
+        set_duration(message.remaining_time, progress.remaining_time or 0.0)
+        _set_errors(message.errors, progress.errors.values())
+        return message
+
+    def result(self, result: FlyToResult) -> Any:
+        """Return a result as a message."""
+        message = self.kind.Result(outcome=result.outcome, message=result.message)
+        _set_errors(message.errors, result.errors.values())
+        return message
+
+
+class NavigateToPoseAction(GoalAction):
+    """``nav2_msgs/action/NavigateToPose``: a pose of the base alone."""
+
+    package, type_name, name = "nav2_msgs", "NavigateToPose", "~/navigate_to_pose"
+
+    def read(self, request: Any, surroundings: Surroundings) -> FlyTo:
+        """Return the goal of a request; see :meth:`GoalAction.read`."""
+        if request.behavior_tree:
+            raise PlanningError(
+                f"The goal names the behavior tree '{request.behavior_tree}': there are none here; "
+                "leave it empty."
+            )
+        return FlyTo(
+            goal_of(
+                request.pose,
+                surroundings.world_frame,
+                _OF_BASE,
+                pose_of=surroundings.pose_of,
+            )
+        )
+
+    def feedback(self, progress: Progress, world_frame: str) -> Any:
+        """Return the course of a goal as a message."""
+        message = self.kind.Feedback()
+        if progress.pose is not None:
+            here = Goal(progress.pose[:3], progress.pose[3:])
+            message.current_pose = goal_message(here, world_frame, progress.stamp_ns)
+        set_duration(message.navigation_time, progress.elapsed_time)
+        set_duration(message.estimated_time_remaining, progress.remaining_time or 0.0)
+        distance = progress.errors.position
+        message.distance_remaining = 0.0 if math.isnan(distance) else distance
+        return message
+
+    def result(self, result: FlyToResult) -> Any:
+        """Return a result as a message; ROS 2 Humble's is empty."""
+        message = self.kind.Result()
+        if hasattr(message, "error_code"):
+            message.error_code = 0 if result.outcome == "reached" else _NAV2_FAILURE
+        if hasattr(message, "error_msg"):
+            message.error_msg = "" if result.outcome == "reached" else result.message
+        return message
+
+
+class _Server(ActionServer):
+    """An action server whose goals end when the commander decides, not when a callback returns."""
+
+    def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
+        """Run nothing: states of the plant move the goal."""
+
+    def end(self, handle: ServerGoalHandle, result: Any) -> None:
+        """Send the result of a goal in a final state to its client."""
+        response = self.action_type.Impl.GetResultService.Response()
+        response.status, response.result = handle.status, result
+        self._result_futures[bytes(handle.goal_id.uuid)].set_result(response)
+
+
+class _Client:
+    """The client of one goal of a server; a :class:`.FlyToClient`."""
+
+    def __init__(
+        self, server: _Server, handle: ServerGoalHandle, action: GoalAction, world_frame: str
+    ) -> None:
+        self._server, self._handle, self._action = server, handle, action
+        self._world_frame = world_frame
+
+    def feedback(self, progress: Progress) -> None:
+        self._handle.publish_feedback(self._action.feedback(progress, self._world_frame))
+
+    def end(self, result: FlyToResult) -> None:
+        handle = self._handle
+        if result.outcome == "reached":
+            handle.succeed()
+        elif handle.is_cancel_requested:
+            handle.canceled()
+        else:
+            handle.abort()
+        self._server.end(handle, self._action.result(result))
+
+
+class GoalActions:
+    """The action servers of a commander node, which are there as long as the node.
+
+    So a client hears the result of a goal that the node has ended while it is cleaned up.
+
+    Parameters
+    ----------
+    node
+        The node; while it is not configured, goals are rejected.
+    """
+
+    def __init__(self, node: Any) -> None:
+        self._node: Any = node
+        self._servers: list[_Server] = []
+        for kind in (FlyToAction, NavigateToPoseAction):
+            found = action_class(kind.package, kind.type_name)
+            if found is not None:
+                self._servers.append(self._serve(kind(found)))
+        if not self._servers:
+            node.get_logger().info(
+                "Goals come by topics alone: neither spacerobot_msgs nor nav2_msgs is installed, "
+                "whose actions bring them, too."
+            )
+
+    def _serve(self, action: GoalAction) -> _Server:
+        node = self._node
+
+        def on_request(_: Any) -> GoalResponse:
+            return GoalResponse.ACCEPT if node.takes_goals else GoalResponse.REJECT
+
+        def on_goal(handle: ServerGoalHandle) -> None:
+            handle.execute()
+            surroundings = node.surroundings()
+            node.commander.receive_fly_to(
+                _goal_id(handle),
+                lambda: action.read(handle.request, surroundings),
+                _Client(server, handle, action, surroundings.world_frame),
+            )
+
+        def on_cancel(handle: ServerGoalHandle) -> CancelResponse:
+            # The state of the goal changes after this callback, before its result may come.
+            self._later(lambda: node.commander.cancel_fly_to(_goal_id(handle)))
+            return CancelResponse.ACCEPT
+
+        server = _Server(
+            node,
+            action.kind,
+            action.name,
+            lambda handle: None,
+            goal_callback=on_request,
+            handle_accepted_callback=node.guarded(on_goal, f"a goal of '{action.name}'"),
+            cancel_callback=on_cancel,
+            result_timeout=_RESULT_TIMEOUT,
+        )
+        return server
+
+    def _later(self, act: Callable[[], None]) -> None:
+        """Call a function once from the executor."""
+
+        def once() -> None:
+            self._node.destroy_timer(timer)
+            act()
+
+        timer = self._node.create_timer(0.0, once, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def destroy(self) -> None:
+        """Destroy the servers, with the node."""
+        servers, self._servers = self._servers, []
+        for server in servers:
+            server.destroy()
+
+
+def _goal_id(handle: ServerGoalHandle) -> str:
+    """Return the id of a goal in statuses, as `ros2 action` prints it."""
+    return bytes(handle.goal_id.uuid).hex()
+
+
+def action_class(package: str, name: str) -> Any | None:
+    """Return the class of an action; None if its package is not installed whole."""
+    try:
+        kind = getattr(importlib.import_module(f"{package}.action"), name)
+        check_for_type_support(kind)
+    except Exception:  # Several kinds tell that it, or its libraries, are not on the paths.
+        return None
+    return kind
+
+
+def set_duration(message: Any, seconds: float) -> None:
+    """Set a builtin_interfaces/Duration."""
+    message.sec, message.nanosec = divmod(round(seconds * SECOND), SECOND)
+
+
+def _set_errors(message: Any, errors: Mapping[str, float]) -> None:
+    for name, value in errors.items():
+        setattr(message, name, float(value))
