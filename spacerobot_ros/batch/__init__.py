@@ -12,6 +12,7 @@ from spacerobot_ros.batch.flights import (
 )
 from spacerobot_ros.batch.lanes import fly_lanes
 from spacerobot_ros.batch.scalar import fly_one_by_one
+from spacerobot_ros.batch.stepping import SteppedFlights
 from spacerobot_ros.control.goal_monitor import Decision
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "HeldCommands",
     "SensorErrors",
     "Starts",
+    "SteppedFlights",
     "fly_lanes",
     "fly_one_by_one",
 ]

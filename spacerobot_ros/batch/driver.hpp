@@ -92,6 +92,7 @@ static void measure(const Job &job, long long g, long long tick, V *group) {
 }
 
 static void command(const Job &job, long long g, long long tick, V *group) {
+  if (job.program == program::GIVEN) return;
   V *to = group + row::command;
   if (job.program == program::HELD) {
     for (long long j = 0; j < COMMANDS; ++j)

@@ -23,7 +23,7 @@ from spacerobot_ros.batch.flights import (
     SensorErrors,
 )
 from spacerobot_ros.batch.native import CompiledTick, Job, Pending, Program
-from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of
+from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of, pose_of_link
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.reference import ReferenceProfile
 from spacerobot_ros.control.state import ControlState
@@ -77,25 +77,30 @@ def _fly_in_lanes(flights: Flights) -> BatchResult:
     NoLibraryError
         The tick cannot be compiled for them here.
     """
-    inertial = flights.inertial
-    if inertial is None:
-        inertial = flights.robot.inertial.scaled(np.ones((len(flights), 1)))
-    model, p = flights.robot.symbolic_model(inertial)
+    model, p = symbolic_model_of(flights)
     tick = CompiledTick.of(flights, model)
-    fit = _regular_starts(flights)
+    fit = regular_starts(flights)
     # The scalar plant gives the message about each irregular start.
     result = fly_one_by_one(flights, np.flatnonzero(~fit).tolist())
     failures = dict(result.failures)
     rows = np.flatnonzero(fit)
     size = _block_size(flights, tick)
     for first in range(0, len(rows), size):
-        block = _Block(flights, tick, model, p, rows[first : first + size])
+        block = Block(flights, tick, model, p, rows[first : first + size])
         block.fly(result, failures)
     engine = f"{tick.unit.lanes} lanes ({tick.unit.name})"
     return replace(result, engine=engine, failures=failures)
 
 
-def _regular_starts(flights: Flights) -> Flags:
+def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
+    """Return the model of the robot and its arguments ``p`` (N, ...), the masses of the flights."""
+    inertial = flights.inertial
+    if inertial is None:
+        inertial = flights.robot.inertial.scaled(np.ones((len(flights), 1)))
+    return flights.robot.symbolic_model(inertial)
+
+
+def regular_starts(flights: Flights) -> Flags:
     """Return which flights (N,) start in a state that the plant accepts."""
     starts, robot = flights.starts, flights.robot
     fit = np.isfinite(starts.position).all(axis=1) & np.isfinite(starts.momenta).all(axis=1)
@@ -125,7 +130,7 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
     return int(groups * lanes)
 
 
-class _Block:
+class Block:
     """Memory of the flights that are in lanes at the same time.
 
     Surplus lanes repeat the last flight; their results are dropped.
@@ -138,7 +143,8 @@ class _Block:
         self._lanes, self._rows = tick.unit.lanes, tick.rows
         self._groups = -(-len(rows) // self._lanes)
         count = self._groups * self._lanes
-        self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], count - len(rows))])
+        self._surplus = count - len(rows)
+        self._rows_of_lanes = np.concatenate([rows, np.repeat(rows[-1:], self._surplus)])
         self._modulator = None
         if flights.thrusters is not None:
             self._modulator = ThrusterModulator(flights.thrusters, flights.control_period)
@@ -146,7 +152,6 @@ class _Block:
         self._memory[:, self._rows["alive"]] = 1.0
         self._memory[:, self._rows["decided_state"]] = np.nan
         self._memory[:, self._rows["end_state"]] = np.nan
-        self._write_rows("p", p[self._rows_of_lanes])
         self._noise = SensorNoise(flights, self._rows_of_lanes)
         self._stopped: dict[int, EffortPlant] = {}
         """Scalar plants of flights that have touched a stop, by their lane in the block."""
@@ -154,41 +159,54 @@ class _Block:
         """Ticks at which flights failed, by their lane in the block."""
         self._profiles: dict[int, ReferenceProfile] = {}
         """Reference profiles of flights with a controller, by their lane in the block."""
-        self._write_starts(model, p)
+        self._write_starts(model, p[self._rows_of_lanes])
+        self._write_errors_and_gains()
         self._at = np.zeros(self._groups, np.int64)
         self._pending = np.zeros(self._groups, np.uint8)
-        width = self._rows.size("end_state")
+        width = tick.report_width
         self._reports = _aligned_array((self._groups, len(flights.instants), width, self._lanes))
         self._job, self._referenced = self._prepare_job()
 
-    def _write_rows(self, name: str, values: Array) -> None:
-        """Write rows (flights of the block, size) of a name."""
-        part = values.reshape(self._groups, self._lanes, -1)
-        self._memory[:, self._rows[name]] = np.swapaxes(part, 1, 2)
+    def _write_rows(self, name: str, values: Array, lanes: Counts | None = None) -> None:
+        """Write rows of a name: (flights of the block, size), or those of some lanes alone."""
+        if lanes is None:
+            part = values.reshape(self._groups, self._lanes, -1)
+            self._memory[:, self._rows[name]] = np.swapaxes(part, 1, 2)
+            return
+        group, lane = np.divmod(lanes[:, np.newaxis], self._lanes)
+        rows = np.arange(self._rows.count)[self._rows[name]]
+        self._memory[group, rows, lane] = values
 
     def _read_rows(self, name: str) -> Array:
         """Return rows (flights of the block, size) of a name."""
         part = np.swapaxes(self._memory[:, self._rows[name]], 1, 2)
         return part.reshape(len(self._rows_of_lanes), -1)
 
-    def _write_starts(self, model: ModelFunctions, p: Array) -> None:
-        """Write the initial states, biases and gains of the flights."""
+    def _write_starts(self, model: ModelFunctions, p: Array, lanes: Counts | None = None) -> None:
+        """Write masses ``p`` and initial states of the flights in all lanes, or in some."""
         starts, at = self._flights.starts, self._rows_of_lanes
+        if lanes is not None:
+            at = at[lanes]
+        self._write_rows("p", p, lanes)
         quaternion = starts.quaternion[at]
         quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
         q, r = starts.q[at], starts.position[at]
-        centers = model.function("center_of_mass", compile=False)(q.T, p[at].T).full().T
+        centers = model.function("center_of_mass", compile=False)(q.T, p.T).full().T
         of_base = r + _rotate_vectors(quaternion, centers)
         r_cm = np.where(starts.of_center[at][:, None], r, of_base)
         if self._flights.actuation == "velocity":
             state = np.concatenate([q, quaternion], axis=1)
-            self._write_rows("momenta", starts.momenta[at])
-            self._write_rows("r_cm", r_cm)
+            self._write_rows("momenta", starts.momenta[at], lanes)
+            self._write_rows("r_cm", r_cm, lanes)
         else:
             state = np.concatenate(
                 [q, quaternion, starts.qdot[at], starts.momenta[at], r_cm], axis=1
             )
-        self._write_rows("state", state)
+        self._write_rows("state", state, lanes)
+
+    def _write_errors_and_gains(self) -> None:
+        """Write the biases of sensors and the gains of the flights."""
+        at = self._rows_of_lanes
         if self._flights.sensors is not None:
             self._write_rows("joint_bias", self._flights.sensors.joint_bias[at])
             self._write_rows("joint_noise", self._flights.sensors.noise[at, 4:5])
@@ -205,13 +223,14 @@ class _Block:
     def _prepare_job(self) -> tuple[Job, list[npt.NDArray[np.generic]]]:
         """Return the driver's job, and the arrays that it points to."""
         flights, program, table = self._flights, self._flights.program, self._command_table()
+        self._instants = np.array(flights.instants, dtype=np.int64)
         each_table = table.ndim == 4
         arrays: dict[str, npt.NDArray[np.generic]] = {
             "memory": self._memory,
             "at": self._at,
             "pending": self._pending,
             "table": table,
-            "instants": np.array(flights.instants, dtype=np.int64),
+            "instants": self._instants,
             "reports": self._reports,
         }
         if self._modulator is not None:
@@ -294,6 +313,68 @@ class _Block:
         if self._tick.controller is not None:
             library.end_flights(job)
         self._write_results(result)
+
+    # -- stepping -----------------------------------------------------------------------------
+
+    def begin_stepping(self) -> None:
+        """Prepare for :meth:`restart` and :meth:`step`: surplus lanes are idle."""
+        self._job.program = Program.GIVEN
+        count = len(self._flown)
+        self.idle(np.arange(count, count + self._surplus))
+        self._write_rows("h", np.full(len(self._rows_of_lanes), self._flights.control_period))
+
+    def continue_from(self, other: Block) -> None:
+        """Take over the states of a block of the same flights, whose model has other masses."""
+        for name in ("state", "before", "momenta", "r_cm", "alive"):
+            if name in self._rows.slices:
+                self._write_rows(name, other._read_rows(name))
+
+    def restart(self, model: ModelFunctions, p: Array, lanes: Counts) -> Array:
+        """Begin the flights of some lanes anew, and return their reports (lanes, width).
+
+        ``p`` are their masses as arguments of the model.
+        """
+        self._write_starts(model, p, lanes)
+        width = self._rows.size("command")
+        self._write_rows("command", np.zeros((len(lanes), width)), lanes)
+        if self._flights.actuation == "velocity":
+            self._write_rows("before", np.zeros((len(lanes), self._flights.robot.n)), lanes)
+        # A tick of no duration reports the start; other lanes of a group are not changed by it.
+        self._write_rows("h", np.zeros((len(lanes), 1)), lanes)
+        self._write_rows("alive", np.ones((len(lanes), 1)), lanes)
+        job, memory, reports = self._job, self._memory, self._reports
+        self._instants[0] = 0
+        groups, job.groups = job.groups, 1
+        for group in np.unique(lanes // self._lanes):
+            job.memory, job.reports = memory[group].ctypes.data, reports[group].ctypes.data
+            self._tick.library.start_flights(job)
+        job.memory, job.reports, job.groups = memory.ctypes.data, reports.ctypes.data, groups
+        self._write_rows("h", np.full((len(lanes), 1), self._flights.control_period), lanes)
+        for lane in lanes.tolist():
+            self._stopped.pop(lane, None)
+        return reports[lanes // self._lanes, 0, :, lanes % self._lanes]
+
+    def idle(self, lanes: Counts) -> None:
+        """End the flights of some lanes; a group whose lanes are all idle costs nothing."""
+        self._write_rows("alive", np.zeros((len(lanes), 1)), lanes)
+
+    def step(
+        self, commands: Array, ticks: int, result: BatchResult, failures: dict[int, str]
+    ) -> Array:
+        """Fly some ticks under given commands, and return the reports (flights, width).
+
+        ``commands`` (flights, width) are held. Flights that fail end with a message in
+        ``failures``.
+        """
+        count = len(self._flown)
+        if self._surplus:
+            commands = np.concatenate([commands, np.repeat(commands[-1:], self._surplus, axis=0)])
+        self._write_rows("command", commands)
+        self._at[:], self._instants[0] = 0, ticks
+        while self._tick.library.fly_until(self._job, ticks):
+            self._step_outside_lanes(result, failures)
+        reports = np.moveaxis(self._reports[:, 0], 2, 1)
+        return reports.reshape(-1, self._reports.shape[2])[:count]
 
     def _end_flight(self, index: int, tick: int, message: str, failures: dict[int, str]) -> None:
         """End the flight of a lane that fails at a tick."""
@@ -385,6 +466,8 @@ class _Block:
         memory["next_state"][:] = plant.state
         memory["pose"][:], memory["twist"][:] = plant.pose, plant.twist
         memory["momentum"][:], memory["limited"][1 + n] = plant.momentum, 0.0
+        if self._tick.link:
+            memory["link_pose"][:] = pose_of_link(plant, self._tick.link)
         if index < len(self._flown):
             result.limited["stroke"][row] += plant.stroke_limited - before
 

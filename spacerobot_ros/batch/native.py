@@ -85,11 +85,12 @@ def vector_unit() -> VectorUnit:
 
 
 class Program(IntEnum):
-    """Kind of commands: held, along a schedule, or of a controller."""
+    """Kind of commands: held, along a schedule, of a controller, or given before each step."""
 
     HELD = 0
     FOLLOWED = 1
     CONTROLLED = 2
+    GIVEN = 3
 
 
 class Pending(IntEnum):
@@ -182,6 +183,10 @@ class CompiledTick:
         Vector registers that they use.
     rows
         Memory of a group.
+    report_width
+        Numbers of a report.
+    link
+        Link whose pose in B is reported after the rest; empty: none.
     controller
         Source of the commands; None: tables.
     """
@@ -189,11 +194,16 @@ class CompiledTick:
     library: Any
     unit: VectorUnit
     rows: Rows
+    report_width: int
+    link: str = ""
     controller: BatchController | None = None
 
     @classmethod
-    def of(cls, flights: Flights, model: ModelFunctions) -> CompiledTick:
+    def of(cls, flights: Flights, model: ModelFunctions, link: str = "") -> CompiledTick:
         """Compile the tick of flights, or return it from an earlier compilation.
+
+        With ``link``, reports end with the pose in B of that link: the rotation by columns (9) and
+        the position (3), m.
 
         Raises
         ------
@@ -203,7 +213,7 @@ class CompiledTick:
             The law cannot drive the selected outputs, or cannot be flown in lanes.
         """
         key: tuple[Any, ...] = (cls, flights.actuation, flights.substeps)
-        key = (*key, vector_unit(), compilation_settings())
+        key = (*key, link, vector_unit(), compilation_settings())
         program = flights.program
         if isinstance(program, Controlled):
             # The function has all parameters as constants, except the gains of each flight.
@@ -213,7 +223,7 @@ class CompiledTick:
             key = (*key, believed, repr(parameters), repr(program.config.motion))
             key = (*key, flights.thruster_count)
         if key not in model.derived:
-            model.derived[key] = cls._compile(flights, model)
+            model.derived[key] = cls._compile(flights, model, link)
         compiled: CompiledTick = model.derived[key]
         if compiled.controller is not None and isinstance(program, Controlled):
             controller = BatchController(program, compiled.controller.controller)
@@ -221,7 +231,7 @@ class CompiledTick:
         return compiled
 
     @classmethod
-    def _compile(cls, flights: Flights, model: ModelFunctions) -> CompiledTick:
+    def _compile(cls, flights: Flights, model: ModelFunctions, link: str) -> CompiledTick:
         effort, robot = flights.actuation == "effort", flights.robot
         names, n = _TICKS[flights.actuation], robot.n
         make = (effort_plant if effort else velocity_plant).tick_function
@@ -230,6 +240,13 @@ class CompiledTick:
         outputs = dict(zip(names.outputs, whole.call(inputs, True, False), strict=True))
         # Reports need all results except the poses of links.
         reported = tuple(name for name in names.outputs if not name.startswith("link"))
+        poses: dict[str, int] = {}
+        if link:
+            index = robot.link_names.index(link)
+            R, r = outputs["link_R"], outputs["link_r"]
+            R, r = R[:, 3 * index : 3 * index + 3], ca.reshape(r, 3, -1)[:, index]
+            outputs["link_pose"] = ca.densify(ca.vertcat(ca.vec(R), r))
+            reported, poses = (*reported, "link_pose"), {"link_pose": 12}
         arguments = {"FLIGHT": (*names.inputs, "p"), "REPORT": (*names.inputs, "p")}
         results = {"FLIGHT": names.flight, "REPORT": reported}
         functions = {
@@ -241,6 +258,7 @@ class CompiledTick:
         sizes = {
             **{name: whole.nnz_in(i) for i, name in enumerate(arguments["FLIGHT"])},
             **{name: whole.nnz_out(i) for i, name in enumerate(names.outputs)},
+            **poses,
         }
         controller, count = None, flights.thruster_count
         if isinstance(flights.program, Controlled):
@@ -280,7 +298,7 @@ class CompiledTick:
         efforts = rows.first("realised" if effort else "effort")
         peaks = [(rates, rows.first("peak_rate"), n), (efforts, rows.first("peak_effort"), n)]
         report, width = [(state, 0, n), (rates, n, n)], 2 * n
-        for name in ("pose", "twist", "momentum"):
+        for name in ("pose", "twist", "momentum", *poses):
             report.append((rows.first(name), width, rows.size(name)))
             width += rows.size(name)
         spans = {
@@ -301,7 +319,7 @@ class CompiledTick:
             constants["EXPECTED_ROW"] = state + 2 * n + 4
         declarations, unit = _declare_shared(rows, constants, arrays, spans), vector_unit()
         library = _load_library(functions, declarations, unit, count)
-        return cls(library, unit, rows, controller)
+        return cls(library, unit, rows, width, link, controller)
 
 
 @dataclass(frozen=True)

@@ -62,6 +62,13 @@ def plant_of(flights: Flights, row: int) -> Plant:
     )
 
 
+def pose_of_link(plant: Plant, link: str) -> Array:
+    """Return the pose in B of a link of a plant: rotation by columns (9), position (3), m."""
+    index = plant.robot.link_names.index(link)
+    R = plant.link_R[:, 3 * index : 3 * index + 3]
+    return np.concatenate([R.ravel(order="F"), plant.link_r.reshape((3, -1), order="F")[:, index]])
+
+
 def _fly_row(
     flights: Flights, row: int, result: BatchResult, controller: BatchController | None
 ) -> None:

@@ -83,7 +83,7 @@ class InertialParameters:
             np.stack([one.inertias for one in each]),
         )
 
-    def __getitem__(self, index: int | slice | Array) -> InertialParameters:
+    def __getitem__(self, index: int | slice | Array | npt.NDArray[np.int64]) -> InertialParameters:
         """Return the parameters of some robots of a batch."""
         return InertialParameters(self.masses[index], self.centers[index], self.inertias[index])
 

@@ -128,8 +128,10 @@ def block_of(
         rows=Rows({**SIZES, **state, "p": p.shape[1], **sizes}),
         controller=controller,
         library=library or Library(),
+        report_width=2 * N + 20,
+        link="",
     )
-    return lanes._Block(flights, cast(Any, tick), model, p, np.array(rows))
+    return lanes.Block(flights, cast(Any, tick), model, p, np.array(rows))
 
 
 def held(actuation: str = "effort") -> HeldCommands:
@@ -562,7 +564,7 @@ def test_starts_that_the_plant_would_refuse_are_left_to_it() -> None:
         starts[name][row] = value
     robot = SimpleNamespace(lower=lower, upper=upper)
     flights: Any = SimpleNamespace(starts=SimpleNamespace(**starts), robot=robot)
-    assert lanes._regular_starts(flights).tolist() == [fit for _, _, fit in cases]
+    assert lanes.regular_starts(flights).tolist() == [fit for _, _, fit in cases]
 
 
 @pytest.mark.parametrize(

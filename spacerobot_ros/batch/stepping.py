@@ -1,0 +1,365 @@
+"""Flights that a caller advances tick by tick, each with a start, a time and an end of its own.
+
+:class:`SteppedFlights` is the plant of many flights at once: a policy, or any other source of
+commands, looks at the states and gives the next commands. The step is that of the plant, in SIMD
+lanes or, without them, in one plant for each flight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.batch.flights import BatchResult, Counts, Flights, HeldCommands, Starts
+from spacerobot_ros.batch.lanes import Block, regular_starts, symbolic_model_of
+from spacerobot_ros.batch.native import CompiledTick
+from spacerobot_ros.batch.scalar import plant_of, pose_of_link
+from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
+from spacerobot_ros.files import warn_once
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import NoLibraryError
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.simulation.actuators import PLANTS
+from spacerobot_ros.simulation.plant import Plant
+
+Flags = npt.NDArray[np.bool_]
+
+LINK_POSE_SIZE = 12
+"""Numbers of a link's pose: rotation by columns and position."""
+
+
+class SteppedFlights:
+    """N flights of one robot, advanced together by ticks under commands that are given.
+
+    After :meth:`reset` and :meth:`step`, the attributes have the states of the flights:
+
+    ``pose``
+        (N, 7) position ``r_WB`` (m) and quaternion ``R_WB`` (x, y, z, w) of the base.
+    ``twist``
+        (N, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s).
+    ``q``, ``qdot``
+        (N, n) joint positions (m or rad) and velocities (a second).
+    ``momentum``
+        (N, 7) linear (kg m/s) and angular momentum about the centre of mass (kg m^2/s), both in
+        W, and kinetic energy (J).
+    ``link_R``, ``link_r``
+        (N, 3, 3) and (N, 3): pose in B of the link ``link``; empty arrays without one.
+    ``ticks``
+        (N,) ticks since the last reset of each flight.
+    ``alive``
+        (N,) whether the flight is under way: it has neither failed nor been ended.
+    ``failures``
+        The messages of flights that failed since their last reset, by row.
+
+    The state of a flight that is not alive stays that of its last tick.
+
+    Parameters
+    ----------
+    robot, actuation, control_period, starts, inertial, integration_step
+        See :class:`.Flights`; all flights begin at the starts.
+    link
+        Link whose pose is wanted; empty: none.
+    in_lanes
+        Whether the flights are in SIMD lanes; where these cannot be compiled, or if this is false,
+        each flight has a plant. Both give the same states to rounding.
+
+    Raises
+    ------
+    ParameterError
+        Some values do not match, there is no such link, or a start is refused.
+    RobotDescriptionError
+        A mass or an inertia is not physical.
+    """
+
+    pose: Array
+    twist: Array
+    q: Array
+    qdot: Array
+    momentum: Array
+    link_R: Array
+    link_r: Array
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        actuation: str,
+        control_period: float,
+        starts: Starts,
+        inertial: InertialParameters | None = None,
+        *,
+        integration_step: float = 0.0,
+        link: str = "",
+        in_lanes: bool = True,
+    ) -> None:
+        if link and link not in robot.link_names:
+            raise ParameterError(
+                f"Robot '{robot.description.name}' has no link '{link}'; it has: "
+                f"{', '.join(robot.link_names)}."
+            )
+        count = len(starts)
+        if inertial is None:
+            inertial = robot.inertial.scaled(np.ones((count, 1)))
+        # Rows are replaced at resets: the arrays are copies.
+        self._flights = Flights(
+            *(robot, actuation, control_period, 1),
+            Starts(*(getattr(starts, each.name).copy() for each in fields(starts))),
+            HeldCommands(np.zeros((1, robot.n))),
+            InertialParameters(
+                inertial.masses.copy(), inertial.centers.copy(), inertial.inertias.copy()
+            ),
+            integration_step=integration_step,
+        )
+        self.robot, self.control_period, self._link = robot, control_period, link
+        self.command_size = robot.n + (6 if PLANTS[actuation].wrench else 0)
+        """Numbers of a command: n joint velocities, or n efforts and a wrench (6) on the base."""
+        self.ticks = np.zeros(count, dtype=np.int64)
+        self.alive = np.ones(count, dtype=np.bool_)
+        self.failures: dict[int, str] = {}
+        self._engine = self._choose_engine() if in_lanes else _Plants(self._flights, link)
+        width = 2 * robot.n + 20 + (LINK_POSE_SIZE if link else 0)
+        self._reports = np.zeros((count, width))
+        self._attach_reports()
+        self._begin(np.arange(count))
+
+    def __len__(self) -> int:
+        return len(self.ticks)
+
+    @property
+    def engine(self) -> str:
+        """Name of the engine: lanes with their registers, or ``scalar``."""
+        return self._engine.name
+
+    @property
+    def time(self) -> Array:
+        """(N,) simulated time since the last reset of each flight, s."""
+        return np.asarray(self.ticks * self.control_period)
+
+    def reset(
+        self, rows: npt.ArrayLike, starts: Starts, inertial: InertialParameters | None = None
+    ) -> None:
+        """Begin some flights anew; the others are not changed.
+
+        Parameters
+        ----------
+        rows
+            (K,) numbers of the flights.
+        starts
+            Initial states, K rows.
+        inertial
+            Masses, centres and inertias, (K, ...); None: those that the flights have.
+
+        Raises
+        ------
+        ParameterError
+            The numbers of rows differ, or a start is refused.
+        RobotDescriptionError
+            A mass or an inertia is not physical.
+        """
+        chosen = np.atleast_1d(np.asarray(rows, dtype=np.int64))
+        if len(starts) != len(chosen) or (
+            inertial is not None and len(inertial.masses) != len(chosen)
+        ):
+            raise ParameterError(
+                f"{len(chosen)} flights are reset to {len(starts)} starts"
+                + ("." if inertial is None else f" with {len(inertial.masses)} rows of masses.")
+            )
+        of_others = self._flights.starts, self._flights.inertial
+        assert of_others[1] is not None
+        # Checked as rows of their own: what is refused changes no flight.
+        masses = of_others[1][chosen] if inertial is None else inertial
+        self._require_regular(replace(self._flights, starts=starts, inertial=masses))
+        for each in fields(starts):
+            getattr(of_others[0], each.name)[chosen] = getattr(starts, each.name)
+        if inertial is not None:
+            for part in fields(inertial):
+                getattr(of_others[1], part.name)[chosen] = getattr(inertial, part.name)
+        self._begin(chosen)
+
+    def end(self, rows: npt.ArrayLike) -> None:
+        """End some flights: they are not stepped until they are reset."""
+        chosen = np.atleast_1d(np.asarray(rows, dtype=np.int64))
+        self.alive[chosen] = False
+        self._engine.end(chosen)
+
+    def step(self, commands: Array, ticks: int = 1) -> None:
+        """Advance all flights that are alive by some ticks, under commands that are held.
+
+        Parameters
+        ----------
+        commands
+            (N, command_size) joint velocities, or efforts and a wrench on the base: force (N) over
+            torque (N m) at the origin of the base link, base components. Limits clip them.
+        ticks
+            Number of ticks.
+
+        Raises
+        ------
+        ParameterError
+            The shape of the commands is wrong, or there are no ticks.
+        CommandError
+            A command of a flight that is alive is not finite; no flight is stepped.
+        """
+        if np.shape(commands) != (len(self), self.command_size):
+            raise ParameterError(
+                f"The commands are {np.shape(commands)}, not ({len(self)}, {self.command_size})."
+            )
+        if ticks < 1:
+            raise ParameterError(f"A step of {ticks} ticks is too short; it needs one.")
+        bad = np.flatnonzero(self.alive & ~np.isfinite(commands).all(axis=1))
+        if bad.size:
+            raise CommandError(f"The command of flight {bad[0]} is not finite.")
+        before = self.alive.copy()
+        failed: dict[int, str] = {}
+        reports = self._engine.step(commands, ticks, failed)
+        self.failures |= failed
+        self.alive[list(failed)] = False
+        self._reports[self.alive] = reports[self.alive]
+        self.ticks[before & self.alive] += ticks
+
+    def _begin(self, rows: Counts) -> None:
+        self._reports[rows] = self._engine.start(rows)
+        self.ticks[rows], self.alive[rows] = 0, True
+        for row in rows.tolist():
+            self.failures.pop(row, None)
+
+    def _require_regular(self, flights: Flights) -> None:
+        """Refuse starts that the plant would refuse, with its message."""
+        for row in np.flatnonzero(~regular_starts(flights)).tolist():
+            plant_of(flights, row)
+
+    def _choose_engine(self) -> _Engine:
+        self._require_regular(self._flights)
+        try:
+            return _Lanes(self._flights, self._link)
+        except NoLibraryError as reason:
+            warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
+            return _Plants(self._flights, self._link)
+
+    def _attach_reports(self) -> None:
+        """Let the attributes be parts of the reports."""
+        n, count = self.robot.n, len(self)
+        ends = np.cumsum([n, n, 7, 6, 7])
+        names = ("q", "qdot", "pose", "twist", "momentum")
+        *parts, rest = np.split(self._reports, ends, axis=1)
+        for name, part in zip(names, parts, strict=True):
+            setattr(self, name, part)
+        rotation, self.link_r = rest[:, :9], rest[:, 9:]
+        self.link_R = np.swapaxes(rotation.reshape((count, 3, -1)), 1, 2)
+
+
+class _Engine(Protocol):
+    """Steps flights; reports are rows of q, qdot, pose, twist, momentum and the link's pose."""
+
+    name: str
+
+    def start(self, rows: Counts) -> Array:
+        """Begin flights at the starts of their rows, and return their reports."""
+
+    def end(self, rows: Counts) -> None:
+        """End flights."""
+
+    def step(self, commands: Array, ticks: int, failures: dict[int, str]) -> Array:
+        """Step the flights that are alive; those that fail are ended, with their messages."""
+
+
+class _Lanes:
+    """Flights in SIMD lanes, all in one block.
+
+    Raises
+    ------
+    NoLibraryError
+        The tick cannot be compiled for lanes here.
+    """
+
+    def __init__(self, flights: Flights, link: str) -> None:
+        self._flights, self._link = flights, link
+        self._result = BatchResult.empty(flights)
+        self._block = self._new_block()
+
+    def _new_block(self) -> Block:
+        flights = self._flights
+        self._model, p = symbolic_model_of(flights)
+        tick = CompiledTick.of(flights, self._model, self._link)
+        self.name = f"{tick.unit.lanes} lanes ({tick.unit.name})"
+        block = Block(flights, tick, self._model, p, np.arange(len(flights)))
+        block.begin_stepping()
+        return block
+
+    def start(self, rows: Counts) -> Array:
+        flights = self._flights
+        assert flights.inertial is not None
+        model, p = flights.robot.symbolic_model(flights.inertial[rows])
+        if model is not self._model:
+            whole, all_p = symbolic_model_of(flights)
+            if whole is not self._model:
+                # The first masses with entries that are usually zero need another model.
+                before, self._block = self._block, self._new_block()
+                self._block.continue_from(before)
+            p = all_p[rows]
+        return self._block.restart(self._model, p, rows)
+
+    def end(self, rows: Counts) -> None:
+        self._block.idle(rows)
+
+    def step(self, commands: Array, ticks: int, failures: dict[int, str]) -> Array:
+        return self._block.step(commands, ticks, self._result, failures)
+
+
+class _Plants:
+    """Flights in one plant each."""
+
+    name = "scalar"
+
+    def __init__(self, flights: Flights, link: str) -> None:
+        self._flights, self._link = flights, link
+        self._plants: dict[int, Plant] = {}
+        self._alive = np.ones(len(flights), dtype=np.bool_)
+        self._masses = [b""] * len(flights)
+
+    def start(self, rows: Counts) -> Array:
+        for row in rows.tolist():
+            self._start_plant(row)
+        self._alive[rows] = True
+        return np.array([self._report(self._plants[row]) for row in rows.tolist()])
+
+    def _start_plant(self, row: int) -> None:
+        """Return the plant of a flight to a start; other masses need another plant."""
+        flights = self._flights
+        assert flights.inertial is not None
+        masses = flights.inertial[row].vector.tobytes()
+        if row in self._plants and self._masses[row] == masses:
+            plant = self._plants[row]
+            plant.initial = flights.starts.initial_state(row)
+            plant.reset()
+        else:
+            self._plants[row], self._masses[row] = plant_of(flights, row), masses
+
+    def end(self, rows: Counts) -> None:
+        self._alive[rows] = False
+
+    def step(self, commands: Array, ticks: int, failures: dict[int, str]) -> Array:
+        reports, n = [], self._flights.robot.n
+        for row, plant in sorted(self._plants.items()):
+            parts = [commands[row, :n], commands[row, n:]][: 1 + (commands.shape[1] > n)]
+            if self._alive[row]:
+                try:
+                    self._step_plant(plant.step, parts, ticks)
+                except SpaceRobotError as error:
+                    failures[row], self._alive[row] = str(error), False
+            reports.append(self._report(plant))
+        return np.array(reports)
+
+    def _step_plant(self, step: Callable[..., bool], command: list[Array], ticks: int) -> None:
+        for _ in range(ticks):
+            step(*command)
+
+    def _report(self, plant: Plant) -> Array:
+        parts = [plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum]
+        if self._link:
+            parts.append(pose_of_link(plant, self._link))
+        return np.concatenate(parts)
