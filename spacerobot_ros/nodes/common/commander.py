@@ -23,6 +23,7 @@ from std_srvs.srv import Trigger
 
 from spacerobot_ros.commanding.commander import Commander, LogLevel
 from spacerobot_ros.commanding.goal_follower import Status
+from spacerobot_ros.commanding.line_limit import Line, LineLimit
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
@@ -85,6 +86,7 @@ class CommanderNode(FlightNode):
     def prepare(self) -> None:
         """Create an inactive commander, and the servers of actions."""
         self.commander = self.make_commander()
+        self._goal_lines = LineLimit()
         self._goal_actions = GoalActions(self)
 
     @abstractmethod
@@ -195,6 +197,14 @@ class CommanderNode(FlightNode):
             case "error":
                 logger.error(message)
 
+    def log_of_goals(self, level: LogLevel, message: str) -> None:
+        """Write a line about a goal into the log; of goals that pour in, one line a second."""
+        self._write(self._goal_lines.offer(time.monotonic(), Line(level, message)))
+
+    def _write(self, line: Line | None) -> None:
+        if line is not None:
+            self.log(line.level, line.message)
+
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of a topic of the state, or of a reference, is connected."""
         return self._inputs[topic].get_publisher_count() > 0
@@ -229,7 +239,8 @@ class CommanderNode(FlightNode):
         stamp, part = message.header.stamp, key.replace("_", "-")
         accepted = self.commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
         if accepted is not None:
-            self.log("info", goal_description(part, accepted.goal_id, message, accepted.goal))
+            line = goal_description(part, accepted.goal_id, message, accepted.goal)
+            self.log_of_goals("info", line)
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or another part of the robot.
@@ -380,6 +391,7 @@ class CommanderNode(FlightNode):
     def _process_waiting_messages(self) -> None:
         """Process waiting statuses, and a postponed state once its time is accepted."""
         assert self._statuses is not None
+        self._write(self._goal_lines.due(time.monotonic()))
         commander, handle = self.commander, self._statuses.handle
         # A busy executor may lose a callback.
         with handle:
