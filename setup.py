@@ -52,6 +52,9 @@ VIEWER = ["viser>=1.1"]
 # Many flights: workers on this machine or on others, datasets, Sobol indices.
 CAMPAIGN = ["dask", "distributed", "pandas>=2.1", "pyarrow", "SALib"]
 
+# Learning environments.
+RL = ["gymnasium>=1.1"]
+
 setup(
     name=NAME,
     version=VERSION,
@@ -119,6 +122,7 @@ setup(
         "viewer": ["meshcat", *MESHES, *VIEWER],
         "campaign": CAMPAIGN,
         "data": DATA,
+        "rl": RL,
         "docs": [*DOCS, *DATA],  # The notebook makes tables.
         "test": [
             *CAMPAIGN,
@@ -129,6 +133,7 @@ setup(
             "mcap-ros2-support",
             "meshcat",
             *MESHES,
+            *RL,
             *VIEWER,
             'mujoco>=4; python_version >= "3.11"',
             "mypy",

@@ -62,7 +62,7 @@ def pytest_collection_finish() -> None:
 
 
 OPTIONAL = {
-    *("SALib", "collada", "dask", "distributed", "mermaidx", "mkdocs", "pandas"),
+    *("SALib", "collada", "dask", "distributed", "gymnasium", "mermaidx", "mkdocs", "pandas"),
     *("pyarrow", "trimesh", "viser", "websockets", "xarray", "ziamath"),
 }
 """Packages of extras: package.xml names none of them, and the test command of colcon has none."""

@@ -20,6 +20,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("__main__", "__init__"),  # The package's own module offers parts of all layers.
         ("cli",),
         ("benchmarks",),
+        ("environments",),  # above campaigns, whose draws they start from
         ("campaign",),  # above the reports, whose style it has, and the stack, which it flies
         ("report",),
         ("session",),
@@ -165,7 +166,7 @@ def test_everything_that_is_imported_is_known_to_these_tests() -> None:
         *("ament_index_python", "casadi", "click", "lz4", "matplotlib", "mcap", "meshcat"),
         *("mujoco", "numpy", "pandas", "rosbags", "rosidl_parser", "rpyutils", "scipy"),
         *("viser", "websockets", "xacro", "xarray", "yaml", "zstandard"),
-        *("coal", "collada", "dask", "distributed", "trimesh"),
+        *("coal", "collada", "dask", "distributed", "gymnasium", "trimesh"),
     }
     others = {name.split(".")[0] for module in sources() for name in imports(module)} - known
     assert others <= needed

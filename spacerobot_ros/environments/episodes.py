@@ -1,0 +1,400 @@
+"""Episodes of N robots: starts and goals that are drawn, steps of the plant, rewards and ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.batch import SensorErrors, Starts, SteppedFlights
+from spacerobot_ros.campaign.config import Campaign, load_campaign
+from spacerobot_ros.campaign.draws import Draws, drawn_flight
+from spacerobot_ros.campaign.targets import DrawnFlight, description_of
+from spacerobot_ros.environments.tasks import (
+    TASKS,
+    Reorient,
+    RewardWeights,
+    RobotStates,
+    Task,
+    action_scale,
+    command_of,
+)
+from spacerobot_ros.errors import CommandError, ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.scenario import Scenario, scenario_or_robot
+from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
+from spacerobot_ros.simulation.plant import InitialState
+
+_MAX_DRAWS = 10_000
+"""Largest number of draws of a campaign that episodes start from."""
+
+_DEFAULT_SCENARIOS = {"reorient": "arm_attitude", "reach": "reach"}
+
+_GOALS = ("random", "scenario")
+
+Flags = npt.NDArray[np.bool_]
+Counts = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class EpisodeConfig:
+    """What episodes are about: the keyword arguments of the environments.
+
+    Attributes
+    ----------
+    task
+        ``reorient``: the joints turn the base; ``reach``: a link goes to a position.
+    scenario
+        Name or file of a scenario, or of a robot; empty: the task's own.
+    campaign
+        File of a campaign, whose draws are the starts, masses and goals; empty: none.
+    hold
+        Ticks of the plant in a step, in which the action is held.
+    time_limit
+        Simulated time after which an episode is truncated, s.
+    tolerance
+        Error within which the goal is reached, rad or m; 0: the task's own.
+    goals
+        ``random``: around the start; ``scenario``: the goal of the scenario or of the draw; empty:
+        random without a campaign.
+    spread
+        Size of random goals, rad or m; 0: the task's own.
+    link
+        Link that reaches; empty: that of the scenario, else the robot's end-effector.
+    max_force, max_torque
+        Force (N) and torque (N m) on the base of an action of one under efforts; 0: those of the
+        scenario's controller, and where it has none, actions have no wrench.
+    action_scale
+        Command of an action of ones; empty: limits of joints, force and torque.
+    reward
+        Changed weights of :class:`.RewardWeights`.
+    """
+
+    task: str
+    scenario: str = ""
+    campaign: str = ""
+    hold: int = 1
+    time_limit: float = 60.0
+    tolerance: float = 0.0
+    goals: str = ""
+    spread: float = 0.0
+    link: str = ""
+    max_force: float = 0.0
+    max_torque: float = 0.0
+    action_scale: Sequence[float] = ()
+    reward: Mapping[str, float] | None = None
+
+    @classmethod
+    def of(cls, arguments: Mapping[str, Any]) -> EpisodeConfig:
+        """Return the configuration of keyword arguments.
+
+        Raises
+        ------
+        ParameterError
+            There is no such argument, or a value is refused.
+        """
+        known = [each.name for each in fields(cls)]
+        for name in arguments:
+            if name not in known:
+                raise ParameterError(
+                    f"There is no argument '{name}' of environments; there are {', '.join(known)}."
+                )
+        return cls(**arguments)
+
+    def __post_init__(self) -> None:
+        for name, choices in (("task", tuple(TASKS)), ("goals", ("", *_GOALS))):
+            value = getattr(self, name)
+            if value not in choices:
+                raise ParameterError(
+                    f"Argument '{name}' is '{value}'; it may be {', '.join(filter(None, choices))}."
+                )
+        if self.hold < 1:
+            raise ParameterError(f"Argument 'hold' is {self.hold}; an action is held for a tick.")
+        for name in ("time_limit", "tolerance", "spread", "max_force", "max_torque"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise ParameterError(f"Argument '{name}' is {value}; it must be finite, from 0.")
+        if self.scenario and self.campaign:
+            raise ParameterError(
+                "Arguments 'scenario' and 'campaign' are both given: a campaign names its scenario."
+            )
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Start of an episode: one row of :class:`.Starts`, masses, and the scenario that it is of."""
+
+    starts: Starts
+    inertial: InertialParameters | None
+    scenario: Scenario
+
+
+class EpisodeStarts:
+    """Starts of episodes: of a scenario, or of the draws of a campaign.
+
+    Raises
+    ------
+    ParameterError
+        Scenario or campaign is refused, or has parts that environments do not have.
+    """
+
+    def __init__(self, config: EpisodeConfig) -> None:
+        self._campaign: Campaign | None = None
+        if config.campaign:
+            self._campaign = load_campaign(Path(config.campaign))
+            self.scenario = self._campaign.scenario
+            draws = Draws(self._campaign)
+            self._draws = [draws[number] for number in range(min(len(draws), _MAX_DRAWS))]
+        else:
+            self.scenario = scenario_or_robot(config.scenario or _DEFAULT_SCENARIOS[config.task])
+        self.robot = SpaceRobot(description_of(self.scenario))
+        _require_steppable(self.scenario, self.robot)
+        self.nominal = _Start(self._row(self.scenario), None, self.scenario)
+        self._made: dict[int, _Start] = {}
+
+    def _row(self, scenario: Scenario) -> Starts:
+        return Starts.of(self.robot, [InitialState.of(scenario.plant)])
+
+    def draw(self, rng: np.random.Generator) -> _Start:
+        """Return a start; that of a campaign is one of its draws at random."""
+        if self._campaign is None:
+            return self.nominal
+        number = int(rng.integers(len(self._draws)))
+        if number not in self._made:
+            common = DrawnFlight.of(self.scenario)
+            flight = drawn_flight(self._campaign, self._draws[number], common)
+            _require_steppable(flight.scenario, self.robot)
+            masses = flight.inertial or self.robot.inertial
+            self._made[number] = _Start(self._row(flight.scenario), masses, flight.scenario)
+        return self._made[number]
+
+
+def _require_steppable(scenario: Scenario, robot: SpaceRobot) -> None:
+    """Refuse what environments do not have."""
+    plant = scenario.plant
+    parts = {
+        "faults": bool(plant.faults),
+        "a target": plant.target.given,
+        "disturbances, an orbit or a table": (plant.disturbances, plant.orbit, plant.table)
+        != ((), OrbitConfig(), TableConfig()),
+        "thrusters that are on or off": bool(plant.thrusters),
+        "errors of sensors": bool(SensorErrors.of(robot, [plant.sensors]).used[0]),
+    }
+    for part, given in parts.items():
+        if given:
+            raise ParameterError(
+                f"Scenario '{scenario.name}' has {part}, which environments do not have: leave "
+                "them out by another scenario or campaign."
+            )
+
+
+class Episodes:
+    """N episodes that are stepped together.
+
+    Attributes are arrays of N rows: ``observations``, and after :meth:`step` ``rewards``,
+    ``terminations`` and ``truncations``; ``errors`` are rad or m.
+
+    Parameters
+    ----------
+    config
+        What they are about.
+    count
+        Their number N.
+    in_lanes
+        Whether the robots are in SIMD lanes, or in a plant each.
+    """
+
+    def __init__(self, config: EpisodeConfig, count: int, *, in_lanes: bool) -> None:
+        self._config, self._weights = config, RewardWeights.of(config.reward)
+        self._source = EpisodeStarts(config)
+        scenario, self.robot = self._source.scenario, self._source.robot
+        plant = scenario.plant
+        self.task: Task = TASKS[config.task](self.robot)
+        self._tolerance = config.tolerance or self.task.tolerance
+        self._spread = config.spread or self.task.spread
+        self._goals_of_scenario = (config.goals or _GOALS[bool(config.campaign)]) == "scenario"
+        self._link = self._reaching_link(scenario) if config.task == "reach" else ""
+        first = self._source.nominal.starts
+        self._flights = SteppedFlights(
+            self.robot,
+            plant.actuation,
+            plant.control_period,
+            Starts(
+                *(np.repeat(getattr(first, each.name), count, axis=0) for each in fields(first))
+            ),
+            integration_step=plant.integration_step,
+            link=self._link,
+            in_lanes=in_lanes,
+        )
+        self._scale, self.taken = self._action_scale(scenario)
+        self._goals = np.zeros((count, self.task.goal_size))
+        self._goals[:, -1] = 1.0
+        self.step_duration = config.hold * plant.control_period
+        self.rewards = np.zeros(count)
+        self.terminations = np.zeros(count, dtype=np.bool_)
+        self.truncations = np.zeros(count, dtype=np.bool_)
+        self.reached = np.zeros(count, dtype=np.bool_)
+        self._observe()
+
+    def _reaching_link(self, scenario: Scenario) -> str:
+        link = self._config.link or scenario.plant.end_effector_frame
+        link = self.robot.description.end_effector(link)
+        if not link:
+            raise ParameterError(
+                f"Robot '{self.robot.description.name}' has no end-effector that reaches: give "
+                "argument 'link'."
+            )
+        return link
+
+    def _action_scale(self, scenario: Scenario) -> tuple[Array, Counts]:
+        """Return the command of an action of ones, and the entries that actions have."""
+        config, size, actuation = self._config, self._flights.command_size, scenario.plant.actuation
+        force, torque = config.max_force, config.max_torque
+        if "coordinated_control" in scenario.commanders:
+            force = force or scenario.controller.max_force
+            torque = torque or scenario.controller.max_torque
+        if len(config.action_scale):
+            scale = np.array(config.action_scale, dtype=float)
+            if scale.shape != (size,) or not np.isfinite(scale).all():
+                raise ParameterError(
+                    f"Argument 'action_scale' has {scale.size} numbers; robot "
+                    f"'{self.robot.description.name}' takes {size} finite ones."
+                )
+        else:
+            scale = action_scale(self.robot, actuation, force, torque)
+        return scale, np.flatnonzero(scale != 0.0)
+
+    @property
+    def action_size(self) -> int:
+        """Number of entries of an action."""
+        return len(self.taken)
+
+    @property
+    def engine(self) -> str:
+        """Name of the engine that steps."""
+        return self._flights.engine
+
+    @property
+    def flights(self) -> SteppedFlights:
+        """The flights, whose states may be read."""
+        return self._flights
+
+    @property
+    def goals(self) -> Array:
+        """Goals (N, goal_size)."""
+        return self._goals
+
+    def begin(
+        self,
+        rows: Sequence[int] | Counts,
+        generators: Sequence[np.random.Generator],
+        goal: Any = None,
+    ) -> None:
+        """Begin the episodes of some rows anew, by the random generators of all rows.
+
+        ``goal`` (goal_size,) replaces the goals that are drawn.
+
+        Raises
+        ------
+        ParameterError
+            A draw or the goal is refused.
+        """
+        chosen = np.asarray(rows, dtype=np.int64)
+        drawn = [self._source.draw(generators[row]) for row in chosen.tolist()]
+        starts = Starts(
+            *(
+                np.concatenate([getattr(each.starts, part.name) for each in drawn])
+                for part in fields(Starts)
+            )
+        )
+        masses = [each.inertial for each in drawn if each.inertial is not None]
+        self._flights.reset(chosen, starts, InertialParameters.stacked(masses) if masses else None)
+        for row, each in zip(chosen.tolist(), drawn, strict=True):
+            if goal is not None:
+                self._goals[row] = self._checked_goal(goal)
+            elif self._goals_of_scenario:
+                self._goals[row] = self._goal_of(each.scenario)
+            else:
+                start = self._states(slice(row, row + 1))
+                self._goals[row] = self.task.random_goal(start, self._spread, generators[row])
+        self.terminations[chosen] = self.truncations[chosen] = False
+        self.rewards[chosen] = 0.0
+        self._observe()
+
+    def _checked_goal(self, goal: Any) -> Array:
+        values = np.asarray(goal, dtype=float)
+        if values.shape != (self.task.goal_size,) or not np.isfinite(values).all():
+            raise ParameterError(
+                f"The goal has {values.size} numbers; task '{self.task.name}' takes "
+                f"{self.task.goal_size} finite ones."
+            )
+        size = np.linalg.norm(values)
+        if isinstance(self.task, Reorient):
+            if size < 1e-3:
+                raise ParameterError("The goal is a quaternion of zeros, which is no attitude.")
+            return np.asarray(values / size)
+        return values
+
+    def _goal_of(self, scenario: Scenario) -> Array:
+        if isinstance(self.task, Reorient):
+            return scenario.goal.quaternion
+        for each in scenario.goal.end_effectors:
+            if each.link == self._link:
+                return each.position
+        if scenario.end_effector_goal is None:
+            raise ParameterError(
+                f"Scenario '{scenario.name}' has no goal of link '{self._link}': take random goals."
+            )
+        return scenario.end_effector_goal.position
+
+    def end(self, rows: Counts) -> None:
+        """End episodes: they are not stepped until they begin anew."""
+        self._flights.end(rows)
+
+    def step(self, actions: Any) -> None:
+        """Step all episodes that have not ended, for ``hold`` ticks.
+
+        ``actions`` (N, action_size) are shares of the largest command, clipped to -1 and 1.
+
+        Raises
+        ------
+        CommandError
+            The shape is wrong, or an action is not finite.
+        """
+        count, size = len(self._flights), self.action_size
+        if np.shape(actions) != (count, size):
+            raise CommandError(f"The actions are {np.shape(actions)}, not ({count}, {size}).")
+        under_way, before = self._flights.alive.copy(), self.errors
+        shares = np.asarray(actions, dtype=float)
+        self._flights.step(command_of(shares, self._scale, self.taken), self._config.hold)
+        self._observe()
+        weights, seconds = self._weights, self.step_duration
+        reached = self._flights.alive & (self.errors <= self._tolerance)
+        failed = under_way & ~self._flights.alive
+        square = np.mean(np.clip(shares, -1.0, 1.0) ** 2, axis=1)
+        reward = weights.progress * (before - self.errors)
+        reward -= seconds * (weights.time + weights.action * square)
+        reward += weights.reached * reached - weights.failed * failed
+        self.rewards = np.where(under_way, reward, 0.0)
+        self.reached = reached
+        self.terminations = reached | failed
+        late = self._flights.time > self._config.time_limit - 0.5 * seconds
+        self.truncations = self._flights.alive & late & ~reached
+
+    def _observe(self) -> None:
+        states = self._states(slice(None))
+        remaining = self.task.remaining(states, self._goals)
+        self.errors = self.task.errors(remaining)
+        self.observations = self.task.observe(states, remaining)
+
+    def _states(self, rows: slice) -> RobotStates:
+        flights = self._flights
+        link_r = flights.link_r[rows] if self._link else None
+        pose, twist = flights.pose[rows], flights.twist[rows]
+        return RobotStates(pose, twist, flights.q[rows], flights.qdot[rows], link_r)

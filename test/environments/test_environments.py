@@ -1,0 +1,359 @@
+"""Environments of Gymnasium: its own checks, wrappers, autoreset modes, and the plant."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+
+import spacerobot_ros.environments
+from spacerobot_ros.environments.episodes import EpisodeConfig, Episodes
+from spacerobot_ros.environments.registration import import_gymnasium
+from spacerobot_ros.environments.tasks import (
+    Reach,
+    Reorient,
+    RewardWeights,
+    RobotStates,
+    action_scale,
+    command_of,
+)
+from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
+from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.model.compilation import cxx_compiler
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.scenario import load_scenario
+from spacerobot_ros.simulation.actuators import build_plant
+
+MODES = "NextStep", "SameStep", "Disabled"
+ARM = "spacerobot/ReorientArm-v0"
+SHORT = {"scenario": "planar_chain", "hold": 2, "time_limit": 0.5, "spread": 0.02}
+
+
+@pytest.fixture(autouse=True)
+def interpreted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interpret the models, which a small robot is faster with; without a compiler are no lanes."""
+    if "slow" not in request.keywords:
+        monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+
+
+@pytest.fixture
+def strict() -> Iterator[None]:
+    """Let every warning of Gymnasium be an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*sre_.*:DeprecationWarning")
+        yield
+
+
+@pytest.mark.usefixtures("strict")
+@pytest.mark.parametrize(
+    ("name", "arguments", "sizes"),
+    [
+        (ARM, {"scenario": "planar_chain"}, (13, 2)),
+        ("spacerobot/Reach-v0", {"scenario": "planar_chain", "link": "segment_2"}, (13, 2)),
+    ],
+)
+def test_gymnasium_checks_the_environments(
+    name: str, arguments: dict[str, Any], sizes: tuple[int, int]
+) -> None:
+    environment = gymnasium.make(name, **arguments)
+    assert environment.observation_space.shape == sizes[:1]
+    assert environment.action_space.shape == sizes[1:]
+    check_env(environment.unwrapped, skip_render_check=True)
+
+
+def fly_beside_single_ones(name: str, mode: str, arguments: dict[str, Any], steps: int) -> int:
+    """Step a vector environment, wrapped, beside Gymnasium's vector of single ones; count ends."""
+    count, ends = 5, 0
+    there = gymnasium.vector.SyncVectorEnv(
+        [lambda: gymnasium.make(name, **arguments)] * count, autoreset_mode=mode
+    )
+    here = RecordEpisodeStatistics(
+        gymnasium.make_vec(name, num_envs=count, autoreset_mode=mode, **arguments)
+    )
+    assert here.observation_space == there.observation_space
+    assert here.action_space == there.action_space
+    rng = np.random.default_rng(0)
+    states = here.reset(seed=7)[0], there.reset(seed=7)[0]
+    assert here.unwrapped.np_random_seed == tuple(range(7, 12))
+    for _ in range(steps):
+        np.testing.assert_allclose(*states, atol=1e-12)
+        actions = rng.uniform(-1.2, 1.2, (count, *here.single_action_space.shape))
+        *mine, infos = here.step(actions)
+        *wanted, others = there.step(actions)
+        for one, two in zip(mine, wanted, strict=True):
+            np.testing.assert_allclose(one, two, atol=1e-12)
+        states = mine[0], wanted[0]
+        ended = mine[2] | mine[3]
+        ends += int(ended.sum())
+        if ended.any() and mode == "SameStep":
+            assert infos["_final_obs"].tolist() == others["_final_obs"].tolist() == ended.tolist()
+            for row in np.flatnonzero(ended):
+                np.testing.assert_allclose(
+                    infos["final_obs"][row], others["final_obs"][row], atol=1e-12
+                )
+            for key in ("error", "is_success"):
+                np.testing.assert_allclose(
+                    infos["final_info"][key], others["final_info"][key], atol=1e-12
+                )
+        elif ended.any():
+            assert infos["_is_success"].tolist() == others["_is_success"].tolist()
+            assert infos["is_success"].tolist() == others["is_success"].tolist()
+            assert infos["episode"]["l"][ended].all()
+        if mode == "Disabled" and ended.any():
+            with pytest.raises(ResetNeeded, match=f"{int(ended.sum())} episodes have ended"):
+                here.step(actions)
+            states = (
+                here.reset(options={"reset_mask": ended.copy()})[0],
+                there.reset(options={"reset_mask": ended.copy()})[0],
+            )
+    return ends
+
+
+@pytest.mark.usefixtures("strict")
+@pytest.mark.parametrize("mode", MODES)
+def test_a_vector_environment_is_as_many_single_ones(mode: str) -> None:
+    assert fly_beside_single_ones(ARM, mode, SHORT, 12) > 5
+
+
+@pytest.mark.usefixtures("strict")
+@pytest.mark.slow
+@pytest.mark.skipif(cxx_compiler() is None, reason="there is no C++ compiler")
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", [ARM, "spacerobot/Reach-v0"])
+def test_environments_in_lanes_are_as_many_single_ones(name: str, mode: str) -> None:
+    arguments = {"hold": 3, "time_limit": 4.0, "spread": 0.05}
+    assert fly_beside_single_ones(name, mode, arguments, 100) > 5
+
+
+@pytest.mark.usefixtures("strict")
+def test_observations_can_be_normalised() -> None:
+    vector = NormalizeObservation(gymnasium.make_vec(ARM, num_envs=3, **SHORT))
+    vector.reset(seed=1)
+    for _ in range(8):
+        observations, *_ = vector.step(vector.action_space.sample())
+        assert np.isfinite(observations).all()
+
+
+def test_a_step_is_that_of_the_plant_of_the_scenario() -> None:
+    environment: Any = gymnasium.make(ARM, scenario="sliding_masses", hold=3).unwrapped
+    scenario = load_scenario("sliding_masses")
+    robot = SpaceRobot(load_robot(robot_file("sliding_masses")))
+    plant = build_plant(robot, scenario.plant)
+    goal = quaternion_from_rotvec([0.0, 0.0, 0.3])
+    observation, info = environment.reset(options={"goal": 2.0 * goal})
+    before = info["error"]
+    assert before == pytest.approx(0.3)
+    np.testing.assert_allclose(observation[:3], [0, 0, 0.3], atol=1e-12)
+    np.testing.assert_array_equal(observation[3:6], plant.q)
+    action = np.array([0.25, -1.5, 0.5])
+    observation, reward, terminated, truncated, info = environment.step(action)
+    for _ in range(3):
+        plant.step(np.array([0.25, -1.0, 0.5]) * robot.velocity_limit)
+    for part, wanted in zip(
+        np.split(observation[3:], [3, 6]), (plant.q, plant.qdot, plant.twist), strict=True
+    ):
+        np.testing.assert_array_equal(part, wanted)
+    R_BG = matrix_from_quaternion(plant.pose[3:]).T @ matrix_from_quaternion(goal)
+    assert info["error"] == pytest.approx(np.arccos((np.trace(R_BG) - 1) / 2), abs=1e-9)
+    seconds = 3 * scenario.plant.control_period
+    assert reward == pytest.approx(
+        10 * (before - info["error"]) - seconds * (0.02 + 0.01 * (0.0625 + 1 + 0.25) / 3)
+    )
+    assert (terminated, truncated) == (False, False)
+
+
+def test_a_goal_that_is_reached_ends_the_episode_and_is_rewarded() -> None:
+    environment: Any = gymnasium.make(
+        ARM, scenario="planar_chain", tolerance=0.05, reward={"reached": 7.0, "time": 0.0}
+    ).unwrapped
+    environment.reset(options={"goal": quaternion_from_rotvec([0.0, 0.0, 0.04])})
+    _, reward, terminated, truncated, info = environment.step(np.zeros(2))
+    assert (reward, terminated, truncated) == (pytest.approx(7.0), True, False)
+    assert info["is_success"] is True
+
+
+def test_time_truncates() -> None:
+    environment: Any = gymnasium.make(
+        ARM, scenario="sliding_masses", time_limit=0.4, hold=2
+    ).unwrapped
+    environment.reset(options={"goal": quaternion_from_rotvec([0.0, 0.0, 0.5])})
+    last = round(0.4 / (2 * environment.episodes.flights.control_period)) - 1
+    assert last > 1
+    ends = [environment.step(np.zeros(3))[2:5] for _ in range(last + 1)]
+    assert [truncated for _, truncated, _ in ends] == [False] * last + [True]
+    assert ends[last][2]["is_success"] is False
+
+
+CAMPAIGN = """
+campaign:
+  scenario: planar_chain
+  flights: 5
+  seed: 2
+  disperse:
+    mass.*: {uniform: {loc: 0.8, scale: 0.4}}
+    goal.rotvec.z: {uniform: [-0.2, 0.4]}
+    initial.joints.pin_1: {uniform: [-0.1, 0.2]}
+"""
+
+
+def test_draws_of_a_campaign_are_starts_masses_and_goals(tmp_path: Path) -> None:
+    file = tmp_path / "draws.yaml"
+    file.write_text(CAMPAIGN)
+    config = EpisodeConfig("reorient", campaign=str(file))
+    episodes = Episodes(config, 4, in_lanes=False)
+    generators = [np.random.default_rng(seed) for seed in range(4)]
+    seen = set()
+    for _ in range(6):
+        episodes.begin(range(4), generators)
+        masses = episodes.flights._flights.inertial
+        assert masses is not None
+        for row in range(4):
+            seen.add((masses.masses[row, 0], episodes.goals[row, 2], episodes.flights.q[row, 0]))
+    # Five draws, each with a mass, a goal and a start of its own.
+    assert len(seen) == 5
+    for column in range(3):
+        assert len({each[column] for each in seen}) == 5
+    repeated = [np.random.default_rng(seed) for seed in range(4)]
+    episodes.begin(range(4), repeated)
+    first = episodes.goals.copy()
+    episodes.begin(range(4), [np.random.default_rng(seed) for seed in range(4)])
+    np.testing.assert_array_equal(first, episodes.goals)
+
+
+def test_goals_of_a_scenario() -> None:
+    config = EpisodeConfig("reorient", scenario="planar_chain", goals="scenario")
+    episodes = Episodes(config, 2, in_lanes=False)
+    episodes.begin([1], [np.random.default_rng(0)] * 2)
+    wanted = load_scenario("planar_chain").goal.quaternion
+    np.testing.assert_array_equal(episodes.goals, [[0, 0, 0, 1], wanted])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"ticks": 3}, "There is no argument 'ticks' of environments; there are task, scenario, "),
+        ({"goals": "far"}, "Argument 'goals' is 'far'; it may be random, scenario"),
+        ({"hold": 0}, "Argument 'hold' is 0; an action is held for a tick"),
+        ({"spread": -1.0}, "Argument 'spread' is -1.0; it must be finite, from 0"),
+        ({"time_limit": np.inf}, "Argument 'time_limit' is inf; it must be finite"),
+        ({"scenario": "a", "campaign": "b"}, "both given: a campaign names its scenario"),
+        ({"reward": {"speed": 1}}, "There is no weight 'speed' of the reward; there are progress"),
+        ({"scenario": "faults/stuck_slider"}, "has faults, which environments do not have"),
+        ({"scenario": "faults/noisy_sensors"}, "has errors of sensors, which environments do not"),
+        ({"scenario": "capture"}, "has a target, which environments do not have"),
+        ({"action_scale": [1.0]}, "'action_scale' has 1 numbers; robot .* takes 8 finite ones"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        gymnasium.make(ARM, **{"scenario": "planar_chain", **arguments})
+
+
+def test_bad_actions_goals_and_masks_are_refused() -> None:
+    vector: Any = gymnasium.make_vec(ARM, num_envs=2, scenario="planar_chain")
+    vector.reset(seed=[3, 4])
+    assert vector.np_random_seed == (3, 4)
+    for actions, message in (
+        (np.zeros((2, 3)), r"The actions are \(2, 3\), not \(2, 2\)"),
+        (np.full((2, 2), np.nan), "not finite"),
+    ):
+        with pytest.raises(CommandError, match=message):
+            vector.step(actions)
+    with pytest.raises(ParameterError, match="The goal has 3 numbers; task 'reorient' takes 4"):
+        vector.reset(options={"goal": [0, 0, 0]})
+    with pytest.raises(ParameterError, match="a quaternion of zeros"):
+        vector.reset(options={"goal": [0, 0, 0, 0]})
+    for mask in (np.zeros(2, dtype=bool), np.ones(3, dtype=bool), np.ones(2)):
+        with pytest.raises(ValueError, match="must be 2 booleans, at least one true"):
+            vector.reset(options={"reset_mask": mask})
+    with pytest.raises(ValueError, match="There are 3 seeds of 2 environments"):
+        vector.reset(seed=[1, 2, 3])
+
+
+def states(n: int) -> RobotStates:
+    rng = np.random.default_rng(4)
+    quaternion = rng.normal(size=(3, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    pose = np.hstack([rng.normal(size=(3, 3)), quaternion])
+    parts = rng.normal(size=(3, 6)), rng.normal(size=(3, n)), rng.normal(size=(3, n))
+    return RobotStates(pose, *parts, rng.normal(size=(3, 3)))
+
+
+def test_the_way_of_a_link_is_in_the_frame_of_the_base() -> None:
+    task = Reach(SpaceRobot(load_robot(robot_file("planar_chain"))))
+    given = states(2)
+    assert given.link_r is not None
+    goals = np.random.default_rng(5).normal(size=(3, 3))
+    ways = task.remaining(given, goals)
+    for row in range(3):
+        R = matrix_from_quaternion(given.pose[row, 3:])
+        link = given.pose[row, :3] + R @ given.link_r[row]
+        np.testing.assert_allclose(ways[row], R.T @ (goals[row] - link))
+        np.testing.assert_allclose(task.link_positions(given)[row], link)
+    np.testing.assert_allclose(task.errors(ways), np.sqrt((ways**2).sum(axis=1)))
+    start = RobotStates(
+        given.pose[:1], given.twist[:1], given.q[:1], given.qdot[:1], given.link_r[:1]
+    )
+    rng = np.random.default_rng(6)
+    distances = [
+        np.linalg.norm(task.random_goal(start, 0.25, rng) - task.link_positions(given)[0])
+        for _ in range(50)
+    ]
+    assert 0.2 < max(distances) <= 0.25
+
+
+def test_random_attitudes_are_within_their_spread() -> None:
+    robot = SpaceRobot(load_robot(robot_file("planar_chain")))
+    task, given = Reorient(robot), states(2)
+    rng = np.random.default_rng(6)
+    turns = []
+    for _ in range(40):
+        goal = task.random_goal(given, 0.3, rng)
+        turns.append(task.remaining(given, goal[np.newaxis])[0])
+    # A planar robot turns about the axis of its plane alone.
+    np.testing.assert_allclose(np.array(turns)[:, :2], 0.0, atol=1e-12)
+    assert 0.25 < np.abs(turns).max() <= 0.3
+    assert min(turn[2] for turn in turns) < -0.1
+
+
+def test_actions_are_shares_of_limits() -> None:
+    robot = SpaceRobot(load_robot(robot_file("planar_chain")))
+    np.testing.assert_array_equal(
+        action_scale(robot, "effort", 2.0, 3.0), [*robot.effort_limit, 2, 2, 2, 3, 3, 3]
+    )
+    np.testing.assert_array_equal(action_scale(robot, "velocity", 2.0, 3.0), robot.velocity_limit)
+    commands = command_of([[0.5, -3.0], [2.0, 0.25]], np.array([2.0, 9.0, 4.0]), [0, 2])
+    assert commands.tolist() == [[1.0, 0.0, -4.0], [2.0, 0.0, 1.0]]
+    assert RewardWeights.of(None) == RewardWeights()
+
+
+def test_a_force_on_the_base_is_an_action_where_there_is_one() -> None:
+    for force, torque, taken in (
+        (0.0, 0.0, [0, 1]),
+        (5.0, 0.0, [0, 1, 2, 3, 4]),
+        (5.0, 3.0, [0, 1, 2, 3, 4, 5, 6, 7]),
+    ):
+        config = EpisodeConfig(
+            "reorient", scenario="planar_chain", max_force=force, max_torque=torque
+        )
+        assert Episodes(config, 1, in_lanes=False).taken.tolist() == taken
+
+
+def test_registering_twice_changes_nothing_and_a_missing_package_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    spacerobot_ros.environments.register()
+    assert ARM in gymnasium.registry
+    monkeypatch.setitem(__import__("sys").modules, "gymnasium", None)
+    with pytest.raises(SpaceRobotError, match=r"pip install 'spacerobot_ros\[rl\]'"):
+        import_gymnasium()
