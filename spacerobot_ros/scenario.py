@@ -455,9 +455,9 @@ def scenario_text(scenario: Scenario) -> str:
     return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
 
-def _end_effector_values(goal: Goal) -> dict[str, list[float]]:
-    """Return the numbers of the goals of end-effectors by link."""
-    return {each.link: list(each.values) for each in goal.end_effectors}
+def _end_effector_values(goal: Goal) -> dict[str, list[float] | list[list[float]]]:
+    """Return the numbers of the goals of end-effectors by link; those of a path are nested."""
+    return {each.link: each.numbers for each in goal.end_effectors}
 
 
 def load_scenario(name: str) -> Scenario:
@@ -655,7 +655,7 @@ def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
         if not isinstance(links, Mapping):
             raise TypeError(f"end_effector_goals has no poses by name: {links!r}.")
         of_base = any(f"{name}_{part}" in values for part in ("position", "orientation", "rotvec"))
-        goals = [EndEffectorGoal.checked(str(link), pose) for link, pose in links.items()]
+        goals = [EndEffectorGoal.of_numbers(str(link), pose) for link, pose in links.items()]
         hands = Goal.of_end_effectors(goals).end_effectors
         return replace(goal, end_effectors=hands, base=POSE if of_base else frozenset())
     except (GoalError, ValueError, TypeError, AttributeError) as error:

@@ -256,6 +256,7 @@ def goal_command(
     links: tuple[str, ...],
     positions: tuple[tuple[float, ...], ...],
     poses: tuple[tuple[float, ...], ...],
+    paths: tuple[Path, ...],
     namespace: str,
     timeout: float,
 ) -> None:
@@ -265,7 +266,7 @@ def goal_command(
     goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C has ended the command, and the stack
     still pursues the goal.
     """
-    hands = EndEffectorOptions(poses, positions, links).goals()
+    hands = EndEffectorOptions(poses, positions, links, paths).goals()
     if len(pose) not in ((0, 3, 7) if hands else (3, 7)):
         raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")
     if rotvec and rpy_deg:

@@ -186,12 +186,15 @@ class EndEffectorOptions:
     poses, positions
         Poses (7,) and positions (3,), m.
     links
-        Names of their links, in the order of the poses, then of the positions; none: the default.
+        Names of their links, in the order of the poses, positions and paths; none: the default.
+    paths
+        Files of paths: a line is a position or a pose.
     """
 
     poses: Sequence[tuple[float, ...]] = ()
     positions: Sequence[tuple[float, ...]] = ()
     links: Sequence[str] = ()
+    paths: Sequence[Path] = ()
 
     def goals(self) -> list[EndEffectorGoal]:
         """Return the goals; none where none is given.
@@ -201,20 +204,45 @@ class EndEffectorOptions:
         click.UsageError
             There are more or fewer names than goals.
         GoalError
-            One is no position or no pose, or a link has two.
+            One is no position, pose or path, or a link has two.
         """
         from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
 
-        values = [*self.poses, *self.positions]
+        values: list[Any] = [*self.poses, *self.positions, *map(_read_path, self.paths)]
         links = self.links or [""] * min(len(values), 1)
         if len(links) != len(values):
             raise click.UsageError(
                 f"{len(values)} goal(s) of end-effectors and {len(self.links)} name(s): give one "
                 "--end-effector for each --end-effector-goal, then for each "
-                "--end-effector-position."
+                "--end-effector-position, then for each --end-effector-path."
             )
-        goals = [EndEffectorGoal.checked(*each) for each in zip(links, values, strict=True)]
+        goals = [EndEffectorGoal.of_numbers(*each) for each in zip(links, values, strict=True)]
         return list(Goal.of_end_effectors(goals).end_effectors) if goals else goals
+
+
+def _read_path(file: Path) -> list[list[float]]:
+    """Return the numbers of a path in a text file: a line is a position or a pose.
+
+    Raises
+    ------
+    click.BadParameter
+        The file cannot be read, or has other text.
+    """
+    try:
+        lines = [line.partition("#")[0] for line in file.read_text("utf-8").splitlines()]
+        rows = [list(map(float, line.replace(",", " ").split())) for line in lines]
+    except (OSError, ValueError) as error:
+        raise click.BadParameter(
+            f"The path {file} cannot be read: {error}. Each of its lines has 3 numbers, a "
+            "position, or 7, a position and a quaternion."
+        ) from error
+    found = [row for row in rows if row]
+    if not found or len({len(row) for row in found}) > 1:
+        raise click.BadParameter(
+            f"The path {file} has lines of {sorted({len(row) for row in found})} numbers; give "
+            "each 3, a position, or each 7, a position and a quaternion."
+        )
+    return found
 
 
 def goal_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -229,9 +257,10 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
         poses: Any = (),
         positions: Any = (),
         links: Any = (),
+        paths: Any = (),
         **options: Any,
     ) -> None:
-        hands = EndEffectorOptions(poses, positions, links)
+        hands = EndEffectorOptions(poses, positions, links, paths)
         command(*words, goal=GoalOptions(goal, rotvec, rpy_deg, hands), **options)
 
     return cast("Callable[..., None]", _pose_option(_attitude_options("goal-")(with_goal)))
@@ -246,7 +275,16 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
             multiple=True,
             metavar="NAME",
             help="Link of a goal of an end-effector [end_effector]. May be repeated: in the order "
-            "of the poses, then of the positions.",
+            "of the poses, then of the positions, then of the paths.",
+        ),
+        click.option(
+            "--end-effector-path",
+            "paths",
+            type=PATH,
+            multiple=True,
+            metavar="FILE",
+            help="Path of an end-effector, which the method resolved_rate follows: a text file "
+            "with a position X Y Z (m) or a pose X Y Z QX QY QZ QW in each line. May be repeated.",
         ),
         click.option(
             "--end-effector-position",

@@ -530,7 +530,9 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
         if links:
             free = goal is None
             goal = goal or _NO_GOAL
-            aims = tuple(EndEffectorGoal.checked(str(link), pose) for link, pose in links.items())
+            aims = tuple(
+                EndEffectorGoal.of_numbers(str(link), pose) for link, pose in links.items()
+            )
             goal = replace(goal, end_effectors=aims, base=frozenset() if free else POSE)
     return Scenario(
         name=about.get("name", "") or bag.path.stem,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
@@ -21,13 +22,13 @@ from spacerobot_ros.events import EventKind
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
-from spacerobot_ros.nodes.common.messages import goal_message, shape_message
+from spacerobot_ros.nodes.common.messages import goal_message, path_message, shape_message
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
-from spacerobot_ros.topics import goal_topic
+from spacerobot_ros.topics import goal_topic, path_topic
 
 _STATUS_CHECK_PERIOD = 0.2
 """Wall time between two calls of a ``look`` function, s."""
@@ -52,6 +53,8 @@ class MissionClient:
         those of an earlier goal may be in force; None: no goal of this stack has any.
     end_effectors
         Links that there will be goals for; empty name: the default end-effector.
+    paths
+        Those of them whose goals are paths.
     on_end
         Called, within the callback, when the goal is decided or no longer followed.
     name, namespace, context
@@ -66,6 +69,7 @@ class MissionClient:
         *,
         joint_names: Callable[[], Sequence[str]] | None = None,
         end_effectors: Sequence[str] = (),
+        paths: Collection[str] = (),
         on_end: Callable[[], None] = lambda: None,
         name: str = "mission_client",
         namespace: str = "",
@@ -86,10 +90,7 @@ class MissionClient:
             self._shape_topic = self.node.create_publisher(JointState, "goal_joint_states", STREAM)
             self._sends.append(self._shape_topic)
         self._end_effector_topics = {
-            link: self.node.create_publisher(
-                PoseStamped, goal_topic(link or DEFAULT_END_EFFECTOR), STREAM
-            )
-            for link in end_effectors
+            link: self._make_publisher(link, path=link in paths) for link in end_effectors
         }
         self._sends += self._end_effector_topics.values()
         self.failures: dict[str, str] = {}
@@ -99,6 +100,13 @@ class MissionClient:
         self._status_topic = self.node.create_subscription(
             DiagnosticStatus, topic, self._on_status, LATCHED
         )
+
+    def _make_publisher(self, link: str, *, path: bool) -> Publisher:
+        """Return the publisher of goals of a link: of paths, or of poses."""
+        name = link or DEFAULT_END_EFFECTOR
+        if path:
+            return self.node.create_publisher(Path, path_topic(name), STREAM)
+        return self.node.create_publisher(PoseStamped, goal_topic(name), STREAM)
 
     @property
     def goal_id(self) -> str | None:
@@ -172,12 +180,16 @@ class MissionClient:
             self._shape_topic.publish(shape_message(goal, self._joint_names()))
         if goal.base:
             self._goal_topic.publish(message)
-        of_links = {each.link: each.as_goal() for each in goal.end_effectors}
+        of_links = {
+            each.link: goal_message(each.as_goal(), self._frame, time_ns)
+            if each.waypoints is None
+            else path_message(each.values_on_way, self._frame, time_ns)
+            for each in goal.end_effectors
+        }
         if end_effector is not None:
-            of_links[""] = end_effector
+            of_links[""] = goal_message(end_effector, self._frame, time_ns)
         for link, aim in of_links.items():
-            topic = self._end_effector_topics[link]
-            topic.publish(goal_message(aim, self._frame, time_ns))
+            self._end_effector_topics[link].publish(aim)
 
     def await_delivery(self) -> None:
         """Wait until all readers of goals have received the goal that was sent."""

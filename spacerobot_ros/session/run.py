@@ -37,7 +37,7 @@ from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.stack import InProcessStack, Stack, checked_namespace
 from spacerobot_ros.termination import ended_on_request
 from spacerobot_ros.times import SECOND, stamp_to_ns
-from spacerobot_ros.topics import goal_topic
+from spacerobot_ros.topics import goal_topic, path_topic
 
 Progress = Callable[[float, float], None]
 """Function called with simulated time and the end time of the present schedule, s."""
@@ -266,6 +266,7 @@ def send_goal(
                 namespace=namespace,
                 name=f"goal_{decider}",
                 end_effectors=[each.link for each in goal.end_effectors],
+                paths=goal.links_with_paths,
                 # An empty message resets the joint positions that an earlier goal required.
                 joint_names=tuple if decider == "planner" else None,
             )
@@ -315,7 +316,12 @@ def _find_decider(
                 while not client.is_connected() and time.monotonic() < deadline:
                     executor.spin_once(timeout_sec=0.05)
                 return client
-    links = [goal_topic(each.link or DEFAULT_END_EFFECTOR) for each in goal.end_effectors]
+    links = [
+        (path_topic if each.link in goal.links_with_paths else goal_topic)(
+            each.link or DEFAULT_END_EFFECTOR
+        )
+        for each in goal.end_effectors
+    ]
     topics = " and ".join(f"'{topic}'" for topic in ("goal_pose", *links))
     listed = "; the planner's parameter end_effectors lists other links" if links else ""
     raise SpaceRobotError(

@@ -120,6 +120,7 @@ class Stack(ABC):
             lambda: self.time_ns,
             joint_names=joint_names,
             end_effectors=self.scenario.end_effectors,
+            paths=self.scenario.goal.links_with_paths,
             namespace=self.namespace,
             **options,
         )

@@ -94,7 +94,7 @@ def test_end_effectors_with_more_or_fewer_names_are_refused(
         EndEffectorOptions(poses, positions, links).goals()
     assert refused.value.message == (
         f"{counts}: give one --end-effector for each --end-effector-goal, then for each "
-        "--end-effector-position."
+        "--end-effector-position, then for each --end-effector-path."
     )
 
 
@@ -238,3 +238,37 @@ def test_a_path_of_bytes_that_are_no_text_is_refused() -> None:
     with pytest.raises(click.BadParameter) as refused:
         PATH.convert("a\udcff", None, None)
     assert refused.value.message == "the name 'a\\udcff' has bytes that are not UTF-8."
+
+
+def test_paths_of_end_effectors_are_read_from_files(tmp_path: Path) -> None:
+    """After poses and positions; comments, commas and empty lines are left out."""
+    places, poses = tmp_path / "places.txt", tmp_path / "poses.csv"
+    places.write_text("# x y z\n1.5 0.7 1.3\n\n1.3, -0.9 0.8  # the goal\n", encoding="utf-8")
+    poses.write_text("0.1,0.2,0.3,0,0,0,2\n0.4,0.5,0.6,0,0.6,0,0.8\n", encoding="utf-8")
+    options = EndEffectorOptions((), (HAND,), ("tip", "left", "right"), (places, poses))
+    found = {each.link: each for each in options.goals()}
+    assert found["tip"].waypoints is None
+    assert found["left"].values_on_way.tolist() == [[1.5, 0.7, 1.3], [1.3, -0.9, 0.8]]
+    assert found["right"].values == (0.4, 0.5, 0.6, 0.0, 0.6, 0.0, 0.8)
+    assert found["right"].waypoints is not None
+    assert found["right"].waypoints.tolist() == [[0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1 2 three\n", "three"),
+        ("1 2 3\n1 2 3 0 0 0 1\n", "lines of [3, 7] numbers"),
+        ("# nothing\n", "lines of [] numbers"),
+        (None, "No such file"),
+    ],
+)
+def test_files_that_are_no_paths_are_refused(tmp_path: Path, text: str | None, words: str) -> None:
+    file = tmp_path / "way.txt"
+    if text is not None:
+        file.write_text(text, encoding="utf-8")
+    with pytest.raises(click.BadParameter) as refused:
+        EndEffectorOptions((), (), (), (file,)).goals()
+    assert f"The path {file}" in refused.value.message
+    assert words in refused.value.message
+    assert "7, a position and a quaternion" in refused.value.message

@@ -132,6 +132,43 @@ def test_goals_of_end_effectors_are_sent_with_and_without_one_of_the_base(
         np.testing.assert_array_equal(goal.position, pose)
 
 
+def way_in(folder: Path) -> Path:
+    """Return a file with a path: the hand of the other options goes elsewhere."""
+    (folder / "way.txt").write_text("0.5 -0.1 0.7\n0.4 0.1 0.8\n", encoding="utf-8")
+    return folder / "way.txt"
+
+
+@pytest.mark.parametrize("command", ["plan", "run"])
+def test_paths_of_end_effectors_reach_the_scenario(
+    command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found: list[Any] = []
+
+    def noted(self: Any, hands: Any, *_: Any) -> Any:
+        found.extend(hands)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(type(load_scenario("arm_attitude")), "with_end_effectors", noted)
+    call(command, "arm_attitude", "--end-effector-path", way_in(tmp_path))
+    (hand,) = found
+    assert hand.values_on_way.tolist() == [[0.5, -0.1, 0.7], [0.4, 0.1, 0.8]]
+
+
+def test_a_path_of_an_end_effector_is_sent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    sent: list[Any] = []
+
+    def send_goal(goal: Any, *_: Any, **named: Any) -> Outcome:
+        sent.append(goal)
+        return Outcome.REACHED
+
+    monkeypatch.setattr(session, "send_goal", send_goal)
+    words = ("--end-effector", "tip", "--end-effector-path", way_in(tmp_path))
+    assert call("goal", *words).exit_code == 0
+    assert sent[0].links_with_paths == {"tip"}
+    assert sent[0].end_effectors[0].values == (0.4, 0.1, 0.8)
+
+
 # -- libraries of manoeuvres --------------------------------------------------------------------
 
 

@@ -318,3 +318,11 @@ def test_without_stuck_joints_the_rest_of_the_path_is_planned(flown: GaitSchedul
     assert RemainingJointsGait._methods_to_try(method, again)[1] is not None
     other = replace(flown, progress=_RemainingProgress(frozenset({"elbow"}), "auto", None))
     assert RemainingJointsGait._methods_to_try(method, other) == (["auto"], None)
+
+
+def test_a_goal_with_a_path_is_displaced_with_its_waypoints() -> None:
+    way = [[0.1, 0.2, 0.3, 0.0, 0.6, 0.0, 0.8], [1.0, -2.0, 3.0, 0.0, 0.0, 0.0, 1.0]]
+    goal = Goal.of_end_effectors([EndEffectorGoal.along("tip", way)])
+    (moved,) = goal.displaced(np.array([1.0, 10.0, -100.0])).end_effectors
+    assert moved.values_on_way[:, :3].tolist() == [[1.1, 10.2, -99.7], [2.0, 8.0, -97.0]]
+    assert moved.values_on_way[:, 3:].tolist() == [row[3:] for row in way]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from spacerobot_ros import fly
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.reading import read_run
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.resources import robot_file
@@ -108,6 +110,40 @@ def test_a_scenario_is_written_with_its_end_effectors(tmp_path: Path) -> None:
     assert again.planner.end_effectors == ("left_link_7", "right_link_7")
 
 
+def test_a_scenario_may_have_paths_of_end_effectors(tmp_path: Path) -> None:
+    """A list of positions or poses: as it is written, and in the records of a bag."""
+    way = [[0.4, 0.1, 0.8], [0.5, -0.1, 0.7]]
+    aims = [
+        EndEffectorGoal.along("link_5", way),
+        EndEffectorGoal.checked("link_7", [0.4, 0.1, 1.8]),
+    ]
+    scenario, file = load_scenario("reach").with_end_effectors(aims), tmp_path / "again.yaml"
+    file.write_text(scenario_text(scenario), "utf-8")
+    for again in (scenario, load_scenario(str(file))):
+        assert again.goal.links_with_paths == {"link_5"}
+        given = json.loads(again.records(())["scenario"]["end_effector_goals"])
+        assert given == {"link_5": way, "link_7": [0.4, 0.1, 1.8]}
+
+
+@pytest.mark.slow
+def test_a_path_is_flown_by_nodes_and_in_the_bag(tmp_path: Path) -> None:
+    """`run` sends it as a path; the hand passes its corner, by the poses of the bag."""
+    way = [[1.5, 0.7, 1.3], [1.3, 0.9, 0.8]]
+    robot = scenario_or_robot("three_joint_arm").with_overrides(
+        "plant", {"initial_joint_positions": [0.4, -0.9, 1.1]}
+    )
+    scenario = robot.with_end_effectors([EndEffectorGoal.along("", way)])
+    result = run_scenario(scenario, bag=tmp_path / "path.mcap")
+    assert result.succeeded
+    series = read_bag(tmp_path / "path.mcap")["/end_effector_pose"]
+    places = series.table([f"pose.position.{axis}" for axis in "xyz"], 3)
+    assert np.linalg.norm(places[-1] - way[1]) < 1e-6
+    assert np.linalg.norm(places - way[0], axis=1).min() < 0.03
+    flight = read_run(tmp_path / "path.mcap")
+    assert flight.scenario.goal.links_with_paths
+    assert flight.outcome is Outcome.REACHED
+
+
 def test_another_end_effector_is_heard_by_the_planner_without_being_listed() -> None:
     aim = EndEffectorGoal.checked("link_5", [0.4, 0.1, 0.8])
     scenario = load_scenario("reach").with_end_effectors([aim])
@@ -125,6 +161,8 @@ def test_another_end_effector_is_heard_by_the_planner_without_being_listed() -> 
         ("[1.0, 2.0, 3.0]", r"has no poses by name: \[1.0, 2.0, 3.0\]\.$"),
         ("1.5", r"has no poses by name: 1.5\.$"),
         ("{link_7: far}", "is not a list of numbers"),
+        ("{link_7: [[0, 0, 1], [0, 0, 1, 0]]}", "is not a list of numbers"),
+        ("{link_7: [[0, 0, 1, 0], [0, 0, 1, 0]]}", "each of its poses takes 3 numbers"),
     ],
 )
 def test_goals_of_a_file_that_are_none_are_refused(

@@ -9,13 +9,16 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path as PathMessage
 from sensor_msgs.msg import JointState
 from support.ros_harness import LATCHED, Harness, Probe
 
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.nodes.common.messages import path_poses
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.session.mission_client import MissionClient
 
@@ -201,3 +204,37 @@ def test_a_recorder_that_reads_goals_is_no_commander(harness: Harness) -> None:
     harness.spin_until(lambda: client.has_decider() and client.is_connected(2))
     client.send(GOAL)
     harness.spin_until(lambda: commander.count("goal_pose"), "the goal")
+
+
+def test_a_path_of_an_end_effector_is_sent_on_its_topic(harness: Harness) -> None:
+    """With the stamp of the goal, beside the goal of another link."""
+    goal = Goal.of_end_effectors(
+        [
+            EndEffectorGoal.along("left", [[1.0, 2.0, 3.0], [1.5, -2.0, 0.3]]),
+            EndEffectorGoal.checked("right", [0.1, 0.2, 0.3, 0.0, 0.6, 0.0, 0.8]),
+        ]
+    )
+    assert goal.links_with_paths == {"left"}
+    client = MissionClient(
+        "planner",
+        "world",
+        lambda: NOW,
+        end_effectors=("left", "right"),
+        paths=goal.links_with_paths,
+        context=harness.context,
+    )
+    harness.add(client.node)
+    listener = harness.probe({"left/path": PathMessage, "right/goal_pose": PoseStamped})
+    harness.spin_until(
+        lambda: all(
+            client.node.count_subscribers(topic) for topic in ("left/path", "right/goal_pose")
+        )
+    )
+    client.send(goal)
+    harness.spin_until(
+        lambda: bool(listener.count("left/path") and listener.count("right/goal_pose"))
+    )
+    path, pose = listener.last("left/path"), listener.last("right/goal_pose")
+    assert path.header == pose.header
+    assert path_poses(path, "world", "the path").tolist() == [[1.0, 2.0, 3.0], [1.5, -2.0, 0.3]]
+    assert (pose.pose.position.y, pose.pose.orientation.y) == (0.2, 0.6)

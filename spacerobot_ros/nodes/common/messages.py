@@ -146,6 +146,18 @@ def goal_message(goal: Goal, frame: str, time_ns: int) -> PoseStamped:
     return message
 
 
+def path_message(poses: Array, frame: str, time_ns: int) -> Path:
+    """Return a path of poses (K, 7), or of positions (K, 3), in ``frame``: the inverse of
+    :func:`path_poses`. Positions alone have quaternions of zeros.
+    """
+    quaternions = poses[:, 3:] if poses.shape[1] == 7 else np.zeros((len(poses), 4))
+    given = zip(poses[:, :3], quaternions, strict=True)
+    message = Path(poses=[goal_message(Goal(r, x), frame, time_ns) for r, x in given])
+    message.header.frame_id = frame
+    set_stamp(message.header.stamp, time_ns)
+    return message
+
+
 def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
     """Return a message of the joint positions required at a goal; empty without a requirement."""
     positions = goal.joint_positions

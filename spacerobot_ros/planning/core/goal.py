@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -125,11 +125,35 @@ class EndEffectorGoal:
         goal = cls.checked(link, values[-1])
         return replace(goal, waypoints=values[:-1]) if len(values) > 1 else goal
 
+    @classmethod
+    def of_numbers(cls, link: str, numbers: npt.ArrayLike) -> EndEffectorGoal:
+        """Return the goal as files have it: one position or pose, or a list of them, a path.
+
+        Raises
+        ------
+        GoalError
+            As for :meth:`checked` and :meth:`along`.
+        """
+        nested = isinstance(numbers, Sequence) and any(isinstance(x, Sequence) for x in numbers)
+        return cls.along(link, numbers) if nested else cls.checked(link, numbers)
+
+    @property
+    def numbers(self) -> list[float] | list[list[float]]:
+        """The goal as :meth:`of_numbers` takes it."""
+        return list(self.values) if self.waypoints is None else self.values_on_way.tolist()
+
     @property
     def values_on_way(self) -> Array:
         """The waypoints and the goal (K + 1, 3) or (K + 1, 7), as :meth:`along` takes them."""
         end = np.array(self.values)[np.newaxis]
         return end if self.waypoints is None else np.vstack([self.waypoints, end])
+
+    def displaced(self, by: Array) -> EndEffectorGoal:
+        """Return the goal and its waypoints displaced by a vector (3,) in W, m."""
+        waypoints = self.waypoints
+        if waypoints is not None:
+            waypoints = np.hstack([waypoints[:, :3] + by, waypoints[:, 3:]])
+        return replace(self, position=self.position + by, waypoints=waypoints)
 
     def as_goal(self) -> Goal:
         """Return it as a pose for a message: the quaternion is zero where any attitude will do."""
@@ -323,11 +347,16 @@ class Goal:
     @property
     def has_path(self) -> bool:
         """Whether an end-effector is to follow a given path to the goal."""
-        return any(each.waypoints is not None for each in self.end_effectors)
+        return bool(self.links_with_paths)
+
+    @property
+    def links_with_paths(self) -> frozenset[str]:
+        """Links that are to follow a given path."""
+        return frozenset(each.link for each in self.end_effectors if each.waypoints is not None)
 
     def displaced(self, by: Array) -> Goal:
         """Return the goal with all its places (3,) displaced in W, m."""
-        hands = tuple(replace(each, position=each.position + by) for each in self.end_effectors)
+        hands = tuple(each.displaced(by) for each in self.end_effectors)
         return replace(self, position=self.position + by, end_effectors=hands)
 
     def equals(self, other: Goal) -> bool:
