@@ -39,7 +39,7 @@ from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.scenario import COMMANDERS, CONFIGS, Published, Scenario
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import TOPICS, StateField, Topic, goal_topic, topic_named
+from spacerobot_ros.topics import TOPICS, StateField, Topic, goal_topic, path_topic, topic_named
 
 _SAME_CLOCK_TOLERANCE = 1.0
 """Stamps this near to the log times, in s, come from the same clock."""
@@ -409,7 +409,8 @@ def read_flight(bag: FlightBag) -> Flight:
     )
     reports = [status for _, status in statuses[decider]]
     # Bags of version 0.1 have no ids.
-    sent = goals or next((bag.goals(goal_topic(link)) for link in scenario.goal_links), ())
+    topics = [topic(link) for link in scenario.goal_links for topic in (goal_topic, path_topic)]
+    sent = goals or next(filter(None, map(bag.goals, topics)), ())
     follower, status = GoalFollower(sent[-1].goal_id if sent else "", unnamed=True), None
     for status in reports:
         if follower.take(status):
