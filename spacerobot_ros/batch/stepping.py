@@ -135,6 +135,11 @@ class SteppedFlights:
         return self._engine.name
 
     @property
+    def substeps(self) -> int:
+        """Runge-Kutta steps in a tick."""
+        return self._flights.substeps
+
+    @property
     def time(self) -> Array:
         """(N,) simulated time since the last reset of each flight, s."""
         return np.asarray(self.ticks * self.control_period)

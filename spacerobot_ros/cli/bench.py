@@ -214,6 +214,19 @@ def campaign(json_file: Path | None) -> None:
     _write_figures(json_file, lanes_benchmark(click.echo))
 
 
+@bench_command.command("environments")
+@click.argument("lanes", default=1024, type=click.IntRange(min=1))
+@_json_option
+def environments(lanes: int, json_file: Path | None) -> None:
+    """Step learning environments in SIMD lanes, in a plant and in MuJoCo.
+
+    Steps a CPU second are measured for an arm and a servicer, LANES [1024] of each.
+    """
+    from spacerobot_ros.benchmarks.environments import environments_benchmark
+
+    _write_figures(json_file, environments_benchmark(lanes, click.echo))
+
+
 def _compare_checkouts(
     other: Path, measure: Callable[[Checkout], Any], rounds: int, json_file: Path | None
 ) -> None:

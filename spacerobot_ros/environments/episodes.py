@@ -232,7 +232,7 @@ class Episodes:
             link=self._link,
             in_lanes=in_lanes,
         )
-        self._scale, self.taken = self._action_scale(scenario)
+        self.scale, self.taken = self._action_scale(scenario)
         self._goals = np.zeros((count, self.task.goal_size))
         self._goals[:, -1] = 1.0
         self.step_duration = config.hold * plant.control_period
@@ -372,7 +372,7 @@ class Episodes:
             raise CommandError(f"The actions are {np.shape(actions)}, not ({count}, {size}).")
         under_way, before = self._flights.alive.copy(), self.errors
         shares = np.asarray(actions, dtype=float)
-        self._flights.step(command_of(shares, self._scale, self.taken), self._config.hold)
+        self._flights.step(command_of(shares, self.scale, self.taken), self._config.hold)
         self._observe()
         weights, seconds = self._weights, self.step_duration
         reached = self._flights.alive & (self.errors <= self._tolerance)

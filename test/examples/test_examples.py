@@ -47,7 +47,7 @@ def test_an_example_is_short_and_says_what_it_is(example: Path) -> None:
     "example",
     some_fast(
         {each.stem: each for each in EXAMPLES},
-        *(each.stem for each in EXAMPLES if not each.stem.startswith("test_")),
+        *(each.stem for each in EXAMPLES if not each.stem.startswith(("fly_", "test_", "train_"))),
     ),
 )
 def test_an_example_runs(example: Path, tmp_path: Path, warm_python: WarmPython) -> None:
@@ -74,3 +74,12 @@ def test_the_bag_example_draws_a_picture(tmp_path: Path, warm_python: WarmPython
     example = ROOT / "examples" / "read_bag_and_plot.py"
     run(warm_python, tmp_path, example, bag, tmp_path / "mine.png")
     assert (tmp_path / "mine.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_domain")
+def test_a_policy_flies_through_ros_as_in_its_environment(
+    tmp_path: Path, warm_python: WarmPython
+) -> None:
+    said = run(warm_python, tmp_path, ROOT / "examples" / "fly_policy.py")
+    assert float(said.rstrip().rpartition(": ")[2]) < 1e-12
