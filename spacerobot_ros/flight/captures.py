@@ -1,4 +1,4 @@
-"""The robot of a flight with the body that it held: who it was when, and its momentum budget."""
+"""The body that a robot held in a flight: when, its parameters, and the momentum budget."""
 
 from __future__ import annotations
 
@@ -9,15 +9,29 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.control.wheels import momentum_budget
+from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.flight import Flight, Signal
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
-from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.grasp import Payload, RobotMotion, frame_motion
 from spacerobot_ros.model.kinematics import ForwardKinematics
-from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.payload_estimation import (
+    PayloadEstimate,
+    estimate_payload,
+    momentum_regressor,
+)
+from spacerobot_ros.model.rotations import (
+    matrices_from_quaternions,
+    matrix_from_quaternion,
+    quaternion_inverse,
+    quaternion_multiply,
+    quaternions_from_rotvecs,
+    rotvecs_from_quaternions,
+)
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.simulation.capture import capturing_link
+from spacerobot_ros.simulation.loads import Surroundings
 
 BUDGET_PARTS = ("base", "arm", "wheels", "sum")
 """Columns of :func:`momentum_budget_over_time`."""
@@ -45,7 +59,7 @@ class HeldBody:
 
 @dataclass(frozen=True)
 class States:
-    """True states of the robot in which base and joints are known.
+    """States of the robot in which base and joints are known.
 
     Attributes
     ----------
@@ -64,9 +78,12 @@ class States:
     qdot: Array
 
     @classmethod
-    def of(cls, flight: Flight, robot: RobotDescription) -> States:
-        """Return the states of a flight; none where its joints are not those of the robot."""
-        pose, q = flight.signal("pose"), flight.signal("q")
+    def of(cls, flight: Flight, robot: RobotDescription, prefix: str = "") -> States:
+        """Return the states of a flight; none where its joints are not those of the robot.
+
+        With the prefix ``measured_`` they are those that the sensors measured.
+        """
+        pose, q = flight.signal(f"{prefix}pose"), flight.signal(f"{prefix}q")
         names = list(flight.joint_names)
         time, base, joints = np.intersect1d(pose.time, q.time, return_indices=True)
         if not set(robot.joint_names) <= set(names):
@@ -77,9 +94,9 @@ class States:
         return cls(
             time,
             pose.values[base],
-            flight.signal("twist").values[base],
+            flight.signal(f"{prefix}twist").values[base],
             q.values[joints][:, columns],
-            flight.signal("qdot").values[joints][:, columns],
+            flight.signal(f"{prefix}qdot").values[joints][:, columns],
         )
 
     def __len__(self) -> int:
@@ -96,9 +113,9 @@ class States:
         inside = (self.time >= start - _SAME_TIME) & (self.time <= end + _SAME_TIME)
         return self.at(np.flatnonzero(inside))
 
-    def thinned(self, most: int) -> States:
-        """Return at most so many states, at about equal intervals."""
-        return self.at(np.unique(np.linspace(0, len(self) - 1, most).round().astype(int)))
+    def thinned_rows(self, most: int) -> npt.NDArray[np.int64]:
+        """Return the rows of at most so many states, at about equal intervals."""
+        return np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64))
 
 
 def held_bodies(flight: Flight) -> tuple[HeldBody, ...]:
@@ -165,7 +182,7 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
     states = States.of(flight, flight.robot)
     if not len(states):
         return Signal.empty(len(BUDGET_PARTS))
-    states = states.thinned(most)
+    states = states.at(states.thinned_rows(most))
     wheels = ReactionWheels.of(flight.robot)
     alone = SpaceRobot(wheels.gyrostat)
     held = [(each, each.payload.attached_to(alone)) for each in held_bodies(flight)]
@@ -179,3 +196,117 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
         )
         values[row] = [np.linalg.norm(parts[name]) for name in BUDGET_PARTS]
     return Signal(states.time, values)
+
+
+def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate, ...]:
+    """Return the estimated parameters of each body that the robot held.
+
+    They follow from the measured motion of base and joints, from the masses of the robot alone and
+    from the thrust, by the conservation of momentum (:mod:`.model.payload_estimation`): nothing is
+    taken from the target's description.
+
+    Parameters
+    ----------
+    flight
+        The flight.
+    most
+        Largest number of states of each body that are used.
+
+    Raises
+    ------
+    SpaceRobotError
+        Loads whose impulse is not known acted on the robot.
+    RobotDescriptionError
+        The described robot has no positive inertia.
+    """
+    robot, plant = flight.robot, flight.scenario.plant
+    held = held_bodies(flight)
+    if robot is None or not held:
+        return ()
+    loaded = any(event.kind is EventKind.DISTURBANCE for event in flight.events)
+    if loaded or plant.disturbances or Surroundings.of(plant.orbit, plant.table).act:
+        raise SpaceRobotError(
+            "The held body is not estimated: loads from outside (disturbances, an orbit or a "
+            "table) acted on the robot, and their impulse is not known to it; estimate it from a "
+            "flight without them."
+        )
+    prefix = "measured_" if len(flight.signal("measured_pose")) else ""
+    states, alone = States.of(flight, robot, prefix), SpaceRobot(robot)
+    # The state of the capture itself shows the motion before it.
+    spans = [
+        (each.payload.link, states.between(each.start + 2 * _SAME_TIME, each.end)) for each in held
+    ]
+    return tuple(
+        _payload_estimate(flight, alone, link, span, most) for link, span in spans if len(span) > 2
+    )
+
+
+def _payload_estimate(
+    flight: Flight, robot: SpaceRobot, link: str, states: States, most: int
+) -> PayloadEstimate:
+    about = states.pose[:, :3].mean(axis=0)
+    impulses = _impulses(flight, states, about)
+    middle = 1 + np.unique(
+        np.linspace(0, len(states) - 3, max(most // 3, 1)).round().astype(np.int64)
+    )
+    rows = (middle[:, np.newaxis] + np.arange(-1, 2)).reshape(-1)
+    regressors, known = np.empty((len(rows), 6, 10)), np.empty((len(rows), 6))
+    for at, row in enumerate(rows.tolist()):
+        pose, twist, q, qdot = (
+            each[row] for each in (states.pose, states.twist, states.q, states.qdot)
+        )
+        motion = RobotMotion(pose, twist, q, qdot)
+        p, L, _ = robot.momentum(pose[3:], q, twist[:3], twist[3:], qdot)
+        center = pose[:3] + motion.R_WB @ robot.center_of_mass(q)
+        known[at, :3], known[at, 3:] = p, L + np.cross(center - about, p)
+        regressors[at] = momentum_regressor(frame_motion(robot, link, motion), about)
+    inertia = robot.inertia_matrix(states.q[0])[3:6, 3:6]
+    radius = math.sqrt(float(np.trace(inertia)) / 2 / robot.total_mass)
+    return estimate_payload(
+        link,
+        regressors.reshape(-1, 3, 6, 10),
+        (known - impulses[rows]).reshape(-1, 3, 6),
+        robot.total_mass,
+        radius,
+    )
+
+
+def _impulses(flight: Flight, states: States, about: Array) -> Array:
+    """Return the impulses (N, 6) of the thrust since the first of N states, N s and N m s about a
+    point, in W. Wrenches are constant over a tick in the frame of the base.
+    """
+    wrench = _thrust_before(flight, states.time[1:])
+    step = np.diff(states.time)[:, np.newaxis]
+    r, q = states.pose[:, :3], states.pose[:, 3:]
+    R = matrices_from_quaternions(q)
+    turn = rotvecs_from_quaternions(quaternion_multiply(quaternion_inverse(q[:-1]), q[1:]))
+    middle = matrices_from_quaternions(
+        quaternion_multiply(q[:-1], quaternions_from_rotvecs(turn / 2))
+    )
+    v = np.einsum("nij,nj->ni", R, states.twist[:, :3])
+    r_middle = (r[:-1] + r[1:]) / 2 + step * (v[:-1] - v[1:]) / 8
+    total = np.zeros((len(states), 6))
+    for share, rotation, place in (
+        (1 / 6, R[:-1], r[:-1]),
+        (4 / 6, middle, r_middle),
+        (1 / 6, R[1:], r[1:]),
+    ):
+        force = np.einsum("nij,nj->ni", rotation, wrench[:, :3])
+        torque = np.einsum("nij,nj->ni", rotation, wrench[:, 3:])
+        torque += np.cross(place - about, force)
+        total[1:] += share * step * np.hstack([force, torque])
+    return np.cumsum(total, axis=0)
+
+
+def _thrust_before(flight: Flight, times: Array) -> Array:
+    """Return the wrench (N, 6) of the thrusters on the base in the ticks that end at times (N,)."""
+    fired, commands = flight.signal("thruster_wrench"), flight.commands.get("base_wrench")
+    found = np.zeros((len(times), 6))
+    if len(fired):
+        _, own, other = np.intersect1d(times, fired.time, return_indices=True)
+        found[own] = fired.values[other]
+    elif commands is not None and len(commands.tick):
+        ticks = np.round(times / flight.control_period).astype(np.int64) - 1
+        _, own, other = np.intersect1d(ticks, commands.tick, return_indices=True)
+        found[own] = commands.values[other]
+    return found

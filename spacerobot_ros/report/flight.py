@@ -13,7 +13,11 @@ import numpy as np
 from spacerobot_ros.collision.drawn import obstacle_visuals
 from spacerobot_ros.control.status import CommandReport, ControllerStatus
 from spacerobot_ros.errors import MeshError
-from spacerobot_ros.flight.captures import BUDGET_PARTS, momentum_budget_over_time
+from spacerobot_ros.flight.captures import (
+    BUDGET_PARTS,
+    momentum_budget_over_time,
+    payload_estimates,
+)
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.flight.flight import Flight, SentGoal, Signal, pose_error, reported_goal
 from spacerobot_ros.flight.reading import (
@@ -29,6 +33,7 @@ from spacerobot_ros.model import RobotDescription
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, Pose, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh
+from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.rotations import (
     matrices_from_quaternions,
     matrix_from_quaternion,
@@ -230,6 +235,17 @@ class FlightReport:
             return Signal.empty(len(BUDGET_PARTS))
         found = momentum_budget_over_time(self.flight, _BUDGET_STATES)
         return _shift_time(found, self.bag.began)
+
+    @cached_property
+    def payload_estimates(self) -> tuple[PayloadEstimate, ...]:
+        """Estimated parameters of each body that the robot held.
+
+        Raises
+        ------
+        SpaceRobotError
+            Loads whose impulse is not known acted on the robot, or it has no positive inertia.
+        """
+        return payload_estimates(self.flight)
 
     @cached_property
     def tool(self) -> Signal:

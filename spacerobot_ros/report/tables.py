@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
+from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.report.flight import FlightReport, joint_unit
@@ -110,11 +113,41 @@ def result_table(flight: FlightReport) -> Table:
         linear, angular = flight.drift
         drifts = f"linear {linear:.3g} kg m/s, angular {angular:.3g} kg m²/s"
         rows.append(("Momentum drift", drifts))
+    rows += _payload_rows(flight)
     if (clearance := flight.clearance) is not None:
         nearest = clearance.nearest
         at = f"links {nearest.links} at {clearance.nearest_time:.6g} s"
         rows.append(("Clearance", f"{nearest.distance:.4g} m, {at}"))
     return Table(("Quantity", "Value"), rows)
+
+
+def _payload_rows(flight: FlightReport) -> list[tuple[str, ...]]:
+    """Return the estimated parameters of each body that the robot held."""
+    try:
+        estimates = flight.payload_estimates
+    except SpaceRobotError as error:
+        return [("Held body, estimated", str(error))]
+    return [("Held body, estimated", payload_text(each)) for each in estimates]
+
+
+def payload_text(estimate: PayloadEstimate) -> str:
+    """Return the estimated parameters of a held body that its motion determines."""
+    parts = []
+    mass, spread = estimate.parameters[0], estimate.deviations[0]
+    if not math.isnan(mass):
+        parts.append(f"mass {mass:.6g} ± {spread:.1g} kg")
+    if not np.isnan(estimate.parameters[:4]).any():
+        center = _format_vector(estimate.parameters[1:4] / mass)
+        parts.append(f"centre of mass ({center}) m in {estimate.link}")
+    if (payload := estimate.payload) is not None:
+        inertia = payload.inertia.about_com
+        moments = ", ".join(f"{inertia[i, j]:.4g}" for i, j in INERTIA_ENTRIES)
+        parts.append(f"inertia about it ({moments}) kg m² (xx, yy, zz, xy, xz, yz)")
+    if estimate.undetermined:
+        parts.append(f"not shown by its motion: {', '.join(estimate.undetermined)}")
+    if estimate.corrected:
+        parts.append("corrected to the nearest parameters of a body")
+    return "; ".join(parts)
 
 
 def _tool_rows(flight: FlightReport, error: PoseError) -> list[tuple[str, ...]]:

@@ -12,16 +12,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.oracles import Array
 
+from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.captures import (
     BUDGET_PARTS,
     States,
     held_bodies,
     momentum_budget_over_time,
+    payload_estimates,
 )
 from spacerobot_ros.flight.flight import Flight, Signal
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.payload_estimation import PAYLOAD_PARAMETERS, payload_parameters
 
 BAGS = Path(__file__).parents[2] / "bags"
 
@@ -139,5 +142,91 @@ def test_states_are_those_at_which_base_and_joints_are_known(capture: Flight) ->
     assert np.array_equal(states.q, fewer.values[:, ::-1])
     middle = states.between(float(q.time[4]), float(q.time[6]))
     assert np.array_equal(middle.time, q.time[4:7])
-    assert np.array_equal(states.thinned(2).time, q.time[[3, 8]])
-    assert len(states.thinned(100)) == 6
+    assert np.array_equal(states.time[states.thinned_rows(2)], q.time[[3, 8]])
+    assert len(states.thinned_rows(100)) == 6
+
+
+def test_a_planar_flight_determines_seven_parameters_of_the_block(capture: Flight) -> None:
+    """Thrusters fire all the time: their impulse is part of the balance."""
+    (found,) = payload_estimates(capture, 80)
+    assert found.undetermined == ("Ixx", "Iyy", "Ixy")
+    (held,) = held_bodies(capture)
+    shown = ~np.isnan(found.parameters)
+    true = payload_parameters(held.payload.inertia)
+    np.testing.assert_allclose(found.parameters[shown], true[shown], atol=1e-5)
+    # Without the thrust it would be another body.
+    still = {**capture.commands, "base_wrench": replace(capture.commands["base_wrench"])}
+    still["base_wrench"] = replace(
+        still["base_wrench"], values=np.zeros_like(capture.commands["base_wrench"].values)
+    )
+    (other,) = payload_estimates(replace(capture, commands=still), 80)
+    assert abs(other.parameters[0] - 10.0) > 1.0
+
+
+@pytest.fixture(scope="module")
+def servicing() -> Flight:
+    return read_run(BAGS / "servicing.mcap")
+
+
+def noisy(flight: Flight, size: float) -> Flight:
+    """The flight with white noise of measured velocities, and a hundredth of it of positions."""
+    rng = np.random.default_rng(4)
+    noise = {"pose": size / 100, "twist": size, "q": size / 100, "qdot": size}
+    measured = {
+        f"measured_{name}": Signal(
+            flight.signal(name).time,
+            flight.signal(name).values + s * rng.normal(size=flight.signal(name).values.shape),
+        )
+        for name, s in noise.items()
+    }
+    return replace(flight, series={**flight.series, **measured})
+
+
+def test_a_satellite_with_unequal_moments_is_estimated_from_its_flight(servicing: Flight) -> None:
+    """Its thrusters fire on and off, and its wheels turn."""
+    (found,) = payload_estimates(servicing, 90)
+    assert found.undetermined == ()
+    (held,) = held_bodies(servicing)
+    true = payload_parameters(held.payload.inertia)
+    assert len(set(np.round(true, 3))) == 10
+    np.testing.assert_allclose(found.parameters, true, rtol=1e-3, atol=0.03)
+    assert found.payload is not None
+    assert found.payload.link == held.payload.link
+
+
+def test_an_estimate_from_noisy_sensors_knows_its_errors(servicing: Flight) -> None:
+    (held,) = held_bodies(servicing)
+    true = payload_parameters(held.payload.inertia)
+    (found,) = payload_estimates(noisy(servicing, 1e-6), 240)
+    assert found.undetermined == ()
+    error = np.abs(found.parameters - true)
+    assert 1e-4 < found.deviations[0] < 0.02
+    assert (error < 3.5 * found.deviations).all()
+    (coarse,) = payload_estimates(noisy(servicing, 1e-4), 240)
+    assert set(coarse.undetermined) >= {"Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"}
+
+
+def test_a_short_flight_with_noise_shows_nothing(capture: Flight) -> None:
+    (found,) = payload_estimates(noisy(capture, 1e-5), 200)
+    assert found.undetermined == PAYLOAD_PARAMETERS
+
+
+def test_loads_from_outside_are_not_taken_for_a_body(capture: Flight) -> None:
+    loaded = Event(EventKind.DISTURBANCE, "A wrench acts.", 1, 0.5)
+    scenario = capture.scenario
+    windy = scenario.with_overrides("plant", {"disturbances": ("wrench spacecraft 1 0 0 0 0 0",)})
+    orbit = scenario.with_overrides("plant", {"orbit.mean_motion": 1e-3})
+    for flight in (
+        replace(capture, events=(*capture.events, loaded)),
+        replace(capture, scenario=windy),
+        replace(capture, scenario=orbit),
+    ):
+        with pytest.raises(SpaceRobotError) as error:
+            payload_estimates(flight)
+        assert str(error.value) == (
+            "The held body is not estimated: loads from outside (disturbances, an orbit or a "
+            "table) acted on the robot, and their impulse is not known to it; estimate it from a "
+            "flight without them."
+        )
+    assert payload_estimates(replace(capture, robot=None)) == ()
+    assert payload_estimates(replace(capture, events=(loaded,))) == ()

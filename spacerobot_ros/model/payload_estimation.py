@@ -1,0 +1,297 @@
+"""The ten inertial parameters of a held body, from motion and the conservation of momentum.
+
+The momentum of a body is linear in its parameters ``phi = [m, m c, I]`` (10,): mass, first moment
+and moments of inertia about the origin of the frame L that it is given in (Atkeson, An and
+Hollerbach, 1986). The robot's own momentum ``P_r`` is known by its model. Without loads other than
+the known impulse J since the first state, and with the total momentum P_0 then,
+
+    P_r(t) + A(t) phi = P_0 + J(t),
+
+of linear momentum over angular momentum about a fixed point. P_0 is not known either. A motion that
+leaves columns of A without change (a planar one, say) does not determine all parameters: these are
+named, not invented. The others are physically consistent: some body has them. That is so if and
+only if the pseudo-inertia matrix ``[[tr(I)/2 1 - I, m c], [m c', m]]`` is positive definite
+(Wensing, Kim and Slotine, 2018), which its Cholesky factor with logarithms on the diagonal makes
+sure of (Rucker and Wensing, 2022). The sources are cited from memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from spacerobot_ros.model.description import Array, Inertia
+from spacerobot_ros.model.grasp import BodyMotion, Payload
+from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
+from spacerobot_ros.model.rotations import hat
+
+PAYLOAD_PARAMETERS = ("m", "m cx", "m cy", "m cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
+"""Names of the parameters: kg, kg m, and kg m^2 about the origin of L."""
+
+_SMALLEST_SINGULAR_VALUE = 1e-7
+"""Smallest singular value of a direction that motion determines, relative to the largest."""
+
+_LEAST_SIGNAL = 10.0
+"""Least power of the motion that determines a direction, relative to that of its errors."""
+
+_JERK = 3.0
+"""Second difference beyond which it counts as a jerk of the motion, relative to the median."""
+
+_UNDETERMINED_SHARE = 0.2
+"""Share of undetermined directions in a parameter from which it is undetermined itself."""
+
+_ROUNDING = 1e-13
+"""Least relative error of momenta."""
+
+_PRIOR_WEIGHT = 1e-6
+"""Weight of the prior of undetermined directions, relative to the largest singular value."""
+
+_CONSISTENT = 1.0
+"""Largest distance from some body that counts as noise, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class PayloadEstimate:
+    """Estimated parameters of a body that a link holds, in the frame of the link.
+
+    Attributes
+    ----------
+    link
+        Name of the link.
+    parameters
+        (10,) of :data:`PAYLOAD_PARAMETERS`; NaN where motion does not determine one.
+    deviations
+        (10,) their standard deviations, by the scatter of the momenta.
+    directions
+        (k, 10) orthonormal combinations that are not determined, each parameter in units of the
+        robot's mass and radius of gyration.
+    corrected
+        Whether no body has the parameters that fit best, so that the nearest of a body are given.
+    """
+
+    link: str
+    parameters: Array
+    deviations: Array
+    directions: Array
+    corrected: bool
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Names of the parameters that the motion does not determine."""
+        pairs = zip(PAYLOAD_PARAMETERS, self.parameters, strict=True)
+        return tuple(name for name, value in pairs if np.isnan(value))
+
+    @property
+    def payload(self) -> Payload | None:
+        """The body; None where a parameter is not determined."""
+        if self.undetermined:
+            return None
+        mass, h, about = _parts(self.parameters)
+        com = h / mass
+        about_com = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
+        return Payload(self.link, Inertia(float(mass), com, about_com))
+
+
+def payload_parameters(inertia: Inertia) -> Array:
+    """Return the parameters (10,) of a body, in the order of :data:`PAYLOAD_PARAMETERS`."""
+    com, mass = inertia.com, inertia.mass
+    about = inertia.about_com + mass * (com @ com * np.eye(3) - np.outer(com, com))
+    return np.array([mass, *(mass * com), *(about[i, j] for i, j in INERTIA_ENTRIES)])
+
+
+def momentum_regressor(motion: BodyMotion, about: Array) -> Array:
+    """Return A (6, 10): the momenta of a body are A times its parameters.
+
+    Parameters
+    ----------
+    motion
+        Motion of the frame L of the parameters.
+    about
+        (3,) point in W that angular momentum is about, m.
+    """
+    R = motion.R_WT
+    v, omega = R.T @ motion.v, R.T @ motion.omega
+    A = np.zeros((6, 10))
+    A[:3, 0], A[:3, 1:4] = v, hat(omega)
+    A[3:, 1:4] = -hat(v)
+    for column, (i, j) in enumerate(INERTIA_ENTRIES, 4):
+        A[3 + i, column] += omega[j]
+        if i != j:
+            A[3 + j, column] += omega[i]
+    A[:3], A[3:] = R @ A[:3], R @ A[3:]
+    A[3:] += hat(motion.r_WT - about) @ A[:3]
+    return A
+
+
+def estimate_payload(
+    link: str, regressors: Array, known: Array, mass: float, radius: float
+) -> PayloadEstimate:
+    """Return the parameters of a held body, by least squares with errors in all variables.
+
+    Measured velocities have errors, on which both sides of the equation depend. Their covariance is
+    taken from second differences, and subtracted from the normal equations. A motion without errors
+    fulfils the equation in its differences, too, so that nothing is lost then.
+
+    Parameters
+    ----------
+    link
+        Link that holds it.
+    regressors
+        (T, 3, 6, 10) of :func:`momentum_regressor` at T times three successive states, equally far
+        apart in time.
+    known
+        (T, 3, 6) momenta of the robot without the body, less the impulse since the first state.
+    mass, radius
+        Mass (kg) and radius of gyration (m) of the robot: units in which parameters are compared.
+    """
+    unit = mass * np.array([1.0, *[radius] * 3, *[radius**2] * 6])
+    rows = np.concatenate([regressors * unit, -known[..., np.newaxis]], axis=-1)
+    rows = rows - rows.mean(axis=(0, 1))
+    least = _ROUNDING * max(np.abs(known).max(initial=0.0), float(np.finfo(float).tiny))
+    weights = np.array([1.0] * 3 + [1.0 / radius] * 3)
+    for _ in range(2):
+        # Linear and angular momenta scatter differently; the first fit shows by how much.
+        fit = _fit(rows * weights[:, np.newaxis])
+        left = rows[..., :10] @ fit.x - rows[..., 10]
+        scatter = [np.sqrt(np.mean(left[..., part] ** 2)) for part in (slice(3), slice(3, 6))]
+        weights = 1.0 / np.maximum(np.repeat(scatter, 3), least)
+    fit = _fit(rows * weights[:, np.newaxis])
+    x, corrected = _of_a_body(fit)
+    shares = np.sqrt(np.sum(fit.undetermined**2, axis=0))
+    spread = np.sqrt(
+        np.sum((fit.determined * fit.deviations[:, np.newaxis]) ** 2, axis=0)
+        # The part in undetermined directions is left out; it is about as large as the others.
+        + (shares * np.linalg.norm(x)) ** 2
+    )
+    unknown = shares > _UNDETERMINED_SHARE
+    return PayloadEstimate(
+        link,
+        np.where(unknown, np.nan, unit * x),
+        np.where(unknown, np.nan, unit * spread),
+        fit.undetermined,
+        corrected,
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A least-squares fit: ``x`` (10,), in ``determined`` directions (r, 10) with standard
+    ``deviations`` (r,); the ``undetermined`` (10 - r, 10) are orthogonal to x.
+    """
+
+    x: Array
+    determined: Array
+    deviations: Array
+    undetermined: Array
+
+
+def _fit(rows: Array) -> _Fit:
+    """Return the fit of rows (T, 3, 6, 11) of triples of states: the last column by the others."""
+    differences = (rows[:, 0] - 2.0 * rows[:, 1] + rows[:, 2]) / np.sqrt(6.0)
+    size = np.linalg.norm(differences, axis=(1, 2))
+    # Errors are in all states; a jerk of the motion itself is in few.
+    usual = differences[size <= _JERK * np.median(size)]
+    flat, between = rows.reshape(-1, 11), usual.reshape(-1, 11)
+    errors = len(flat) / len(between) * between.T @ between
+    signal = flat.T @ flat - errors
+    power, V = np.linalg.eigh(signal[:10, :10])
+    noise = np.einsum("ik,ij,jk->k", V, errors[:10, :10], V)
+    found = (power > _SMALLEST_SINGULAR_VALUE**2 * max(power[-1], 0.0)) & (
+        power > _LEAST_SIGNAL * noise
+    )
+    determined = V.T[found]
+    inverse = determined.T / power[found]
+    x = inverse @ (determined @ signal[:10, 10])
+    left = flat[:, :10] @ x - flat[:, 10]
+    # Each row by its own error.
+    scattered = (flat[:, :10] @ inverse) * left[:, np.newaxis]
+    deviations = np.sqrt(np.sum(scattered**2, axis=0))
+    rounding = _ROUNDING * max(float(np.linalg.norm(x)), 1e-300)
+    return _Fit(x, determined, np.maximum(deviations, rounding), V.T[~found])
+
+
+def _of_a_body(fit: _Fit) -> tuple[Array, bool]:
+    """Return parameters (10,) of a body near the fit, and whether the fit has been corrected."""
+    if not len(fit.undetermined) and np.linalg.eigvalsh(_pseudo_inertia(fit.x)).min() > 0.0:
+        return fit.x, False
+    if not len(fit.deviations):
+        return fit.x, False
+    aim, weights = fit.determined @ fit.x, fit.deviations.min() / fit.deviations
+    start = _start(fit.x)
+
+    def left(theta: Array) -> Array:
+        of_data = weights * (fit.determined @ _from_log_cholesky(theta) - aim)
+        return np.concatenate([of_data, _PRIOR_WEIGHT * weights.min() * (theta - start)])
+
+    def slopes(theta: Array) -> Array:
+        of_data = weights[:, np.newaxis] * (fit.determined @ _log_cholesky_slopes(theta))
+        return np.vstack([of_data, _PRIOR_WEIGHT * weights.min() * np.eye(10)])
+
+    result = least_squares(
+        left, start, slopes, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-14, max_nfev=300
+    )
+    found = _from_log_cholesky(result.x)
+    distance = float(np.linalg.norm((fit.determined @ found - aim) / fit.deviations))
+    near = np.linalg.norm(fit.determined @ found - aim) <= 1e-6 * np.linalg.norm(aim)
+    corrected = not (near or distance <= _CONSISTENT)
+    return (found, True) if corrected else (fit.x, False)
+
+
+def _parts(x: Array) -> tuple[float, Array, Array]:
+    """Return mass, first moment (3,) and inertia (3, 3) of parameters (10,)."""
+    about = np.zeros((3, 3))
+    for value, (i, j) in zip(x[4:], INERTIA_ENTRIES, strict=True):
+        about[i, j] = about[j, i] = value
+    return float(x[0]), x[1:4], about
+
+
+def _pseudo_inertia(x: Array) -> Array:
+    """Return the pseudo-inertia matrix (4, 4) of parameters (10,)."""
+    mass, h, about = _parts(x)
+    J = np.empty((4, 4))
+    J[:3, :3] = np.trace(about) / 2 * np.eye(3) - about
+    J[:3, 3] = J[3, :3] = h
+    J[3, 3] = mass
+    return J
+
+
+def _start(x: Array) -> Array:
+    """Return the logarithmic Cholesky factor of a body near parameters (10,)."""
+    values, vectors = np.linalg.eigh(_pseudo_inertia(x))
+    size = max(float(np.abs(values).max()), 1e-12)
+    L = np.linalg.cholesky((vectors * np.maximum(values, 1e-3 * size)) @ vectors.T)
+    return np.concatenate([np.log(np.diag(L)), L[_BELOW]])
+
+
+def _from_log_cholesky(theta: Array) -> Array:
+    """Return the parameters (10,) of a body from its logarithmic Cholesky factor (10,)."""
+    L = _factor(theta)
+    return _of_pseudo_inertia(L @ L.T)
+
+
+def _log_cholesky_slopes(theta: Array) -> Array:
+    """Return the derivatives (10, 10) of :func:`_from_log_cholesky`."""
+    L, slopes = _factor(theta), np.empty((10, 10))
+    for k, (i, j) in enumerate([*((i, i) for i in range(4)), *zip(*_BELOW, strict=True)]):
+        dL = np.zeros((4, 4))
+        dL[i, j] = L[i, j] if i == j else 1.0
+        slopes[:, k] = _of_pseudo_inertia(dL @ L.T + L @ dL.T)
+    return slopes
+
+
+def _factor(theta: Array) -> Array:
+    L = np.diag(np.exp(theta[:4]))
+    L[_BELOW] = theta[4:]
+    return L
+
+
+def _of_pseudo_inertia(J: Array) -> Array:
+    """Return the parameters (10,) of a pseudo-inertia matrix (4, 4)."""
+    about = np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3]
+    return np.array([J[3, 3], *J[:3, 3], *(about[i, j] for i, j in INERTIA_ENTRIES)])
+
+
+_BELOW = np.tril_indices(4, -1)
+"""Entries of a Cholesky factor below its diagonal."""
