@@ -274,7 +274,8 @@ def _from_log_cholesky(theta: Array) -> Array:
 def _log_cholesky_slopes(theta: Array) -> Array:
     """Return the derivatives (10, 10) of :func:`_from_log_cholesky`."""
     L, slopes = _factor(theta), np.empty((10, 10))
-    for k, (i, j) in enumerate([*((i, i) for i in range(4)), *zip(*_BELOW, strict=True)]):
+    rows, columns = (np.concatenate([range(4), each]).tolist() for each in _BELOW)
+    for k, (i, j) in enumerate(zip(rows, columns, strict=True)):
         dL = np.zeros((4, 4))
         dL[i, j] = L[i, j] if i == j else 1.0
         slopes[:, k] = _of_pseudo_inertia(dL @ L.T + L @ dL.T)

@@ -28,6 +28,9 @@ _Made = TypeVar("_Made")
 _MIN_RELATIVE_INERTIA = 1e-6
 """Largest component of a joint that counts as zero in a motion without inertia."""
 
+_MIN_RELATIVE_COUPLING = 1e-9
+"""Smallest singular value of the connection that counts as a turn of the base, rad per rad."""
+
 
 class SpaceRobot:
     """Model of a free-floating robot, built once from its description.
@@ -198,6 +201,17 @@ class SpaceRobot:
     def connection(self, q: npt.ArrayLike) -> Array:
         """Return ``A(q)`` (6, n): ``[v_WB_B; omega_WB_B] = -A qdot`` at zero momentum (paper 1)."""
         return self._call_function("connection", q)[0].reshape((6, self.n), order="F")
+
+    def reaction_null_space(self, q: npt.ArrayLike) -> Array:
+        """Return an orthonormal basis (n, k) of the joint rates that do not turn the base.
+
+        They are the null space of the coupling inertia ``D_q`` (Nenchev, Umetani and Yoshida, 1992,
+        from memory): at zero angular momentum the base keeps its attitude while the joints move at
+        such rates. Its projection ``N N'`` takes the nearest of them from any rates.
+        """
+        _, s, Vt = np.linalg.svd(self.connection(q)[3:])
+        rank = int(np.count_nonzero(s > _MIN_RELATIVE_COUPLING * max(1.0, s.max(initial=0.0))))
+        return np.asarray(Vt[rank:].T)
 
     def curvature(self, q: npt.ArrayLike) -> Array:
         """Return ``K`` (6, n, n) of ``F = -A``: ``dF_j/dq_i - dF_i/dq_j + [F_i, F_j]``.

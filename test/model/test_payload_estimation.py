@@ -153,8 +153,7 @@ def test_errors_of_the_velocities_of_the_body_do_not_bias_its_mass() -> None:
     assert spread < 1.0
     assert abs(mass - MASSES.sum()) < 3.5 * spread
     # Without the correction the errors make it lighter by their share of 40 kg.
-    A, b = (np.array(each).reshape(-1, n) for each, n in ((regressors, 10), (known, 1)))
-    A, b = (each.reshape(len(moving), 6, -1) for each in (A, b))
+    A, b = np.array(regressors), np.array(known)
     plain = np.linalg.lstsq(
         (A - A.mean(axis=0)).reshape(-1, 10), -(b - b.mean(axis=0)).ravel(), rcond=None
     )[0]
