@@ -149,6 +149,8 @@ class CollisionGeometry:
     mesh_of
         Returns the triangles of a visual of the kind ``mesh`` in the frame of its link; a mesh for
         which it raises a :class:`.MeshError` is left out.
+    obstacles_alone
+        Whether pairs of two links of the robot are left out.
 
     Attributes
     ----------
@@ -164,7 +166,11 @@ class CollisionGeometry:
     """
 
     def __init__(
-        self, robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
+        self,
+        robot: RobotDescription,
+        mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh,
+        *,
+        obstacles_alone: bool = False,
     ) -> None:
         self.robot = robot
         self._kinematics = ForwardKinematics(robot)
@@ -183,6 +189,9 @@ class CollisionGeometry:
         self._centers = np.array([each.enclosure.pose.r for each in self.solids]).reshape(-1, 3)
         self._radii = np.array([each.enclosure.bounding_radius for each in self.solids])
         self.pairs = self._distinct_pairs()
+        if obstacles_alone:
+            self.pairs = self.pairs[[self.solids[j].is_obstacle for _, j in self.pairs]]
+            return
         self._leave_out(self._always_in_contact())
 
     @cached_property

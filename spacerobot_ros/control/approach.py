@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -21,14 +22,16 @@ from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.outputs import AXES
 from spacerobot_ros.control.reference import quintic_duration
 from spacerobot_ros.control.state import ControlState, PoseReference
+from spacerobot_ros.control.target_clearance import NearestLinks, TargetClearance
 from spacerobot_ros.control.target_motion import (
     FrameMotion,
+    PathInWorld,
     RelativeMotionOverTime,
     RelativePath,
     TorqueFreeMotion,
 )
 from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -54,6 +57,12 @@ _CLOSING_SHARE = 0.5
 
 _REACHED = 1e-3
 """Distance of an end-effector from its reference (m, rad) below which the arm reaches it."""
+
+_STANDOFF_FACTORS = (1.0, 2.0, 3.0)
+"""Distances of the standoffs that are tried where the target is in the way, over the given one."""
+
+_MOST_BLOCKED = 100
+"""Number of paths past the body of the target that are tried."""
 
 _MAX_ITERATIONS = 30
 _DAMPING = 0.02
@@ -93,6 +102,14 @@ class ApproachOptions:
     patience: float = parameter(
         3.0, "time at contact within which the target has to be captured", unit="s", minimum=0.0
     )
+    clearance: float = parameter(
+        0.02,
+        "smallest distance of base and arm from the body of the target on the way; of the "
+        "end-effector's own body up to the standoff; 0: the body is not looked at",
+        unit="m",
+        minimum=0.0,
+        maximum=100.0,
+    )
     timeout: float = parameter(
         0.5, "age of the target's odometry at which the target is lost", unit="s", minimum=0.0
     )
@@ -110,12 +127,16 @@ class ApproachPlan:
         Its paths relative to the grapple frame: to the standoff, and from there to contact.
     standoff_time
         Time at the standoff, s.
+    distance
+        Smallest distance of the robot from the body of the target on the way, m; infinite where
+        nothing can touch.
     """
 
     start: float
-    outward: RelativePath
+    outward: RelativePath | PathInWorld
     closing: RelativePath
     standoff_time: float
+    distance: float = math.inf
 
     @property
     def closes_at(self) -> float:
@@ -167,26 +188,37 @@ class ArmReach:
         """Return the distance (m or rad) that remains to the k-th pose, from the present shape."""
         return self._solve(self._q, motion, k)[1]
 
-    def follows(self, motion: FrameMotion, period: float) -> str:
-        """Return why the arm does not follow a motion from its present shape; empty: it does.
+    @property
+    def base(self) -> Pose:
+        """Pose of the base in W."""
+        return Pose(self._R_WB, self._r_WB)
+
+    def waiting(self, count: int) -> Array:
+        """Return the present shape, ``count`` times (count, n)."""
+        return np.tile(self._q, (count, 1))
+
+    def follows(self, motion: FrameMotion, period: float) -> tuple[Array, str]:
+        """Return the shapes (K, n) of the arm that follows a motion from its present shape on, and
+        why it does not; empty: it does.
 
         ``period`` is the time between two poses of the motion, s.
         """
-        q = self._q
+        q, shapes = self._q, np.empty((len(motion.r), len(self._q)))
         for k in range(len(motion.r)):
             before = q
             q, distance = self._solve(q, motion, k)
+            shapes[k] = q
             if distance > _REACHED:
-                return f"the end-effector stays {distance:.3g} m or rad away from it"
+                return shapes, f"the end-effector stays {distance:.3g} m or rad away from it"
             rate = np.abs(q - before) / period
             share = rate / (_RATE_SHARE * self._rates)
             if k and share.max(initial=0.0) > 1.0:
                 worst = int(share.argmax())
-                return (
+                return shapes, (
                     f"joint '{self._robot.joint_names[worst]}' would move at {rate[worst]:.3g}/s, "
                     f"of {self._rates[worst]:.3g}/s"
                 )
-        return ""
+        return shapes, ""
 
     def _solve(self, q: Array, motion: FrameMotion, k: int) -> tuple[Array, float]:
         """Return the shape nearest to a pose, from a shape on, and the distance that remains."""
@@ -222,8 +254,12 @@ def plan_approach(
     limits: MotionLimits,
     reach: ArmReach,
     axes: tuple[str, ...],
+    clearance: TargetClearance | None = None,
 ) -> ApproachPlan:
     """Return the approach that begins earliest.
+
+    Where the body of the target is in the way, the end-effector goes round: along a path that is
+    short in W, to the standoff or to one two or three times as far away; or it sets out later.
 
     Parameters
     ----------
@@ -237,6 +273,8 @@ def plan_approach(
         The arm.
     axes
         Axes of the end-effector that are controlled.
+    clearance
+        Distances from the body of the target; None: its body is not known.
 
     Raises
     ------
@@ -245,16 +283,26 @@ def plan_approach(
     """
     moving = bool(held.velocity.any() or held.angular_velocity.any())
     starts = np.arange(0.0, 0.0 if moving else options.horizon, _START_PERIOD)
-    standoff, closing = np.array(options.standoff), _closing_path(options, limits)
+    standoffs = [factor * np.array(options.standoff) for factor in _STANDOFF_FACTORS]
+    ways = [(each, _closing_path(each, options, limits)) for each in standoffs]
+    ways.insert(0, ways[0])  # Relative to the grapple frame; the others are short in W.
     at_rest, failure = FrameMotion.of_reference(held), _Failure()
-    longest = _LONGEST_PATH + options.standoff_time + closing.duration + 2 * _SAMPLE_PERIOD
+    longest = _LONGEST_PATH + options.standoff_time + ways[-1][1].duration + 2 * _SAMPLE_PERIOD
     samples = round((options.horizon + longest) / _SAMPLE_PERIOD)
     grapple = target.grapple(_SAMPLE_PERIOD * np.arange(samples))
+    in_the_way = False
     for start in [0.0] if moving else starts.tolist():
         first = round(start / _SAMPLE_PERIOD)
         begin = RelativeMotionOverTime.between(grapple.part(first, first + 1), at_rest)
-        for duration in _outward_durations():
-            outward = RelativePath(begin, standoff, duration)
+        for duration, (way, (standoff, closing)) in product(_outward_durations(), enumerate(ways)):
+            if not way:
+                in_the_way = False
+            elif not in_the_way:
+                continue
+            relative = RelativePath(begin, standoff, duration)
+            outward: RelativePath | PathInWorld = relative
+            if way:
+                outward = PathInWorld(relative, target, start, at_rest, standoff)
             plan = ApproachPlan(start, outward, closing, options.standoff_time)
             last = first + math.ceil((plan.contact - start) / _SAMPLE_PERIOD) + 1
             # Few samples refuse most of the paths.
@@ -270,17 +318,37 @@ def plan_approach(
             distance = reach.distance(motion, -1)
             if distance > _REACHED:
                 failure.out_of_reach(distance, plan.contact)
+                if way:
+                    continue
                 break  # A longer path meets the target later, which other start times do, too.
-            why = reach.follows(motion, _SAMPLE_PERIOD)
-            if not why:
-                return plan
-            failure.unfollowed(why, plan.contact)
+            near: NearestLinks | None = None
+            for every in (_COARSE, 1):
+                shapes, why = reach.follows(
+                    motion.rows(slice(None, None, every)), every * _SAMPLE_PERIOD
+                )
+                if clearance is None or why:
+                    continue
+                ticks = np.r_[0:first:every, first:last:every]
+                shapes = np.concatenate([reach.waiting(len(ticks) - len(shapes)), shapes])
+                # A hand that is planned for in motion may be beside the target already.
+                closes = 0 if moving else int(np.sum(ticks * _SAMPLE_PERIOD < plan.closes_at))
+                near = clearance.nearest(reach.base, shapes, grapple.rows(ticks), closes)
+                if near is not None and near.distance < clearance.least:
+                    break
+            if clearance is not None and near is not None and near.distance < clearance.least:
+                in_the_way = True
+                failure.blocked(near, clearance.least, plan.contact)
+            elif why:
+                failure.unfollowed(why, plan.contact)
+            else:
+                return plan if near is None else replace(plan, distance=near.distance)
+            if failure.blocks == _MOST_BLOCKED:
+                raise PlanningError(failure.message(options.horizon))
     raise PlanningError(failure.message(options.horizon))
 
 
-def _closing_path(options: ApproachOptions, limits: MotionLimits) -> RelativePath:
-    """Return the path from the standoff to contact, at rest beside the grapple frame at both."""
-    standoff = np.array(options.standoff)
+def _closing_path(standoff: Array, options: ApproachOptions, limits: MotionLimits) -> RelativePath:
+    """Return the path from a standoff to contact, at rest beside the grapple frame at both."""
     length, speed = float(np.linalg.norm(standoff)), min(options.closing_speed, limits.speed)
     acceleration = _CLOSING_SHARE * limits.acceleration
     duration = max(quintic_duration(length, speed, acceleration), _SAMPLE_PERIOD)
@@ -321,6 +389,10 @@ class _Failure:
         self._excess, self._limit = np.inf, ""
         self._distance, self._nearest_at = np.inf, 0.0
         self._why, self._tried_at = "", 0.0
+        self.blocks = 0
+        """Number of paths that come too near to the body of the target."""
+        self._beside = -np.inf, "", 0.0
+        """Distance of the best of them, m, the clause about it, and the time of contact, s."""
 
     def note(self, excess: float, limit: str) -> None:
         if excess < self._excess:
@@ -333,6 +405,18 @@ class _Failure:
     def unfollowed(self, why: str, contact: float) -> None:
         self._why, self._tried_at = why, contact
 
+    def blocked(self, nearest: NearestLinks, least: float, contact: float) -> None:
+        self.blocks += 1
+        if nearest.distance < self._beside[0]:
+            return
+        first, second = nearest.links
+        near = f"come within {nearest.distance:.3g} m of"
+        limit = f", and 'target.clearance' is {least:g} m"
+        if nearest.distance <= 0.0:
+            near, limit = "touch", ""
+        why = f"link '{first}' would {near} '{second}' of the target{limit}"
+        self._beside = nearest.distance, why, contact
+
     def message(self, horizon: float) -> str:
         if self._excess > 1.0:
             return (
@@ -340,11 +424,9 @@ class _Failure:
                 f"{self._limit}."
             )
         within = f"within the next {horizon:g} s"
-        if self._why:
-            return (
-                f"The target cannot be met {within}: with contact at {self._tried_at:.4g} s, "
-                f"{self._why}."
-            )
+        why, contact = (self._beside[1:]) if self.blocks else (self._why, self._tried_at)
+        if why:
+            return f"The target cannot be met {within}: with contact at {contact:.4g} s, {why}."
         return (
             f"The target is out of reach {within}: at best, with contact at "
             f"{self._nearest_at:.4g} s, the end-effector stays {self._distance:.3g} m or rad away "

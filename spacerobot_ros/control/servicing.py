@@ -18,6 +18,7 @@ from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.detumbling import Detumbling, shortest_detumbling
 from spacerobot_ros.control.state import ControlState, Reference
+from spacerobot_ros.control.target_clearance import TargetClearance
 from spacerobot_ros.control.target_motion import TorqueFreeMotion
 from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError
 from spacerobot_ros.events import Event, EventKind
@@ -90,8 +91,8 @@ class MeasuredTarget:
 
     Attributes
     ----------
-    body
-        The body; None: it is not described.
+    description, body
+        Its description, and the body; None: it is not described.
     why_unknown
         Why the body is not known; empty: nothing was received.
     motion, time
@@ -99,6 +100,7 @@ class MeasuredTarget:
     """
 
     def __init__(self) -> None:
+        self.description: RobotDescription | None = None
         self.body: TargetBody | None = None
         self.why_unknown = ""
         self.motion: BodyMotion | None = None
@@ -106,6 +108,7 @@ class MeasuredTarget:
 
     def describe(self, target: RobotDescription, grapple_frame: str) -> None:
         """Take the description of the target."""
+        self.description = target
         try:
             self.body, self.why_unknown = TargetBody.of(target, grapple_frame), ""
         except RobotDescriptionError as error:
@@ -218,6 +221,20 @@ class Approach:
         off = RelativeMotion.between(expected, measured.at(self.target.body.grapple))
         return off.distance > _PREDICTION_SLACK or off.angle > _PREDICTION_SLACK
 
+    def _clearance(self, controller: CoordinatedController) -> TargetClearance | None:
+        """Return the distances of the robot from the body of the target."""
+        target, link = self.target, controller.law.outputs.selection.end_effector_link
+        least = self.config.target.clearance
+        if target.description is None or target.body is None or not least:
+            return None
+        return TargetClearance(
+            controller.law.robot.description,
+            link,
+            target.description,
+            target.body.grapple,
+            least,
+        )
+
     def _make_plan(
         self,
         time: float,
@@ -238,6 +255,7 @@ class Approach:
             self.config.motion,
             controller.arm_reach(state),
             axes,
+            self._clearance(controller),
         )
         self._plan, self._predicted, self._planned_at = plan, target, time
         message = (

@@ -10,6 +10,7 @@ All quantities are arrays over times (K,): positions (K, 3) and attitudes (K, 3,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -82,7 +83,10 @@ class FrameMotion:
 
     def part(self, first: int, last: int, every: int = 1) -> FrameMotion:
         """Return the motion at times from the first up to the last, which is not included."""
-        chosen = slice(first, last, every)
+        return self.rows(slice(first, last, every))
+
+    def rows(self, chosen: slice | npt.NDArray[np.int64]) -> FrameMotion:
+        """Return the motion at some of the times."""
         return FrameMotion(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
     def body_motion(self, k: int = 0) -> BodyMotion:
@@ -210,7 +214,8 @@ class RelativePath:
         y = np.concatenate([start.x[0], start.phi[0]])
         rate = np.concatenate([start.xdot[0], start.phidot[0]])
         acceleration = np.concatenate([start.xddot[0], start.phiddot[0]])
-        self._coefficients = _quintic_to_rest(y, rate, acceleration, self._end, duration)
+        zero = np.zeros(6)
+        self._coefficients = _quintic((y, rate, acceleration), (self._end, zero, zero), duration)
 
     @classmethod
     def from_rest(cls, start: Array, end: Array, duration: float) -> RelativePath:
@@ -222,12 +227,7 @@ class RelativePath:
     def at(self, times: npt.ArrayLike) -> RelativeMotionOverTime:
         """Return the motion at times (K,), s since the beginning; at rest after the end."""
         t = np.minimum(np.asarray(times, dtype=float), self.duration)
-        powers = t[:, np.newaxis] ** np.arange(6)
-        parts = []
-        c = self._coefficients
-        for _ in range(3):
-            parts.append(powers[:, : len(c)] @ c)
-            c = c[1:] * np.arange(1, len(c))[:, np.newaxis]
+        parts = _along(self._coefficients, t)
         rested = np.asarray(times, dtype=float) >= self.duration
         parts[0][rested], parts[1][rested], parts[2][rested] = self._end, 0.0, 0.0
         y, ydot, yddot = parts
@@ -236,18 +236,33 @@ class RelativePath:
         )
 
 
-def _quintic_to_rest(y: Array, rate: Array, acceleration: Array, end: Array, T: float) -> Array:
-    """Return the coefficients (6, m) of the polynomials that come to rest at ``end`` after T s."""
-    d, v, a = end - y, rate * T, acceleration * T**2
+def _quintic(start: Sequence[Array], end: Sequence[Array], T: float) -> Array:
+    """Return the coefficients (6, m) of polynomials of fifth order in time.
+
+    They lead from one value, rate and acceleration, (m,) each, to another within ``T`` s.
+    """
+    (y, v, a), (y_1, v_1, a_1) = (
+        (value, rate * T, acceleration * T**2) for value, rate, acceleration in (start, end)
+    )
+    d = y_1 - y
     scaled = [
         y,
         v,
         a / 2,
-        10 * d - 6 * v - 1.5 * a,
-        -15 * d + 8 * v + 1.5 * a,
-        6 * d - 3 * v - 0.5 * a,
+        10 * d - 6 * v - 1.5 * a - 4 * v_1 + 0.5 * a_1,
+        -15 * d + 8 * v + 1.5 * a + 7 * v_1 - a_1,
+        6 * d - 3 * v - 0.5 * a - 3 * v_1 + 0.5 * a_1,
     ]
     return np.array([c / T**i for i, c in enumerate(scaled)])
+
+
+def _along(coefficients: Array, t: Array) -> list[Array]:
+    """Return values, rates and accelerations (K, m) of polynomials at times (K,)."""
+    powers, c, parts = t[:, np.newaxis] ** np.arange(6), coefficients, []
+    for _ in range(3):
+        parts.append(powers[:, : len(c)] @ c)
+        c = c[1:] * np.arange(1, len(c))[:, np.newaxis]
+    return parts
 
 
 class TorqueFreeMotion:
@@ -323,3 +338,58 @@ class TorqueFreeMotion:
 def _turned(R: Array, vectors: Array) -> Array:
     """Return vectors (K, 3) turned by matrices (K, 3, 3)."""
     return np.asarray(np.einsum("kij,kj->ki", R, vectors))
+
+
+class PathInWorld:
+    """A path that is short in W, not relative to a frame G that turns: round the body of G.
+
+    The position is a polynomial of fifth order in W, from a motion to that of a point that is fixed
+    in G; the attitude relative to G is that of another path.
+
+    Parameters
+    ----------
+    relative
+        The path relative to G with the same ends.
+    target
+        The target whose grapple frame G is.
+    start
+        Time at the beginning, s since the state that the motion of the target is predicted from.
+    moving
+        The motion in W at the beginning (K = 1).
+    position
+        (3,) where the path ends, in G, m.
+    """
+
+    def __init__(
+        self,
+        relative: RelativePath,
+        target: TorqueFreeMotion,
+        start: float,
+        moving: FrameMotion,
+        position: Array,
+    ) -> None:
+        self.duration = relative.duration
+        self._relative, self._target, self._start = relative, target, start
+        zero = np.zeros((1, 3))
+        fixed = RelativeMotionOverTime(position[np.newaxis], zero, zero, zero, zero, zero)
+        end = target.grapple([start + self.duration]).carrying(fixed)
+        first, last = ((each.r[0], each.v[0], each.a[0]) for each in (moving, end))
+        self._coefficients = _quintic(first, last, self.duration)
+
+    def at(self, times: npt.ArrayLike) -> RelativeMotionOverTime:
+        """Return the motion relative to G at times (K,), s since the beginning."""
+        t = np.asarray(times, dtype=float)
+        found = self._relative.at(t)
+        on_way = t < self.duration
+        if not on_way.any():
+            return found
+        r, v, a = _along(self._coefficients, t[on_way])
+        frame = self._target.grapple(self._start + t[on_way])
+        arm, omega = r - frame.r, frame.omega
+        v_rel = v - frame.v - cross(omega, arm)
+        a_rel = a - frame.a - cross(frame.alpha, arm) - cross(omega, cross(omega, arm))
+        a_rel = a_rel - 2 * cross(omega, v_rel)
+        R_GW = np.swapaxes(frame.R, 1, 2)
+        for values, each in ((found.x, arm), (found.xdot, v_rel), (found.xddot, a_rel)):
+            values[on_way] = _turned(R_GW, each)
+        return found

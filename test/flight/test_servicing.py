@@ -26,6 +26,8 @@ def test_a_planar_arm_fetches_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
         "tasks": "approach detumble",
         "target.standoff": (-0.1, 0.0, 0.0),
         "target.standoff_time": 0.5,
+        # The arm grasps obliquely, past a corner of the block.
+        "target.clearance": 0.0,
         "detumble.grapple_torque_limit": 0.5,
         "max_torque": 2.0,
         "max_force": 5.0,
