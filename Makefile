@@ -132,6 +132,12 @@ actions: $(STAMP)/test ## do COUNT random actions in lockstep and as many in rea
 	SPACEROBOT_ACTIONS=$(COUNT) SPACEROBOT_ACTIONS_SEED=$(SEED) \
 	    $(BIN)/python3 -m pytest -q -s -m slow -k "$(ONLY)" test/nodes/test_random_actions.py
 
+INTERLEAVINGS ?= 200
+.PHONY: action-interleavings
+action-interleavings: $(STAMP)/test ## send goals by actions and topics, abort, cancel, change life, INTERLEAVINGS times from SEED, with interfaces built here
+	SPACEROBOT_INTERLEAVINGS=$(INTERLEAVINGS) SPACEROBOT_INTERLEAVINGS_SEED=$(SEED) \
+	    $(BIN)/python3 -m pytest -q -s -m slow test/packaging/test_real_actions.py
+
 .PHONY: first-flights
 first-flights: $(STAMP)/test ## fly robots of others from their URDFs to a goal by `spacerobot new`, with minutes taken
 	$(BIN)/python3 -m pytest -q -s -m slow test/cli/test_first_flights.py

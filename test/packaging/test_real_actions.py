@@ -14,12 +14,15 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.slow
-def test_actions_are_served_by_both_kinds_of_interface() -> None:
+@pytest.mark.parametrize("tests", ["test_fly_to.py", "test_action_interleavings.py"])
+def test_actions_are_served_by_both_kinds_of_interface(tests: str) -> None:
     environment = {**os.environ, **with_interfaces(SPACEROBOT_MSGS, NAV2_MSGS)}
     run = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-rs", "-m", "slow",
-         "test/nodes/test_fly_to.py"],
+        [sys.executable, "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-rs", "-m", "slow",
+         f"test/nodes/{tests}"],
         cwd=ROOT, env=environment, capture_output=True, text=True, check=False,
     )  # fmt: skip
+    told = [line for line in run.stdout.splitlines() if not line.startswith("[")]
+    print("\n".join(told))
     assert run.returncode == 0, run.stdout[-3000:]
     assert "skipped" not in run.stdout

@@ -76,9 +76,9 @@ class Sender:
 
         def on_answer(future: Any) -> None:
             sent.handle = future.result()
-            assert sent.handle.accepted
             sent.goal_id = bytes(sent.handle.goal_id.uuid).hex()
-            sent.handle.get_result_async().add_done_callback(on_result)
+            if sent.handle.accepted:
+                sent.handle.get_result_async().add_done_callback(on_result)
 
         future = self.client.send_goal_async(
             self.kind.Goal(**fields),
