@@ -302,9 +302,10 @@ class _ScheduledLanes:
         if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
             return "had a joint that did not follow its schedule"
         error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
-        remaining = describe_remaining_error(error, schedule.controls)
+        tolerance = scenario.planner.tolerance
+        remaining = describe_remaining_error(error, schedule.controls, tolerance, scenario.goal)
         outcome, message = Outcome.REACHED, f"The goal is reached: {remaining}."
-        if not scenario.planner.tolerance.admits(error, schedule.controls):
+        if not tolerance.admits(error, schedule.controls):
             if scenario.planner.max_corrections:
                 return "needed corrections"
             outcome = Outcome.FAILED
@@ -433,7 +434,8 @@ class _ControlledLanes:
             message = f"Interrupted after {duration:.6g} s of simulated time."
         else:
             outcome, state = _OUTCOME_OF_DECISION[decision]
-            message = decided_message(state, OutputDistance(*result.decided_distance[row].tolist()))
+            distance = OutputDistance(*result.decided_distance[row].tolist())
+            message = decided_message(state, distance, ready.flight.scenario.controller)
             flown = decided * period_ns / SECOND
         return Measures(
             outcome=outcome,

@@ -137,8 +137,12 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
     position, attitude = summary["position_error_m"], summary["attitude_error_rad"]
     beside = turned = ""
     if position is not None and attitude is not None:
-        beside = f", {position:.3g} m from the goal"
-        turned = f", {attitude:.3g} rad = {math.degrees(attitude):.3g} deg from the goal"
+        beside = f", {position:.3g} m from the goal{_judged(summary, 'position', 'm')}"
+        turned = (
+            f", {attitude:.3g} rad = {math.degrees(attitude):.3g} deg from the goal"
+            f"{_judged(summary, 'attitude', 'rad')}"
+        )
+    drift = "not explained by thrusters: at most" if summary["has_thrust"] else "changed by at most"
     return [
         f"{summary['scenario']}, {summary['method']}: {summary['message']}",
         f"position    ({numbers(summary['final_position_m'])}) m{beside}",
@@ -149,12 +153,20 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         f"{summary['corrections']} correction(s), planned in {summary['plan_time_s']:.3f} s",
         f"flight      {summary['ticks']} ticks in {summary['wall_time_s']:.2f} s: "
         f"{summary['ticks_per_s']:.0f} ticks/s, {summary['real_time_factor']:.0f} times real time",
-        f"momentum    changed by at most {summary['linear_momentum_drift']:.1e} kg m/s and "
+        f"momentum    {drift} {summary['linear_momentum_drift']:.1e} kg m/s and "
         f"{summary['angular_momentum_drift']:.1e} kg m^2/s",
         *_propellant_line(summary),
         *_clearance_line(summary),
         f"bag         {summary['bag']} ({summary['messages_recorded']} messages)",
     ]
+
+
+def _judged(summary: dict[str, Any], part: str, unit: str) -> str:
+    """Return the tolerance of an error, or that the part is not controlled, in brackets."""
+    if part in summary["not_controlled"]:
+        return " (not controlled)"
+    tolerance = summary[f"{part}_tolerance_{unit}"]
+    return "" if tolerance is None else f" (tolerance {tolerance:.3g} {unit})"
 
 
 def _end_effector_line(summary: dict[str, Any]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
@@ -623,7 +624,7 @@ class ControlExecutive:
                 away = self.controller.distance_from_reference()
                 return f"Flying to the goal; {away} from the reference."
             case ControllerState.REACHED | ControllerState.FAILED:
-                return decided_message(state, self.controller.distance_to_goal())
+                return decided_message(state, self.controller.distance_to_goal(), self._goal_config)
             case ControllerState.ABORTED:
                 return self._abort_message
             case ControllerState.ESTIMATING:
@@ -635,10 +636,22 @@ class ControlExecutive:
                 raise ValueError("a refusal has a message of its own")
 
 
-def decided_message(state: ControllerState, distance: OutputDistance) -> str:
+def decided_message(
+    state: ControllerState, distance: OutputDistance, config: ControllerConfig
+) -> str:
     """Return the message about a goal that is reached or failed, at a distance from the goal."""
-    reached = state is ControllerState.REACHED
-    return f"The goal is {'reached' if reached else 'not reached in time'}: {distance} from it."
+    reached = "reached" if state is ControllerState.REACHED else "not reached in time"
+    tolerance = OutputDistance(
+        *(
+            math.nan if math.isnan(off) else largest
+            for off, largest in (
+                (distance.position, config.position_tolerance),
+                (distance.attitude, config.attitude_tolerance),
+                (distance.joints, config.joint_tolerance),
+            )
+        )
+    )
+    return f"The goal is {reached}: {distance} from it (tolerance {tolerance})."
 
 
 _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10

@@ -11,13 +11,13 @@ from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.commanding.goal_follower import Status
-from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.control.status import CommandReport, ControllerStatus
 from spacerobot_ros.errors import PlanningError, RecordingError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.clearance import FlightClearance
@@ -38,9 +38,9 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_matrix,
     rotvec_from_quaternion,
 )
-from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
-from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, PoseError
+from spacerobot_ros.planning.core.goal import Controlled, EndEffectorGoal, uncontrolled_parts
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
 from spacerobot_ros.simulation.capture import capture_values, load_target
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
@@ -374,6 +374,48 @@ class Flight:
         plans = "planner" in scenario.commanders
         return scenario.planner.method if plans else scenario.controller.law
 
+    def tolerance(self, part: Literal["position", "attitude"]) -> float | None:
+        """Return the largest error of a part of a reached goal, m or rad; None where a bag has no
+        parameters of the commander.
+        """
+        scenario, name = self.scenario, f"{part}_tolerance"
+        node = "planner" if "planner" in scenario.commanders else "coordinated_control"
+        given = scenario.parameters(node)
+        if not given:
+            return None
+        value = given[name] if name in given else getattr(scenario.config(node), name)
+        return float(value) if isinstance(value, float | int) else None
+
+    @cached_property
+    def not_controlled(self) -> tuple[Controlled, ...]:
+        """Parts of the goal's base and shape that the method or the law does not control."""
+        if self.goal is None:
+            return ()
+        match self.status:
+            case ControllerStatus(command=CommandReport(errors=errors)) if errors:
+                controlled: set[Controlled] = {"shape"} if _any_begins(errors, "joint.") else set()
+                controlled |= {"attitude"} if _any_begins(errors, "base.r") else set()
+                positions = _any_begins(errors, *(f"base.{axis}" for axis in "xyz"))
+                controlled |= {"position"} if positions else set()
+                return uncontrolled_parts(self.goal, frozenset(controlled))
+            case PlannerStatus(not_controlled=parts) if parts:
+                return parts
+            case PlannerStatus(state=PlannerState.REACHED, position_error_m=float(left)) if left > (
+                self.tolerance("position") or math.inf
+            ):
+                # Bags of earlier versions do not name the parts.
+                return ("position",)
+        method = METHODS.get(self.method)
+        if method is None:
+            return ()
+        return tuple(x for x in uncontrolled_parts(self.goal, method.controls) if x != "shape")
+
+    @property
+    def has_thrust(self) -> bool:
+        """Whether forces or torques were commanded of thrusters."""
+        wrench = self.commands.get("base_wrench")
+        return wrench is not None and bool(wrench.values.any())
+
     @property
     def error(self) -> PoseError | None:
         """Error of the last true pose to the goal; None without a pose or a goal of the base."""
@@ -473,8 +515,16 @@ class Flight:
         return math.inf if self.measures_clearance else math.nan
 
     def __repr__(self) -> str:
-        error = self.error
-        left = "" if error is None else f", {error.distance:.3g} m and {error.angle:.3g} rad from "
+        error, left = self.error, ""
+        if error is not None:
+            distance, angle = (
+                f"{value:.3g} {unit}" + " (not controlled)" * (part in self.not_controlled)
+                for part, value, unit in (
+                    ("position", error.distance, "m"),
+                    ("attitude", error.angle, "rad"),
+                )
+            )
+            left = f", {distance} and {angle} from "
         return (
             f"<Flight of {self.scenario.name} by {self.method}: {self.outcome.value} after "
             f"{self.duration:.6g} s ({len(self.time) - 1} ticks, {self.corrections} "
@@ -502,6 +552,10 @@ class Flight:
             "joint_names": list(self.joint_names),
             "position_error_m": None if error is None else error.distance,
             "attitude_error_rad": None if error is None else error.angle,
+            "position_tolerance_m": self.tolerance("position"),
+            "attitude_tolerance_rad": self.tolerance("attitude"),
+            "not_controlled": list(self.not_controlled),
+            "has_thrust": self.has_thrust,
             "sim_time_s": measures.duration,
             "manoeuvre_time_s": measures.manoeuvre_time,
             "plan_time_s": measures.plan_time,
@@ -604,6 +658,10 @@ def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:
     if goal is None or not len(poses):
         return None
     return PoseError.between(poses.values[-1, :3], poses.values[-1, 3:], goal)
+
+
+def _any_begins(labels: Iterable[str], *beginnings: str) -> bool:
+    return any(label.startswith(beginnings) for label in labels)
 
 
 def _turns_end_effector(status: Status | None) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from spacerobot_ros.model.rotations import (
     rotvec_from_quaternion,
 )
 from spacerobot_ros.model.visuals import Visual, meshes_from_attachments
-from spacerobot_ros.planning import METHODS, Goal, PoseError
+from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.report.events import FlightEvent, drawn_events
@@ -382,10 +382,9 @@ class FlightReport:
         """Return a parameter of a node; None if the bag does not hold it."""
         return self.flight.scenario.in_file.get(node, {}).get(name)
 
-    def tolerance(self, of: str) -> float | None:
-        """Return the planner's tolerance of ``position``, m, or ``attitude``, rad, if known."""
-        value = self.parameter("planner", f"{of}_tolerance")
-        return float(value) if isinstance(value, float | int) else None
+    def tolerance(self, of: Literal["position", "attitude"]) -> float | None:
+        """Return the tolerance of a part of the goal, m or rad, if known."""
+        return self.flight.tolerance(of)
 
     @property
     def published(self) -> tuple[Published, ...]:
@@ -531,8 +530,7 @@ class FlightReport:
     @property
     def position_counts(self) -> bool:
         """Whether the method controls the position of the base."""
-        method = METHODS.get(self.method)
-        return method is None or "position" in method.controls
+        return "position" not in self.flight.not_controlled
 
     def controls(self, part: str) -> list[int]:
         """Components x, y, z, rx, ry, rz (0..5) of ``base`` or ``end_effector`` under control.

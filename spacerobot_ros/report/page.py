@@ -111,8 +111,14 @@ def _outcome_html(flight: FlightReport) -> str:
     sentence = last.sentence
     if last.executing:
         sentence += " The recording ends before the outcome is known."
-    state = f"<b>{escape(last.state.capitalize())}</b>" if last.state else ""
-    return f'<p class="outcome {escape(last.state)}">{state}{escape(sentence)}</p>'
+    word, tone = last.state.capitalize(), last.state
+    left_out = flight.flight.not_controlled
+    if last.state == "reached" and left_out:
+        word, tone = f"Reached, but for the {' and '.join(left_out)}", "reached partly"
+        if "not controlled" not in sentence:
+            sentence += f" Not controlled: {' and '.join(left_out)}."
+    state = f"<b>{escape(word)}</b>" if word else ""
+    return f'<p class="outcome {escape(tone)}">{state}{escape(sentence)}</p>'
 
 
 def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str]:

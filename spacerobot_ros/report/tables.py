@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -35,12 +36,14 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     rows: list[tuple[str, str, str]] = []
     error, tool, sensed = flight.final_error, flight.tool_error, flight.sensed_error
     if error is not None:
-        if flight.position_counts:
-            note = "" if sensed is None else f"measured: {sensed.distance:.3g} m"
-            rows.append(("Position error", f"{error.distance:.3g} m", note))
-        angle = f"{math.degrees(error.angle):.3g}°"
-        angle += "" if sensed is None else f"; measured: {sensed.angle:.3g} rad"
-        rows.append(("Attitude error", f"{error.angle:.3g} rad", angle))
+        measured = "" if sensed is None else f"measured: {sensed.distance:.3g} m"
+        left = f"{error.distance:.3g} m", measured
+        rows.append(("Position error", *_judged(flight, "position", *left)))
+        degrees = f"{math.degrees(error.angle):.3g}°"
+        measured = degrees + ("" if sensed is None else f"; measured: {sensed.angle:.3g} rad")
+        rows.append(
+            ("Attitude error", *_judged(flight, "attitude", f"{error.angle:.3g} rad", measured))
+        )
     if tool is not None:
         turned = set(flight.controls("end_effector")) & {3, 4, 5}
         note = f"{tool.angle:.3g} rad" if turned else ""
@@ -54,11 +57,28 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         rows.append(("Method", flight.method, ""))
     if len(flight.momentum):
         linear, angular = flight.drift
-        rows.append(("Momentum drift", f"{linear:.1e} kg m/s", f"angular {angular:.1e} kg m²/s"))
+        values = f"{linear:.1e} kg m/s", f"angular {angular:.1e} kg m²/s"
+        rows.append((_momentum_label(flight), *values))
+    if (propellant := flight.flight.propellant) is not None:
+        rows.append(("Propellant", f"{1e3 * propellant:.3g} g", ""))
     if len(flight.position) > 1:
         time = flight.position.time
         rows.append(("Recorded", f"{len(time) - 1} ticks", f"{time[-1] - time[0]:.6g} s"))
     return rows
+
+
+def _judged(
+    flight: FlightReport, part: Literal["position", "attitude"], error: str, note: str
+) -> tuple[str, str]:
+    """Return value and note of an error with its tolerance, or that it is not controlled."""
+    if part in flight.flight.not_controlled:
+        return "not controlled", f"{error} from the goal"
+    tolerance = _tolerance_text(flight, part, "m" if part == "position" else "rad").strip(" ()")
+    return error, "; ".join(filter(None, (note, tolerance)))
+
+
+def _momentum_label(flight: FlightReport) -> str:
+    return "Momentum not explained by thrusters" if flight.flight.has_thrust else "Momentum drift"
 
 
 def runs_table(flights: Sequence[FlightReport]) -> Table:
@@ -79,8 +99,7 @@ def result_table(flight: FlightReport) -> Table:
     if goal is not None and (flight.controls("base") or not flight.outputs):
         last = flight.statuses[-1].state if flight.statuses else ""
         refused = " (refused)" if last == "refused" and not flight.executing else ""
-        if flight.position_counts:
-            rows.append((f"Goal position{refused}", f"({_format_vector(goal.position)}) m"))
+        rows.append((f"Goal position{refused}", f"({_format_vector(goal.position)}) m"))
         rows.append(
             (f"Goal attitude{refused}", _format_attitude(rotvec_from_quaternion(goal.quaternion)))
         )
@@ -92,11 +111,15 @@ def result_table(flight: FlightReport) -> Table:
             ("Final attitude", _format_attitude(rotvec_from_quaternion(flight.quaternion[-1])))
         )
     if error is not None:
-        if flight.position_counts:
-            left = f"{error.distance:.4g} m{_tolerance_text(flight, 'position', 'm')}"
-            rows.append(("Position error", left))
         angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
-        rows.append(("Attitude error", f"{angle}{_tolerance_text(flight, 'attitude', 'rad')}"))
+        for part, unit, left in (
+            ("position", "m", f"{error.distance:.4g} m"),
+            ("attitude", "rad", angle),
+        ):
+            text = f"{left}{_tolerance_text(flight, part, unit)}"
+            if part in flight.flight.not_controlled:
+                text = f"not controlled; {left} from the goal"
+            rows.append((f"{part.capitalize()} error", text))
     if (sensed := flight.sensed_error) is not None:
         parts = [f"{sensed.distance:.4g} m"] if flight.position_counts else []
         rows.append(("Errors as measured", ", ".join([*parts, f"{sensed.angle:.4g} rad"])))
@@ -112,7 +135,9 @@ def result_table(flight: FlightReport) -> Table:
     if len(flight.momentum):
         linear, angular = flight.drift
         drifts = f"linear {linear:.3g} kg m/s, angular {angular:.3g} kg m²/s"
-        rows.append(("Momentum drift", drifts))
+        rows.append((_momentum_label(flight), drifts))
+    if (propellant := flight.flight.propellant) is not None:
+        rows.append(("Propellant", f"{1e3 * propellant:.4g} g"))
     rows += _payload_rows(flight)
     if (clearance := flight.clearance) is not None:
         nearest = clearance.nearest
@@ -282,8 +307,8 @@ def _format_attitude(rotvec: Iterable[float]) -> str:
     return f"rotation vector ({_format_vector(rotvec)}) rad, {angle:.3f}° in all"
 
 
-def _tolerance_text(flight: FlightReport, what: str, unit: str) -> str:
-    value = flight.tolerance(what)
+def _tolerance_text(flight: FlightReport, part: str, unit: str) -> str:
+    value = flight.tolerance("position" if part == "position" else "attitude")
     return "" if value is None else f" (tolerance {value:.4g} {unit})"
 
 

@@ -126,7 +126,10 @@ def status_html(
         )
     if state.planner is not None:
         status = state.planner
-        text = _node_html("Planner", status.state.value, status.message, status.state.level)
+        level = status.state.level
+        if status.state is PlannerState.REACHED and status.not_controlled:
+            level = 1
+        text = _node_html("Planner", status.state.value, status.message, level)
         lines.append(_grey_out(text, offline="planner" in state.absent))
         lines.extend(
             _line_html(f"{part} is {error} from its goal.", None)

@@ -401,7 +401,7 @@ def test_the_measures_along_a_schedule_are_those_of_its_end() -> None:
     found = scheduled(planner={"position_tolerance": 0.0201})
     assert (found.outcome, found.message) == (
         Outcome.REACHED,
-        "The goal is reached: 0.02 m and 0 rad from the goal.",
+        "The goal is reached: 0.02 m and 0 rad from the goal (tolerance 0.0201 m, 0.001 rad).",
     )
     assert (found.duration, found.manoeuvre_time) == (2.5, 2.5)
     assert found.error.distance == pytest.approx(0.03)
@@ -446,7 +446,8 @@ def test_a_goal_that_is_missed_without_corrections_has_failed() -> None:
     found = scheduled(planner={"position_tolerance": 0.0199})
     assert found.outcome is Outcome.FAILED
     assert found.message == (
-        "The goal is not reached: 0.02 m and 0 rad from the goal after 0 correction(s)."
+        "The goal is not reached: 0.02 m and 0 rad from the goal (tolerance 0.0199 m, 0.001 rad) "
+        "after 0 correction(s)."
     )
 
 
@@ -518,7 +519,8 @@ def decided(decision: Decision, tick: int, **given: Any) -> Any:
 def test_the_measures_of_control_are_those_of_the_end_of_the_flight() -> None:
     found = decided(Decision.REACHED, 20)
     assert found.outcome is Outcome.REACHED
-    assert found.message == "The goal is reached: 0.125 m, 0.25 rad from it."
+    tolerance = "(tolerance 0.001 m, 0.001 rad)"
+    assert found.message == f"The goal is reached: 0.125 m, 0.25 rad from it {tolerance}."
     assert found.duration == pytest.approx(0.3)  # At 100 Hz.
     assert found.manoeuvre_time == pytest.approx(0.2)
     assert found.error.distance == pytest.approx(0.5)
@@ -537,7 +539,9 @@ def test_the_measures_of_control_are_those_of_the_end_of_the_flight() -> None:
 def test_how_control_ends() -> None:
     failed = decided(Decision.FAILED, 29)
     assert failed.outcome is Outcome.FAILED
-    assert failed.message == "The goal is not reached in time: 0.125 m, 0.25 rad from it."
+    assert failed.message == (
+        "The goal is not reached in time: 0.125 m, 0.25 rad from it (tolerance 0.001 m, 0.001 rad)."
+    )
     cut = decided(Decision.NONE, -1)
     assert cut.outcome is Outcome.INTERRUPTED
     assert cut.message == "Interrupted after 0.3 s of simulated time."

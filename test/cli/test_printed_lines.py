@@ -40,6 +40,10 @@ SUMMARY: dict[str, Any] = {
     "position_error_m": 0.0012345,
     "final_attitude_rotvec_rad": [0.1, 0.2, -0.3],
     "attitude_error_rad": 0.05,
+    "position_tolerance_m": 0.02,
+    "attitude_tolerance_rad": 0.06,
+    "not_controlled": [],
+    "has_thrust": False,
     "final_joint_positions": [0.4, -0.7, 1.5],
     "manoeuvre_time_s": 12.5,
     "corrections": 3,
@@ -59,8 +63,8 @@ SUMMARY: dict[str, Any] = {
 
 LINES = """\
 sliding_masses, lie_bracket: The goal is reached.
-position    (0.12346, -2.00000, 0.50000) m, 0.00123 m from the goal
-attitude    (0.10000, 0.20000, -0.30000) rad, 0.05 rad = 2.86 deg from the goal
+position    (0.12346, -2.00000, 0.50000) m, 0.00123 m from the goal (tolerance 0.02 m)
+attitude    (0.10000, 0.20000, -0.30000) rad, 0.05 rad = 2.86 deg from the goal (tolerance 0.06 rad)
 shape       (0.40000, -0.70000, 1.50000)
 manoeuvre   12.5 s, 3 correction(s), planned in 0.457 s
 flight      260 ticks in 0.52 s: 500 ticks/s, 25 times real time
@@ -112,6 +116,27 @@ def test_end_effector_and_propellant_have_lines_where_there_are_some(
     assert lines == LINES.splitlines()
     # None used is a number too.
     assert "propellant  0.0 g" in run(monkeypatch, SUMMARY | {"propellant_kg": 0.0}, *GOAL).stdout
+
+
+def test_errors_have_their_tolerance_or_are_not_controlled(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lines(**changed: Any) -> list[str]:
+        return run(monkeypatch, SUMMARY | changed, *GOAL).stdout.splitlines()
+
+    position = LINES.splitlines()[1].replace("(tolerance 0.02 m)", "(not controlled)")
+    assert lines(not_controlled=["position", "shape"]) == [
+        *(LINES.splitlines()[0], position),
+        *LINES.splitlines()[2:],
+    ]
+    attitude = LINES.splitlines()[2].replace("(tolerance 0.06 rad)", "(not controlled)")
+    assert lines(not_controlled=["attitude"])[1:3] == [LINES.splitlines()[1], attitude]
+    unknown = lines(position_tolerance_m=None, attitude_tolerance_rad=None)
+    assert unknown[1].endswith(" m, 0.00123 m from the goal")
+    assert unknown[2].endswith("2.86 deg from the goal")
+
+
+def test_the_momentum_of_thrusters_is_no_drift(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = "momentum    not explained by thrusters: at most 1.2e-15 kg m/s and 3.4e-14 kg m^2/s"
+    assert run(monkeypatch, SUMMARY | {"has_thrust": True}, *GOAL).stdout.splitlines()[6] == words
 
 
 def test_the_clearance_has_a_line(monkeypatch: pytest.MonkeyPatch) -> None:

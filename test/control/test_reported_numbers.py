@@ -35,7 +35,7 @@ def test_what_actuators_lose_is_reported_by_kind() -> None:
 
 
 def test_the_distances_of_a_message_are_euclidean_and_each_of_its_kind() -> None:
-    loop = ExecutiveLoop(settle_time=0.02, time_limit=0.05)
+    loop = ExecutiveLoop(settle_time=0.02, time_limit=0.05, attitude_tolerance=0.002)
     loop.answer()
     loop.place = np.array([0.03, -0.04, 0.0])
     loop.answer(3)
@@ -45,20 +45,23 @@ def test_the_distances_of_a_message_are_euclidean_and_each_of_its_kind() -> None
     loop.answer()
     assert loop.status.message == "Flying to the goal; 0.5 m, 0 rad from the reference."
     loop.answer(8)
-    assert loop.status.message == "The goal is not reached in time: 0.5 m, 0 rad from it."
+    left = "0.5 m, 0 rad from it (tolerance 0.001 m, 0.002 rad)"
+    assert loop.status.message == f"The goal is not reached in time: {left}."
 
 
 def test_a_goal_that_is_missed_is_as_far_as_the_goal_and_not_as_the_reference() -> None:
     """A smooth reference has hardly left the start when the time is over."""
     settings: dict[str, Any] = {"profile": "quintic", **SHAPE_IS_CONTROLLED}
-    loop = ExecutiveLoop(time_limit=0.05, **settings)
+    loop = ExecutiveLoop(time_limit=0.05, joint_tolerance=0.003, **settings)
     turned = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])
     goal = Goal(np.array([0.6, -0.8, 0.0]), turned, SHAPE + np.array([0.1, -0.3]))
     loop.aim(base=IdentifiedGoal(goal))
     loop.answer()
     assert loop.status.message.startswith("Flying to the goal; 0 m, ")
     loop.answer(8)
-    words = "The goal is not reached in time: 1 m, 0.2 rad, 0.3 at the joints from it."
+    left = "1 m, 0.2 rad, 0.3 at the joints"
+    tolerance = "0.001 m, 0.001 rad, 0.003 at the joints"
+    words = f"The goal is not reached in time: {left} from it (tolerance {tolerance})."
     assert loop.status.message == words
 
 

@@ -282,6 +282,8 @@ def test_a_summary_has_the_measures_by_their_names() -> None:
         {
             "position_error_m": off.distance,
             "attitude_error_rad": off.angle,
+            "position_tolerance_m": 0.0005,
+            "attitude_tolerance_rad": 0.001,
             "sim_time_s": 1.25,
             "manoeuvre_time_s": 6.5,
             "plan_time_s": 2.5,
@@ -305,6 +307,8 @@ def test_a_summary_has_the_measures_by_their_names() -> None:
         "ticks": 2,
         "corrections": 2,
         "gait": {"duration_s": 7.5, "loops": 3},
+        "not_controlled": ["position"],
+        "has_thrust": True,
         "state": "reached",
         "message": "The goal is reached.",
         "succeeded": True,
@@ -312,6 +316,56 @@ def test_a_summary_has_the_measures_by_their_names() -> None:
     }
     instant = made_flight(wall_time=0.0).summary()
     assert (instant["ticks_per_s"], instant["real_time_factor"]) == (math.inf, math.inf)
+
+
+def flown_by(*labels: str, goal: Goal = GOAL) -> Flight:
+    report = CommandReport("law", False, 1.0, 0.0, 0.0, 0.0, 0.0, dict.fromkeys(labels, 0.25))
+    status = ControllerStatus(ControllerState.REACHED, command=report)
+    return made_flight(status=status, goal=goal)
+
+
+def test_a_controller_controls_its_outputs() -> None:
+    shaped = replace(GOAL, joint_positions=np.zeros(N))
+    assert flown_by("base.y", "base.rz", "joint.a", goal=shaped).not_controlled == ()
+    assert flown_by("base.rz", "end_effector.x").not_controlled == ("position",)
+    assert flown_by("base.z", goal=shaped).not_controlled == ("attitude", "shape")
+    assert flown_by("joint.a").not_controlled == ("position", "attitude")
+    assert made_flight(goal=None).not_controlled == ()
+    off = Offset(turned := flown_by("base.rz"))
+    assert f", {off.distance:.3g} m (not controlled) and {off.angle:.3g} rad from" in repr(turned)
+    assert turned.summary()["not_controlled"] == ["position"]
+
+
+def test_a_planner_names_what_it_does_not_control_and_bags_of_before_show_it() -> None:
+    def planned(**about: Any) -> Flight:
+        status = PlannerStatus(PlannerState.REACHED, method="optimal", **about)
+        return made_flight("sliding_masses", status=status, gait=status)
+
+    assert planned(not_controlled=("attitude",)).not_controlled == ("attitude",)
+    tolerance = planned().tolerance("position")
+    assert tolerance is not None
+    assert planned(position_error_m=0.99 * tolerance).not_controlled == ()
+    assert planned(position_error_m=1.01 * tolerance).not_controlled == ("position",)
+    looped = PlannerStatus(PlannerState.EXECUTING, method="area_loop")
+    assert made_flight("sliding_masses", gait=looped).not_controlled == ("position",)
+
+
+def test_a_tolerance_is_the_commanders() -> None:
+    assert FLIGHT.tolerance("position") == 0.0005
+    assert FLIGHT.tolerance("attitude") == 0.001
+    planned = load_scenario("sliding_masses").with_overrides(
+        "planner", {"attitude_tolerance": 0.07}
+    )
+    assert made_flight(scenario=planned).tolerance("attitude") == 0.07
+    bare = replace(load_scenario("servicer"), in_file={}, overrides={})
+    assert made_flight(scenario=bare).tolerance("position") is None
+
+
+def test_thrust_is_a_wrench_that_is_not_zero() -> None:
+    assert FLIGHT.has_thrust
+    assert not made_flight(commands={}).has_thrust
+    idle = Commands(np.array([1]), np.zeros((1, 6)))
+    assert not made_flight(commands={"base_wrench": idle}).has_thrust
 
 
 def test_a_summary_has_the_turn_of_an_end_effector_that_a_controller_turns() -> None:

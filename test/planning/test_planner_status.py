@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.planning import Goal, PoseError
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance, uncontrolled_parts
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
     GoalFile,
@@ -227,6 +227,23 @@ def test_a_goal_file_is_replaced_as_a_whole(
     assert {each.name for each in tmp_path.iterdir()} == {"goal.json", "goal.json.new"}
 
 
+def test_a_status_names_the_parts_that_are_not_controlled() -> None:
+    status = PlannerStatus(PlannerState.REACHED, "Text.", not_controlled=("position", "shape"))
+    values = status.to_values()
+    assert values["not_controlled"] == "position shape"
+    assert PlannerStatus.from_values(values, "Text.") == status
+    assert "not_controlled" not in PlannerStatus(PlannerState.REACHED).to_values()
+
+
+def test_a_goal_that_is_not_asked_for_in_the_base_leaves_nothing_of_it_out() -> None:
+    turned = Goal.of_end_effectors(
+        [EndEffectorGoal.checked("tip", [1, 2, 3])], quaternion=[0, 0, 0, 1]
+    )
+    assert uncontrolled_parts(turned, frozenset({"end_effectors"})) == ("attitude",)
+    assert uncontrolled_parts(turned, frozenset({"attitude"})) == ()
+    assert uncontrolled_parts(GOAL, frozenset({"attitude"}))[0] == "position"
+
+
 def test_a_remaining_error_names_what_is_controlled() -> None:
     error = PoseError(
         np.array([0.03, 0.04, 0.0]), np.array([0.0, 0.0, -0.2]), np.array([0.5, -0.75])
@@ -245,7 +262,19 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
     ):
         of_hands = PoseError(error.position, error.rotvec, end_effectors=hands)
         assert describe_remaining_error(of_hands, frozenset({"end_effectors"})) == words
+    within, goal = Tolerance(0.02, 0.06, 0.3), Goal.checked([1, 2, 3], [0, 0, 0, 1], [0.5, 0.25])
+    for controls, words in (
+        ({"position"}, "tolerance 0.02 m; attitude and shape not controlled"),
+        ({"attitude", "shape"}, "tolerance 0.06 rad, 0.3 at the joints; position not controlled"),
+        ({"position", "attitude", "shape"}, "tolerance 0.02 m, 0.06 rad, 0.3 at the joints"),
+    ):
+        told = describe_remaining_error(error, frozenset(controls), within, goal)  # type: ignore[arg-type]
+        assert told.endswith(f" from the goal ({words})")
+    hands = describe_remaining_error(of_hands, frozenset({"end_effectors"}), within)
+    assert hands.endswith(" at the end-effectors from the goal (tolerance 0.02 m, 0.06 rad)")
     unshaped = PoseError(error.position, error.rotvec)
+    told = describe_remaining_error(unshaped, frozenset({"position", "shape"}), within)
+    assert told == "0.05 m from the goal (tolerance 0.02 m)"
     assert (
         describe_remaining_error(unshaped, frozenset({"attitude", "shape"}))
         == "0.2 rad from the goal"

@@ -22,6 +22,7 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose, sta
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.flight.flight import Commands, Signal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.figures import ReportFigure
 from spacerobot_ros.report.figures_over_time import (
@@ -138,6 +139,41 @@ def test_the_numbers_on_top(tmp_path: Path) -> None:
     ]
 
 
+def test_cards_of_tolerances_thrusters_and_propellant(tmp_path: Path) -> None:
+    tolerances = {"position_tolerance": "0.02", "attitude_tolerance": "0.06"}
+    found = flight(tmp_path, metadata={"parameters/planner": tolerances})
+    wrench = Commands(np.array([1]), np.array([[0.0, 0.0, 0.0, 0.0, 0.25, 0.0]]))
+    used = Signal(np.array([0.0, 1.0]), np.array([[0.0], [0.01234]]))
+    flown = replace(
+        found.flight,
+        commands={"base_wrench": wrench},
+        series={**found.flight.series, "propellant": used},
+    )
+    thrusting = replace(found, flight=flown)
+    cards = {label: (value, note) for label, value, note in headline(thrusting)}
+    assert cards["Position error"] == ("0.5 m", "tolerance 0.02 m")
+    assert cards["Attitude error"] == ("0.3 rad", "17.2°; tolerance 0.06 rad")
+    drift = "2.0e-08 kg m/s", "angular 2.4e-08 kg m²/s"
+    assert cards["Momentum not explained by thrusters"] == drift
+    assert "Momentum drift" not in cards
+    assert cards["Propellant"] == ("12.3 g", "")
+    rows = rows_of(thrusting)
+    assert rows["Propellant"] == "12.34 g"
+    assert rows["Momentum not explained by thrusters"].startswith("linear 2e-08 kg m/s")
+
+
+def test_a_goal_that_is_reached_but_for_a_part_is_not_called_reached(tmp_path: Path) -> None:
+    statuses = [
+        planner(PlannerState.EXECUTING, 5.0, method="area_loop"),
+        planner(PlannerState.REACHED, 6.5, "Done.", not_controlled=("position",)),
+    ]
+    text = page(flight(tmp_path, statuses), PagePart(""), [])
+    assert (
+        '<p class="outcome reached partly"><b>Reached, but for the position</b>'
+        "Done. Not controlled: position.</p>"
+    ) in text
+
+
 def test_the_numbers_of_the_run(tmp_path: Path) -> None:
     tolerances = {"position_tolerance": "0.02", "attitude_tolerance": "0.06"}
     found = result_table(flight(tmp_path, metadata={"parameters/planner": tolerances}))
@@ -154,14 +190,16 @@ def test_the_numbers_of_the_run(tmp_path: Path) -> None:
     ]
 
 
-def test_a_method_that_leaves_the_position_has_no_rows_of_it(tmp_path: Path) -> None:
+def test_a_position_that_is_not_controlled_is_called_so(tmp_path: Path) -> None:
     statuses = [planner(PlannerState.EXECUTING, 5.0, method="area_loop")]
     found = flight(tmp_path, statuses)
-    assert "Position error" not in [label for label, _, _ in headline(found)]
-    labels = [row[0] for row in result_table(found).rows]
-    assert "Goal position" not in labels
-    assert "Position error" not in labels
-    assert {"Goal attitude", "Final position", "Attitude error"} <= set(labels)
+    cards = headline(found)
+    assert cards[0] == ("Position error", "not controlled", "0.5 m from the goal")
+    assert cards[1] == ("Attitude error", "0.3 rad", "17.2°")
+    rows = rows_of(found)
+    assert rows["Goal position"] == "(1.00000, 2.00000, 3.00000) m"
+    assert rows["Position error"] == "not controlled; 0.5 m from the goal"
+    assert rows["Attitude error"] == "0.3 rad = 17.19°"
     assert position_group(found).goals == []
     assert len(attitude_group(found).goals) == 3
 

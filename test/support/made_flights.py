@@ -105,6 +105,7 @@ def _report(
     sent = tuple(SentGoal(t, goal, f"{t:.9f}") for t, goal in goals)
     tool_sent = tuple(SentGoal(t, goal, f"{t:.9f}") for t, goal in tool_goals)
     scenario = Scenario(name, Path(), description, AT_REST, in_file=in_file, published=published)
+    told = [each for all_of in statuses.values() for _, each in all_of if not isinstance(each, str)]
     flight = Flight(
         scenario=scenario,
         robot=parse_robot(urdf) if urdf else None,
@@ -119,6 +120,8 @@ def _report(
         end_effector_goal=tool_sent[-1].goal if tool_sent else None,
         goals=sent,
         end_effector_goals=tool_sent,
+        status=told[-1] if told else None,
+        gait=next((each for each in told if isinstance(each, PlannerStatus) and each.method), None),
     )
     pose = flight.signal("pose")
     position = Signal(pose.time - BEGAN, pose.values[:, :3])

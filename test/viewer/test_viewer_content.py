@@ -357,3 +357,16 @@ def test_the_clearance_and_its_links_are_shown() -> None:
     assert escape("and 'right' touch, 0.2 m deep.") in deep
     gone = replace(STATE, clearance=ClearanceStatus(0.1, links, 4.0), absent=frozenset({"plant"}))
     assert 'opacity:.45"><div style="margin:2px 0">Links' in content.status_html(gone)
+
+
+def test_a_goal_reached_but_for_a_part_is_amber() -> None:
+    reached = PlannerStatus(PlannerState.REACHED, "There.")
+    green = content.status_html(replace(STATE, planner=reached))
+    assert 'color:#2a9d5c;font-weight:600">reached</span> There.' in green
+    partly = replace(reached, not_controlled=("position",))
+    amber = content.status_html(replace(STATE, planner=partly))
+    assert 'color:#c98a00;font-weight:600">reached</span> There.' in amber
+    flying = replace(partly, state=PlannerState.EXECUTING)
+    assert 'color:#2a9d5c;font-weight:600">executing</span>' in content.status_html(
+        replace(STATE, planner=flying)
+    )

@@ -511,6 +511,14 @@ def end_effector_pose(
     return position + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE)
 
 
+def uncontrolled_parts(goal: Goal, controls: frozenset[Controlled]) -> tuple[Controlled, ...]:
+    """Return the parts of the base and of the shape that a goal asks for beyond ``controls``."""
+    asked: list[Controlled] = [part for part in ("position", "attitude") if part in goal.base]
+    if goal.joint_positions is not None:
+        asked.append("shape")
+    return tuple(part for part in asked if part not in controls)
+
+
 @dataclass(frozen=True)
 class Tolerance:
     """Largest errors of a reached goal: ``position`` m, ``attitude`` rad, joints m or rad.

@@ -25,7 +25,13 @@ from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.goal import Controlled, PoseError, RobotState, Tolerance
+from spacerobot_ros.planning.core.goal import (
+    Controlled,
+    PoseError,
+    RobotState,
+    Tolerance,
+    uncontrolled_parts,
+)
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -709,8 +715,10 @@ class Executive:
             return
         goal = active.identified.goal
         error = PoseError.between(state.position, state.quaternion, goal, state.q, self._robot)
-        if self._tolerance_of(active.identified).admits(error, controls):
-            message = f"The goal is reached: {describe_remaining_error(error, controls)}."
+        tolerance = self._tolerance_of(active.identified)
+        if tolerance.admits(error, controls):
+            left = describe_remaining_error(error, controls, tolerance, goal)
+            message = f"The goal is reached: {left}."
             self._add_status(PlannerState.REACHED, message, active.identified, active, error)
             self._end_goal(Event.REACHED)
             return
@@ -1148,7 +1156,10 @@ class Executive:
         self, active: ActiveGoal, remaining: PoseError, why: str, event: Event = Event.FAILED
     ) -> None:
         """Report that the active goal is not reached; ``why`` ends the message."""
-        off = describe_remaining_error(remaining, active.schedule.controls)
+        about = active.identified
+        off = describe_remaining_error(
+            remaining, active.schedule.controls, self._tolerance_of(about), about.goal
+        )
         message = f"The goal is not reached: {off}{why}"
         self._add_status(PlannerState.FAILED, message, active.identified, active, remaining)
         self._end_goal(event)
@@ -1227,6 +1238,8 @@ class Executive:
         if active is not None:
             values["corrections"] = active.corrections
             values |= {"manoeuvre_time_s": active.manoeuvre_time, "ends_at_s": active.ends_at}
+            controls = active.schedule.controls
+            values["not_controlled"] = uncontrolled_parts(identified.goal, controls)
         aim = identified.goal
         if remaining is not None:
             if not aim.end_effectors or "position" in aim.base:

@@ -9,7 +9,13 @@ from enum import Enum
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError
+from spacerobot_ros.planning.core.goal import (
+    Controlled,
+    Goal,
+    PoseError,
+    Tolerance,
+    uncontrolled_parts,
+)
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 
 _END_EFFECTOR_ERRORS = ("end_effector_position_error_m", "end_effector_attitude_error_rad")
@@ -19,6 +25,9 @@ _GOAL_PREFIX = "goal_of_"
 
 _WAYPOINTS_PREFIX = "waypoints_of_"
 """Beginning of the keys of numbers of waypoints, before the link."""
+
+_PARTS: tuple[Controlled, ...] = ("position", "attitude", "shape")
+"""The parts of a goal that a method may leave uncontrolled."""
 
 _NUMBER_KEYS = (
     *_END_EFFECTOR_ERRORS,
@@ -91,6 +100,8 @@ class PlannerStatus:
         Its duration.
     notes
         Results of the method by name.
+    not_controlled
+        Parts of the goal that the method of the latest schedule does not control.
     """
 
     state: PlannerState
@@ -109,6 +120,7 @@ class PlannerStatus:
     method: str = ""
     duration_s: float = 0.0
     notes: Notes = field(default_factory=dict)
+    not_controlled: tuple[Controlled, ...] = ()
 
     def to_values(self) -> dict[str, str]:
         """Return the status as the key-value pairs of a DiagnosticStatus; numbers have 9 digits."""
@@ -129,6 +141,8 @@ class PlannerStatus:
             error = getattr(self, name)
             if error is not None:
                 values[name] = _format_note(error)
+        if self.not_controlled:
+            values["not_controlled"] = " ".join(self.not_controlled)
         if self.ends_at_s:
             values["manoeuvre_time_s"] = _format_note(self.manoeuvre_time_s)
             values["ends_at_s"] = _format_note(self.ends_at_s)
@@ -161,10 +175,12 @@ class PlannerStatus:
                 for name in list(given)
                 if name.startswith(_WAYPOINTS_PREFIX)
             }
+            left_out = given.pop("not_controlled", "").split()
             return cls(
                 state=state,
                 message=message,
                 goal_id=given.pop("goal_id", ""),
+                not_controlled=tuple(part for part in _PARTS if part in left_out),
                 goal=tuple(float(word) for word in given.pop("goal", "").split()),
                 end_effector_goals=end_effectors,
                 end_effector_waypoints=waypoints,
@@ -246,8 +262,16 @@ def waypoint_counts(goal: Goal) -> dict[str, int]:
     }
 
 
-def describe_remaining_error(error: PoseError, controls: frozenset[Controlled]) -> str:
-    """Return a clause with the remaining error in the parts of the goal that are controlled."""
+def describe_remaining_error(
+    error: PoseError,
+    controls: frozenset[Controlled],
+    tolerance: Tolerance | None = None,
+    goal: Goal | None = None,
+) -> str:
+    """Return a clause with the remaining error in the parts of the goal that are controlled.
+
+    With a tolerance it names that of each part, with a goal also the parts that are not controlled.
+    """
     parts: dict[Controlled, str] = {
         "position": f"{error.distance:.3g} m",
         "attitude": f"{error.angle:.3g} rad",
@@ -260,7 +284,18 @@ def describe_remaining_error(error: PoseError, controls: frozenset[Controlled]) 
         turn = f" and {angle:.3g} rad" if angle > 0 else ""
         parts["end_effectors"] = f"{distance:.3g} m{turn} at the end-effectors"
     remaining = " and ".join(text for part, text in parts.items() if part in controls)
-    return f"{remaining} from the goal"
+    notes = []
+    if tolerance is not None:
+        hands = "end_effectors" in controls
+        limits = (
+            (f"{tolerance.position:.3g} m", hands or "position" in controls),
+            (f"{tolerance.attitude:.3g} rad", hands or "attitude" in controls),
+            (f"{tolerance.shape:.3g} at the joints", "shape" in controls and len(error.shape)),
+        )
+        notes.append("tolerance " + ", ".join(text for text, counts in limits if counts))
+    if goal is not None and (parts_left := uncontrolled_parts(goal, controls)):
+        notes.append(f"{' and '.join(parts_left)} not controlled")
+    return f"{remaining} from the goal" + (f" ({'; '.join(notes)})" if notes else "")
 
 
 def _format_note(note: list[float] | Array | float | str) -> str:

@@ -1,0 +1,179 @@
+"""Every number of error that the project shows, against one from the bag by other libraries.
+
+The bag is read by ``mcap`` and ``mcap-ros2-support``, rotations are scipy's: distance is the
+Euclidean norm, angle the rotation angle, from the last true pose of the base to its goal.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros import fly
+from spacerobot_ros.cli.flights import _summary_lines
+from spacerobot_ros.flight.flight import Flight
+from spacerobot_ros.flight.reading import open_flight_bag, read_flight
+from spacerobot_ros.measures import Outcome, metrics_of
+from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.report.flight import FlightReport
+from spacerobot_ros.report.page import page
+from spacerobot_ros.report.page_parts import PagePart
+from spacerobot_ros.scenario import load_scenario
+from spacerobot_ros.viewer.content import goal_errors
+from spacerobot_ros.viewer.state import StackState
+
+pytest.importorskip("mcap_ros2")
+
+ROOT = Path(__file__).parents[2]
+BAGS, SCENARIOS = ROOT / "bags", ROOT / "config"
+
+
+@dataclass
+class Truth:
+    """What another library finds in a bag: m, rad, and the last pose (7,)."""
+
+    distance: float
+    angle: float
+    pose: np.ndarray
+    goal: np.ndarray
+
+
+def _vector(message: Any) -> np.ndarray:
+    position, turn = message.position, message.orientation
+    return np.array(
+        [position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w], dtype=float
+    )
+
+
+def truth_in(bag: Path) -> Truth:
+    """Return the errors of the base at the end of a bag with one goal."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    last: dict[str, np.ndarray] = {}
+    with bag.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages(
+            ["/odom", "/odom_true", "/goal_pose"]
+        ):
+            of_goal = channel.topic == "/goal_pose"
+            last[channel.topic] = _vector(message.pose if of_goal else message.pose.pose)
+    goal, pose = last["/goal_pose"], last.get("/odom_true", last["/odom"])
+    turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_quat(goal[3:])
+    distance = float(np.linalg.norm(goal[:3] - pose[:3]))
+    return Truth(distance, float(turn.magnitude()), pose, goal)
+
+
+class Cells(HTMLParser):
+    """The texts of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+        self.feed(text)
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+def shown(text: str, pattern: str) -> float:
+    """Return the one number of a text in the place of ``#`` in a pattern."""
+    found = re.search(pattern.replace("#", r"([-+.\de]+)"), text)
+    assert found is not None, (pattern, text)
+    return float(found[1])
+
+
+def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
+    """Compare what terminal, JSON, report, live page, campaign and ``repr`` say with the truth."""
+    truth = truth_in(bag)
+
+    def same(distance: float, angle: float, digits: int) -> None:
+        slack = 0.51 * 10 ** (1 - digits)
+        # An angle near zero is the difference of numbers near one.
+        assert distance == pytest.approx(truth.distance, rel=slack, abs=1e-12)
+        assert angle == pytest.approx(truth.angle, rel=slack, abs=1e-8)
+
+    summary = flight.summary() | {"bag": str(bag), "messages_recorded": 0}
+    same(summary["position_error_m"], summary["attitude_error_rad"], 9)
+    assert ("position" in summary["not_controlled"]) is not position_counts
+
+    lines = _summary_lines(summary | {"plan_time_s": 0.0, "wall_time_s": 1.0})
+    position, attitude = (next(x for x in lines if x.startswith(y)) for y in ("posi", "atti"))
+    same(shown(position, r"m, # m from the goal"), shown(attitude, r"rad, # rad ="), 3)
+    degrees = shown(attitude, r"= # deg from")
+    assert degrees == pytest.approx(math.degrees(truth.angle), rel=0.006, abs=1e-6)
+    assert ("(not controlled)" in position) is not position_counts
+
+    left = repr(flight)
+    same(shown(left, r", # m"), shown(left, r"and # rad from the goal"), 3)
+
+    assert flight.robot is not None
+    metrics = metrics_of(flight.measured(clearance=False), flight.robot)
+    same(metrics["position_error_m"], metrics["attitude_error_rad"], 9)
+
+    report = FlightReport.of(open_flight_bag(bag))
+    texts = Cells(page(report, PagePart(""), [])).texts
+    cards = texts[texts.index("Position error") :], texts[texts.index("Attitude error") :]
+    near, turned = (" ".join(x.strip() for x in card[:5]) for card in cards)
+    same(shown(near, r" # m\b"), shown(turned, r" # rad"), 3)
+    assert ("not controlled" in near) is not position_counts
+    tables = [texts[len(texts) - texts[::-1].index(name) :] for name in ("Position error",)]
+    tables += [texts[len(texts) - texts[::-1].index("Attitude error") :]]
+    in_table = [" ".join(x.strip() for x in table[:3]) for table in tables]
+    same(shown(in_table[0], r"(?:^| )# m"), shown(in_table[1], r"(?:^| )# rad"), 4)
+
+    live = goal_errors(state_of(flight), ForwardKinematics(flight.robot))["base"]
+    assert live.angle is not None
+    same(live.distance, live.angle, 9)
+
+
+def state_of(flight: Flight) -> StackState:
+    """Return the state of a stack at the end of a flight, as the live page has it."""
+    from spacerobot_ros.viewer.state import Measured
+
+    assert flight.goal is not None
+    last = {name: flight.signal(name).values[-1] for name in ("pose", "q", "qdot", "effort")}
+    measured = Measured(float(flight.time[-1]), **last)
+    return replace(StackState(), measured=measured, goals={"base": flight.goal})
+
+
+@pytest.mark.parametrize(
+    ("name", "position_counts"), [("servicer_thrusters", True), ("planar_chain", False)]
+)
+def test_errors_of_recorded_flights(name: str, position_counts: bool) -> None:
+    bag = BAGS / f"{name}.mcap"
+    flight = read_flight(open_flight_bag(bag))
+    assert_all_say(bag, flight, position_counts=position_counts)
+
+
+@pytest.mark.slow
+def test_errors_of_a_flight_with_corrections(tmp_path: Path) -> None:
+    scenario = load_scenario(str(SCENARIOS / "faults" / "wrong_masses.yaml"))
+    flight = fly(scenario)
+    assert flight.corrections > 0
+    flight.save(tmp_path / "corrected.mcap")
+    read = read_flight(open_flight_bag(tmp_path / "corrected.mcap"))
+    assert_all_say(tmp_path / "corrected.mcap", read, position_counts=True)
+
+
+@pytest.mark.slow
+def test_errors_of_a_flight_that_is_aborted(tmp_path: Path) -> None:
+    """Thrusters that are too weak for a load lose control of the base."""
+    scenario = (
+        load_scenario("coordinated_control")
+        .with_overrides("coordinated_control", {"error_margin.position": 0.01, "max_force": 1.0})
+        .with_overrides("plant", {"disturbances": "base_link force -30 0 20 torque 0 0 -3"})
+    )
+    flight = fly(scenario)
+    assert flight.outcome is Outcome.ABORTED
+    flight.save(tmp_path / "aborted.mcap")
+    read = read_flight(open_flight_bag(tmp_path / "aborted.mcap"))
+    assert_all_say(tmp_path / "aborted.mcap", read, position_counts=True)
