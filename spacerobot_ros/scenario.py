@@ -680,6 +680,21 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     return _sections(_read_content(path), path)
 
 
+def different_parameters(scenarios: Sequence[Scenario]) -> list[tuple[str, ...]]:
+    """Return node and name of each parameter that is not the same in all scenarios, and its values.
+
+    Values are texts; ``–`` where a scenario does not give the parameter. Texts of robots are left
+    out.
+    """
+    given = [{(n, p): v for n in CONFIGS for p, v in s.parameters(n).items()} for s in scenarios]
+    rows = []
+    for key in dict.fromkeys(key for each in given for key in each):
+        values = [str(each[key]) if key in each else "–" for each in given]
+        if len(set(values)) > 1 and not key[1].endswith("robot_description"):
+            rows.append((f"{key[0]}.{key[1]}", *values))
+    return rows
+
+
 def _sections(content: Mapping[Any, Any], path: Path) -> dict[str, dict[str, Any]]:
     """Return the parameters by node of a file, with the paths of files that they name."""
     in_file = {

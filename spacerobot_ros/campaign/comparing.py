@@ -21,6 +21,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
 from spacerobot_ros.report.figures import INK, PALETTE, drawing
 from spacerobot_ros.report.page_parts import facts, html_page, table
+from spacerobot_ros.scenario import different_parameters
 
 
 def require_same_draws(first: Campaign, second: Campaign) -> None:
@@ -87,12 +88,22 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
             f"<header><h1>{escape(a)} and {escape(b)}</h1>",
             facts([f"{len(common)} common draws"]),
             f'<p class="outcome">{escape(sentence)}</p></header>',
+            *_parameters_part(first.campaign, second.campaign),
             "<h2>Paired differences</h2>",
             _difference_table(found, a, b),
             _difference_figure(first, second, rows_a, rows_b, names[:6]),
         ]
     write_output(path, html_page(f"{a} and {b}", body, MADE_BY))
     return [sentence, *(_difference_line(each, b, a) for each in found)]
+
+
+def _parameters_part(first: Campaign, second: Campaign) -> list[str]:
+    """Return a table of the parameters that differ, with its heading."""
+    rows = [list(row) for row in different_parameters([first.scenario, second.scenario])]
+    if not rows:
+        return ["<h2>Parameters that differ</h2>", '<p class="missing">None differ.</p>']
+    head = ["parameter", first.name, second.name]
+    return ["<h2>Parameters that differ</h2>", table("parameters", head, rows)]
 
 
 def _difference_line(each: PairedDifference, second: str, first: str) -> str:

@@ -25,6 +25,7 @@ from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
     Influence,
     Share,
+    corrected,
     influences,
     percentiles,
     share,
@@ -39,6 +40,9 @@ from spacerobot_ros.version import __version__
 
 MADE_BY = f"Made by spacerobot_ros {__version__}."
 """Footer of the pages of campaigns."""
+
+PASSING = "passing"
+"""Name, among the metrics, of whether a flight passed."""
 
 _WORST_FLIGHTS_SHOWN = 10
 _MESSAGES_SHOWN = 4
@@ -177,11 +181,13 @@ class Results:
 
     def influences(self) -> list[Influence]:
         """Return the sensitivities, the strongest first, with Sobol indices if available."""
-        found = influences(self.drawn_numbers, self.metrics())
+        passing = {PASSING: self.passed.astype(float)}
+        found = corrected(influences(self.drawn_numbers, passing | self.metrics()))
         whole = self.campaign.sampler == "saltelli" and len(self) == self.total
         if whole and len(self.drawn_numbers) == len(self.campaign.dispersions):
             names = list(self.drawn_numbers)
-            indices = {name: sobol_indices(names, x) for name, x in self.metrics().items()}
+            indices = {PASSING: sobol_indices(names, self.passed.astype(float))}
+            indices |= {name: sobol_indices(names, x) for name, x in self.metrics().items()}
             for place, each in enumerate(found):
                 if known := indices[each.metric].get(each.cause):
                     found[place] = replace(each, first=known[:2], total=known[2:])
@@ -231,7 +237,9 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
         for outcome, count, message in _messages(results)
         if message and outcome in (ERROR, Outcome.REFUSED, Outcome.ABORTED)
     ]
-    for each in results.influences()[:3]:
+    drivers = results.influences()
+    of_passing = [each for each in drivers if each.metric == PASSING]
+    for each in (of_passing + [each for each in drivers if each.metric != PASSING])[:3]:
         lines.append(f"driver      {each}")
     return lines
 
@@ -404,8 +412,15 @@ def _histograms_section(results: Results) -> str:
         panel.locator_params(axis="x", nbins=6)
         panel.set_xlabel(metric_label(name))
         panel.set_ylabel("flights")
+        shares = panel.twinx()
+        shares.step(
+            np.sort(there), np.arange(1, len(there) + 1) / len(there), color=INK, where="post"
+        )
+        shares.set_ylim(0.0, 1.02)
+        shares.set_ylabel("cumulative share")
     caption = (
-        "Distributions of the metrics; dotted: percentiles 5, 50 and 95, orange: requirements."
+        "Distributions of the metrics; dotted: percentiles 5, 50 and 95, orange: requirements, "
+        "black: share of flights up to a value."
     )
     return picture_part(figure, "distributions", caption)
 
@@ -415,7 +430,8 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
         return '<p class="missing">No drawn number varies with a metric.</p>'
     sobol = any(each.total is not None for each in found)
     rows = []
-    for each in found[:15]:
+    of_passing = [each for each in found if each.metric == PASSING]
+    for each in [*of_passing, *(each for each in found if each.metric != PASSING)][:15]:
         cells = [each.cause, each.metric, f"{each.correlation:+.3f}", f"{each.p:.2g}"]
         cells += [f"{each.departure:+.3f}", f"{each.p_departure:.2g}"]
         if sobol:
@@ -431,7 +447,8 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
         "p",
     ]
     head += ["Sobol, first order", "Sobol, total"] if sobol else []
-    note = "Spearman's rank correlations, the strongest first; p: probability by chance. A metric "
+    note = "Spearman's rank correlations, those of passing and then the strongest first; p: "
+    note += "probability by chance, corrected for all of them (Benjamini-Hochberg). A metric "
     note += "that grows to both sides correlates with the distance of the draw from its median."
     if not sobol:
         note += " The sampler 'saltelli' adds Sobol indices."
@@ -439,7 +456,7 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
 
 
 def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
-    chosen = list(found[:_MAX_SCATTER_PLOTS])
+    chosen = [each for each in found if each.metric != PASSING][:_MAX_SCATTER_PLOTS]
     if not chosen:
         return ""
     figure, axes = figure_with_axes(len(chosen), 3, 2.4)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -128,6 +128,24 @@ def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> lis
             correlation, p, departure, p_departure = numbers
             found.append(Influence(cause, metric, correlation, p, departure, p_departure))
     return found
+
+
+def corrected(found: Sequence[Influence]) -> list[Influence]:
+    """Return sensitivities whose probabilities are corrected for their number.
+
+    All of both kinds together, by the procedure of Benjamini and Hochberg: of those at most p a
+    share of no more than p is by chance.
+    """
+    if not found:
+        return []
+    from scipy.stats import false_discovery_control
+
+    chances = np.array([[each.p, each.p_departure] for each in found])
+    adjusted = false_discovery_control(np.nan_to_num(chances, nan=1.0).ravel()).reshape(-1, 2)
+    return [
+        replace(each, p=p, p_departure=p_departure)
+        for each, (p, p_departure) in zip(found, adjusted.tolist(), strict=True)
+    ]
 
 
 def sobol_indices(

@@ -97,6 +97,14 @@ def run_command(
     with viewing_if(view, chosen.parameters("viewer")), display(chosen.name) as shown:
         result = run_scenario(chosen, path, shown.fly, processes=processes, longest=longest)
     path = Path(result.summary["bag"])
+    if result.summary["state"] == "refused" and not result.summary["ticks"]:
+        if bag is None and report is None:
+            # Nobody asked for the record of a robot that did not move.
+            path.unlink(missing_ok=True)
+            result.summary["bag"] = None
+        if json_file is not None:
+            write_json(json_file, result.summary)
+        fail(result.message)
     if json_file is not None:
         write_json(json_file, result.summary)
     for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):

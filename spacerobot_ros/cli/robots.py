@@ -20,12 +20,16 @@ from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
     from spacerobot_ros.model import SpaceRobot
+    from spacerobot_ros.model.description import RobotDescription
     from spacerobot_ros.planning.analysis import Analysis
     from spacerobot_ros.planning.core.controllability import Controllability
 
 _MAX_LISTED_JOINTS = 12
 """Largest number of listed joints; further joints are only counted."""
 
+
+_MOST_RADIANS = 20.0
+"""Limit of a joint beyond which it is likely to be in degrees."""
 
 _MOST_DISTANCES = 3
 """Pairs of links whose distances are listed, nearest first."""
@@ -103,7 +107,7 @@ def analysis_lines(found: Analysis) -> list[str]:
     base = robot.description.bodies[0].inertia.mass
     n, name = robot.n, robot.description.name
     lines = [f"{name}: {n} joint(s), {robot.total_mass:.6g} kg, of which the base {base:.6g} kg"]
-    lines += _joint_rows(robot)
+    lines += [*_joint_rows(robot), *_degree_warnings(robot.description)]
     lines += ["", *_rotation_lines(found)]
     lines += [f"{'position':<13}{_position_text(found)}", ""]
     for method, objection in found.objections.items():
@@ -212,19 +216,46 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
     for joint, body in list(zip(joints, bodies, strict=True))[:_MAX_LISTED_JOINTS]:
         unit, effort_unit = ("m", "N") if joint.kind is JointKind.PRISMATIC else ("rad", "N m")
         limits = joint.limits
+        turns = unit == "rad"
         range_text = f"{limits.lower:.4g} .. {limits.upper:.4g} {unit}"
+        degrees = ""
+        if turns and not math.isinf(limits.lower):
+            low, high = math.degrees(limits.lower), math.degrees(limits.upper)
+            degrees = f"  {low:.4g} .. {high:.4g} deg"
+        if turns and math.isfinite(limits.velocity):
+            degrees += f"  {math.degrees(limits.velocity):.3g} deg/s"
         if math.isinf(limits.lower):
             range_text = "free"
         speed, effort = f"{limits.velocity:.3g} {unit}/s", f"{limits.effort:.4g} {effort_unit}"
         follows = joint.mimic
         rows.append(
             f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent[:15]:<16}{range_text:>19}"
-            f"{speed:>12}{effort:>10}{body.inertia.mass:>9.4g} kg"
+            f"{speed:>12}{effort:>10}{body.inertia.mass:>9.4g} kg{degrees}"
             + (f"  follows {follows.joint}" if follows is not None else "")
         )
     if len(joints) > _MAX_LISTED_JOINTS:
         rows.append(f"and {len(joints) - _MAX_LISTED_JOINTS} more")
     return rows
+
+
+def _degree_warnings(robot: RobotDescription) -> list[str]:
+    """Return a warning about limits that look as if they were in degrees."""
+    suspects = [
+        joint.name
+        for joint in robot.movable_joints
+        if joint.unit == "rad"
+        and any(
+            math.isfinite(limit) and abs(limit) > _MOST_RADIANS
+            for limit in (joint.limits.lower, joint.limits.upper)
+        )
+    ]
+    if not suspects:
+        return []
+    names = ", ".join(f"'{name}'" for name in suspects[:_MAX_LISTED_JOINTS])
+    return [
+        f"warning: the limits of {names} are beyond {_MOST_RADIANS:g} rad, several turns. Those of "
+        "a URDF are in radians: if these are degrees, divide them by 57.2958."
+    ]
 
 
 def _rotation_lines(found: Analysis) -> list[str]:

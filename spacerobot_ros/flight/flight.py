@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     import os
 
     import pandas as pd
+    import xarray as xr
 
     from spacerobot_ros.scenario import Scenario
 
@@ -600,8 +601,12 @@ class Flight:
 
     # -- views and files ----------------------------------------------------------------------
 
-    def to_pandas(self) -> pd.DataFrame:
+    def to_pandas(self, *, euler: bool = False) -> pd.DataFrame:
         """Return a table with a row a state, indexed by time (s).
+
+        ``attrs["units"]`` has the units of the columns, as with tables of bags. With ``euler`` the
+        turns of each pose about the fixed axes x, y, z (rad) stand beside its quaternion, in
+        columns ``roll``, ``pitch`` and ``yaw``.
 
         Raises
         ------
@@ -610,7 +615,19 @@ class Flight:
         """
         from spacerobot_ros.flight.views import table
 
-        return table(self)
+        return table(self, euler=euler)
+
+    def to_xarray(self, *, euler: bool = False) -> xr.Dataset:
+        """Return the columns of :meth:`to_pandas` as variables over ``time``, with their units.
+
+        Raises
+        ------
+        SpaceRobotError
+            pandas or xarray is not installed.
+        """
+        from spacerobot_ros.flight.views import dataset
+
+        return dataset(self, euler=euler)
 
     def plot(self) -> Any:
         """Return a matplotlib figure: pose of the base and its goal, joints, efforts or rates."""

@@ -22,6 +22,7 @@ from spacerobot_ros.topics import TOPICS
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray as xr
 
     from spacerobot_ros.flight.flight import Flight
 
@@ -78,8 +79,10 @@ class Animation:
         write_output(Path(path), f'<!DOCTYPE html>\n<meta charset="utf-8">\n{self.html}\n')
 
 
-def table(flight: Flight) -> pd.DataFrame:
-    """Return a table with a row a state, indexed by time (s).
+def table(flight: Flight, *, euler: bool = False) -> pd.DataFrame:
+    """Return a table with a row a state, indexed by time (s); ``attrs["units"]`` has the units.
+
+    ``euler``: whether poses have columns ``roll``, ``pitch`` and ``yaw`` (rad) too.
 
     Raises
     ------
@@ -105,7 +108,71 @@ def table(flight: Flight) -> pd.DataFrame:
         if len(values) == len(flight.time):
             for word, column in zip(labels.get(quantity, ()), values.T, strict=False):
                 columns[f"{quantity}.{word}" if word else quantity] = column
-    return pd.DataFrame(columns, index=pd.Index(flight.time, name="time"))
+    if euler:
+        for quantity in [name.removesuffix(".qx") for name in columns if name.endswith(".qx")]:
+            quaternions = np.column_stack([columns[f"{quantity}.q{axis}"] for axis in "xyzw"])
+            for word, column in zip(("roll", "pitch", "yaw"), _rpy(quaternions), strict=True):
+                columns[f"{quantity}.{word}"] = column
+    made = pd.DataFrame(columns, index=pd.Index(flight.time, name="time"))
+    made.attrs["units"] = {"time": "s"} | {name: _unit(flight, name) for name in columns}
+    return made
+
+
+def dataset(flight: Flight, *, euler: bool = False) -> xr.Dataset:
+    """Return the columns of :func:`table` as variables over time, each with its units.
+
+    Raises
+    ------
+    SpaceRobotError
+        pandas or xarray is not installed.
+    """
+    columns = table(flight, euler=euler)
+    try:
+        import xarray as xr
+    except ImportError:
+        raise SpaceRobotError(
+            "Datasets need xarray, which is not installed: pip install 'spacerobot_ros[data]'."
+        ) from None
+    units = columns.attrs["units"]
+    return xr.Dataset(
+        {
+            name: ("time", values.to_numpy(), {"units": units[name]} if units[name] else {})
+            for name, values in columns.items()
+        },
+        {"time": ("time", flight.time, {"units": "s"})},
+        {"scenario": flight.scenario.name, "method": flight.method, "message": flight.message},
+    )
+
+
+def _rpy(quaternions: Array) -> tuple[Array, Array, Array]:
+    """Return the turns (N,) about the fixed axes x, y, z of quaternions (N, 4), rad."""
+    R = matrices_from_quaternions(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
+    pitch = np.arctan2(-R[:, 2, 0], np.hypot(R[:, 0, 0], R[:, 1, 0]))
+    return np.arctan2(R[:, 2, 1], R[:, 2, 2]), pitch, np.arctan2(R[:, 1, 0], R[:, 0, 0])
+
+
+_UNITS = {
+    **{"x": "m", "y": "m", "z": "m", "qx": "", "qy": "", "qz": "", "qw": ""},
+    **{"roll": "rad", "pitch": "rad", "yaw": "rad"},
+    **{"vx": "m/s", "vy": "m/s", "vz": "m/s", "wx": "rad/s", "wy": "rad/s", "wz": "rad/s"},
+    **{"px": "kg m/s", "py": "kg m/s", "pz": "kg m/s"},
+    **{"Lx": "kg m^2/s", "Ly": "kg m^2/s", "Lz": "kg m^2/s", "kinetic_energy": "J"},
+}
+"""Units of the last words of columns."""
+
+
+def _unit(flight: Flight, column: str) -> str:
+    """Return the unit of a column of :func:`table`; empty: none, or none that is known."""
+    quantity, _, word = column.partition(".")
+    kind = quantity.removeprefix("measured_")
+    if kind in ("q", "qdot", "effort"):
+        joints = flight.robot.movable_joints if flight.robot is not None else ()
+        unit = next((joint.unit for joint in joints if joint.name == word), "m or rad")
+        if kind == "effort":
+            return {"m": "N", "rad": "N m"}.get(unit, "N or N m")
+        return unit if kind == "q" else "/s or ".join(unit.split(" or ")) + "/s"
+    of_quantity = {"propellant": "kg", "thruster_on_time": "s", "thruster_force": "N"}
+    return of_quantity.get(quantity) or _UNITS.get(word, "")
 
 
 def _quantity_labels(flight: Flight) -> dict[str, tuple[str, ...]]:

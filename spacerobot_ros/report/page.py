@@ -32,6 +32,7 @@ from spacerobot_ros.report.tables import (
     result_table,
     runs_table,
 )
+from spacerobot_ros.scenario import different_parameters
 
 _CHART_HELP = (
     '<p class="facts" id="use">Drag across a chart to look at a part of the time in all of them, '
@@ -124,7 +125,13 @@ def _outcome_html(flight: FlightReport) -> str:
 def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str]:
     if not beside:
         return []
-    return ["<h2>Runs side by side</h2>", _table_html("runs", runs_table([flight, *beside]))]
+    flights = [flight, *beside]
+    parts = ["<h2>Runs side by side</h2>", _table_html("runs", runs_table(flights))]
+    rows = different_parameters([each.flight.scenario for each in flights])
+    if rows:
+        head = ("Parameter", *(each.file_name for each in flights))
+        parts += ["<h3>Parameters that differ</h3>", table("different", head, rows)]
+    return parts
 
 
 def _numbers_html(flight: FlightReport) -> list[str]:

@@ -29,6 +29,7 @@ from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation, 
 from spacerobot_ros.campaign.statistics import (
     Influence,
     PairedDifference,
+    corrected,
     influences,
     paired_difference,
     paired_success,
@@ -94,6 +95,21 @@ def test_what_is_said_of_an_influence() -> None:
     assert whole.strength == 0.375
     bare = Influence("a", "b", 0.25, 0.5)
     assert (bare.departure, bare.p_departure, bare.first, bare.total) == (0.0, 1.0, None, None)
+
+
+def test_chances_are_corrected_for_the_number_of_tests() -> None:
+    """By hand: the k-th smallest of n times n / k, and no larger than the ones above it."""
+    given = [
+        Influence("a", "m", 0.5, 0.01, 0.25, 0.04),
+        Influence("b", "m", 0.25, 0.03, 0.1, 0.5),
+    ]
+    first, second = corrected(given)
+    assert (first.p, first.p_departure) == pytest.approx((0.04, 0.16 / 3))
+    assert (second.p, second.p_departure) == pytest.approx((0.16 / 3, 0.5))
+    assert (first.cause, first.correlation, second.departure) == ("a", 0.5, 0.1)
+    assert corrected([]) == []
+    (constant,) = corrected([Influence("a", "m", 0.0, math.nan)])
+    assert constant.p == 1.0
 
 
 def test_influences_are_rank_correlations_of_finite_values() -> None:

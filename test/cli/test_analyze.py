@@ -13,7 +13,12 @@ from support.command_line import CliRunner, Result
 from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.cli.robots import analysis_json, analysis_lines
+from spacerobot_ros.cli.robots import (
+    _degree_warnings,
+    _joint_rows,
+    analysis_json,
+    analysis_lines,
+)
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import METHODS
 from spacerobot_ros.planning.analysis import analyze
@@ -85,6 +90,44 @@ def test_the_best_shape_is_better_than_the_papers() -> None:
     over = found["condition_over_shapes"]
     assert over["best"] <= over["median"]
     assert over["spanning"] == over["shapes"]
+
+
+def jointed(*limits: str) -> SpaceRobot:
+    """Return a robot with a revolute joint for each text of limits, and a slider."""
+    body = '<link name="{}"><inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="1" '
+    body += 'ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    names = ["base", *(f"link_{i}" for i in range(len(limits) + 1))]
+    kinds = [*("revolute" for _ in limits), "prismatic"]
+    joints = [
+        f'<joint name="joint_{i}" type="{kind}"><parent link="{names[i]}"/>'
+        f'<child link="{names[i + 1]}"/><axis xyz="0 0 1"/><limit {limit}/></joint>'
+        for i, (kind, limit) in enumerate(
+            zip(kinds, [*limits, 'lower="-90" upper="90" velocity="30" effort="4"'], strict=True)
+        )
+    ]
+    links = "".join(body.format(name) for name in names)
+    return SpaceRobot.from_urdf(f'<robot name="odd">{links}{"".join(joints)}</robot>')
+
+
+def test_limits_of_turning_joints_are_also_in_degrees() -> None:
+    robot = jointed('lower="-1.5" upper="0.25" velocity="0.5" effort="3"')
+    turns, slides = _joint_rows(robot)[1:]
+    assert "-1.5 .. 0.25 rad" in turns
+    assert turns.endswith(" kg  -85.94 .. 14.32 deg  28.6 deg/s")
+    assert slides.endswith(" 2 kg")
+    assert _degree_warnings(robot.description) == []
+
+
+def test_limits_that_look_like_degrees_are_pointed_out() -> None:
+    robot = jointed(
+        'lower="-1" upper="90" velocity="0.5" effort="3"',
+        'lower="-19" upper="19.9" velocity="0.5" effort="3"',
+        'lower="-20.1" upper="1" velocity="0.5" effort="3"',
+    )
+    assert _degree_warnings(robot.description) == [
+        "warning: the limits of 'joint_0', 'joint_2' are beyond 20 rad, several turns. Those of a "
+        "URDF are in radians: if these are degrees, divide them by 57.2958."
+    ]
 
 
 def test_masses_and_limits_are_those_of_the_urdf() -> None:

@@ -139,6 +139,21 @@ def test_the_momentum_of_thrusters_is_no_drift(monkeypatch: pytest.MonkeyPatch) 
     assert run(monkeypatch, SUMMARY | {"has_thrust": True}, *GOAL).stdout.splitlines()[6] == words
 
 
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_refused_goal_is_told_once_and_leaves_no_bag_that_nobody_asked_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kept: bool
+) -> None:
+    bag, found = tmp_path / "a.mcap", tmp_path / "a.json"
+    bag.write_text("a bag")
+    reason = "No loop of the joints turns the base."
+    refused = {"state": "refused", "succeeded": False, "ticks": 0, "message": reason}
+    options = ("--json", str(found), *(("--bag", str(bag)) if kept else ()))
+    result = run(monkeypatch, SUMMARY | refused | {"bag": str(bag)}, *GOAL, *options)
+    assert (result.exit_code, result.output) == (1, f"{reason}\n")
+    assert bag.exists() is kept
+    assert json.loads(found.read_text())["bag"] == (str(bag) if kept else None)
+
+
 def test_the_clearance_has_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     found = {"clearance_m": 0.01234, "clearance_links": ["a", "b"], "clearance_time_s": 2.5}
     lines = run(monkeypatch, SUMMARY | found, *GOAL).stdout.splitlines()

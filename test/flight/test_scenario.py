@@ -19,6 +19,7 @@ from spacerobot_ros.scenario import (
     CONFIGS,
     NODES,
     Kill,
+    different_parameters,
     load_scenario,
     parse_kills,
     scenario_names,
@@ -236,3 +237,15 @@ def test_a_misspelt_name_gets_a_suggestion(name: str, suggested: str) -> None:
     with pytest.raises(ParameterError) as refusal:
         scenario_or_robot(name)
     assert f"Did you mean '{suggested}'?" in str(refusal.value)
+
+
+def test_parameters_that_differ_between_scenarios() -> None:
+    first = load_scenario("sliding_masses")
+    second = first.with_overrides("planner", {"position_tolerance": 0.125, "max_corrections": 7})
+    third = second.with_overrides("plant", {"robot_description": "<robot/>"})
+    base = str(first.parameters("planner")["position_tolerance"])
+    assert different_parameters([first, second, third]) == [
+        ("planner.position_tolerance", base, "0.125", "0.125"),
+        ("planner.max_corrections", "3", "7", "7"),
+    ]
+    assert different_parameters([first, first]) == []

@@ -244,6 +244,41 @@ def test_pictures_of_an_animation_are_spread_over_the_flight(films: list[Film]) 
     assert str(refused.value) == named
 
 
+def test_columns_have_units_in_tables_and_datasets() -> None:
+    table, dataset = FLIGHT.to_pandas(), FLIGHT.to_xarray()
+    units = table.attrs["units"]
+    joint = ROBOT.joint_names[0]
+    assert list(units) == ["time", *table.columns]
+    expected = {
+        **{"time": "s", "pose.x": "m", "pose.qw": "", "twist.wz": "rad/s", "twist.vx": "m/s"},
+        **{"momentum.pz": "kg m/s", "momentum.Lx": "kg m^2/s", "momentum.kinetic_energy": "J"},
+        **{f"q.{joint}": "rad", f"qdot.{joint}": "rad/s", f"effort.{joint}": "N m"},
+        **{f"measured_q.{joint}": "rad", f"measured_qdot.{joint}": "rad/s", "propellant": "kg"},
+        **{"end_effector_pose.z": "m", "thruster_force.1": "N", "thruster_on_time.0": "s"},
+        **{"thruster_duty.0": "", "pose_lost": "", "measured_twist.wx": "rad/s"},
+    }
+    assert {name: units[name] for name in expected} == expected
+    assert set(dataset.data_vars) == set(table.columns)
+    assert dataset.time.attrs == {"units": "s"}
+    for name, values in table.items():
+        np.testing.assert_array_equal(dataset[name], values)
+        assert dataset[name].attrs == ({"units": units[name]} if units[name] else {})
+    assert dataset.attrs["scenario"] == "servicer_thrusters"
+
+
+def test_euler_angles_are_turns_about_fixed_axes_on_request() -> None:
+    assert not any(name.endswith(".roll") for name in FLIGHT.to_pandas().columns)
+    table = FLIGHT.to_pandas(euler=True)
+    for quantity in ("pose", "measured_pose", "end_effector_pose"):
+        found = table[[f"{quantity}.{word}" for word in ("roll", "pitch", "yaw")]].to_numpy()
+        quaternions = table[[f"{quantity}.q{axis}" for axis in "xyzw"]].to_numpy()
+        np.testing.assert_allclose(
+            found, Rotation.from_quat(quaternions).as_euler("xyz"), atol=1e-12
+        )
+    assert table.attrs["units"]["measured_pose.pitch"] == "rad"
+    assert "pose.yaw" in FLIGHT.to_xarray(euler=True)
+
+
 def test_a_flight_says_how_it_ended_in_one_line() -> None:
     off = Offset(FLIGHT)
     assert repr(FLIGHT) == (
