@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -702,7 +703,11 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Distance and angle of each link to its goals; None where no link had a goal."""
     if not flight.link_errors:
         return flight.not_drawn or None if flight.link_goals else None
-    groups, parts = [], (("position", "distance", "m"), ("attitude", "angle", "rad"))
+    groups: list[TraceGroup] = []
+    parts: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
+        ("position", "distance", "m"),
+        ("attitude", "angle", "rad"),
+    )
     for number, (link, errors) in enumerate(flight.link_errors.items()):
         for part, quantity, unit in parts:
             signal: Signal = getattr(errors, quantity)

@@ -37,8 +37,8 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     error, tool, sensed = flight.final_error, flight.tool_error, flight.sensed_error
     if error is not None:
         measured = "" if sensed is None else f"measured: {sensed.distance:.3g} m"
-        left = f"{error.distance:.3g} m", measured
-        rows.append(("Position error", *_judged(flight, "position", *left)))
+        near = f"{error.distance:.3g} m", measured
+        rows.append(("Position error", *_judged(flight, "position", *near)))
         degrees = f"{math.degrees(error.angle):.3g}°"
         measured = degrees + ("" if sensed is None else f"; measured: {sensed.angle:.3g} rad")
         rows.append(

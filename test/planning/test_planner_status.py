@@ -270,8 +270,8 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
     ):
         told = describe_remaining_error(error, frozenset(controls), within, goal)  # type: ignore[arg-type]
         assert told.endswith(f" from the goal ({words})")
-    hands = describe_remaining_error(of_hands, frozenset({"end_effectors"}), within)
-    assert hands.endswith(" at the end-effectors from the goal (tolerance 0.02 m, 0.06 rad)")
+    told = describe_remaining_error(of_hands, frozenset({"end_effectors"}), within)
+    assert told.endswith(" at the end-effectors from the goal (tolerance 0.02 m, 0.06 rad)")
     unshaped = PoseError(error.position, error.rotvec)
     told = describe_remaining_error(unshaped, frozenset({"position", "shape"}), within)
     assert told == "0.05 m from the goal (tolerance 0.02 m)"
