@@ -218,7 +218,7 @@ def campaign(json_file: Path | None) -> None:
 @click.argument("lanes", default=1024, type=click.IntRange(min=1))
 @_json_option
 def environments(lanes: int, json_file: Path | None) -> None:
-    """Step learning environments in SIMD lanes, in a plant and in MuJoCo.
+    """Step environments in SIMD lanes, a plant and MuJoCo.
 
     Steps a CPU second are measured for an arm and a servicer, LANES [1024] of each.
     """

@@ -497,19 +497,20 @@ def test_readers_are_awaited_for_so_long_together(monkeypatch: pytest.MonkeyPatc
     assert waits == [[longest], [max(0.0, longest - 0.5)], [0.0], []]
 
 
-@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize(("lost", "target_lost"), [(False, True), (True, False), (False, False)])
 @pytest.mark.parametrize("everything", [False, True])
-def test_a_lost_pose_is_not_published(lost: bool, everything: bool) -> None:
-    outputs = {name: Output(name) for name in ("odom", "joints", "base_pose")}
+def test_a_lost_pose_is_not_published(lost: bool, target_lost: bool, everything: bool) -> None:
+    outputs = {name: Output(name) for name in ("odom", "joints", "base_pose", "target_odom")}
     pairs = {
         name: (output, SimpleNamespace(serialised=lambda stamp, name=name: (name, stamp)))
         for name, output in outputs.items()
     }
     some: Any = SimpleNamespace(
         _all=list(pairs.values()),
-        _every_tick=[pairs["odom"], pairs["joints"]],
+        _every_tick=[pairs["odom"], pairs["joints"], pairs["target_odom"]],
         _of_measured_pose=[pairs["odom"][1]],
-        _state=SimpleNamespace(sensors=SimpleNamespace(dropout=lost)),
+        _of_target=[pairs["target_odom"][1]],
+        _state=SimpleNamespace(sensors=SimpleNamespace(dropout=lost), misses_target=target_lost),
     )
     StatePublisher.publish(some, 3 * S + 7, all_topics=everything)
     stamp = stamp_bytes(3 * S + 7)
@@ -517,6 +518,7 @@ def test_a_lost_pose_is_not_published(lost: bool, everything: bool) -> None:
         "odom": [] if lost else [("odom", stamp)],
         "joints": [("joints", stamp)],
         "base_pose": [("base_pose", stamp)] if everything else [],
+        "target_odom": [] if target_lost else [("target_odom", stamp)],
     }
 
 
