@@ -102,9 +102,9 @@ def test_joints_are_rows() -> None:
     )
     assert free == (
         "long_name  continuous aaaaaaaaaaaaaaa                free 0.125 rad/s  12.5 N m"
-        "      1.5 kg"
+        "      1.5 kg  7.16 deg/s"
     )
-    assert follower.endswith("12.5 N m      1.5 kg  follows a")
+    assert follower.endswith("12.5 N m      1.5 kg  -57.3 .. 143.2 deg  7.16 deg/s  follows a")
 
 
 def test_joints_beyond_twelve_are_counted() -> None:

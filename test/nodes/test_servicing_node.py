@@ -25,7 +25,8 @@ def asked(loop: Loop, task: str) -> Any:
 
 def test_tasks_are_done_on_request(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    loop = Loop(harness, activate=False)
+    # The arm grasps obliquely, past a corner of the block.
+    loop = Loop(harness, activate=False, **{"target.clearance": 0.0})
     odom = loop.probe.create_publisher(Odometry, "target/odom", 10)
     described = loop.probe.create_publisher(String, "target/robot_description", LATCHED)
     described.publish(String(data=BLOCK))
