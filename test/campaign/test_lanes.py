@@ -168,6 +168,7 @@ def test_a_draw_that_is_refused_leaves_the_others_of_its_batch_in_lanes() -> Non
     assert all(row.fallback == row.reason for row in lanes.values() if row.fallback)
 
 
+@pytest.mark.slow
 def test_lanes_measure_the_end_effector_that_a_planner_does_not_move() -> None:
     """Its goal is one of the scenario: the criterion is of where it is, in every engine."""
     made = campaign(

@@ -77,6 +77,7 @@ def test_a_campaign_that_is_ended_goes_on_where_it_was(tmp_path: Path) -> None:
     assert (len(results), results.total) == (6, 6)
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_not_there_is_refused_before_a_folder_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -282,6 +283,7 @@ def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("own_domain")
 @pytest.mark.parametrize("count", [1, pytest.param(20, marks=pytest.mark.slow)])
 def test_rows_flown_again_through_ros_are_the_same(tmp_path: Path, count: int) -> None:

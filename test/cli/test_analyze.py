@@ -151,6 +151,7 @@ def test_a_urdf_of_ones_own(tmp_path: Path) -> None:
     assert len(lines) <= 27
 
 
+@pytest.mark.slow
 def test_the_workspaces_of_paper_4(tmp_path: Path) -> None:
     found, lines, picture = analyzed(tmp_path, "planar_manipulator")
     free, limited = found["workspaces"]

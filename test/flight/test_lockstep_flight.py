@@ -26,6 +26,7 @@ WHOLE = ("time", "pose", "twist", "q", "qdot", "effort", "momentum")
 HEAVY = {
     *("servicer", "servicer_thrusters", "arm_attitude", "coordinated_control"),
     *("reach", "two_hands", "strut", "planar_chain", "gravity_gradient", "wheels", "capture"),
+    "servicing",
 }
 """Reference bags whose robot takes seconds to compile."""
 
@@ -122,6 +123,7 @@ def chain(**settings: Any) -> Scenario:
     return scenario.with_overrides("plant", settings)
 
 
+@pytest.mark.slow
 def test_what_is_saved_is_verified_and_read_back(tmp_path: Path) -> None:
     links = {"end_effectors": ["segment_2", "base_link"]}
     flight = fly_scenario(chain(**{"sensors.joint_noise": 1e-7}, **links))

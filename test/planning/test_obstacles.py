@@ -143,6 +143,7 @@ def test_optimal_goes_round_a_rock(arm: SpaceRobot) -> None:
     assert min(distances_to(*rock, arm, clear, start)) >= 0.01 - 1e-4
 
 
+@pytest.mark.slow
 def test_other_methods_refuse_with_link_obstacle_and_place(arm: SpaceRobot) -> None:
     world = ball_at((1.5, 0, 0.2), 0.2)
     # The shape round which loops are best; no other is looked for where one is given.

@@ -47,6 +47,7 @@ def test_a_library_gives_the_first_guesses(library: Path) -> None:
     assert float(str(with_it.notes["starts"])) <= 3
 
 
+@pytest.mark.slow
 def test_the_nearest_manoeuvres_are_bent_to_the_ends(library: Path) -> None:
     found = SolutionLibrary.from_bytes(library.read_bytes())
     start, final = np.array([0.2, -0.1]), np.array([0.3, 0.4])

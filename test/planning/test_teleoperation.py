@@ -189,6 +189,7 @@ def test_joints_stop_at_their_limits() -> None:
     assert np.all(np.abs(np.diff(np.array(loop.commands), axis=0)) <= most + 1e-9)
 
 
+@pytest.mark.slow
 def test_links_do_not_come_too_near() -> None:
     robot = robot_of("three_joint_arm")
     clearance = Clearance(robot.description, 0.05)

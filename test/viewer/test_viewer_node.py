@@ -265,6 +265,7 @@ def test_a_goal_has_the_joint_positions_that_the_page_shows(harness: Harness) ->
     assert list(shapes[2].name) == []
 
 
+@pytest.mark.slow
 def test_a_viewer_survives_what_is_wrong(harness: Harness) -> None:
     stack = Stack(harness)
     page = stack.page
