@@ -72,7 +72,10 @@ class CompiledRows:
         pairs = np.flatnonzero(~geometry.with_obstacles).tolist()
         if not pairs:
             return None
-        functions = compiled_functions(_source(geometry), _tried(geometry, pairs[0]))
+        names = ("link_distance", "link_distance_jac", "link_distance_hess")
+        functions = compiled_functions(
+            _source(geometry), names, lambda: _rows_of_pair(geometry, pairs[0], names)
+        )
         return None if functions is None else cls(geometry, functions)
 
     def rows(self, pair: int) -> DistanceRows:
@@ -94,16 +97,18 @@ class CompiledRows:
         )
 
 
-def _tried(geometry: CollisionGeometry, pair: int) -> list[ca.Function]:
+def _rows_of_pair(
+    geometry: CollisionGeometry, pair: int, names: tuple[str, str, str]
+) -> list[ca.Function]:
     """Return functions of CasADi, by their names in C, that are right for one pair."""
     rows = DistanceRows.of(geometry, [pair])
     q, number = ca.MX.sym("q", len(geometry.robot.joint_names)), ca.MX.sym("pair")
     multiplier = ca.MX.sym("lambda")
     curvature = ca.densify(rows.hessian(q, multiplier))
     return [
-        ca.Function("link_distance", [q, number], [rows.values(q)]),
-        ca.Function("link_distance_jac", [q, number], [ca.densify(rows.jacobian(q))]),
-        ca.Function("link_distance_hess", [q, number, multiplier], [curvature]),
+        ca.Function(names[0], [q, number], [rows.values(q)]),
+        ca.Function(names[1], [q, number], [ca.densify(rows.jacobian(q))]),
+        ca.Function(names[2], [q, number, multiplier], [curvature]),
     ]
 
 

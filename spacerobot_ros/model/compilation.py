@@ -188,22 +188,26 @@ def compiled(function: ca.Function) -> ca.Function:
         return function
 
 
-def compiled_functions(source: str, tried: Sequence[ca.Function]) -> list[ca.Function] | None:
+def compiled_functions(
+    source: str, names: Sequence[str], trial: Callable[[], Sequence[ca.Function]]
+) -> list[ca.Function] | None:
     """Return functions of a C source, compiled, tried and cached like single functions.
 
     Parameters
     ----------
     source
-        C, which has the functions ``tried`` by their names with CasADi's interface.
-    tried
-        The same functions for the virtual machine, at least near the values at which they are
-        tried.
+        C, which has functions by these ``names`` with CasADi's interface.
+    names
+        Names of the functions.
+    trial
+        Derives the same functions for the virtual machine, at least near the values at which they
+        are tried: called before something is compiled.
 
     Returns
     -------
     :
-        Those of the source, in the same order; None: compiling is off, or impossible, with a
-        warning.
+        Those of the source, in the order of ``names``; None: compiling is off, or impossible, with
+        a warning.
 
     Raises
     ------
@@ -213,17 +217,17 @@ def compiled_functions(source: str, tried: Sequence[ca.Function]) -> list[ca.Fun
     compiler = c_compiler()
     if compiler is None:
         return None
-    name = tried[0].name()
     key = _hash_text(f"{_platform_key(compiler, _SOURCE_FLAGS)}\n{source}")
 
     def load(path: str) -> list[ca.Function]:
-        return [ca.external(each.name(), path) for each in tried]
+        return [ca.external(name, path) for name in names]
 
-    if kept := Cache(cache_directory()).load(_object_file_name(name, key), key):
+    if kept := Cache(cache_directory()).load(_object_file_name(names[0], key), key):
         with suppress(RuntimeError):
             return load(str(kept[0]))
     try:
-        return _make_object(name, key, _CompilerCall(source, compiler, _SOURCE_FLAGS), tried, load)
+        call = _CompilerCall(source, compiler, _SOURCE_FLAGS)
+        return _make_object(names[0], key, call, trial(), load)
     except _CompilationError as reason:
         _warn_of_virtual_machine(reason)
         return None

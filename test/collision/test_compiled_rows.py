@@ -43,6 +43,13 @@ def compare(geometry: CollisionGeometry, pairs: list[int], shapes: int) -> None:
 def test_values_and_derivatives_are_those_of_casadi(tmp_path: Path) -> None:
     geometry = CollisionGeometry(branched_robot(tmp_path))
     assert len(geometry.pairs) > 6
+    compare(geometry, [1, len(geometry.pairs) - 1], 3)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(compilation.c_compiler() is None, reason="no C compiler")
+def test_all_pairs_have_the_rows_of_casadi(tmp_path: Path) -> None:
+    geometry = CollisionGeometry(branched_robot(tmp_path))
     compare(geometry, list(range(len(geometry.pairs))), 3)
 
 
@@ -56,7 +63,23 @@ def test_pairs_of_robots_have_the_rows_of_casadi(name: str) -> None:
 
 def test_without_a_compiler_there_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    monkeypatch.setattr(compiled_rows, "DistanceRows", None)  # Nothing is derived in vain.
     assert CompiledRows.of(CollisionGeometry(branched_robot(tmp_path))) is None
+
+
+def test_rows_from_the_cache_derive_none_for_a_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if compilation.c_compiler() is None:
+        pytest.skip("no C compiler")
+    geometry = CollisionGeometry(branched_robot(tmp_path))
+    first = CompiledRows.of(geometry)
+    monkeypatch.setattr(compiled_rows, "_rows_of_pair", None)
+    again = CompiledRows.of(geometry)
+    assert first is not None
+    assert again is not None
+    q = np.linspace(-0.4, 0.7, len(geometry.robot.joint_names))
+    assert float(again.rows(3).values(q)) == float(first.rows(3).values(q))
 
 
 def test_wrong_functions_are_not_used(
