@@ -10,6 +10,7 @@ from typing import Any
 
 from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
 from spacerobot_ros.commanding.plant_state import Pairing, PlantChange
+from spacerobot_ros.commanding.trajectory_output import MotionEnd, TrajectoryOutput
 from spacerobot_ros.errors import (
     CommandError,
     PlanningError,
@@ -107,6 +108,8 @@ class PlannerCommander(Commander):
         """The text on the topic obstacles; None: the robot has its own."""
         self._world: RobotDescription | None = None
         """The obstacles of this text."""
+        self.trajectories: TrajectoryOutput | None = None
+        """Where schedules are sent to, for ``output: trajectory``."""
 
     def _make_status(self, state: str, message: str, goal_id: str) -> PlannerStatus:
         return PlannerStatus(PlannerState(state), message, goal_id)
@@ -144,6 +147,11 @@ class PlannerCommander(Commander):
         if self._obstacles is not None:
             described = among_obstacles(described, self._world)
         return PlanningWorker(robot, self.config, method, self._long_work, described)
+
+    def end_schedule(self, end: MotionEnd) -> None:
+        """End the present schedule: the controller that follows it has ended it."""
+        if self.executive is not None:
+            self.executive.schedule_ended(end.message, final=end.final)
 
     def receive_obstacles(self, text: str) -> None:
         """Plan around the obstacles of a URDF text in place of those so far; empty: around none.
@@ -188,8 +196,9 @@ class PlannerCommander(Commander):
 
     def _stop_executive(self) -> None:
         assert self.executive is not None
-        commands = self.statistics.commands_published
-        self.host.log("info", f"{commands} commands were published.")
+        if self.trajectories is None:
+            commands = self.statistics.commands_published
+            self.host.log("info", f"{commands} commands were published.")
         self.executive.stop()
         self._pass_on_outputs()
 
@@ -277,7 +286,7 @@ class PlannerCommander(Commander):
 
     def _warn_of_disturbances(self, lines: Sequence[str]) -> None:
         """Report disturbances that a schedule does not know; a controller holds against them."""
-        if lines and self._status is not None and self.config.output == "commands":
+        if lines and self._status is not None and self.config.output != "reference":
             message = (
                 "The plan assumes constant momenta, which a disturbance changes: "
                 f"{'; '.join(lines)}."
@@ -334,6 +343,8 @@ class PlannerCommander(Commander):
                     self._publish_decision(status)
                 case ScheduleStart() as start:
                     host.announce(start)
+                    if self.trajectories is not None:
+                        self.trajectories.start(start)
                     self._warn_of_disturbances(self._disturbances)
                 case Event() as event:
                     host.report_event(event)
@@ -341,3 +352,5 @@ class PlannerCommander(Commander):
                     host.log(severity.value, message)
                 case Transition(source, event, target):
                     host.log("debug", f"{source.value} -> {target.value}: {event.value}")
+                    if self.trajectories is not None:
+                        self.trajectories.phase_changed(target, event)

@@ -129,6 +129,8 @@ def require_flyable(scenario: Scenario) -> None:
         why = "planner.plan_in_background is true"
     elif any(scenario.config(name).resume_file for name in scenario.commanders):
         why = "a resume_file is set"
+    elif "planner" in scenario.commanders and scenario.planner.output == "trajectory":
+        why = "planner.output is trajectory"
     elif len(scenario.commanders) > 1 and scenario.planner.output == "commands":
         why = "planner and controller both command the joints"
     if why:

@@ -32,6 +32,7 @@ from spacerobot_ros.nodes.common.messages import (
 )
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.nodes.common.streams import RawOutput
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
@@ -62,6 +63,8 @@ class PlannerNode(CommanderNode):
     Config: ClassVar = PlannerConfig
     config: PlannerConfig
     commander: PlannerCommander
+    _trajectories: Any = None
+    """Clients of FollowJointTrajectory, for ``output: trajectory``."""
 
     def __init__(self, name: str = "planner", **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
@@ -81,12 +84,16 @@ class PlannerNode(CommanderNode):
         """Create the topics; without a robot of its own the planner waits for robot_description."""
         self._shape: Array | None = None
         self._announcement: Thread | None = None
-        topic = "joint_commands" if self.config.output == "commands" else "joint_reference"
-        self._commands = self.send_raw(JointState, topic)
+        self._commands: RawOutput | None = None
+        if self.config.output != "trajectory":
+            topic = "joint_commands" if self.config.output == "commands" else "joint_reference"
+            self._commands = self.send_raw(JointState, topic)
         self._schedule_topic = self.create_publisher(JointTrajectory, "gait_schedule", LATCHED)
         self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
         self._markers_topic = self.create_publisher(MarkerArray, "markers", STREAM)
         self.listen("planner/status")
+        if self.config.output == "trajectory":
+            self._follow_trajectories()
         self.take_goals("goal_pose")
         for name in self.config.goal_links:
             self.take_goals(goal_topic(name), name)
@@ -109,6 +116,22 @@ class PlannerNode(CommanderNode):
         super().deactivate()
         if self._announcement is not None:
             self._announcement.join(MAX_THREAD_END_TIME)
+
+    def destroy_node(self) -> None:
+        """Destroy the node with its clients of trajectories."""
+        if self._trajectories is not None:
+            self._trajectories.destroy()
+        super().destroy_node()
+
+    def _follow_trajectories(self) -> None:
+        """Send schedules to the robot's own controller from now on."""
+        from spacerobot_ros.nodes.common.trajectory_client import TrajectoryClients
+
+        if self._trajectories is None:
+            self._trajectories = TrajectoryClients(self)
+        self.commander.trajectories = self._trajectories.connect(
+            self.config.trajectory_action, self.commander.end_schedule
+        )
 
     def interrupt(self) -> None:
         """Cancel the plan that is being made."""
@@ -204,7 +227,8 @@ class PlannerNode(CommanderNode):
 
     def send_command(self, stamp_ns: int) -> None:
         """Publish the setpoint as the answer to the state of this stamp."""
-        self._commands.take(self._message.serialised(stamp_bytes(stamp_ns)))
+        if self._commands is not None:
+            self._commands.take(self._message.serialised(stamp_bytes(stamp_ns)))
 
     def publish_status(self, status: Status) -> None:
         """Publish and log a status of the goal."""

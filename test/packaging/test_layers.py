@@ -59,6 +59,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
 }
 
 ROS = {
+    "action_msgs",
     "builtin_interfaces",
     "diagnostic_msgs",
     "geometry_msgs",

@@ -8,7 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.interface_package import NAV2_MSGS, SPACEROBOT_MSGS, with_interfaces
+from support.interface_package import (
+    CONTROL_MSGS,
+    NAV2_MSGS,
+    SPACEROBOT_MSGS,
+    InterfacePackage,
+    with_interfaces,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -16,7 +22,17 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.slow
 @pytest.mark.parametrize("tests", ["test_fly_to.py", "test_action_interleavings.py"])
 def test_actions_are_served_by_both_kinds_of_interface(tests: str) -> None:
-    environment = {**os.environ, **with_interfaces(SPACEROBOT_MSGS, NAV2_MSGS)}
+    _run(tests, SPACEROBOT_MSGS, NAV2_MSGS)
+
+
+@pytest.mark.slow
+def test_schedules_are_flown_by_a_trajectory_server() -> None:
+    _run("test_trajectory_output.py", CONTROL_MSGS)
+
+
+def _run(tests: str, *packages: InterfacePackage) -> None:
+    """Run tests of nodes with packages that are built."""
+    environment = {**os.environ, **with_interfaces(*packages)}
     run = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-rs", "-m", "slow",
          f"test/nodes/{tests}"],

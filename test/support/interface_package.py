@@ -99,6 +99,45 @@ float32 distance_remaining
 )
 """The action of nav2_msgs that the nodes serve, with the fields of ROS 2 Jazzy."""
 
+CONTROL_MSGS = InterfacePackage.of(
+    "control_msgs",
+    {
+        "msg/JointTolerance.msg": """\
+string name
+float64 position
+float64 velocity
+float64 acceleration
+""",
+        "msg/JointComponentTolerance.msg": """\
+string joint_name
+uint16 component
+float64 position
+float64 velocity
+float64 acceleration
+""",
+        "action/FollowJointTrajectory.action": """\
+trajectory_msgs/JointTrajectory trajectory
+trajectory_msgs/MultiDOFJointTrajectory multi_dof_trajectory
+JointTolerance[] path_tolerance
+JointComponentTolerance[] component_path_tolerance
+JointTolerance[] goal_tolerance
+JointComponentTolerance[] component_goal_tolerance
+builtin_interfaces/Duration goal_time_tolerance
+---
+int32 error_code
+string error_string
+---
+std_msgs/Header header
+string[] joint_names
+trajectory_msgs/JointTrajectoryPoint desired
+trajectory_msgs/JointTrajectoryPoint actual
+trajectory_msgs/JointTrajectoryPoint error
+""",
+    },
+    ["builtin_interfaces", "std_msgs", "trajectory_msgs"],
+)
+"""The action of control_msgs that the planner is a client of, with the fields that it has."""
+
 SPACEROBOT_MSGS = InterfacePackage(
     "spacerobot_msgs",
     {

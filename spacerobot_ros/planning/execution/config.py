@@ -35,8 +35,13 @@ class PlannerConfig(CommanderConfig):
     )
     output: str = parameter(
         "commands",
-        "joint_commands (velocities) for the plant, or joint_reference for a controller",
-        choices=("commands", "reference"),
+        "joint_commands (velocities) for the plant, joint_reference for a controller, or schedules "
+        "for the FollowJointTrajectory server of a robot",
+        choices=("commands", "reference", "trajectory"),
+    )
+    trajectory_action: str = parameter(
+        "joint_trajectory_controller/follow_joint_trajectory",
+        "name of the FollowJointTrajectory action to which `output` trajectory sends schedules",
     )
     clearance: float = parameter(
         DEFAULT_CLEARANCE,
@@ -131,7 +136,7 @@ class PlannerConfig(CommanderConfig):
 
         Where a controller moves the robot, goals of its end-effector are for the controller.
         """
-        default = [DEFAULT_END_EFFECTOR] if self.output == "commands" else []
+        default = [DEFAULT_END_EFFECTOR] if self.output != "reference" else []
         return tuple(dict.fromkeys((*default, *self.end_effectors)))
 
     @property
@@ -148,7 +153,7 @@ class PlannerConfig(CommanderConfig):
         A controller that is given a reference has a reserve of efforts for its feedback.
         """
         optimal = self.options.get(OptimalGait.name, OptimalGait.Options())
-        if self.output == "commands" or optimal.effort_limits != 0:
+        if self.output != "reference" or optimal.effort_limits != 0:
             return self.options
         return {**self.options, OptimalGait.name: replace(optimal, effort_limits=1)}
 

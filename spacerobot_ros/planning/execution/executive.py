@@ -208,6 +208,8 @@ class ActiveGoal:
     """Positions of the stuck joints, m or rad, as measured for the last plan."""
     required: frozenset[Controlled] = frozenset()
     """Parts of the goal that plans without the stuck joints must control."""
+    not_flown: str = ""
+    """Clause that tells why no schedule is flown any more; empty: schedules are flown."""
 
 
 @dataclass
@@ -413,6 +415,8 @@ class Executive:
                 self._tracker.brake(self._stamp_ns)
                 duration = self.config.abort_time
                 message = f"The joints brake along the planned path within {duration:g} s."
+                if self.config.output == "trajectory":
+                    message = f"The joints' controller has {duration:g} s to bring them to rest."
                 self._change_phase(Event.ABORTED, Phase.BRAKING)
         self._forget_goals()
         self.outputs.append(
@@ -466,6 +470,28 @@ class Executive:
         if active is None or commanded_until_ns < active.begins_ns:
             return False
         return commanded_until_ns >= since or rests_since_ns <= since
+
+    def schedule_ended(self, why: str = "", *, final: bool = False) -> None:
+        """End the schedule at the next state: the robot's own controller has ended it.
+
+        The measured state is compared with the goal as after every schedule, and the remaining
+        motion is planned again.
+
+        Parameters
+        ----------
+        why
+            Clause that tells why it ended early; empty: it was followed to its end.
+        final
+            Whether nothing is planned again: the goal fails unless it is reached.
+        """
+        active = self._active_goal
+        if active is None:
+            return
+        if final:
+            active.not_flown = why
+        elif why:
+            self._add_notice(Severity.WARNING, f"{sentence_case(why)}.")
+        self._tracker.end_by_result()
 
     def plant_reset(self) -> None:
         """Plan again for the present goal, if any: the robot is in another state than
@@ -721,6 +747,9 @@ class Executive:
             message = f"The goal is reached: {left}."
             self._add_status(PlannerState.REACHED, message, active.identified, active, error)
             self._end_goal(Event.REACHED)
+            return
+        if active.not_flown:
+            self._fail_goal(active, error, f", and {active.not_flown}.")
             return
         if active.next_plan is PlanReason.CORRECTION:
             if active.corrections >= self.config.max_corrections:

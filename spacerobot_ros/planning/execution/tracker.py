@@ -97,6 +97,10 @@ class ScheduleFollower:
         far = np.abs(self._positions[-1] - q).max(initial=0.0) > max(_END_TOLERANCE, self._deadband)
         return not far or late > _MAX_SETTLING_TIME * SECOND
 
+    def is_overdue(self, stamp_ns: int) -> bool:
+        """Whether the schedule has been over for longer than any settling takes."""
+        return stamp_ns - self._end_ns > _MAX_SETTLING_TIME * SECOND
+
     def covers(self, stamp_ns: int) -> bool:
         """Whether the schedule, or the settling after it, covers a time."""
         return self._start_ns <= stamp_ns <= self._end_ns + _MAX_SETTLING_TIME * SECOND
@@ -213,14 +217,21 @@ class TrajectoryTracker:
         """Stuck joints; their commands are zero."""
         self._config = config
         # No feedback here: a controller closes its own loop around the reference.
-        self._commands_plant = config.output == "commands"
+        self._commands_plant = config.output != "reference"
+        self._ends_by_result = config.output == "trajectory"
+        """Whether the robot's own controller follows schedules, and says when they are over."""
+        self._has_result = False
         self._follower: ScheduleFollower | BrakingFollower | None = None
         self._holds_position = False
         """Whether the position of the setpoint is the shape to hold."""
         self.use_robot(robot)
         band = 2 * config.shape_deadband
         self._stuck_watch = StuckJointWatch(
-            robot.n, config.stuck_ticks, config.control_period, band
+            # A controller of the robot's own sees itself that a joint does not follow.
+            robot.n,
+            0 if self._ends_by_result else config.stuck_ticks,
+            config.control_period,
+            band,
         )
 
     def use_robot(self, robot: SpaceRobot) -> None:
@@ -246,7 +257,7 @@ class TrajectoryTracker:
 
         ``average`` measured poses are averaged for plans that begin in motion; 0: none are wanted.
         """
-        config = self._config
+        config, self._has_result = self._config, False
         gain = config.shape_gain if self._commands_plant else 0.0
         self._follower = ScheduleFollower(schedule, stamp_ns, gain, config.shape_deadband)
         sensitivity = None
@@ -291,7 +302,13 @@ class TrajectoryTracker:
 
     def has_ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the schedule or the braking is over."""
+        if self._ends_by_result and isinstance(self._follower, ScheduleFollower):
+            return self._has_result or self._follower.is_overdue(stamp_ns)
         return self._follower is not None and self._follower.has_ended(stamp_ns, q)
+
+    def end_by_result(self) -> None:
+        """Let the schedule end at the next state: the controller that follows it has ended it."""
+        self._has_result = True
 
     def stop(self, *, at_last_shape: bool = False) -> None:
         """Stop tracking; hold the schedule's last shape, or the next measured shape."""

@@ -1,0 +1,168 @@
+"""Schedules for a server of FollowJointTrajectory: one at a time, and how each of them ends.
+
+Nothing here knows ROS: a :class:`TrajectoryServer` sends and cancels, and its answers come back
+with the number of the schedule that they are for. An answer about a schedule that was replaced or
+cancelled changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+from typing import Protocol
+
+from spacerobot_ros.planning.execution.executive import Event, Phase
+from spacerobot_ros.planning.execution.status import ScheduleStart
+
+_PHASES_OF_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.PLANNING)
+"""Phases in which a schedule is followed on; in PLANNING its successor replaces it."""
+
+
+class ErrorCode(IntEnum):
+    """``error_code`` of a result of control_msgs/action/FollowJointTrajectory."""
+
+    SUCCESSFUL = 0
+    INVALID_GOAL = -1
+    INVALID_JOINTS = -2
+    OLD_HEADER_TIMESTAMP = -3
+    PATH_TOLERANCE_VIOLATED = -4
+    GOAL_TOLERANCE_VIOLATED = -5
+
+
+class Outcome(Enum):
+    """Final state of an action's goal."""
+
+    SUCCEEDED = "succeeded"
+    ABORTED = "aborted"
+    CANCELED = "canceled"
+
+
+@dataclass(frozen=True)
+class MotionEnd:
+    """The end of a schedule that the robot's own controller follows.
+
+    Attributes
+    ----------
+    message
+        A clause that tells why it ended early; empty: it was followed to its end.
+    final
+        Whether a corrected schedule would end alike, so that none is planned.
+    """
+
+    message: str = ""
+    final: bool = False
+
+
+class TrajectoryServer(Protocol):
+    """The connection with the action server."""
+
+    def ready(self) -> bool:
+        """Whether the server is there."""
+
+    def send(self, number: int, start: ScheduleStart) -> None:
+        """Send a schedule."""
+
+    def cancel(self, number: int) -> None:
+        """Have a schedule cancelled, accepted or not."""
+
+
+class TrajectoryOutput:
+    """Sends each schedule to a server, follows its result, and cancels what is given up.
+
+    Parameters
+    ----------
+    server
+        The connection.
+    name
+        Name of the action, for messages.
+    on_end
+        Called once for each schedule that ends without being replaced or cancelled.
+    """
+
+    def __init__(
+        self, server: TrajectoryServer, name: str, on_end: Callable[[MotionEnd], None]
+    ) -> None:
+        self._server, self._name, self._on_end = server, name, on_end
+        self._number = 0
+        """Number of the latest schedule."""
+        self._sent: int | None = None
+        """Number of the schedule without a result."""
+        self._replaced: int | None = None
+        """Number of the one that it replaces, until it is accepted."""
+        self._accepted = False
+
+    @property
+    def waits(self) -> bool:
+        """Whether a schedule has no result yet."""
+        return self._sent is not None
+
+    def start(self, start: ScheduleStart) -> None:
+        """Send a schedule; it replaces the one that is followed."""
+        self._number += 1
+        self._replaced, self._sent, self._accepted = self._sent, self._number, False
+        if not self._server.ready():
+            self._end(MotionEnd(f"no server of the action '{self._name}' is there", final=True))
+            return
+        self._server.send(self._number, start)
+
+    def phase_changed(self, phase: Phase, event: Event) -> None:
+        """Cancel the schedule if the planner has left it."""
+        sent = self._sent
+        if sent is None or phase in _PHASES_OF_MOTION:
+            return
+        unanswered = not self._accepted
+        self._sent = self._replaced = None
+        self._server.cancel(sent)
+        if unanswered and event is Event.SCHEDULE_ENDED:
+            self._on_end(MotionEnd(f"the action '{self._name}' has not answered", final=True))
+
+    def accepted(self, number: int) -> None:
+        """Note that the server follows a schedule now."""
+        if number == self._sent:
+            self._accepted, self._replaced = True, None
+
+    def rejected(self, number: int) -> None:
+        """End a schedule that the server does not take, and the one that it was to replace."""
+        if number != self._sent:
+            return
+        if self._replaced is not None:
+            self._server.cancel(self._replaced)
+        self._end(MotionEnd(f"the action '{self._name}' has rejected the trajectory", final=True))
+
+    def ended(self, number: int, outcome: Outcome, code: int, text: str) -> None:
+        """End a schedule by the result of the server.
+
+        Parameters
+        ----------
+        number
+            Number of the schedule.
+        outcome
+            Final state of the goal.
+        code
+            ``error_code`` of the result.
+        text
+            ``error_string`` of the result.
+        """
+        if number == self._sent:
+            self._end(_motion_end(outcome, code, text))
+
+    def _end(self, end: MotionEnd) -> None:
+        self._sent = self._replaced = None
+        self._on_end(end)
+
+
+def _motion_end(outcome: Outcome, code: int, text: str) -> MotionEnd:
+    """Return the meaning of a result."""
+    if outcome is Outcome.SUCCEEDED and code == ErrorCode.SUCCESSFUL:
+        return MotionEnd()
+    told = f": {text.rstrip('.')}" if text else ""
+    if outcome is Outcome.CANCELED:
+        return MotionEnd(f"another client has replaced or cancelled the trajectory{told}", True)
+    try:
+        name = ErrorCode(code).name
+    except ValueError:
+        name = f"error code {code}"
+    clause = f"the trajectory has ended early by {name}{told}"
+    violated = code in (ErrorCode.PATH_TOLERANCE_VIOLATED, ErrorCode.GOAL_TOLERANCE_VIOLATED)
+    return MotionEnd(clause, final=not violated)

@@ -1,0 +1,145 @@
+"""Schedules for the trajectory server of a robot: sent, replaced, cancelled, and their ends."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from spacerobot_ros.commanding.trajectory_output import (
+    MotionEnd,
+    Outcome,
+    TrajectoryOutput,
+)
+from spacerobot_ros.planning.execution.executive import Event, Phase
+
+
+class Server:
+    """Keeps what it is asked, and is there or not."""
+
+    def __init__(self) -> None:
+        self.present = True
+        self.sent: list[tuple[int, Any]] = []
+        self.cancelled: list[int] = []
+
+    def ready(self) -> bool:
+        return self.present
+
+    def send(self, number: int, start: Any) -> None:
+        self.sent.append((number, start))
+
+    def cancel(self, number: int) -> None:
+        self.cancelled.append(number)
+
+
+class Sent:
+    """An output with its server and the ends that it has told."""
+
+    def __init__(self) -> None:
+        self.server, self.ends = Server(), list[MotionEnd]()
+        self.output = TrajectoryOutput(self.server, "/arm/follow", self.ends.append)
+
+    def start(self, schedule: Any = "schedule", *, accepted: bool = True) -> int:
+        self.output.start(schedule)
+        number = self.server.sent[-1][0]
+        if accepted:
+            self.output.accepted(number)
+        return number
+
+
+def test_a_schedule_is_sent_and_ends_with_its_result() -> None:
+    sent = Sent()
+    number = sent.start("first")
+    assert sent.server.sent == [(number, "first")]
+    assert sent.output.waits
+    sent.output.phase_changed(Phase.EXECUTING, Event.PLANNED)
+    sent.output.ended(number, Outcome.SUCCEEDED, 0, "")
+    assert sent.ends == [MotionEnd()]
+    assert not sent.output.waits
+    # Each schedule ends once, and nothing that has ended is cancelled.
+    sent.output.ended(number, Outcome.ABORTED, -4, "")
+    sent.output.rejected(number)
+    sent.output.phase_changed(Phase.EVALUATING, Event.SCHEDULE_ENDED)
+    assert len(sent.ends) == 1
+    assert sent.server.cancelled == []
+
+
+@pytest.mark.parametrize(
+    ("outcome", "code", "text", "message", "final"),
+    [
+        (Outcome.ABORTED, -4, "wrist off.", "the trajectory has ended early by "
+         "PATH_TOLERANCE_VIOLATED: wrist off", False),
+        (Outcome.ABORTED, -5, "", "the trajectory has ended early by GOAL_TOLERANCE_VIOLATED",
+         False),
+        (Outcome.ABORTED, -1, "", "the trajectory has ended early by INVALID_GOAL", True),
+        (Outcome.ABORTED, -2, "no wrist", "the trajectory has ended early by INVALID_JOINTS: "
+         "no wrist", True),
+        (Outcome.ABORTED, -3, "", "the trajectory has ended early by OLD_HEADER_TIMESTAMP", True),
+        (Outcome.ABORTED, 0, "", "the trajectory has ended early by SUCCESSFUL", True),
+        (Outcome.ABORTED, 17, "", "the trajectory has ended early by error code 17", True),
+        (Outcome.CANCELED, -4, "new goal", "another client has replaced or cancelled the "
+         "trajectory: new goal", True),
+        (Outcome.SUCCEEDED, -5, "", "the trajectory has ended early by GOAL_TOLERANCE_VIOLATED",
+         False),
+    ],
+)  # fmt: skip
+def test_results_are_corrected_or_final(
+    outcome: Outcome, code: int, text: str, message: str, final: bool
+) -> None:
+    sent = Sent()
+    sent.output.ended(sent.start(), outcome, code, text)
+    assert sent.ends == [MotionEnd(message, final)]
+
+
+def test_what_is_left_is_cancelled_and_its_result_does_not_count() -> None:
+    for phase in Phase:
+        sent = Sent()
+        number = sent.start()
+        sent.output.phase_changed(phase, Event.NEW_GOAL)
+        goes_on = phase in (
+            Phase.EXECUTING, Phase.PLANNING, Phase.REPLANNING, Phase.TAKING_OVER
+        )  # fmt: skip
+        assert sent.server.cancelled == ([] if goes_on else [number])
+        assert sent.output.waits is goes_on
+        sent.output.ended(number, Outcome.CANCELED, 0, "")
+        assert len(sent.ends) == (1 if goes_on else 0)
+
+
+def test_a_schedule_replaces_another() -> None:
+    sent = Sent()
+    first, second = sent.start("first"), sent.start("second", accepted=False)
+    assert first != second
+    sent.output.accepted(first)  # Too late, and of no meaning
+    sent.output.ended(first, Outcome.CANCELED, -1, "preempted")
+    assert sent.ends == []
+    sent.output.accepted(second)
+    assert sent.server.cancelled == []
+    third = sent.start("third", accepted=False)
+    sent.output.rejected(second)
+    assert sent.ends == []
+    sent.output.rejected(third)
+    # The robot must not follow the second one on.
+    assert sent.server.cancelled == [second]
+    assert sent.ends == [MotionEnd("the action '/arm/follow' has rejected the trajectory", True)]
+
+
+def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
+    sent = Sent()
+    sent.server.present = False
+    lost: Any = "lost"
+    sent.output.start(lost)
+    assert sent.server.sent == []
+    assert sent.ends.pop() == MotionEnd("no server of the action '/arm/follow' is there", True)
+    assert not sent.output.waits
+    sent.server.present = True
+    number = sent.start(accepted=False)
+    sent.output.phase_changed(Phase.EVALUATING, Event.SCHEDULE_ENDED)
+    assert sent.ends == [MotionEnd("the action '/arm/follow' has not answered", True)]
+    assert sent.server.cancelled == [number]
+    # One that was accepted and has no result may be corrected; a reset is nobody's fault.
+    later = sent.start()
+    sent.output.phase_changed(Phase.EVALUATING, Event.SCHEDULE_ENDED)
+    reset = sent.start(accepted=False)
+    sent.output.phase_changed(Phase.EVALUATING, Event.PLANT_RESET)
+    assert len(sent.ends) == 1
+    assert sent.server.cancelled == [number, later, reset]
