@@ -87,6 +87,7 @@ setup(
         *share("launch"),
         *share("bags"),
         *share("foxglove"),
+        *share("ros2_control"),
         *share("rviz"),
         # The nodes are files and not console scripts because pip puts every console script into
         # bin/, where `ros2 run` does not look and a command called `plant` is out of place. As
