@@ -1,5 +1,5 @@
 // Draws figures over time as charts, in place of their pictures: zoom, values under the cursor,
-// events below, and the instant that the 3D view shows. The page holds the numbers in #charts.
+// events below the first, and the instant that the 3D view shows. The page holds the numbers in #charts.
 "use strict";
 (() => {
   const given = JSON.parse(document.getElementById("charts").textContent);
@@ -54,6 +54,7 @@
     const at = (time) => ((time - span[0]) / (span[1] - span[0])) * width;
     hand.hidden = now < span[0] || now > span[1];
     hand.style.left = `${at(now)}px`;
+    if (lane === null) return;
     lane.style.marginLeft = `${left}px`;
     lane.style.width = `${width}px`;
     // From the last to the first: a mark's words have the room up to the next.
@@ -215,9 +216,9 @@
       box,
     );
     const hand = make("div", "hand", plot.over);
-    const lane = make("div", "lane", box);
-    lane.hidden = given.events.length === 0;
-    const marks = given.events.map((event) => {
+    // Events stand once, below the first chart; all charts have the lines of the strong ones.
+    const lane = charts.length === 0 && given.events.length > 0 ? make("div", "lane", box) : null;
+    const marks = (lane === null ? [] : given.events).map((event) => {
       const mark = make("span", `mark row${event.row}`, lane);
       mark.title = `${text(event.time)} s: ${event.sentence}`;
       mark.dataset.kind = event.kind;

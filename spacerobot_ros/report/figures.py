@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
 from importlib.resources import files
@@ -74,12 +74,22 @@ _FIXED_SETTINGS: Any = {
 
 
 _figure_width = ContextVar("_figure_width", default=WIDTH)
+_degrees = ContextVar("_degrees", default=False)
+_lettered = ContextVar("_lettered", default=False)
+"""Whether panels of several have letters: (a), (b)."""
 _font_scale = ContextVar("_font_scale", default=1.0)
 """Ratio of the font size to 8.5 points."""
 
 
 @contextmanager
-def drawing(width: float = WIDTH, style: str = "report", own: Path | None = None) -> Iterator[None]:
+def drawing(
+    width: float = WIDTH,
+    style: str = "report",
+    own: Path | None = None,
+    *,
+    degrees: bool = False,
+    lettered: bool = False,
+) -> Iterator[None]:
     """Draw in the style of these figures while the block lasts.
 
     Parameters
@@ -89,7 +99,12 @@ def drawing(width: float = WIDTH, style: str = "report", own: Path | None = None
     style
         Style file of this package: ``report`` for pages, ``paper`` for papers.
     own
-        Style file of the user, or name of a style of matplotlib; it overrides ``style``.
+        Style file of the user, or name of a style of this package or of matplotlib; it overrides
+        ``style``.
+    degrees
+        Whether angles over time are in degrees, and not in rad.
+    lettered
+        Whether the panels of a figure that has several are called (a), (b) and so on.
 
     Raises
     ------
@@ -105,9 +120,12 @@ def drawing(width: float = WIDTH, style: str = "report", own: Path | None = None
         mpl.rcParams.update(_FIXED_SETTINGS)
         across = _figure_width.set(width)
         scale = _font_scale.set(float(mpl.rcParams["font.size"]) / _FONT_SIZE)
+        angles, letters = _degrees.set(degrees), _lettered.set(lettered)
         try:
             yield
         finally:
+            _degrees.reset(angles)
+            _lettered.reset(letters)
             _figure_width.reset(across)
             _font_scale.reset(scale)
 
@@ -125,6 +143,9 @@ def _apply_style(path: Path) -> None:
 
 
 def _read_style(path: Path) -> mpl.RcParams:
+    shipped = files("spacerobot_ros.report").joinpath(f"{path}.mplstyle")
+    if not path.exists() and path.name == str(path) and shipped.is_file():
+        path = Path(str(shipped))
     if not path.exists():
         # The import reads all styles of matplotlib.
         import matplotlib.style as styles
@@ -214,6 +235,11 @@ def inches(length: float) -> float:
     return length * _font_scale.get()
 
 
+def angle_unit() -> tuple[float, str]:
+    """Return the unit that angles are drawn in, and its number in one rad."""
+    return (180.0 / np.pi, "deg") if _degrees.get() else (1.0, "rad")
+
+
 def sheet(
     rows: Sequence[Sequence[float]],
     heights: Sequence[float],
@@ -256,7 +282,23 @@ def sheet(
             x += across + between
         panels.append(row)
         y -= gap
+    _letter_panels([axes for row in panels for axes in row], left)
     return figure, panels
+
+
+def _letter_panels(panels: Sequence[Axes], left: float) -> None:
+    """Write (a), (b) and so on ``left`` of the top of each panel, inches, if that is wanted."""
+    if not _lettered.get() or len(panels) < 2:
+        return
+    for number, axes in enumerate(panels):
+        axes.annotate(
+            f"({chr(ord('a') + number % 26)})",
+            (0.0, 1.0),
+            (-72.0 * left + 1.0, 3.0),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            annotation_clip=False,
+        )
 
 
 def new_figure(height: float) -> Figure:
@@ -531,6 +573,24 @@ class TraceGroup:
     window: tuple[float, float] | None = None
     decades: int = 0
     rows: bool = False
+
+    def in_unit_of_angles(self) -> TraceGroup:
+        """Return the traces in the unit of angles that is drawn: in degrees instead of rad, if
+        that is wanted.
+        """
+        if not _degrees.get() or not self.unit.startswith("rad"):
+            return self
+        factor, unit = angle_unit()
+        return replace(
+            self,
+            signal=Signal(self.signal.time, factor * self.signal.values),
+            unit=unit + self.unit.removeprefix("rad"),
+            goals=[(start, end, k, factor * value) for start, end, k, value in self.goals],
+            limits=[(k, factor * value) for k, value in self.limits],
+            window=None
+            if self.window is None
+            else (factor * self.window[0], factor * self.window[1]),
+        )
 
 
 @dataclass(frozen=True)

@@ -143,6 +143,7 @@ def time_figure(
 
     ``caption`` is its beginning.
     """
+    groups = [group.in_unit_of_angles() for group in groups]
     cycles = flight.cycles
     rows, heights = [[1.0]], [2.3]
     if any(group.decades for group in groups):
@@ -401,7 +402,10 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
         limit = joint.limits.velocity if joint is not None else np.inf
         unit = f"{joint_unit(flight, name)}/s"
         bounds = [(0, limit), (0, -limit)]
-        groups.append(TraceGroup(signal, [name], short(name), unit, [colour(i)], limits=bounds))
+        group = TraceGroup(signal, [name], short(name), unit, [colour(i)], limits=bounds)
+        group = group.in_unit_of_angles()
+        groups.append(group)
+        signal, unit, limit = group.signal, group.unit, group.limits[0][1]
         for axes, (start, end) in zip(row, spans, strict=True):
             set_range(axes, signal.values, [limit, -limit])
             low, high = axes.get_ylim()

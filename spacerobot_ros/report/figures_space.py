@@ -21,6 +21,7 @@ from spacerobot_ros.report.figures import (
     MUTED,
     PALETTE,
     ReportFigure,
+    angle_unit,
     colour,
     end_labels,
     legend_above,
@@ -347,20 +348,25 @@ _LOG_AXIS_RATIO = 10.0
 def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     """Attitude, and the remaining angle to the goal, at the end of each loop in shape space.
 
-    None if the joints do not return to one shape several times.
+    None if no method repeats cycles, or the joints do not return to one shape several times.
     """
-    if not len(flight.shape) or len(flight.attitude) != len(flight.shape):
+    if (
+        not flight.repeats_cycles
+        or not len(flight.shape)
+        or len(flight.attitude) != len(flight.shape)
+    ):
         return None
     ends = loop_ends(flight.shape)
     if len(ends) < _MIN_LOOPS:
         return None
     number = np.arange(len(ends))
-    attitude = flight.attitude.values[ends]
+    factor, unit = angle_unit()
+    attitude = factor * flight.attitude.values[ends]
     goal = flight.goal
     figure, panels = sheet([[1.0], [1.0]] if goal else [[1.0]], [2.0, 1.3] if goal else [2.0])
     above = panels[0][0]
     dots = "." if len(ends) <= 60 else ""
-    wanted = flight.goal_rotvec(goal) if goal is not None else np.empty(0)
+    wanted = factor * flight.goal_rotvec(goal) if goal is not None else np.empty(0)
     set_range(above, np.concatenate([attitude.ravel(), wanted]))
     for i in range(3):
         above.plot(number, attitude[:, i], color=PALETTE[i], marker=dots)
@@ -368,7 +374,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
         above.axhline(value, color=PALETTE[i], ls=(0, DASHES), lw=1.2, zorder=1.8)
     if goal is not None:
         legend_above(above, [legend_entry(MUTED, "goal", DASHES)])
-    above.set_ylabel("rotation vector (rad)")
+    above.set_ylabel(f"rotation vector ({unit})")
     end_labels(above, list(zip(attitude[-1].tolist(), "xyz", PALETTE[:3], strict=True)))
     caption = (
         f"Attitude of the base link at the {len(ends)} instants at which the shape is back where "
@@ -377,9 +383,9 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     if goal is not None:
         below = panels[1][0]
         poses = zip(flight.position.values[ends], flight.quaternion[ends], strict=True)
-        left = np.array([PoseError.between(r, q, goal).angle for r, q in poses])
+        left = factor * np.array([PoseError.between(r, q, goal).angle for r, q in poses])
         below.plot(number, left, color=PALETTE[0], marker=dots)
-        below.set_ylabel("remaining angle (rad)")
+        below.set_ylabel(f"remaining angle ({unit})")
         caption += "; dashed, the goal. Below, the remaining angle to the goal"
         if left.min() > 0 and left.max() > _LOG_AXIS_RATIO * left.min():
             below.set_yscale("log")

@@ -44,6 +44,7 @@ from spacerobot_ros.model.visuals import Visual, meshes_from_attachments
 from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
+from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.report.events import FlightEvent, drawn_events
 from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, rotvecs
 from spacerobot_ros.report.solids import SolidRobot
@@ -649,9 +650,21 @@ class FlightReport:
         columns = [np.interp(time, self.shape.time, self.shape.values[:, i]) for i in chosen]
         return np.column_stack(columns)
 
+    @property
+    def repeats_cycles(self) -> bool:
+        """Whether a method flew that repeats cycles, or one that is not known; no law does."""
+        if any(isinstance(status.report, ControllerStatus) for status in self.statuses):
+            return False
+        flown = {status.method for status in self.executing if status.method}
+        return not flown or any(
+            name not in METHODS or METHODS[name].repeats_cycles for name in flown
+        )
+
     @cached_property
     def cycles(self) -> Cycles | None:
-        """The equal cycles with which the longest schedule ends."""
+        """The equal cycles with which the longest schedule ends; None: there are none."""
+        if not self.repeats_cycles:
+            return None
         starts = [0.0, *(status.time for status in self.executing)]
         spans = list(zip(starts, [*starts[1:], self.end], strict=True))
         start, end = max(spans, key=lambda span: span[1] - span[0])

@@ -23,6 +23,15 @@
       if (box.previousElementSibling) box.previousElementSibling.classList.toggle("needed", shown);
     }
   }
+  // On paper everything is unfolded; afterwards each is as it was.
+  const folds = () => [...document.querySelectorAll("details:not(#licences)")];
+  let folded = [];
+  addEventListener("beforeprint", () => {
+    folded = folds().filter((each) => !each.open);
+    folded.forEach((each) => { each.open = true; });
+  });
+  addEventListener("afterprint", () => folded.forEach((each) => { each.open = false; }));
+
   addEventListener("resize", hint);
   hint();
   changed();

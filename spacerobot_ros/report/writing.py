@@ -138,6 +138,7 @@ def write_figures(
     width: float = 88.0,
     style: Path | None = None,
     events: bool = False,
+    degrees: bool = False,
     namespace: str | None = None,
 ) -> dict[str, Path | str]:
     """Write figures of a flight for a paper, each a file of its own.
@@ -157,9 +158,11 @@ def write_figures(
         Of a figure, mm.
     style
         A style file of matplotlib's, for fonts, sizes and colours of lines and axes, or the name
-        of one of its own styles.
+        of one of its own styles, or ``serif``.
     events
         Whether what happened is shown below time axes.
+    degrees
+        Whether angles over time are in degrees, and not in rad.
     namespace
         Of the robot, where the bag has several.
 
@@ -187,7 +190,7 @@ def write_figures(
     if not events:
         flight = replace(flight, events=[])
     made: dict[str, Path | str] = {}
-    with drawing(width / 25.4, "paper", style):
+    with drawing(width / 25.4, "paper", style, degrees=degrees, lettered=True):
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
             try:
                 figure = FIGURES[name](flight)

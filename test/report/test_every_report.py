@@ -83,8 +83,8 @@ def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Brows
         outside = [url for url in window.requests if not url.startswith("data:")]
         assert outside == [page.as_uri()]
         assert window.evaluate("document.documentElement.scrollWidth") <= width
-        charts = window.evaluate("flightCharts.charts.length")
-        assert charts == window.evaluate("document.querySelectorAll('.lane').length") >= 5
+        assert window.evaluate("flightCharts.charts.length") >= 5
+        assert window.evaluate("document.querySelectorAll('.lane').length") == 1
         below = lanes(window)
         for words in FAULTS.get(Path(name).name, ()):
             assert any(words in text for text in below), (words, below)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.report import write_figures, write_picture
-from spacerobot_ros.report.figures import PictureFormat
+from spacerobot_ros.report.figures import PictureFormat, TraceGroup, angle_unit, drawing, sheet
 from spacerobot_ros.report.figures_over_time import range_without_peaks
 
 MAGIC = {"png": b"\x89PNG", "pdf": b"%PDF-", "svg": b"<?xml"}
@@ -262,3 +263,49 @@ def test_an_axis_is_for_what_can_be_read_beside_a_peak() -> None:
     resting = np.where(np.abs(time - 5.0) < 0.05, 1.0, 1e-9 * calm)
     assert range_without_peaks(Signal(time, resting[:, np.newaxis])) is None
     assert range_without_peaks(Signal(time[:0], np.empty((0, 1)))) is None
+
+
+def test_angles_of_a_paper_are_in_degrees_if_asked_and_panels_have_letters(
+    bag: Path, tmp_path: Path
+) -> None:
+    texts = {}
+    for name, words in (("rad", ()), ("deg", ("--degrees", "--style", "serif"))):
+        out = tmp_path / name
+        command = ["figures", str(bag), "--only", "pose", "--format", "svg", "-o", str(out), *words]
+        assert CliRunner().invoke(main, command).exit_code == 0
+        texts[name] = (out / "pose.svg").read_text("utf-8")
+    for name, text in texts.items():
+        assert f">rotation vector ({name})<" in text
+        assert re.findall(r">\(([a-z])\)<", text) == ["a", "b"]
+        assert ("STIXGeneral" in text) == (name == "deg")
+
+
+def test_traces_in_degrees_have_goals_limits_and_window_in_degrees() -> None:
+    time = np.array([0.0, 1.0])
+    radian = Signal(time, np.array([[0.1], [np.pi]]))
+    goals, limits = [(0.0, 1.0, 0, np.pi / 2)], [(0, np.pi / 6)]
+    group = TraceGroup(radian, ["a"], "rate", "rad/s", ["red"], goals, limits, window=(-np.pi, 1.0))
+    metre = TraceGroup(radian, ["a"], "way", "m", ["red"], goals)
+    assert group.in_unit_of_angles() is group
+    with drawing(degrees=True):
+        found = group.in_unit_of_angles()
+        assert metre.in_unit_of_angles() is metre
+        assert replace(group, window=None).in_unit_of_angles().window is None
+        assert angle_unit()[0] == pytest.approx(57.29578)
+    assert angle_unit()[0] == 1.0
+    assert found.unit == "deg/s"
+    np.testing.assert_allclose(found.signal.values, [[5.729578], [180.0]], rtol=1e-6)
+    assert found.signal.time is time
+    np.testing.assert_allclose(found.goals, [[0.0, 1.0, 0, 90.0]])
+    np.testing.assert_allclose(found.limits, [[0, 30.0]])
+    np.testing.assert_allclose(found.window or (), [-180.0, 57.29578], rtol=1e-6)
+
+
+def test_panels_have_letters_only_in_papers_and_where_there_are_several() -> None:
+    def letters(rows: int, *, lettered: bool) -> list[str]:
+        with drawing(lettered=lettered):
+            figure, _ = sheet([[1.0, 2.0]] * rows if rows else [[1.0]], [1.0] * max(rows, 1))
+        return [text.get_text() for axes in figure.axes for text in axes.texts]
+
+    assert letters(2, lettered=True) == ["(a)", "(b)", "(c)", "(d)"]
+    assert letters(0, lettered=True) == letters(2, lettered=False) == []

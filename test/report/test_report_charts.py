@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pypdf
 import pytest
 from support.chromium import Browser, browser, chromium
 from support.flight_bags import GOAL, TICK, Story, goal_value, tell
@@ -42,6 +45,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         statuses=[(0.1, "Executing.", executing)],
         goals=[(0.0, *GOAL)],
         events=[(time, values) for time, values, _ in EVENTS],
+        metadata={"parameters/planner": {"position_tolerance": "0.017", "method": '"lie_bracket"'}},
     )
     return tell(tmp_path_factory.mktemp("charts") / "flight.mcap", story)
 
@@ -110,19 +114,20 @@ def test_events_of_one_kind_at_once_are_counted(tmp_path: Path) -> None:
 
 
 @with_browser
-def test_what_happened_stands_below_every_chart(window: Browser) -> None:
-    for number in range(9):
-        left, width = chart(window, number, "[0, chart.lane.clientWidth]")
-        marks = chart(
-            window,
-            number,
-            "chart.marks.map(({event, mark, words}) => "
-            "[event.time, words.textContent, parseFloat(mark.style.left), event.row])",
-        )
-        assert [mark[0] for mark in marks] == [time for time, _, _ in EVENTS]
-        for (_, _, words), (time, text, x, _) in zip(EVENTS, marks, strict=True):
-            assert words in text
-            assert x == pytest.approx(left + width * time / END, abs=0.5)
+def test_what_happened_stands_once_below_the_first_chart(window: Browser) -> None:
+    left, width = chart(window, 0, "[0, chart.lane.clientWidth]")
+    marks = chart(
+        window,
+        0,
+        "chart.marks.map(({event, mark, words}) => "
+        "[event.time, words.textContent, parseFloat(mark.style.left), event.row])",
+    )
+    assert [mark[0] for mark in marks] == [time for time, _, _ in EVENTS]
+    for (_, _, words), (time, text, x, _) in zip(EVENTS, marks, strict=True):
+        assert words in text
+        assert x == pytest.approx(left + width * time / END, abs=0.5)
+    assert window.evaluate("document.querySelectorAll('.lane').length") == 1
+    assert chart(window, 8, "chart.lane === null && chart.marks.length === 0")
     rows = {mark[1].split(":")[0]: mark[3] for mark in marks}
     assert rows["fault on"] == rows["fault off"] != rows["stuck joint"] != rows["takeover"]
     seen = window.evaluate("document.querySelector('.lane').innerText")
@@ -169,12 +174,12 @@ def press(window: Browser, number: int, *shares: float, clicks: int = 1) -> None
 def test_a_drag_zooms_all_charts_and_two_clicks_show_all(window: Browser) -> None:
     press(window, 1, 0.25, 0.4, 0.5)
     low, high = window.evaluate("flightCharts.span")
+    shown = chart(window, 0, "chart.marks.filter(m => !m.mark.hidden).length")
+    assert shown == sum(low <= time <= high for time, _, _ in EVENTS)
     assert (low, high) == (pytest.approx(END / 4, abs=0.1), pytest.approx(END / 2, abs=0.1))
     for number in (0, 1, 8):
         scale = "[chart.plot.scales.x.min, chart.plot.scales.x.max, chart.reset.hidden]"
         assert chart(window, number, scale) == [low, high, False]
-        shown = chart(window, number, "chart.marks.filter(m => !m.mark.hidden).length")
-        assert shown == sum(low <= time <= high for time, _, _ in EVENTS)
     press(window, 1, 0.5, clicks=1)
     press(window, 1, 0.5, clicks=2)
     assert window.evaluate("flightCharts.span") == [0, pytest.approx(END)]
@@ -219,6 +224,23 @@ def test_on_a_phone_what_is_wide_says_so(window: Browser) -> None:
     assert all(shown)
     window.wait_for("flightCharts.charts[0].plot.width < 390")
     assert "stuck joint: j" in window.evaluate("document.querySelector('.lane').innerText")
+
+
+@pytest.mark.slow
+@with_browser
+def test_on_paper_everything_is_unfolded_and_headings_stay_with_their_parts(
+    window: Browser, flight: FlightReport
+) -> None:
+    made = base64.b64decode(window.call("Page.printToPDF", preferCSSPageSize=True)["data"])
+    pages = [page.extract_text() for page in pypdf.PdfReader(io.BytesIO(made)).pages]
+    assert all(len(text.split()) > 10 for text in pages)
+    words = " ".join(" ".join(pages).split())
+    headings = window.evaluate("[...document.querySelectorAll('h2')].map(each => each.innerText)")
+    assert not any(text.strip().endswith(tuple(headings)) for text in pages)
+    for key, value in flight.bag.metadata["parameters/planner"].items():
+        assert f"{key} {value}" in words
+    assert "Permission is hereby granted" not in words
+    assert window.evaluate("[...document.querySelectorAll('details')].every(each => !each.open)")
 
 
 @with_browser

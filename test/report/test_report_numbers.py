@@ -34,7 +34,8 @@ from spacerobot_ros.report.figures_over_time import (
     shape_groups,
     thrusters_figure,
 )
-from spacerobot_ros.report.flight import FlightReport, joint_unit, read_report
+from spacerobot_ros.report.figures_space import cycles_figure
+from spacerobot_ros.report.flight import FlightReport, Status, joint_unit, read_report
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.tables import (
@@ -643,3 +644,31 @@ def test_a_flight_that_was_not_measured_at_its_end_is_drawn(tmp_path: Path) -> N
     figure = position_figure(cut)
     assert isinstance(figure, ReportFigure)
     assert figure.groups[0].signal.time[-1] < whole.cycles.last(3)[0]
+
+
+@pytest.fixture(scope="module")
+def looping(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tell(tmp_path_factory.mktemp("looping") / "a.mcap", Story(cyclic_shapes()))
+
+
+@pytest.mark.parametrize(
+    ("reports", "repeats"),
+    [
+        ([PlannerStatus(PlannerState.EXECUTING, "", method="lie_bracket")], True),
+        ([PlannerStatus(PlannerState.EXECUTING, "", method="square_path")], True),
+        ([PlannerStatus(PlannerState.EXECUTING, "", method="area_loop")], True),
+        ([PlannerStatus(PlannerState.EXECUTING, "", method="optimal")], False),
+        ([PlannerStatus(PlannerState.EXECUTING, "", method="resolved_rate")], False),
+        ([PlannerStatus(PlannerState.EXECUTING, "", method="own_method")], True),
+        ([ControllerStatus(ControllerState.TRACKING)], False),
+        ([], True),
+    ],
+)
+def test_cycles_are_those_of_a_method_that_repeats_them(
+    reports: list[PlannerStatus | ControllerStatus], repeats: bool, looping: Path
+) -> None:
+    found = read_report(looping)
+    vars(found)["statuses"] = [Status(0.1, each) for each in reports]
+    assert found.repeats_cycles is repeats
+    assert (found.cycles is not None) is repeats
+    assert (cycles_figure(found) is not None) is repeats

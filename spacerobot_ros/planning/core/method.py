@@ -122,6 +122,8 @@ class GaitMethod(ABC):
         Whether it plans goals of the base, and goals of end-effectors.
     follows_paths
         Whether it takes end-effectors along given paths.
+    repeats_cycles
+        Whether its gaits repeat a cycle of the shape, by which reports show them.
     starts_in_motion
         Whether its gaits may begin while the joints move (``PlanRequest.motion``).
     Options
@@ -138,6 +140,7 @@ class GaitMethod(ABC):
     plans_for_base: ClassVar[bool] = True
     plans_for_end_effectors: ClassVar[bool] = False
     follows_paths: ClassVar[bool] = False
+    repeats_cycles: ClassVar[bool] = False
     starts_in_motion: ClassVar[bool] = False
     Options: ClassVar[type[Any]] = EmptyOptions
     options: Any

@@ -110,6 +110,7 @@ class AreaLoopGait(GaitMethod):
     """
 
     name: ClassVar[str] = "area_loop"
+    repeats_cycles: ClassVar[bool] = True
     controls: frozenset[Controlled] = frozenset({"attitude", "shape"})
     Options: ClassVar[type[AreaLoopOptions]] = AreaLoopOptions
     options: AreaLoopOptions

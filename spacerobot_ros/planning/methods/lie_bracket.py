@@ -90,6 +90,7 @@ class LieBracketGait(GaitMethod):
     """Controls position and attitude of a base with three or more sliders; slots may be offset."""
 
     name: ClassVar[str] = "lie_bracket"
+    repeats_cycles: ClassVar[bool] = True
     Options: ClassVar[type[LieBracketOptions]] = LieBracketOptions
     options: LieBracketOptions
 

@@ -106,6 +106,7 @@ class SquarePathGait(GaitMethod):
     """
 
     name: ClassVar[str] = "square_path"
+    repeats_cycles: ClassVar[bool] = True
     controls: frozenset[Controlled] = frozenset({"attitude", "shape"})
     Options: ClassVar[type[SquarePathOptions]] = SquarePathOptions
     options: SquarePathOptions
