@@ -532,5 +532,5 @@ def _import_library(name: str) -> Any:
             raise
         raise RecordingError(
             f"The export needs {name.split('.')[0]}, which is not installed: "
-            "pip install 'spacerobot_ros[data]'."
+            "pip install '.[data]' in the clone."
         ) from error

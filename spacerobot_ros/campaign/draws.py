@@ -175,7 +175,7 @@ def require_module(module: str) -> Any:
         name = module.partition(".")[0]
         raise SpaceRobotError(
             f"Campaigns need {name}, which is not installed: "
-            "pip install 'spacerobot_ros[campaign]'."
+            "pip install '.[campaign]' in the clone."
         ) from None
 
 

@@ -52,7 +52,7 @@ def _coal() -> Any:
     except ImportError:
         _LOG.warning(
             "Distances between links are those of spheres, capsules and boxes around them, since "
-            "the package coal is not installed: `pip install 'spacerobot_ros[collision]'`."
+            "the package coal is not installed: `pip install '.[collision]'` in the clone."
         )
         return None
     return coal

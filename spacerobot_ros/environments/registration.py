@@ -24,7 +24,7 @@ def import_gymnasium() -> Any:
         import gymnasium
     except ImportError:
         raise SpaceRobotError(
-            "Environments need gymnasium, which is not installed: pip install 'spacerobot_ros[rl]'."
+            "Environments need gymnasium, which is not installed: pip install '.[rl]' in the clone."
         ) from None
     return gymnasium
 

@@ -93,7 +93,7 @@ def table(flight: Flight, *, euler: bool = False) -> pd.DataFrame:
         import pandas as pd
     except ImportError:
         raise SpaceRobotError(
-            "Tables need pandas, which is not installed: pip install 'spacerobot_ros[data]'."
+            "Tables need pandas, which is not installed: pip install '.[data]' in the clone."
         ) from None
     names = flight.joint_names
     columns: dict[str, Array] = {}
@@ -131,7 +131,7 @@ def dataset(flight: Flight, *, euler: bool = False) -> xr.Dataset:
         import xarray as xr
     except ImportError:
         raise SpaceRobotError(
-            "Datasets need xarray, which is not installed: pip install 'spacerobot_ros[data]'."
+            "Datasets need xarray, which is not installed: pip install '.[data]' in the clone."
         ) from None
     units = columns.attrs["units"]
     return xr.Dataset(

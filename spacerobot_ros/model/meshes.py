@@ -353,7 +353,7 @@ def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
     except ImportError:
         raise MeshError(
             f"The mesh {path} is read by trimesh, which is not installed: "
-            "`pip install 'spacerobot_ros[viewer]'`, or convert it to STL."
+            "`pip install '.[viewer]'` in the clone, or convert it to STL."
         ) from None
     load: Callable[..., Any] = trimesh.load
     try:

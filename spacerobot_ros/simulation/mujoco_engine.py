@@ -42,7 +42,7 @@ def import_mujoco() -> Any:
         import mujoco
     except ImportError as error:
         raise SpaceRobotError(
-            "MuJoCo is not installed: pip install 'spacerobot_ros[mujoco]'."
+            "MuJoCo is not installed: pip install '.[mujoco]' in the clone."
         ) from error
     return mujoco
 

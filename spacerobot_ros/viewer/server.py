@@ -82,7 +82,7 @@ def require_viser() -> None:
     """
     if importlib.util.find_spec("viser") is None:
         raise SpaceRobotError(
-            "The viewer needs viser, which is not installed: pip install 'spacerobot_ros[viewer]' "
+            "The viewer needs viser, which is not installed: pip install '.[viewer]' in the clone "
             "(or: pip install viser)."
         )
 

@@ -310,7 +310,7 @@ def test_a_missing_library_is_one_sentence(
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(RecordingError) as refused:
         bag.to_pandas("events") if library == "pandas" else bag.to_xarray("events")
-    assert_one_sentence(str(refused.value), library, "pip install 'spacerobot_ros[data]'")
+    assert_one_sentence(str(refused.value), library, "pip install '.[data]' in the clone")
 
 
 def test_csv_takes_no_library(bag: Bag, tmp_path: Path) -> None:

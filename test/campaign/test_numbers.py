@@ -327,7 +327,7 @@ def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(SpaceRobotError) as refused:
         sampling.require_module("pyarrow.parquet")
     assert str(refused.value) == (
-        "Campaigns need pyarrow, which is not installed: pip install 'spacerobot_ros[campaign]'."
+        "Campaigns need pyarrow, which is not installed: pip install '.[campaign]' in the clone."
     )
 
 

@@ -218,7 +218,7 @@ def test_without_coal_distances_are_bounds(
         distances_module._coal.cache_clear()
     assert [each.message for each in caplog.records if "coal" in each.message] == [
         "Distances between links are those of spheres, capsules and boxes around them, since the "
-        "package coal is not installed: `pip install 'spacerobot_ros[collision]'`."
+        "package coal is not installed: `pip install '.[collision]'` in the clone."
     ]
     assert exact.exact
     # The box around the bus and that around the arm are always in contact.

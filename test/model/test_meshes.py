@@ -120,7 +120,7 @@ def test_a_missing_reader_is_named_with_the_command_that_installs_it(
 ) -> None:
     path = written(tmp_path, name, b"")
     monkeypatch.setitem(sys.modules, hidden, None)
-    with pytest.raises(MeshError, match=r"pip install 'spacerobot_ros\[viewer\]'"):
+    with pytest.raises(MeshError, match=r"pip install '\.\[viewer\]'` in the clone"):
         read_mesh(path)
 
 

@@ -119,7 +119,7 @@ def test_without_mujoco_one_sentence_says_how_to_get_it(monkeypatch: pytest.Monk
     monkeypatch.setitem(sys.modules, "mujoco", None)
     result = verify(BAGS / "reach.mcap")
     assert result.exit_code == 2
-    assert_one_sentence(result.stderr, "pip install 'spacerobot_ros[mujoco]'")
+    assert_one_sentence(result.stderr, "pip install '.[mujoco]' in the clone")
 
 
 def test_joints_that_follow_others_are_refused() -> None:
