@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ from planning.drifting import END_ERROR, angle_between, flown_by_pinocchio
 from planning.test_optimal import ARM_START, FOLDER
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, matrices_from_quaternions
@@ -20,6 +21,7 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.held_commands import DriftVariation
+from spacerobot_ros.planning.methods.optimal.method import OptimalGait, _Found
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
 
 ATTITUDE = Rotation.from_rotvec([0.4, -0.3, 0.7]).as_quat()
@@ -86,14 +88,13 @@ def test_the_first_variation_of_a_drifting_attitude_is_that_of_its_integration(
     K = arm.function("curvature", compile=False)(positions.T).full()
     K = K.reshape(6, N + 1, 3, 3)[3:]
     moved = np.gradient(positions, axis=0)
-    twists = np.einsum("akji,kj,ki->ka", K, moved, wave)[:, :, np.newaxis]
+    turned = R @ np.einsum("akji,kj->kai", K, moved)
     variation = DriftVariation(arm)
-    xi = variation.accumulated(positions, L @ R, R, R @ twists, wave[:, :, np.newaxis], period)
-    np.testing.assert_allclose(R[-1].T @ xi[:, 0], expected, rtol=0.01, atol=1e-4)
-    still = np.einsum("kab,kbw->aw", R, twists)[:, 0]
-    assert np.linalg.norm(R[-1].T @ still - expected) > 10 * np.linalg.norm(
-        R[-1].T @ xi[:, 0] - expected
-    )
+    carried = variation.carried(positions, L @ R, R, turned, period)
+    xi = np.einsum("kai,ki->a", carried, wave)
+    np.testing.assert_allclose(R[-1].T @ xi, expected, rtol=0.01, atol=1e-4)
+    still = np.einsum("kai,ki->a", turned, wave)
+    assert np.linalg.norm(R[-1].T @ still - expected) > 10 * np.linalg.norm(R[-1].T @ xi - expected)
 
 
 def test_efforts_of_a_robot_that_drifts_are_those_of_forward_dynamics(arm: SpaceRobot) -> None:
@@ -176,3 +177,65 @@ def test_a_base_that_coasts_is_at_its_goal_when_the_plan_ends() -> None:
     r_WB, quaternion = flown_by_pinocchio("sliding_masses", schedule, state)
     np.testing.assert_allclose(r_WB, [0.1, 0.05, 0.0], atol=END_ERROR)
     assert angle_between(quaternion, NO_TURN) < END_ERROR
+
+
+def test_joints_rest_until_the_drift_leads_to_the_goal(
+    arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A search at the start and two after some coasting find nothing."""
+    asked: list[Any] = []
+    moves = ARM_START + np.outer(np.linspace(0.0, 1.0, 30) ** 2, [0.2, -0.3, 0.1])
+
+    def third(self: OptimalGait, request: Any, boundary: Any, *others: Any) -> _Found:
+        asked.append((request.state, boundary, others[1].longest, *others[3:]))
+        if len(asked) == 4:
+            raise PlanningError("Links are in contact.")
+        if len(asked) < 5:
+            raise NotFoundError("Nothing was found.")
+        return _Found(Any, moves, {"starts": 2.0})
+
+    monkeypatch.setattr(OptimalGait, "_begin_now", third)
+    goal = (Rotation.from_quat(ATTITUDE) * TURN).as_rotvec()
+    found = plan(arm, rotvec=goal, start=START, base_position=2, longest=40.0, **QUICK)
+    omega = arm.base_twist(ATTITUDE, ARM_START, np.zeros(3), L_W=START.angular_momentum)[1]
+    rate, period = np.linalg.norm(omega), found.control_period
+    ticks = round(np.radians(20.0) / rate / period)
+    assert [each[2] for each in asked] == pytest.approx(
+        [2 * ticks * period, min(40.0, 4 * np.pi / rate), *3 * [2 * ticks * period]]
+    )
+    assert [each[3] for each in asked] == [8, sys.maxsize, 3, 3, 3]
+    rests = 3 * ticks
+    assert found.notes["coasting_time"] == pytest.approx(rests * period)
+    np.testing.assert_array_equal(found.positions[: rests + 1], np.tile(ARM_START, (rests + 1, 1)))
+    np.testing.assert_array_equal(found.positions[rests:], moves)
+    assert found.notes["starts"] == 2.0
+    state, boundary, *_ = asked[-1]
+    at = int(np.argmin(np.abs(found.path.time - rests * period)))
+    assert angle_between(state.quaternion, found.path.quaternion[at]) < rate * 2 * period
+    # The momentum stays in the world, and turns in the base.
+    L_W = Rotation.from_quat(state.quaternion).apply(boundary.angular_momentum)
+    np.testing.assert_allclose(L_W, START.angular_momentum, atol=1e-12)
+    r_WB, quaternion = flown_by_pinocchio("three_joint_arm", found, START)
+    assert angle_between(quaternion, found.path.quaternion[-1]) < END_ERROR
+    np.testing.assert_allclose(r_WB, found.path.position[-1], atol=END_ERROR)
+
+
+def test_a_goal_that_is_never_in_reach_has_the_refusal_of_the_whole_search(
+    arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = 0
+
+    def never(*asked: Any) -> Any:
+        nonlocal count
+        count += 1
+        raise NotFoundError(f"Nothing was found by search {count}.")
+
+    monkeypatch.setattr(OptimalGait, "_begin_now", never)
+    goal = (Rotation.from_quat(ATTITUDE) * TURN).as_rotvec()
+    with pytest.raises(NotFoundError, match="by search 2"):
+        plan(arm, rotvec=goal, start=START, base_position=2, longest=9.0, **QUICK)
+    few = count
+    with pytest.raises(NotFoundError):
+        plan(arm, rotvec=goal, start=START, base_position=2, **QUICK)
+    # Two turns of the base, 20 deg each time, without an end before.
+    assert count - few == 2 + 36 > few > 2

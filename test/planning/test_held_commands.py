@@ -107,8 +107,9 @@ def test_the_first_variation_is_that_of_the_prediction(
 
     quaternions = model.prediction.attitudes(positions, IDENTITY, np.zeros(3))
     boundary = BoundaryConditions(positions[0], IDENTITY, positions[-1])
-    turns = holder._first_variation(positions, quaternions, waves, boundary)
-    assert turns.shape == (3, 21)
+    by_shapes = holder._turns_by_shapes(positions, quaternions, boundary)
+    assert by_shapes.shape == (3, ticks + 1, 3)
+    turns = np.einsum("akn,kwn->aw", by_shapes, waves)
     size = float(np.abs(turns).max())
     for number in (0, 1, 5, 8, 13, 18, 19, 20):
         h = 1e-4
@@ -149,6 +150,11 @@ class Stretched(CommandHolder):
     def __init__(self, model: ManoeuvreModel, found: bool = True) -> None:
         super().__init__(model)
         self.found, self.asked = found, []  # type: ignore[var-annotated]
+        self.fitted: list[tuple[int, bool]] = []
+
+    def _fit_to_limits(self, positions: Array, *_: object, moves_end: bool) -> HeldCommands | None:
+        self.fitted.append((len(positions) - 1, moves_end))
+        return None
 
     def _adjust_to_goal(
         self, positions: Array, *_: object, moves_end: bool, clipped: bool = False
@@ -183,10 +189,12 @@ def ticks_of(holder: Stretched) -> list[int]:
         (4.0019, 1.0, [40, 41]),
         (4.0021, 0.99, [41]),
         (0.01, 0.01, [1]),
-        # 1.2 times too fast: 48 ticks; 1.24 times: 50 of the 54 that are allowed.
-        (4.0, 1.2, [40, 48]),
-        (4.0, 1.24, [40, 50]),
-        (4.0, 1.36, [40]),
+        # All shapes are changed at four numbers of ticks, a hundredth apart, in vain. 1.2 times too
+        # fast: 48 ticks; 1.24 times: 50 of the 54 that are allowed.
+        (4.0, 1.2, [40, 41, 42, 43, 48]),
+        (4.0, 1.24, [40, 41, 42, 43, 50]),
+        (12.0, 1.24, [120, 122, 124, 126, 149]),
+        (4.0, 1.36, [40, 41, 42, 43]),
     ],
 )
 def test_paths_are_stretched_by_as_much_as_they_are_too_fast(
@@ -198,6 +206,7 @@ def test_paths_are_stretched_by_as_much_as_they_are_too_fast(
     assert (held is None) == (speed > 1.3)
     if held is not None:
         assert len(held.positions) - 1 == ticks[-1]
+    assert holder.fitted == [(each, False) for each in ticks[: min(4, len(ticks) - (speed < 1.3))]]
 
 
 def test_a_given_time_is_not_stretched(model: ManoeuvreModel) -> None:
@@ -239,3 +248,35 @@ def test_efforts_stretch_a_path_too(model: ManoeuvreModel) -> None:
     held = holder.hold(straight(4.0, 1.0), GIVEN, WIDE)
     assert held is not None
     assert ticks_of(holder) == [40, 46]
+    assert holder.fitted == []
+
+
+@pytest.mark.parametrize(("free", "before"), [(False, 0.0), (True, np.array([0.02, 0.0, -0.03]))])
+def test_all_shapes_are_changed_where_waves_exceed_a_limit(
+    model: ManoeuvreModel, holder: Any, free: bool, before: Any
+) -> None:
+    """One joint moves at the limit of its velocity, to a goal 3 mrad from the turn of the path."""
+    positions = START + np.linspace(0.0, 1.0, 41)[:, np.newaxis] * (FINAL - START)
+    speed = np.abs(FINAL - START) / 4.0
+    fast = replace(LIMITS, velocity=speed * [1.01, 1.8, 2.1], acceleration=np.full(3, 1e3))
+    turn = Rotation.from_quat(model.prediction.attitudes(positions, IDENTITY, np.zeros(3))[-1])
+    goal = (turn * Rotation.from_rotvec([1e-3, -2e-3, 2e-3])).as_quat()
+    final = None if free else FINAL
+    boundary = BoundaryConditions(START, goal, FINAL, final)
+    velocities = np.tile((FINAL - START) / 4.0, (41, 1))
+    trajectory = Trajectory(PERIOD, positions, velocities, np.tile(IDENTITY, (41, 1)))
+    by_waves = holder._adjust_to_goal(positions, boundary, FINAL, fast, moves_end=False)
+    assert fast.excess(by_waves.positions, PERIOD, before)[0] > 1
+    held = holder.hold(trajectory, boundary, fast, fixed=True, before=before)
+    assert held is not None
+    assert len(held.positions) == 41
+    assert held.miss <= 1e-8
+    factor, overrun = fast.excess(held.positions, PERIOD, before)
+    assert factor <= 1 + 1e-9
+    assert overrun <= 1e-9
+    np.testing.assert_array_equal(held.positions[0], START)
+    assert free != bool(np.all(held.positions[-1] == FINAL))
+    end = model.prediction.attitudes(held.positions, IDENTITY, np.zeros(3))[-1]
+    assert (Rotation.from_quat(goal).inv() * Rotation.from_quat(end)).magnitude() < 1e-8
+    slow = replace(fast, velocity=speed * [0.999, 1.8, 2.1])
+    assert holder.hold(trajectory, replace(boundary, final=FINAL), slow, fixed=True) is None

@@ -36,6 +36,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.methods.optimal.command_program import least_change
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
@@ -61,6 +62,16 @@ _MAX_STRETCHES = 40
 _MAX_STRETCH_FACTOR = 1.25
 """Largest factor that stretches a manoeuvre to keep its limits: another start does
 better."""
+
+_MAX_PROGRAMS = 4
+"""Numbers of ticks, one after the other, at which all shapes are changed to keep the limits."""
+
+_PROGRAM_STRETCH = 1.01
+"""Factor between them, rounded up to a tick."""
+
+_MAX_PROGRAMS_IN_TURN = 6
+_FITTED = 1e-5
+"""Error before the last program, rad, m or m/s: what it leaves is far below."""
 
 _MIN_SMOOTH_TICKS = 20
 """Fewest ticks of a smooth manoeuvre; shorter manoeuvres are polygons."""
@@ -167,10 +178,11 @@ class CommandHolder:
         free = boundary.final is None and boundary.center is None
         # The last shape is that at which end-effectors are at their goals.
         choices = (False, True)[free and self._end_effectors is not None : 1 + free]
+        programs = 0
         for _ in range(_MAX_STRETCHES):
-            factor = math.inf
+            factor, too_fast = math.inf, True
+            positions = trajectory.at_ticks(ticks)
             for moves_end in choices:
-                positions = trajectory.at_ticks(ticks)
                 held = self._adjust_to_goal(positions, boundary, final, limits, moves_end=moves_end)
                 if held is None:
                     continue
@@ -182,15 +194,23 @@ class CommandHolder:
                     if held is None:
                         continue
                     needed, overrun = limits.excess(held.positions, self._period, before)
-                if self._efforts is not None:
-                    L_B = boundary.momenta_in_base(held.quaternions)
-                    needed = max(needed, self._efforts.excess(held.positions, before, L_B))
+                too_fast = needed > 1 + _LIMIT_ROUNDING
+                needed = max(needed, self._effort_excess(held, boundary, before))
                 if overrun <= _LIMIT_ROUNDING:
                     if needed <= 1 + _LIMIT_ROUNDING:
                         return held
                     factor = min(factor, needed)
                 if ticks >= _MIN_SMOOTH_TICKS:
                     break
+            if too_fast and programs < _MAX_PROGRAMS:
+                programs += 1
+                held = self._fit_to_limits(
+                    positions, boundary, final, limits, before, moves_end=free
+                )
+                if held is not None:
+                    return held
+                if factor < math.inf and programs < _MAX_PROGRAMS:
+                    factor = min(factor, _PROGRAM_STRETCH)
             if factor == math.inf:
                 if ticks >= _MIN_SMOOTH_TICKS:
                     return None
@@ -201,6 +221,66 @@ class CommandHolder:
                 return None
         return None
 
+    def _effort_excess(
+        self, held: HeldCommands, boundary: BoundaryConditions, before: Array | float
+    ) -> float:
+        """Return the factor by which commands must be slower to keep the joints' efforts."""
+        if self._efforts is None:
+            return 0.0
+        L_B = boundary.momenta_in_base(held.quaternions)
+        return self._efforts.excess(held.positions, before, L_B)
+
+    def _fit_to_limits(
+        self,
+        positions: Array,
+        boundary: BoundaryConditions,
+        final: Array,
+        limits: MotionLimits,
+        before: Array | float,
+        *,
+        moves_end: bool,
+    ) -> HeldCommands | None:
+        """Return commands near to shapes (N + 1, n) that end in the goal attitude and keep all
+        limits, where there are some: every shape may change.
+        """
+        positions = self._to_final(positions, boundary, final, limits)
+        for _ in range(_MAX_PROGRAMS_IN_TURN):
+            quaternions = self._attitudes(positions, boundary)
+            error, *by_end = self._end_error(positions, quaternions, boundary)
+            rows = self._end_rows(positions, quaternions, boundary, *by_end)
+            change = least_change(
+                positions, rows, error, limits, self._period, before, moves_end=moves_end
+            )
+            if change is None:
+                return None
+            positions = np.clip(positions + change, limits.lower, limits.upper)
+            if float(np.linalg.norm(error)) <= _FITTED:
+                break
+        else:
+            return None
+        held = self._adjust_to_goal(positions, boundary, positions[-1], limits, moves_end=moves_end)
+        if held is None:
+            return None
+        needed, overrun = limits.excess(held.positions, self._period, before)
+        needed = max(needed, self._effort_excess(held, boundary, before))
+        return held if max(needed - 1, overrun) <= _LIMIT_ROUNDING else None
+
+    def _attitudes(self, positions: Array, boundary: BoundaryConditions) -> Array:
+        """Return the attitudes (N + 1, 4) at the ticks, from the starting one."""
+        start = np.array([0.0, 0.0, 0.0, 1.0])
+        return self._prediction.attitudes(positions, start, boundary.angular_momentum)
+
+    def _to_final(
+        self, positions: Array, boundary: BoundaryConditions, final: Array, limits: MotionLimits
+    ) -> Array:
+        """Return shapes (N + 1, n) that end in the shape ``final`` exactly."""
+        s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
+        # The solver's last shape is the wanted one to its own precision.
+        positions = positions + s**3 * (10 - 15 * s + 6 * s**2) * (final - positions[-1])
+        positions = np.clip(positions, limits.lower, limits.upper)
+        positions[0], positions[-1] = boundary.start, final
+        return positions
+
     def corrected_aim(
         self, trajectory: Trajectory, boundary: BoundaryConditions, ticks: int
     ) -> BoundaryConditions:
@@ -209,8 +289,7 @@ class CommandHolder:
         The goal attitude is turned by the difference between the end of a trajectory and that of
         its commands. Where the robot drifts, the solver's attitude is of order two only.
         """
-        start, L_0 = np.array([0.0, 0.0, 0.0, 1.0]), boundary.angular_momentum
-        reached = self._prediction.attitudes(trajectory.at_ticks(ticks), start, L_0)[-1]
+        reached = self._attitudes(trajectory.at_ticks(ticks), boundary)[-1]
         error = quaternion_from_rotvec(attitude_error(reached, trajectory.quaternions[-1]))
         return replace(boundary, turn=quaternion_multiply(boundary.turn, error))
 
@@ -229,24 +308,14 @@ class CommandHolder:
         ``moves_end``: the last shape is changed, too. ``clipped``: after every step, shapes beyond
         the joint limits are put on them, and the others make up for the change.
         """
+        positions = self._to_final(positions, boundary, final, limits)
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
-        # The solver's last shape is the wanted one to its own precision.
-        positions = positions + s**3 * (10 - 15 * s + 6 * s**2) * (final - positions[-1])
-        positions = np.clip(positions, limits.lower, limits.upper)
-        positions[0], positions[-1] = boundary.start, final
         waves, best = self._build_waves(positions, limits), math.inf
         if moves_end:
             waves = np.hstack([waves, self._build_ramps(s, limits)])
         for _ in range(_MAX_NEWTON_STEPS):
-            quaternions = self._prediction.attitudes(
-                positions, np.array([0.0, 0.0, 0.0, 1.0]), boundary.angular_momentum
-            )
-            error = self._axes @ attitude_error(quaternions[-1], boundary.turn)
-            if self._end_effectors is not None:
-                rows, by_turn, by_shape = self._end_effectors.evaluate(
-                    quaternions[-1:], positions[-1:], boundary.end_effectors
-                )
-                error = np.concatenate([error, -rows[0]])
+            quaternions = self._attitudes(positions, boundary)
+            error, by_turn, by_shape = self._end_error(positions, quaternions, boundary)
             miss = float(np.linalg.norm(error))
             if miss <= _ATTITUDE_TOLERANCE or (
                 miss <= 1e3 * _ATTITUDE_TOLERANCE and miss > best / 2
@@ -255,10 +324,8 @@ class CommandHolder:
             if miss > 2 * best:
                 return None
             best = min(best, miss)
-            turn = self._first_variation(positions, quaternions, waves, boundary)
-            J = self._axes @ turn
-            if self._end_effectors is not None:
-                J = np.vstack([J, by_turn[0] @ turn + by_shape[0] @ waves[-1].T])
+            rows = self._end_rows(positions, quaternions, boundary, by_turn, by_shape)
+            J = np.einsum("mkn,kwn->mw", rows, waves)
             amplitudes = np.linalg.lstsq(J, error, rcond=1e-10)[0]
             positions = positions + np.einsum("kin,i->kn", waves, amplitudes)
             if clipped:
@@ -304,10 +371,42 @@ class CommandHolder:
         half = limits.span(q)[1]
         return np.where(np.isfinite(limits.velocity), limits.velocity, half), half
 
-    def _first_variation(
-        self, positions: Array, quaternions: Array, waves: Array, boundary: BoundaryConditions
+    def _end_error(
+        self, positions: Array, quaternions: Array, boundary: BoundaryConditions
+    ) -> tuple[Array, Array | None, Array | None]:
+        """Return the error (m,) that is left at the end, along the axes and of end-effectors.
+
+        With it, derivatives of the rows of end-effectors by turn (m', 3) and last shape (m', n).
+        """
+        error = self._axes @ attitude_error(quaternions[-1], boundary.turn)
+        if self._end_effectors is None:
+            return np.asarray(error), None, None
+        rows, by_turn, by_shape = self._end_effectors.evaluate(
+            quaternions[-1:], positions[-1:], boundary.end_effectors
+        )
+        return np.concatenate([error, -rows[0]]), by_turn[0], by_shape[0]
+
+    def _end_rows(
+        self,
+        positions: Array,
+        quaternions: Array,
+        boundary: BoundaryConditions,
+        by_turn: Array | None,
+        by_shape: Array | None,
     ) -> Array:
-        """Return the turns (3, w) of the final attitude by waves (N + 1, w, n), base components."""
+        """Return derivatives (m, N + 1, n) of the numbers at the end by the shapes."""
+        turns = self._turns_by_shapes(positions, quaternions, boundary)
+        rows = np.tensordot(self._axes, turns, axes=1)
+        if by_turn is None or by_shape is None:
+            return rows
+        others = np.tensordot(by_turn, turns, axes=1)
+        others[:, -1] += by_shape
+        return np.concatenate([rows, others])
+
+    def _turns_by_shapes(
+        self, positions: Array, quaternions: Array, boundary: BoundaryConditions
+    ) -> Array:
+        """Return the turns (3, N + 1, n) of the final attitude by all shapes, base components."""
         # A few hundred points of a smooth integrand are plenty for Newton's direction.
         stride = max(1, len(positions) // 200)
         chosen = np.arange(stride // 2, len(positions), stride)
@@ -315,17 +414,18 @@ class CommandHolder:
         moved = np.gradient(positions, axis=0)[chosen] * stride
         K = self._curvature(shapes.T).full().reshape(6, len(chosen), self._n, self._n)[3:]
         # The columns of one shape run over i fastest: K[axis, shape, j, i].
-        twists = np.einsum("akji,kj,kwi->kaw", K, moved, waves[chosen])
         R = np.array([matrix_from_quaternion(x) for x in quaternions[chosen]])
-        R_f = matrix_from_quaternion(quaternions[-1])
-        # The last step of a change that does not vanish at the end turns the base directly.
-        direct = self._connection(positions[-1])[3:] @ waves[-1].T
+        turned = R @ np.einsum("akji,kj->kai", K, moved)
         L_B = boundary.momenta_in_base(quaternions[chosen])
-        if L_B is None:
-            return np.asarray(R_f.T @ np.einsum("kab,kbw->aw", R, twists) - direct)
-        moves, duration = waves[chosen].transpose(0, 2, 1), stride * self._period
-        accumulated = self._drift.accumulated(shapes, L_B, R, R @ twists, moves, duration)
-        return np.asarray(R_f.T @ accumulated - direct)
+        if L_B is not None:
+            turned = self._drift.carried(shapes, L_B, R, turned, stride * self._period)
+        R_f = matrix_from_quaternion(quaternions[-1])
+        # Each of the chosen shapes stands for those around it.
+        near = np.minimum(np.arange(len(positions)) // stride, len(chosen) - 1)
+        by_shapes = (R_f.T @ turned)[near] / np.bincount(near)[near, np.newaxis, np.newaxis]
+        # The last step of a change that does not vanish at the end turns the base directly.
+        by_shapes[-1] -= self._connection(positions[-1])[3:]
+        return np.asarray(by_shapes.transpose(1, 0, 2))
 
     @cached_property
     def _drift(self) -> DriftVariation:
@@ -353,26 +453,21 @@ class DriftVariation:
         self._function = ca.Function("drift_variation", [q, L_B], ca.cse(outputs))
         self._n = robot.n
 
-    def accumulated(
-        self,
-        shapes: Array,
-        L_B: Array,
-        R: Array,
-        turned: Array,
-        moves: Array,
-        duration: float,
-    ) -> Array:
-        """Return xi (3, w) at the end of K steps of a duration, s.
+    def carried(self, shapes: Array, L_B: Array, R: Array, turned: Array, duration: float) -> Array:
+        """Return xi (K, 3, n) at the end of K steps of a duration, s, by the changes dq of each.
 
-        ``shapes`` (K, n), ``L_B`` (K, 3) and ``R`` (K, 3, 3) are those of the steps, ``turned``
-        (K, 3, w) what curvature adds to xi in each, and ``moves`` (K, n, w) the changes dq.
+        ``shapes`` (K, n), ``L_B`` (K, 3) and ``R`` (K, 3, 3) are those of the steps, and ``turned``
+        (K, 3, n) what curvature adds to xi in each.
         """
         columns = (each.full().T for each in self._function(shapes.T, L_B.T))
         G, M = (each.reshape(len(shapes), -1, 3).transpose(0, 2, 1) for each in columns)
-        added = turned + duration * (R @ G @ moves)
-        carried = duration * (R @ M @ R.transpose(0, 2, 1))
-        # The implicit midpoint rule of xi' = M xi + b.
-        half, xi = np.eye(3), np.zeros(turned.shape[1:])
-        for step, change in zip(carried, added, strict=True):
-            xi = np.linalg.solve(half - step / 2, (half + step / 2) @ xi + change)
+        added = turned + duration * (R @ G)
+        half = duration / 2 * (R @ M @ R.transpose(0, 2, 1))
+        # The implicit midpoint rule of xi' = M xi + b, from the end: what follows a step acts on
+        # all that was added until then.
+        after, xi = np.eye(3), np.empty_like(added)
+        for k in reversed(range(len(added))):
+            after = after @ np.linalg.inv(np.eye(3) - half[k])
+            xi[k] = after @ added[k]
+            after = after @ (np.eye(3) + half[k])
         return xi

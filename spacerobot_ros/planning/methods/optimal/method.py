@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -97,11 +98,37 @@ centre of mass that coasts."""
 _MOVING_AIM_FACTORS = (1.05, 1.2, 1.5)
 """Factors of the duration of the last one, in which a manoeuvre is planned if they do not agree."""
 
+_STARTS_BEFORE_COASTING = 8
+"""Guesses without a solution after which a robot that drifts coasts with its joints at rest."""
+
+_STARTS_AFTER_COASTING = 3
+"""Guesses without a solution after which it coasts on."""
+
+_COASTING_ANGLE = math.radians(20.0)
+"""Angle by which the base turns meanwhile."""
+
+_MIN_COASTING_TICKS = 5
+"""Control periods for which it coasts at least."""
+
+_COASTING_TURNS = 2.0
+"""Turns of the base for which it coasts at most."""
+
 _LONGEST_FACTOR, _LONGEST_ADDITIONAL_TICKS = 1.25, 20
 """Longest duration of held commands: a factor of optimal.longest, and additional ticks."""
 
 _LIMIT_ROUNDING = 1e-8
 """Largest excess of a cached manoeuvre over a limit, relative or in joint coordinates."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A manoeuvre, the shapes (N + 1, n) at ticks from the start of the plan to its end, and notes
+    on the search.
+    """
+
+    manoeuvre: Manoeuvre
+    positions: Array
+    notes: Notes
 
 
 @dataclass(frozen=True)
@@ -356,13 +383,42 @@ class OptimalGait(GaitMethod):
             key = self._request_key(request)
             if kept := self._load_cached_plan(self._cache, key, request, boundary, limits):
                 return kept
-        # Libraries have manoeuvres to attitudes of the base.
-        library = None if correction or goal.end_effectors else self._library
         chosen = replace(self.options, duration=0.0, answers=1) if correction else self.options
         if duration is not None:
             chosen = replace(chosen, duration=duration)
+        searched = request, boundary, limits, chosen, cancellation
+        # The clearance of a base that coasts on among obstacles is not checked.
+        if boundary.drifts and chosen.duration == 0 and not (correction or self._has_obstacles):
+            found = self._begin_now_or_coast(*searched)
+        else:
+            found = self._begin_now(*searched)
+        schedule = self._build_schedule(state, goal, found.positions, found.notes)
+        # A result of a busy machine is not cached, as an idle machine finds a better one.
+        if (
+            self._cache is not None
+            and key is not None
+            and not found.manoeuvre.cut_short
+            and self._keeps_efforts(found.manoeuvre, boundary=boundary)
+        ):
+            kept_plan = _CachedPlan(schedule.positions, found.notes)
+            self._cache.store(archive_name(key), key, kept_plan.to_bytes())
+        return schedule
+
+    def _begin_now(
+        self,
+        request: PlanRequest,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        chosen: OptimalOptions,
+        cancellation: Cancellation,
+        in_vain: int = sys.maxsize,
+    ) -> _Found:
+        """Return a manoeuvre that begins at once; see :meth:`.ManoeuvreSearch.search`."""
+        state, correction = request.state, request.correction
+        # Libraries have manoeuvres to attitudes of the base.
+        library = None if correction or request.goal.end_effectors else self._library
         found = self._within_efforts(
-            kind,
+            self._kind_of(request.goal),
             lambda searches: searches.from_rest.search(
                 boundary,
                 limits,
@@ -373,6 +429,7 @@ class OptimalGait(GaitMethod):
                 library=library,
                 # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
                 gentle=correction and not boundary.drifts,
+                in_vain=in_vain,
             ),
             boundary=boundary,
         )
@@ -386,17 +443,71 @@ class OptimalGait(GaitMethod):
                 f"The search used up optimal.time_budget, {self.options.time_budget:g} s, after "
                 f"{found.starts} start(s); a longer one may find a faster manoeuvre."
             )
-        schedule = self._build_schedule(state, goal, found.held.positions, notes)
-        # A result of a busy machine is not cached, as an idle machine finds a better one.
-        if (
-            self._cache is not None
-            and key is not None
-            and not found.cut_short
-            and self._keeps_efforts(found, boundary=boundary)
-        ):
-            kept_plan = _CachedPlan(schedule.positions, notes)
-            self._cache.store(archive_name(key), key, kept_plan.to_bytes())
-        return schedule
+        return _Found(found, found.held.positions, notes)
+
+    def _begin_now_or_coast(
+        self,
+        request: PlanRequest,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        chosen: OptimalOptions,
+        cancellation: Cancellation,
+    ) -> _Found:
+        """Return a manoeuvre of a robot that drifts: joints may rest until the goal is in reach.
+
+        The drift may lead away from the goal faster than the joints turn the base back; later, it
+        leads past it. At first a manoeuvre is looked for that ends before the base has turned far,
+        then any, and then a short one after the joints have rested.
+        """
+        state, q, h = request.state, request.state.q, self.control_period
+        specification = self._kind_of(request.goal).specification
+        momenta, rest = (state.linear_momentum, state.angular_momentum), np.zeros(self.robot.n)
+        _, omega = self.robot.base_twist(state.quaternion, q, rest, *momenta)
+        rate = float(np.linalg.norm(omega))
+        every = max(_MIN_COASTING_TICKS, round(_COASTING_ANGLE / rate / h))
+        last = min(chosen.longest, _COASTING_TURNS * 2 * math.pi / rate)
+        brief = replace(chosen, longest=min(chosen.longest, 2 * every * h))
+        tries = ((brief, _STARTS_BEFORE_COASTING), (replace(chosen, longest=last), sys.maxsize))
+        for options, in_vain in tries:
+            try:
+                return self._begin_now(request, boundary, limits, options, cancellation, in_vain)
+            except NotFoundError as refusal:
+                first = refusal
+        most = math.ceil(last / h)
+        coasting = np.tile(q, (most + 1, 1))
+        attitudes = self._prediction.attitudes(coasting, state.quaternion, state.angular_momentum)
+        R_before = matrix_from_quaternion(state.quaternion)
+        for ticks in range(every, most + 1, every):
+            end = slice(ticks, ticks + 1)
+            (r_WB,) = self._prediction.positions(
+                state, np.array([ticks * h]), coasting[end], attitudes[end]
+            )
+            after = replace(state, position=r_WB, quaternion=attitudes[ticks])
+            R_after = matrix_from_quaternion(attitudes[ticks])
+            later = replace(request, state=after)
+            aimed = replace(
+                specification.boundary_conditions(
+                    self.robot,
+                    later,
+                    self._goal_shape(request.goal),
+                    self._limits,
+                    self._constraints.direction_W,
+                ),
+                state=after,
+                angular_momentum=R_after.T @ R_before @ boundary.angular_momentum,
+            )
+            budget = cancellation, _STARTS_AFTER_COASTING
+            try:
+                found = self._begin_now(later, aimed, limits, brief, *budget)
+                self._constraints.check(coasting[:ticks], attitudes[:ticks], h)
+            except (PlanningError, CandidateError):
+                cancellation.raise_if_requested()
+                continue
+            positions = np.vstack([coasting[:ticks], found.positions])
+            return replace(
+                found, positions=positions, notes={**found.notes, "coasting_time": ticks * h}
+            )
+        raise first
 
     def _plan_in_motion(
         self,

@@ -22,6 +22,9 @@ from spacerobot_ros.planning.methods.optimal.transcription import Layout, Stages
 _FEASIBILITY_TOLERANCE = 1e-4
 """Violation of the constraints below which an iterate counts as a trajectory, SI units."""
 
+_INFEASIBLE = "Infeasible_Problem_Detected"
+"""The solver's status where it ends at a least violation of the constraints."""
+
 TOLERANCE = 1e-5
 """Durations within a thousandth of a control period, for manoeuvres of some seconds."""
 
@@ -173,7 +176,9 @@ class MultipleShooting:
         self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
         x = result["x"].full().ravel()
         if not self.converged:
-            if self._monitor.best is None:
+            # Where the goal drifts away, no time makes up for what each interval violates.
+            infeasible = self._drifting and stats["return_status"] == _INFEASIBLE
+            if self._monitor.best is None or infeasible:
                 return None
             x = self._monitor.best
         return self._unpack_trajectory(x)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -90,7 +91,8 @@ _MAX_REFINED_COST_RATIO = 1.1
 coarse grid underestimates some costs by more than others."""
 
 _MAX_ITERATIONS_APART = 80
-"""Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most."""
+"""Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most,
+and in which one of a robot that drifts is brought to keep clear."""
 
 _DISTANCE_INSTANTS = 80
 """Instants of a manoeuvre at which links are kept apart on a grid at least: between the knots of a
@@ -192,6 +194,8 @@ class _Progress:
         Guesses that were tried, and the reason against the last candidate.
     shortest
         Duration of the fastest solution so far, s.
+    in_vain
+        Guesses without any solution after which the search ends.
     kept
         The pairs of links that are kept apart; None: no clearance is asked for.
     """
@@ -203,6 +207,7 @@ class _Progress:
     cancellation: Cancellation
     library: SolutionLibrary | None
     gentle: bool
+    in_vain: int = sys.maxsize
     starts: int = 0
     rejection: str = ""
     shortest: float = math.inf
@@ -287,11 +292,13 @@ class ManoeuvreSearch:
         library: SolutionLibrary | None = None,
         *,
         gentle: bool = False,
+        in_vain: int = sys.maxsize,
     ) -> Manoeuvre:
         """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
 
         The nearest manoeuvres of a library are the first guesses. A ``gentle`` manoeuvre takes the
-        path of least effort, whose turn of the base depends least on errors of masses.
+        path of least effort, whose turn of the base depends least on errors of masses. After
+        ``in_vain`` guesses without any solution the search ends.
 
         Raises
         ------
@@ -308,7 +315,9 @@ class ManoeuvreSearch:
                 f"more than optimal.longest = {options.longest:g} s."
             )
         kept = self._begin(boundary)
-        progress = _Progress(boundary, limits, quaternion, options, cancellation, library, gentle)
+        progress = _Progress(
+            boundary, limits, quaternion, options, cancellation, library, gentle, in_vain
+        )
         found = self._search_on_grids(progress, intervals)
         if found and kept is not None:
             progress.kept = kept
@@ -336,7 +345,8 @@ class ManoeuvreSearch:
         if options.answers > 1 and coarser >= _MIN_COARSE_INTERVALS:
             coarse = self._get_solver(progress, coarser, _COARSE_TOLERANCE)
             found = self._search_from_guesses(progress, coarse, full, options.starts)
-            if found or progress.cut_short(found=False):
+            ends = progress.starts >= progress.in_vain or progress.cut_short(found=False)
+            if found or ends:
                 return found
             return self._search_from_guesses(
                 progress, full, full, min(options.starts, _MAX_FULL_GRID_STARTS)
@@ -387,17 +397,24 @@ class ManoeuvreSearch:
         coarser = intervals // _COARSE_GRID_RATIO
         # On a coarse grid the attitude of a robot that drifts is too far off.
         on_full_grid = progress.boundary.drifts or coarser < _MIN_COARSE_INTERVALS
+        if progress.boundary.drifts:
+            progress = self._in_few_iterations(progress)
         if near[0].distance > _DEEP_CONTACT or on_full_grid:
             return self._clear_on_grid(progress, manoeuvre, intervals, TOLERANCE)
         # The way round is far: it is found on a coarse grid first.
         clear = self._clear_on_grid(progress, manoeuvre, coarser, _COARSE_TOLERANCE)
         try:
-            iterations = min(progress.options.iterations, _MAX_ITERATIONS_APART)
-            brief = replace(progress, options=replace(progress.options, iterations=iterations))
+            brief = self._in_few_iterations(progress)
             refined = self._clear_on_grid(brief, clear, intervals, TOLERANCE)
         except CandidateError:
             return clear
         return min(refined, clear, key=lambda one: one.duration)
+
+    @staticmethod
+    def _in_few_iterations(progress: _Progress) -> _Progress:
+        """Return a search whose solver ends where it does not come near a solution soon."""
+        iterations = min(progress.options.iterations, _MAX_ITERATIONS_APART)
+        return replace(progress, options=replace(progress.options, iterations=iterations))
 
     def _clear_on_grid(
         self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int, tolerance: float
@@ -493,6 +510,7 @@ class ManoeuvreSearch:
             # A search may also be cut short within its last start.
             cut_short = progress.cut_short(found=bool(solutions))
             going_on = len(solutions) < enough and not progress.agreed(solutions)
+            cut_short = cut_short or not (solutions or progress.starts < progress.in_vain)
             if going_on and number < starts and not cut_short:
                 continue
             found = self._refine_solutions(progress, solutions, grid, full)
