@@ -91,8 +91,7 @@ _MAX_REFINED_COST_RATIO = 1.1
 coarse grid underestimates some costs by more than others."""
 
 _MAX_ITERATIONS_APART = 80
-"""Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most,
-and in which one of a robot that drifts is brought to keep clear."""
+"""Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most."""
 
 _DISTANCE_INSTANTS = 80
 """Instants of a manoeuvre at which links are kept apart on a grid at least: between the knots of a
@@ -376,7 +375,8 @@ class ManoeuvreSearch:
                 assert near.kept is not None
                 kept.include(near.kept)
             progress.cancellation.raise_if_requested()
-        if freed or progress.cut_short(found=False):
+        # A robot that drifts finds others sooner after it has coasted.
+        if freed or progress.cut_short(found=False) or progress.boundary.drifts:
             return freed
         progress.limits = kept.within(progress.limits)
         return self._search_on_grids(progress, intervals)
@@ -397,24 +397,17 @@ class ManoeuvreSearch:
         coarser = intervals // _COARSE_GRID_RATIO
         # On a coarse grid the attitude of a robot that drifts is too far off.
         on_full_grid = progress.boundary.drifts or coarser < _MIN_COARSE_INTERVALS
-        if progress.boundary.drifts:
-            progress = self._in_few_iterations(progress)
         if near[0].distance > _DEEP_CONTACT or on_full_grid:
             return self._clear_on_grid(progress, manoeuvre, intervals, TOLERANCE)
         # The way round is far: it is found on a coarse grid first.
         clear = self._clear_on_grid(progress, manoeuvre, coarser, _COARSE_TOLERANCE)
         try:
-            brief = self._in_few_iterations(progress)
+            iterations = min(progress.options.iterations, _MAX_ITERATIONS_APART)
+            brief = replace(progress, options=replace(progress.options, iterations=iterations))
             refined = self._clear_on_grid(brief, clear, intervals, TOLERANCE)
         except CandidateError:
             return clear
         return min(refined, clear, key=lambda one: one.duration)
-
-    @staticmethod
-    def _in_few_iterations(progress: _Progress) -> _Progress:
-        """Return a search whose solver ends where it does not come near a solution soon."""
-        iterations = min(progress.options.iterations, _MAX_ITERATIONS_APART)
-        return replace(progress, options=replace(progress.options, iterations=iterations))
 
     def _clear_on_grid(
         self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int, tolerance: float
