@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.methods.optimal import command_program
 from spacerobot_ros.planning.methods.optimal.command_program import least_change
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 
@@ -132,5 +132,5 @@ def test_a_joint_without_a_speed_limit_changes_by_shares_of_its_range() -> None:
 
 def test_without_the_solver_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     assert change(np.full(3, 1e-3)) is not None
-    monkeypatch.setattr(command_program.ca, "has_conic", lambda name: name != "osqp")
+    monkeypatch.setattr(ca, "has_conic", lambda name: name != "osqp")
     assert change(np.full(3, 1e-3)) is None

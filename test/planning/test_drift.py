@@ -192,7 +192,8 @@ def test_joints_rest_until_the_drift_leads_to_the_goal(
             raise PlanningError("Links are in contact.")
         if len(asked) < 5:
             raise NotFoundError("Nothing was found.")
-        return _Found(Any, moves, {"starts": 2.0})
+        manoeuvre: Any = None
+        return _Found(manoeuvre, moves, {"starts": 2.0})
 
     monkeypatch.setattr(OptimalGait, "_begin_now", third)
     goal = (Rotation.from_quat(ATTITUDE) * TURN).as_rotvec()
