@@ -127,5 +127,5 @@ def test_without_viser_one_sentence_says_what_to_install(monkeypatch: pytest.Mon
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: None if name == "viser" else find(name)
     )
-    with pytest.raises(SpaceRobotError, match=r"pip install 'spacerobot_ros\[viewer\]'"):
+    with pytest.raises(SpaceRobotError, match=r"pip install '\.\[viewer\]' in the clone"):
         start_server("127.0.0.1", 0)
