@@ -12,7 +12,7 @@ import numpy as np
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.measures import momentum_change
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
@@ -101,6 +101,8 @@ def status_html(
         lines.append(
             _line_html("No robot is shown: no valid robot_description has been received.", 2)
         )
+    if stack_ended(state):
+        lines.append(_line_html("The stack has ended: none of its nodes answers.", 2))
     for name, seconds in sorted(state.silent.items()):
         lines.append(_line_html(f"Node '{name}' has been silent for {math.floor(seconds)} s.", 2))
     lines.extend(_line_html(f"Node '{name}' is not active.", 1) for name in sorted(state.inactive))
@@ -115,8 +117,7 @@ def status_html(
         lines.append(_line_html(text, 0))
     if state.plant is not None:
         plant = state.plant
-        text = _node_html("Plant", plant.state.value, plant.message, plant.level)
-        lines.append(_grey_out(text, offline="plant" in state.absent))
+        lines.append(_node_html(state, "plant", plant.state.value, plant.message, plant.level))
         lines.extend(_line_html(f"Fault: {each}", 1) for each in state.plant.faults)
         lines.extend(_line_html(f"Disturbance: {each}", 1) for each in state.plant.disturbances)
     if state.clearance is not None:
@@ -129,8 +130,7 @@ def status_html(
         level = status.state.level
         if status.state is PlannerState.REACHED and status.not_controlled:
             level = 1
-        text = _node_html("Planner", status.state.value, status.message, level)
-        lines.append(_grey_out(text, offline="planner" in state.absent))
+        lines.append(_node_html(state, "planner", status.state.value, status.message, level))
         lines.extend(
             _line_html(f"{part} is {error} from its goal.", None)
             for part, error in (errors or {}).items()
@@ -138,9 +138,27 @@ def status_html(
         )
     if state.controller is not None:
         control = state.controller
-        text = _node_html("Controller", control.state.value, control.message, control.state.level)
-        lines.append(_grey_out(text, offline="controller" in state.absent))
+        word, level = control.state.value, control.state.level
+        lines.append(_node_html(state, "controller", word, control.message, level))
+        lines.extend(
+            _line_html(f"{part} is {error} from its goal.", None)
+            for part, error in (errors or {}).items()
+            if not state.goals[part].end_effectors
+        )
     return padded("".join(lines))
+
+
+def stack_ended(state: StackState) -> bool:
+    """Whether every node that has reported a status is offline, and one of them fell silent."""
+    statuses = {"plant": state.plant, "planner": state.planner, "controller": state.controller}
+    known = {key for key, status in statuses.items() if status is not None}
+    return bool(known and state.silent) and known <= state.absent
+
+
+def ended_html() -> str:
+    """Return the status of a page whose viewer has ended."""
+    text = "The viewer has ended. This page shows its last state, and steers nothing any more."
+    return padded(_line_html(text, 2))
 
 
 def padded(html: str) -> str:
@@ -148,12 +166,17 @@ def padded(html: str) -> str:
     return f'<div style="padding:2px 12px;font-size:.85em;line-height:1.35">{html}</div>'
 
 
-def _node_html(name: str, word: str, message: str, level: int) -> str:
-    return (
-        f'<div style="margin:2px 0"><b>{escape(name)}</b> '
-        f'<span style="color:{_LEVEL_COLORS[level]};font-weight:600">{escape(word)}</span> '
+def _node_html(state: StackState, key: str, word: str, message: str, level: int) -> str:
+    """Return the status of a node; that of one that is offline is called its last one."""
+    offline, color = key in state.absent, _LEVEL_COLORS[level]
+    if offline:
+        word, color = f"offline, last {word}:", _FAINT_COLOR
+    text = (
+        f'<div style="margin:2px 0"><b>{key.capitalize()}</b> '
+        f'<span style="color:{color};font-weight:600">{escape(word)}</span> '
         f"{escape(message)}</div>"
     )
+    return _grey_out(text, offline=offline)
 
 
 def _grey_out(html: str, *, offline: bool) -> str:
@@ -307,6 +330,20 @@ def _measured_pose(
     if measured is None or link not in kinematics.links:
         return None
     return link_pose(kinematics, link, measured.pose, measured.q)
+
+
+def end_effector_positions(state: StackState, kinematics: ForwardKinematics) -> dict[Part, Array]:
+    """Return the positions (3,) in the world of the end-effectors whose paths are drawn, m.
+
+    They are that of the plant, if it publishes one, and the links with goals.
+    """
+    found = {} if state.tool is None else {DEFAULT_END_EFFECTOR: state.tool[:3]}
+    for goal in state.goals.values():
+        for aim in goal.end_effectors:
+            pose = _measured_pose(kinematics, aim.link, state.measured)
+            if pose is not None:
+                found[aim.link] = pose[:3]
+    return found
 
 
 def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:

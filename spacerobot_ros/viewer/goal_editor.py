@@ -87,6 +87,7 @@ class GoalEditor:
         self._marks: dict[str, Any] = {}
         self._poses: dict[str, Array] = {}
         self._ghost: RobotDrawing | None = None
+        self._ghost_shown = True
         self._present: tuple[Array, Array] | None = None
         self._changed_at: float | None = None
         self._check = Check(Verdict.UNCHECKED)
@@ -191,7 +192,14 @@ class GoalEditor:
         goal = self._ghost_pose(pose)
         # The ghost hangs on the gizmo of the base, so that it follows the mouse at once.
         self._ghost.place(relative_pose(self._poses[_BASE_GIZMO], goal))
-        self._ghost.base.visible = not self._is_at_goal(goal, pose, q, shape)
+        hidden = self._is_at_goal(goal, pose, q, shape)
+        self._ghost.base.visible = self._ghost_shown and not hidden
+
+    def show_ghost(self, *, visible: bool) -> None:
+        """Show or hide the ghost, wherever it is not hidden anyway."""
+        self._ghost_shown = visible
+        if self._present is not None:
+            self.robot_is_at(*self._present)
 
     def _ghost_pose(self, pose: Array) -> Array:
         """Return the pose (7,) of the ghost's base: of the goal, or, if free, as predicted."""

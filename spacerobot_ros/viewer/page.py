@@ -72,12 +72,12 @@ class Buttons:
     ) -> None:
         self._fly = gui.add_button("Fly", color="green", hint="Send the goal that is shown.")
         self._goal = gui.add_button_group(
-            "Goal", ("Abort",), hint="Drop the goal; the joints brake."
+            "Goal", ("Abort goal",), hint="Give the goal up; the joints brake, the stack goes on."
         )
         self._plant = gui.add_button_group(
             "Plant",
-            ("Stop", "Rearm", "Reset"),
-            hint="Stop: everything comes to rest until Rearm. Reset: back to the initial state.",
+            ("Stop all", "Rearm", "Reset"),
+            hint="Stop all: all comes to rest until Rearm. Reset: back to the initial state.",
         )
         self._time = gui.add_button_group("Time", ("Pause", "Resume"))
 
@@ -89,7 +89,7 @@ class Buttons:
 
             @group.on_click
             async def _(event: Any) -> None:
-                request = Request(str(event.target.value).lower())
+                request = Request(str(event.target.value).split()[0].lower())
                 defer(lambda: act(request))
 
     def show(self, *, visible: bool) -> None:
@@ -423,6 +423,37 @@ An arm ahead of the base is then on the left: the panel is on the right.
 """
 
 
+_PRESETS = {
+    "Front": np.array([1.9, 0.0, 0.3]),
+    "Side": np.array([0.0, 1.9, 0.3]),
+    "Top": np.array([0.0, 0.01, 1.9]),
+}
+"""Positions of the camera relative to the robot by the names of buttons, in robot lengths."""
+
+_LAYERS = (
+    ("Paths", True, "Planned path of the base, flown paths of base and end-effectors."),
+    ("Frames", False, "Axes of the world and of all links."),
+    ("Ghost", True, "The robot at the goal."),
+    ("Plumes", True, "Thrusters that are on."),
+    ("Collision shapes", False, "The shapes by which distances between links are measured."),
+    ("Names", False, "Names of the links."),
+)
+"""Layers of the scene: name, whether it is shown at first, and its explanation."""
+
+
+_PORTRAIT, _PORTRAIT_DISTANCE, _PORTRAIT_SHIFT = 0.8, 1.5, 0.35
+"""Width to height below which a window is a phone's; how much farther its camera is from the robot,
+and how far below it looks, as a share of the distance.
+"""
+
+
+def screen_up(away: Array) -> Array:
+    """Return the direction (3,) that is up for a camera at ``away`` (3,) of what it looks at."""
+    back = away / np.linalg.norm(away)
+    up: Array = np.array([0.0, 0.0, 1.0]) - back[2] * back
+    return up / np.linalg.norm(up)
+
+
 class Page:
     """The page; all browsers that open it see the same.
 
@@ -486,15 +517,36 @@ class Page:
             if event.client is not None:
                 defer(lambda: self._aim_camera(event.client.camera))
 
-        self._collision_shapes: Any = gui.add_checkbox(
-            "Collision shapes",
-            initial_value=False,
-            hint="Show the shapes by which distances between links are measured.",
+        presets = gui.add_button_group(
+            "View from", tuple(_PRESETS), hint="Turn the camera of this browser."
         )
 
-        @self._collision_shapes.on_update
+        @presets.on_click
         async def _(event: Any) -> None:
-            defer(self._show_collision_shapes)
+            if event.client is not None:
+                offset = _PRESETS[str(event.target.value)]
+                defer(lambda: self._aim_camera(event.client.camera, offset))
+
+        self._follow: Any = gui.add_checkbox(
+            "Follow the robot", initial_value=False, hint="All cameras move with the base."
+        )
+        self._setting: Any = gui.add_dropdown(
+            "Setting", tuple(each.value for each in scene.Setting)
+        )
+        with gui.add_folder("Layers", expand_by_default=False):
+            self._layers: dict[str, Any] = {
+                name: gui.add_checkbox(name, initial_value=shown, hint=hint)
+                for name, shown, hint in _LAYERS
+            }
+        for handle in (self._setting, *self._layers.values()):
+
+            @handle.on_update
+            async def _(event: Any) -> None:
+                defer(self._show_layers)
+
+        @self._server.on_client_connect
+        async def _(client: Any) -> None:
+            defer(lambda: self._greet(client.camera))
 
         self._style = gui.add_button("Dark or light", color="gray")
         themes: dict[int, bool] = {}
@@ -527,6 +579,7 @@ class Page:
         self._drawn_obstacles = []
         reach = 1.0 if robot is None else scene.reach_of(robot)
         self._reach, self._trail = reach, Trail(0.003 * reach)
+        self._end_effector_trails: dict[Part, Trail] = {}
         self.editor.show_robot(robot, reach)
         self._plots.show_robot(robot)
         if robot is None:
@@ -537,7 +590,7 @@ class Page:
         self._drawing.base.visible = False  # Until its first state comes.
         world = robot.world if self._obstacles is None else self._obstacles[0]
         self._drawn_obstacles = scene.draw_obstacles(self._server.scene, _OBSTACLES_PATH, world)
-        self._show_collision_shapes()
+        self._show_layers()
         if self._target is not None:
             self.show_target(self._target)
 
@@ -563,9 +616,25 @@ class Page:
         )
         self._target_drawing.base.visible = False
 
-    def _show_collision_shapes(self) -> None:
+    def _show_layers(self) -> None:
+        """Show the layers that users have chosen, of what is drawn so far."""
+        shown = {name: bool(handle.value) for name, handle in self._layers.items()}
         if self._drawing is not None:
-            self._drawing.show_collision_shapes(visible=bool(self._collision_shapes.value))
+            self._drawing.show_collision_shapes(visible=shown["Collision shapes"])
+            self._drawing.show_frames(visible=shown["Frames"])
+            self._drawing.show_names(visible=shown["Names"])
+        self.editor.show_ghost(visible=shown["Ghost"])
+        if self._around is not None:
+            self._around.show_paths(visible=shown["Paths"])
+            self._around.show_world(visible=shown["Frames"])
+            self._around.plumes.show(visible=shown["Plumes"])
+            self._around.show_setting(scene.Setting(self._setting.value))
+
+    def end(self) -> None:
+        """Say that the viewer has ended, in browsers that go on showing the page."""
+        self._status.content = content.ended_html()
+        self._bar.visible = False
+        self._server.flush()
 
     def show_thrusters(self, table: ThrusterTable | None) -> None:
         """Set the thrusters, which are known later than the robot."""
@@ -608,10 +677,13 @@ class Page:
         assert drawing is not None
         if measured is self._last:
             return
+        if self._last is not None and self._follow.value:
+            self._move_cameras(measured.pose[:3] - self._last.pose[:3])
         self._last = measured
         if self._around is None:
             center = measured.pose[:3]
             self._around = scene.Surroundings(self._server.scene, self._reach, _ROBOT_PATH, center)
+            self._show_layers()
             self._aim_camera(self._server.initial_camera)
             for client in self._server.get_clients().values():
                 self._aim_camera(client.camera)
@@ -623,10 +695,16 @@ class Page:
         self.editor.robot_is_at(measured.pose, measured.q)
         self._plots.add(state, self._goal_errors(state))
         self._trail.add(measured.time_s, measured.pose[:3])
+        assert self._kinematics is not None
+        for part, point in content.end_effector_positions(state, self._kinematics).items():
+            trail = self._end_effector_trails.setdefault(part, Trail(0.003 * self._reach))
+            trail.add(measured.time_s, point)
         if self._is_due("paths", _PATHS_S):
             self._around.flown.draw(self._trail.points)
             path = state.planned_path
             self._around.planned.draw(np.zeros((0, 3)) if path is None else path)
+            for part, trail in self._end_effector_trails.items():
+                self._around.draw_end_effector(part, trail.points)
         if state.firing is not None and self._table is not None:
             names, duty = state.firing.names, state.firing.duty
             self._around.plumes.draw_segments(
@@ -665,10 +743,26 @@ class Page:
         self._due[part] = self._now + period
         return True
 
-    def _aim_camera(self, camera: Any) -> None:
+    def _aim_camera(self, camera: Any, offset: Array = CAMERA) -> None:
         """Turn a camera to the robot; before its first state, to the origin."""
         at = np.zeros(3) if self._last is None else self._last.pose[:3]
-        camera.position, camera.look_at = at + self._reach * CAMERA, at
+        away = self._reach * offset
+        if getattr(camera, "aspect", 1.0) < _PORTRAIT:
+            # On a phone the panel covers the lower half: the robot is seen above it.
+            away = _PORTRAIT_DISTANCE * away
+            at = at - _PORTRAIT_SHIFT * float(np.linalg.norm(away)) * screen_up(away)
+        camera.position, camera.look_at = at + away, at
+
+    def _greet(self, camera: Any) -> None:
+        """Turn the camera of a phone that has opened the page to the robot."""
+        if getattr(camera, "aspect", 1.0) < _PORTRAIT and self._last is not None:
+            self._aim_camera(camera)
+
+    def _move_cameras(self, way: Array) -> None:
+        """Move the cameras of all browsers by ``way`` (3,), m."""
+        for client in self._server.get_clients().values():
+            position, look_at = np.array(client.camera.position), np.array(client.camera.look_at)
+            client.camera.position, client.camera.look_at = position + way, look_at + way
 
     # -- actions of users -----------------------------------------------------------------------
 

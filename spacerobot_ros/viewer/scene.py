@@ -8,6 +8,7 @@ some, stay out of them.
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,10 +29,20 @@ Color = tuple[int, int, int]
 GHOST_OPACITY = 0.35
 _PLANNED: Color = (240, 150, 25)
 _FLOWN: Color = (60, 130, 240)
+_FLOWN_END_EFFECTOR: Color = (20, 190, 170)
 _PLUME: Color = (255, 110, 40)
 _COLLISION: Color = (200, 60, 200)
 _LINE_WIDTH = 3.0
 """Width of lines in the scene, pixels."""
+
+_FRAME_SIZE = 0.12
+"""Length of the axes of a link, in robot lengths."""
+
+_STARS, _SKY = 900, 40.0
+"""Number of stars, and their distance in robot lengths."""
+
+_SUN = np.array([0.55, 0.65, 0.52]) / np.linalg.norm([0.55, 0.65, 0.52])
+_SUN_COLOR: Color = (255, 244, 214)
 
 _MIN_LINE_SEGMENTS = 32
 """Least capacity of a line, in segments."""
@@ -93,6 +104,8 @@ class RobotDrawing:
                     paths[child], show_axes=False, position=pose[:3], wxyz=wxyz(pose[3:])
                 )
         self._moving = [frames[child] for _, child in kinematics.moving]
+        self._frames = {robot.base_link: self.base, **frames}
+        self._names: list[Any] | None = None
         meshes = meshes_from_files(robot, _MAX_MESH_TRIANGLES, on_note)
         self._solids = [
             self._add_visual(f"{paths[visual.link]}/{number}", visual)
@@ -141,6 +154,25 @@ class RobotDrawing:
                 if len(visual.mesh.faces)
             ]
         for each in self._collision_shapes:
+            each.visible = visible
+
+    def show_frames(self, *, visible: bool) -> None:
+        """Show or hide the axes of the frames of all links."""
+        length = _FRAME_SIZE * reach_of(self._robot)
+        for frame in self._frames.values():
+            if visible:
+                frame.axes_length, frame.axes_radius = length, 0.03 * length
+            frame.show_axes = visible
+
+    def show_names(self, *, visible: bool) -> None:
+        """Show or hide the names of all links, at the origins of their frames."""
+        if self._names is None:
+            if not visible:
+                return
+            self._names = [
+                self._scene.add_label(f"{self._paths[link]}/name", link) for link in self._frames
+            ]
+        for each in self._names:
             each.visible = visible
 
     def paint(self, color: Color) -> None:
@@ -231,6 +263,13 @@ class Lines:
         self._scene, self._path, self._color = scene, path, color
         self._capacity = 0
         self._handle: Any = None
+        self._shown, self._empty = True, True
+
+    def show(self, *, visible: bool) -> None:
+        """Show or hide the line."""
+        self._shown = visible
+        if self._handle is not None:
+            self._handle.visible = visible and not self._empty
 
     def draw(self, points: Array) -> None:
         """Connect points (k, 3), m; fewer than two clear the line."""
@@ -238,7 +277,8 @@ class Lines:
 
     def draw_segments(self, segments: Array) -> None:
         """Draw segments (k, 2, 3), m; none clear the line."""
-        if not len(segments):
+        self._empty = not len(segments)
+        if self._empty:
             if self._handle is not None:
                 self._handle.visible = False
             return
@@ -254,7 +294,7 @@ class Lines:
             )
         else:
             self._handle.points = filled
-            self._handle.visible = True
+        self._handle.visible = self._shown
 
 
 def plumes(table: ThrusterTable, names: tuple[str, ...], duty: Array, length: float) -> Array:
@@ -278,8 +318,15 @@ def plumes(table: ThrusterTable, names: tuple[str, ...], duty: Array, length: fl
     return np.array(segments, float).reshape(-1, 2, 3)
 
 
+class Setting(Enum):
+    """The surroundings that a robot is shown in."""
+
+    SPACE = "Space"
+    GRID = "Grid"
+
+
 class Surroundings:
-    """Grid, paths and plumes.
+    """Sky or grid, paths and plumes.
 
     Parameters
     ----------
@@ -298,7 +345,8 @@ class Surroundings:
         cells, sections = _GRID
         # Keep grid lines at round coordinates.
         x, y, _ = 10 * cell * np.round(center / (10 * cell))
-        scene.add_grid(
+        self._scene = scene
+        self._grid = scene.add_grid(
             "/grid",
             width=8 * reach,
             height=8 * reach,
@@ -309,7 +357,65 @@ class Surroundings:
             position=(x, y, center[2] - 1.2 * reach),
             fade_distance=12 * reach,
         )
-        scene.add_frame("/world", axes_length=0.25 * reach, axes_radius=0.006 * reach)
+        self._sky = self._add_sky(reach, center)
+        self._world = scene.add_frame("/world", axes_length=0.25 * reach, axes_radius=0.006 * reach)
         self.planned = Lines(scene, "/planned_path", _PLANNED)
         self.flown = Lines(scene, "/flown_path", _FLOWN)
         self.plumes = Lines(scene, f"{robot_path}/plumes", _PLUME)
+        self._end_effectors: dict[str, Lines] = {}
+        self._paths_shown = True
+
+    def _add_sky(self, reach: float, center: Array) -> list[Any]:
+        """Add stars, and the Sun with its light, around a point."""
+        directions = np.random.default_rng(1957).normal(size=(_STARS, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        brightness = np.random.default_rng(1961).uniform(90, 255, _STARS)
+        distance = _SKY * reach
+        stars = self._scene.add_point_cloud(
+            "/stars",
+            (distance * directions).astype(np.float32),
+            np.repeat(brightness[:, np.newaxis], 3, axis=1).astype(np.uint8),
+            point_size=0.004 * distance,
+            point_shape="circle",
+            position=center,
+        )
+        sun = self._scene.add_point_cloud(
+            "/sun",
+            (distance * _SUN[np.newaxis]).astype(np.float32),
+            _SUN_COLOR,
+            point_size=0.08 * distance,
+            point_shape="circle",
+            position=center,
+        )
+        light = self._scene.add_light_directional(
+            "/sunlight",
+            color=_SUN_COLOR,
+            intensity=1.5,
+            position=(float(_SUN[0]), float(_SUN[1]), float(_SUN[2])),
+        )
+        return [stars, sun, light]
+
+    def show_setting(self, setting: Setting) -> None:
+        """Show the sky or the grid."""
+        self._grid.visible = setting is Setting.GRID
+        for each in self._sky:
+            each.visible = setting is Setting.SPACE
+
+    def show_world(self, *, visible: bool) -> None:
+        """Show or hide the axes of the world."""
+        self._world.visible = visible
+
+    def show_paths(self, *, visible: bool) -> None:
+        """Show or hide the planned path and the flown ones."""
+        self._paths_shown = visible
+        for each in (self.planned, self.flown, *self._end_effectors.values()):
+            each.show(visible=visible)
+
+    def draw_end_effector(self, name: str, points: Array) -> None:
+        """Draw the flown path (k, 3) of an end-effector, m."""
+        if name not in self._end_effectors:
+            path = f"/flown_path_of_end_effector{len(self._end_effectors)}"
+            line = Lines(self._scene, path, _FLOWN_END_EFFECTOR)
+            line.show(visible=self._paths_shown)
+            self._end_effectors[name] = line
+        self._end_effectors[name].draw(points)

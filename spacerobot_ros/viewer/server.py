@@ -50,7 +50,7 @@ class ViewerConfig(WatchdogConfig):
     update_rate: float = parameter(
         20.0, "how often the page is drawn, wall time", unit="Hz", minimum=1.0, maximum=60.0
     )
-    dark: bool = parameter(False, "whether pages are dark when they are opened")
+    dark: bool = parameter(True, "whether pages are dark when they are opened")
     world_frame: str = parameter("world", "frame of the goals that the page sends")
     check_goals: bool = parameter(
         True, "plan for the goal that is shown, to tell whether it is reachable before it is sent"

@@ -149,8 +149,17 @@ class Server:
         import viser
 
         self.gui, self.scene = Elements(viser.GuiApi), Elements(viser.SceneApi)
+        self.greetings: list[Callable[[Any], Any]] = []
+        self.flushed = False
         self.initial_camera: Any = Element(self.gui, "camera", {})
         self.camera: Any = Element(self.gui, "camera", {})
+
+    def on_client_connect(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        self.greetings.append(callback)
+        return callback
+
+    def flush(self) -> None:
+        self.flushed = True
 
     def atomic(self) -> Any:
         return nullcontext()

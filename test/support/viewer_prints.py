@@ -87,7 +87,7 @@ def _planned() -> dict[str, Any]:
     gui.named("Roll, pitch, yaw (deg)").use(seen.server, (10.0, -20.0, 30.0))
     gui.named("Final joint positions").use(seen.server, True)
     gui.named("Fly").use(seen.server)
-    gui.named("Plant").use(seen.server, "Stop")
+    gui.named("Plant").use(seen.server, "Stop all")
     gui.named("Inject").use(seen.server)  # Its number is still 0.
     gui.named("Fault").use(seen.server, "actuator_bias")
     seen.show(replace(flying, measured=seen.measured(4.25, 0.0625)), 0.0625)
@@ -96,6 +96,8 @@ def _planned() -> dict[str, Any]:
     gui.named("Inject").use(seen.server)
     gui.named("Clear faults").use(seen.server)
     gui.named("Look at the robot").use(seen.server)
+    seen.server.camera.position, seen.server.camera.look_at = np.arange(3.0), np.ones(3)
+    gui.named("Follow the robot").use(seen.server, True)
     gui.named("Dark or light").use(seen.server)
     later = replace(flying, measured=seen.measured(5.5, 0.125))
     seen.show(replace(later, momenta=Momenta(np.arange(6.0) / 90, None, 0.5)))
@@ -125,11 +127,17 @@ def _controlled() -> dict[str, Any]:
     seen.show(replace(flying, measured=seen.measured(3.0, 0.75)))
     seen.server.gui.named("Fly").use(seen.server)
     seen.server.gui.named("Goal for the end-effector").use(seen.server, False)
-    seen.server.gui.named("Goal").use(seen.server, "Abort")
+    seen.server.gui.named("Goal").use(seen.server, "Abort goal")
     seen.server.gui.named("Fly").use(seen.server)
     seen.page.editor.show_check(Check(Verdict.REFUSED, "Too far."))
     seen.show(replace(flying, measured=seen.measured(4.0, 1.0)))
     seen.server.gui.named("Goal to the robot").use(seen.server)
+    seen.server.gui.named("View from").use(seen.server, "Top")
+    for name in ("Names", "Frames"):
+        seen.server.gui.named(name).use(seen.server, True)
+    for name in ("Paths", "Ghost", "Plumes"):
+        seen.server.gui.named(name).use(seen.server, False)
+    seen.server.gui.named("Setting").use(seen.server, "Grid")
     seen.show(replace(flying, measured=seen.measured(5.0, 1.5)))
     return seen.shown()
 

@@ -181,7 +181,7 @@ def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness
     assert len({(each.sec, each.nanosec) for each in stamps}) == 2, "statuses name them by it"
     # Services and faults.
     for label, service in (
-        ("Stop", "/robot/abort"),
+        ("Stop all", "/robot/abort"),
         ("Rearm", "/robot/rearm"),
         ("Reset", "/robot/reset"),
     ):
@@ -192,7 +192,7 @@ def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness
     stack.until(lambda: len(stack.called) == 5, "both")
     assert stack.called[3:] == ["/robot/pause True", "/robot/pause False"]
     stack.until(lambda: "Done: /robot/pause." in stack.log(), "its answer")
-    stack.press(page._buttons._goal, "Abort")
+    stack.press(page._buttons._goal, "Abort goal")
     stack.until(
         lambda: "No planner or controller offers the service 'abort' now." in stack.log(), "nobody"
     )

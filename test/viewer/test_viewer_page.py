@@ -137,7 +137,7 @@ def test_a_mission_is_flown_from_the_page(
         page.wait_for_text("Goal reachable")
         page.press("Fly")
         watched.wait("planner/status", "state", "executing")
-        page.press("Abort")
+        page.press("Abort goal")
         watched.wait("planner/status", "state", "aborted")
         page.wait_for_text("aborted")
         watched.hear()

@@ -330,8 +330,8 @@ def test_collision_shapes_are_shown_on_request(server: Any) -> None:
     page.show_robot(robot)
     assert page._drawing is not None
     assert page._drawing._collision_shapes is None
-    page._collision_shapes.value = True
-    page._show_collision_shapes()
+    page._layers["Collision shapes"].value = True
+    page._show_layers()
     shapes = page._drawing._collision_shapes
     assert shapes is not None
     assert len(shapes) == sum(len(link.collisions or link.shapes) for link in robot.links)
@@ -343,11 +343,11 @@ def test_collision_shapes_are_shown_on_request(server: Any) -> None:
         whole = ConvexHull(visual.mesh.vertices).volume
         assert volume == pytest.approx(whole, rel=1e-5), visual.shape.kind
     assert {visual.shape.kind for visual in collision_visuals(robot)} >= {"mesh"}
-    page._collision_shapes.value = False
-    page._show_collision_shapes()
+    page._layers["Collision shapes"].value = False
+    page._show_layers()
     assert not any(each.visible for each in shapes)
     # Another robot is drawn with its own.
-    page._collision_shapes.value = True
+    page._layers["Collision shapes"].value = True
     page.show_robot(load_robot(robot_file("three_joint_arm")))
     again = page._drawing._collision_shapes
     assert again is not None

@@ -1,0 +1,265 @@
+"""Layers, settings and cameras of the page, and its words about nodes that have ended."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.page_elements import Server
+
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.model import load_robot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
+from spacerobot_ros.viewer import content, scene
+from spacerobot_ros.viewer.page import CAMERA, Page, screen_up
+from spacerobot_ros.viewer.server import ViewerConfig
+from spacerobot_ros.viewer.state import Measured, StackState
+
+ROBOT = load_robot(robot_file("planar_manipulator"))
+REACH = scene.reach_of(ROBOT)
+COUNT = len(ROBOT.joint_names)
+
+
+def measured(time: float, *at: float) -> Measured:
+    zeros = np.zeros(COUNT)
+    return Measured(time, np.array([*at, 0.0, 0.0, 0.0, 1.0]), zeros + 0.2, zeros, zeros)
+
+
+@pytest.fixture
+def server() -> Server:
+    return Server()
+
+
+@pytest.fixture
+def page(server: Any) -> Page:
+    page = Page(server, ViewerConfig())
+    page.show_robot(ROBOT)
+    return page
+
+
+FIRST = StackState(
+    measured=measured(1.0, 1.0, 2.0, 0.5),
+    tool=np.array([3.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+    age_s=0.0,
+    planned_path=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5]]),
+)
+LATER = replace(
+    FIRST,
+    measured=measured(2.0, 1.5, 2.25, -0.5),
+    tool=np.array([3.5, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+)
+
+
+def test_space_is_the_setting_and_the_grid_an_option(server: Server, page: Page) -> None:
+    page.update(FIRST, 1.0)
+
+    def seen() -> dict[str, bool]:
+        names = ("/stars", "/sun", "/sunlight", "/grid")
+        return {name: server.scene.named(name).visible for name in names}
+
+    space = {"/stars": True, "/sun": True, "/sunlight": True, "/grid": False}
+    assert seen() == space
+    stars, sun = server.scene.named("/stars"), server.scene.named("/sun")
+    for points in (stars.points, sun.points):
+        np.testing.assert_allclose(np.linalg.norm(points, axis=1), 40 * REACH, rtol=1e-5)
+    np.testing.assert_allclose(stars.position, [1.0, 2.0, 0.5])
+    toward = np.array(server.scene.named("/sunlight").position)
+    np.testing.assert_allclose(sun.points[0], 40 * REACH * toward, rtol=1e-5)
+    server.gui.named("Setting").use(server, "Grid")
+    page.update(FIRST, 1.1)
+    assert seen() == {name: not shown for name, shown in space.items()}
+    assert server.gui.themes[0]["dark_mode"] is True
+
+
+def test_each_layer_is_shown_and_hidden_alone(server: Server, page: Page) -> None:
+    page.update(FIRST, 1.0)
+    page.update(LATER, 2.0)
+    base, world = server.scene.named("/robot"), server.scene.named("/world")
+    lines = [
+        server.scene.named(name)
+        for name in ("/planned_path", "/flown_path", "/flown_path_of_end_effector0")
+    ]
+    np.testing.assert_allclose(lines[2].points[0], [[3.0, 2.0, 1.0], [3.5, 2.0, 1.0]])
+    assert [each.visible for each in lines] == [True] * 3
+    assert not base.show_axes
+    assert not world.visible
+    for name, shown in (("Paths", False), ("Frames", True), ("Names", True)):
+        server.gui.named(name).use(server, shown)
+    page.update(replace(LATER, measured=measured(3.0, 1.75, 2.5, -0.5)), 3.0)
+    assert [each.visible for each in lines] == [False] * 3
+    assert base.show_axes
+    assert base.axes_length == pytest.approx(0.12 * REACH)
+    assert base.axes_radius == pytest.approx(0.0036 * REACH)
+    assert world.visible
+    labels = [each for each in server.scene.elements if each.kind == "add_label"]
+    assert {each.text for each in labels} == {link.name for link in ROBOT.links}
+    assert all(each.visible for each in labels)
+    for name, shown in (("Paths", True), ("Frames", False), ("Names", False)):
+        server.gui.named(name).use(server, shown)
+    page.update(LATER, 4.0)
+    assert [each.visible for each in lines] == [True] * 3
+    assert not base.show_axes
+    assert not any(each.visible for each in labels)
+
+
+def test_an_empty_line_stays_hidden_when_its_layer_is_shown(server: Any) -> None:
+    line = scene.Lines(server.scene, "/line", (1, 2, 3))
+    line.show(visible=True)
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+    line.draw(points)
+    handle = server.scene.named("/line")
+    line.draw(points[:1])
+    line.show(visible=True)
+    assert not handle.visible
+    line.show(visible=False)
+    line.draw(points)
+    assert not handle.visible
+    line.show(visible=True)
+    assert handle.visible
+
+
+def test_the_ghost_is_a_layer(server: Server, page: Page) -> None:
+    page.update(FIRST, 1.0)
+    page.update(LATER, 2.0)
+    ghost = server.scene.named("/goal/ghost")
+    assert ghost.visible
+    server.gui.named("Ghost").use(server, False)
+    page.update(LATER, 2.1)
+    assert not ghost.visible
+    page.update(replace(LATER, measured=measured(3.0, 1.75, 2.5, -0.5)), 3.0)
+    assert not ghost.visible
+    server.gui.named("Ghost").use(server, True)
+    page.update(LATER, 4.0)
+    assert ghost.visible
+
+
+@pytest.mark.parametrize(
+    ("name", "offset"),
+    [("Front", (1.9, 0.0, 0.3)), ("Side", (0.0, 1.9, 0.3)), ("Top", (0.0, 0.01, 1.9))],
+)
+def test_the_camera_looks_from_a_side(
+    name: str, offset: tuple[float, ...], server: Server, page: Page
+) -> None:
+    page.update(FIRST, 1.0)
+    server.gui.named("View from").use(server, name)
+    page.update(FIRST, 1.1)
+    at = np.array([1.0, 2.0, 0.5])
+    np.testing.assert_allclose(server.camera.look_at, at)
+    np.testing.assert_allclose(server.camera.position, at + REACH * np.array(offset))
+
+
+def test_cameras_follow_the_robot_if_asked(server: Server, page: Page) -> None:
+    page.update(FIRST, 1.0)
+    before = np.array(server.camera.position), np.array(server.camera.look_at)
+    page.update(LATER, 2.0)
+    np.testing.assert_allclose(server.camera.position, before[0])
+    server.gui.named("Follow the robot").use(server, True)
+    page.update(replace(LATER, measured=measured(3.0, 2.5, 2.0, -0.25)), 3.0)
+    way = [1.0, -0.25, 0.25]
+    np.testing.assert_allclose(server.camera.position, before[0] + way)
+    np.testing.assert_allclose(server.camera.look_at, before[1] + way)
+
+
+@pytest.mark.parametrize(("aspect", "phone"), [(0.46, True), (0.8, False), (1.5, False)])
+def test_on_a_phone_the_robot_is_above_the_panel(
+    aspect: float, phone: bool, server: Server, page: Page
+) -> None:
+    camera: Any = type("Camera", (), {"aspect": aspect})()
+    page._greet(camera)
+    assert not hasattr(camera, "position"), "there is no robot yet"
+    page.update(FIRST, 1.0)
+    page._greet(camera)
+    assert hasattr(camera, "position") is phone
+    page._aim_camera(camera)
+    at, away = np.array([1.0, 2.0, 0.5]), camera.position - camera.look_at
+    np.testing.assert_allclose(away, (1.5 if phone else 1.0) * REACH * CAMERA)
+    below = at - camera.look_at
+    share = np.linalg.norm(below) / np.linalg.norm(away)
+    assert share == pytest.approx(0.35 if phone else 0.0)
+    assert below @ away == pytest.approx(0.0, abs=1e-9)
+    assert below[2] > 0.0 or not phone
+
+
+def test_up_on_the_screen_is_across_the_view() -> None:
+    up: Array = screen_up(np.array([3.0, 0.0, 4.0]))
+    np.testing.assert_allclose(up, [-0.8, 0.0, 0.6])
+
+
+# -- nodes that have ended ------------------------------------------------------------------------
+
+FLYING = StackState(
+    measured=measured(1.0, 0.0, 0.0, 0.0),
+    age_s=0.1,
+    plant=PlantStatus(PlantState.RUNNING, "It flies."),
+    planner=PlannerStatus(PlannerState.EXECUTING, "Flies."),
+)
+GREEN, ENDED = "#2a9d5c", "The stack has ended"
+
+
+@pytest.mark.parametrize(
+    ("absent", "silent", "ended", "greens"),
+    [
+        ((), (), False, 2),
+        (("planner",), ("/planner",), False, 1),
+        (("plant", "planner"), ("/plant", "/planner"), True, 0),
+        (("plant", "planner"), (), False, 0),
+    ],
+)
+def test_nodes_that_have_ended_are_never_green(
+    absent: tuple[str, ...], silent: tuple[str, ...], ended: bool, greens: int
+) -> None:
+    state = replace(FLYING, absent=frozenset(absent), silent=dict.fromkeys(silent, 3.0))
+    head = content.status_html(state)
+    assert (ENDED in head) is content.stack_ended(state) is ended
+    assert head.count(GREEN) == greens
+    assert ("offline, last executing:" in head) is ("planner" in absent)
+
+
+def test_nothing_has_ended_where_nothing_has_begun() -> None:
+    assert not content.stack_ended(StackState(silent={"/recorder": 3.0}))
+
+
+def test_a_viewer_that_ends_says_so_on_its_page(server: Server, page: Page) -> None:
+    page.update(FLYING, 1.0)
+    page.end()
+    status = next(each for each in server.gui.elements if "steers nothing" in str(each.shown))
+    assert "The viewer has ended." in status.content
+    assert "It flies." not in status.content
+    assert server.flushed
+
+
+def test_a_controller_has_the_distances_of_base_and_end_effector() -> None:
+    goal = Goal.checked([0.0, 3.0, 4.0], [0.0, 0.0, 0.0, 1.0])
+    state = replace(
+        FLYING,
+        planner=None,
+        controller=ControllerStatus(ControllerState.TRACKING, "Tracks."),
+        goals={"base": goal},
+    )
+    errors = {"base": content.GoalDistance(5.0, 0.0)}
+    assert "base is 5 m and 0 rad from its goal." in content.status_html(state, errors)
+    assert "from its goal" not in content.status_html(state)
+
+
+def test_end_effectors_with_paths_are_that_of_the_plant_and_those_with_goals() -> None:
+    kinematics = ForwardKinematics(ROBOT)
+    link = ROBOT.links[1].name
+    aims = [EndEffectorGoal.checked(each, [1.0, 0.0, 0.0]) for each in (link, "no_such_link")]
+    goals = {aim.link: Goal.of_end_effectors([aim]) for aim in aims}
+    state = replace(FIRST, goals=goals)
+    found = content.end_effector_positions(state, kinematics)
+    assert set(found) == {"end_effector", link}
+    np.testing.assert_allclose(found["end_effector"], [3.0, 2.0, 1.0])
+    now = state.measured
+    assert now is not None
+    expected = scene.link_pose(kinematics, link, now.pose, now.q)[:3]
+    np.testing.assert_allclose(found[link], expected)
+    assert content.end_effector_positions(StackState(goals=goals), kinematics) == {}
