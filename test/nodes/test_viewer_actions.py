@@ -111,6 +111,7 @@ class Stand:
             show_robot=lambda robot: self.shown.append(robot),
             show_thrusters=lambda table: self.shown.append(table and table.names),
             note=lambda notice: self.notes.append((notice.message, notice.level, notice.source)),
+            end=lambda: self.shown.append("end"),
             update=lambda state, now: [self.actions.pop()] if self.actions else [],
         )
         checker = SimpleNamespace(

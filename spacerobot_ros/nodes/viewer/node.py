@@ -198,7 +198,8 @@ class ViewerNode(FlightNode):
             request.close()
         server, self._server = self._server, None
         if server is not None:
-            self._page.end()
+            if (page := getattr(self, "_page", None)) is not None:
+                page.end()
             stop_server(server)
         streams, self._streams = self._streams, None
         if streams is not None:
