@@ -76,6 +76,7 @@ setup(
             "report/*.js",
             "report/*.mplstyle",
             "report/vendor/*",
+            "session/*.xml",
         ]
     },
     data_files=[

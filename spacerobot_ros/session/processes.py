@@ -25,6 +25,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
+from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
 from spacerobot_ros.nodes.common.streams import Connections
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
@@ -41,9 +42,6 @@ _LONGEST_END = 10.0
 
 _SETTINGS_WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Settings without shared memory: Fast DDS could keep writing to a killed node's memory."""
-
-_FASTDDS_FILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-"""Environment variables with the settings file of Fast DDS: new and old name."""
 
 _FASTDDS_SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
@@ -154,10 +152,10 @@ class MultiProcessStack(Stack):
     def _environment(self) -> dict[str, str]:
         """Return the environment of a node; variables that the user has set stay."""
         environment = {**_SETTINGS_WITHOUT_SHARED_MEMORY, **os.environ}
-        if not any(name in environment for name in _FASTDDS_FILE_VARIABLES):
+        if not any(name in environment for name in FASTDDS_FILE_VARIABLES):
             file = Path(self._folder.name, "fastdds.xml")
             file.write_text(_FASTDDS_SETTINGS, "utf-8")
-            environment |= dict.fromkeys(_FASTDDS_FILE_VARIABLES, str(file))
+            environment |= dict.fromkeys(FASTDDS_FILE_VARIABLES, str(file))
         return environment
 
     def _log_file_of(self, name: str) -> Path:

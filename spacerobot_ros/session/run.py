@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -26,6 +27,7 @@ from spacerobot_ros.flight.reading import (
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.nodes.common.process import (
+    FASTDDS_FILE_VARIABLES,
     start_ros,
     use_loopback_discovery,
     use_private_discovery,
@@ -63,9 +65,24 @@ class RunResult:
     """Earlier name of :attr:`message`."""
 
 
+_ONE_PROCESS_SETTINGS = Path(__file__).with_name("one_process.xml")
+"""Fast DDS settings with which readers hear a writer of their process however late they come.
+
+Within a process, a reader takes all that a writer sent before for lost messages. With more of them
+than its limit of samples, 5000, a reliable reader gets nothing.
+"""
+
+
 @contextmanager
-def ros(*, private: bool) -> Iterator[None]:
+def ros(*, private: bool, one_process: bool = False) -> Iterator[None]:
     """Initialise rclpy without its signal handlers; discovery is private or on loopback.
+
+    Parameters
+    ----------
+    private
+        Whether discovery is private.
+    one_process
+        Whether nodes are to hear each other within this process.
 
     Raises
     ------
@@ -75,10 +92,16 @@ def ros(*, private: bool) -> Iterator[None]:
     (use_private_discovery if private else use_loopback_discovery)()
     level = get_logger_effective_level("")
     quiet = ["--ros-args", "--log-level", "WARN"]
-    start_ros(quiet)
+    settings: tuple[str, ...] = ()
+    if one_process and not any(os.environ.get(name) for name in FASTDDS_FILE_VARIABLES):
+        settings = FASTDDS_FILE_VARIABLES
+        os.environ.update(dict.fromkeys(settings, str(_ONE_PROCESS_SETTINGS)))
     try:
+        start_ros(quiet)
         yield
     finally:
+        for name in settings:
+            del os.environ[name]
         rclpy.try_shutdown()
         # The level is the process's: it would hold for nodes that are made after the run.
         set_logger_level("", level)
@@ -216,7 +239,7 @@ def run_until_stopped(
     SpaceRobotError
         A node cannot start, or has ended by itself.
     """
-    with ros(private=False):
+    with ros(private=False, one_process=not processes):
         stack = make_stack(scenario, bag, processes=processes, namespace=namespace)
         try:
             with ended_on_request(at_once=stack.interrupt) as stopped:

@@ -35,7 +35,7 @@ SEED = int(os.environ.get("SPACEROBOT_INTERLEAVINGS_SEED", "1"))
 PART = 14
 """Number of interleavings with the nodes of one process.
 
-After some thirty configurations new subscriptions in one process may get no messages any more.
+Subscriptions that begin after 5000 states of a plant in their process get none of them.
 """
 
 STEPS = 8

@@ -87,8 +87,10 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     asked: list[Any] = []
 
     @contextmanager
-    def no_ros(*, private: bool) -> Iterator[None]:
+    def no_ros(*, private: bool, one_process: bool = False) -> Iterator[None]:
         asked.append(("private", private))
+        if one_process:
+            asked.append("one process")
         yield
 
     monkeypatch.setattr(run, "ros", no_ros)
@@ -213,6 +215,11 @@ def test_a_stack_that_is_up_shows_each_status_once(
     assert shown == [up, "Planning.", "Closed.", "Reached."]
     assert looks == [False] * 5
     assert fake.done == [("start", None), "finish", "close"]
+    asked.clear()
+    again = FakeStack(load_scenario("sliding_masses"), time, lambda flown, look: None)
+    use(monkeypatch, again, asked)
+    run.run_until_stopped(again.scenario, None, show, processes=False)
+    assert asked[:2] == [("private", False), "one process"]
 
 
 # -- goals to a stack of others -----------------------------------------------------------------
