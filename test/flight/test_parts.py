@@ -215,6 +215,7 @@ def test_contacts_are_among_the_events_of_their_time() -> None:
         ({"kills": (1,)}, "it kills nodes on the way"),
         ({"resume_bag": "a.mcap"}, "plant.resume_bag is set"),
         ({"plan_in_background": True}, "planner.plan_in_background is true"),
+        ({"output": "trajectory"}, "planner.output is trajectory"),
         ({"plan_in_background": True, "commanders": ("coordinated_control",)}, ""),
         ({"resume_file": "a"}, "a resume_file is set"),
         ({"output": "commands"}, "planner and controller both command the joints"),

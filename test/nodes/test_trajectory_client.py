@@ -191,7 +191,9 @@ def test_the_clients_of_a_node_are_there_until_it_is_destroyed(
 
 
 @pytest.mark.usefixtures("stand_in")
-def test_a_planner_sends_schedules_in_place_of_commands(harness: Harness) -> None:
+def test_a_planner_sends_schedules_in_place_of_commands(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
     parameters = {"robot": "sliding_masses", "output": "trajectory", "trajectory_action": "a/b"}
     planner = harness.make(PlannerNode, parameters)
     clients = planner._trajectories
@@ -200,7 +202,12 @@ def test_a_planner_sends_schedules_in_place_of_commands(harness: Harness) -> Non
     first = planner.commander.trajectories
     assert planner.count_publishers("joint_commands") == 0
     assert planner.config.goal_links == ("end_effector",)
-    planner.trigger_deactivate()
+    lines: list[str] = []
+    for node in (planner, harness.make(PlannerNode, {"robot": "sliding_masses"}, name="other")):
+        monkeypatch.setattr(node, "log", lambda level, line: lines.append(f"{level}: {line}"))
+        node.trigger_deactivate()
+    (told,) = [line for line in lines if line.startswith("info: ")]  # The other's.
+    assert told == "info: 0 commands were published."
     planner.trigger_cleanup()
     # An executor may hold an answer for the client.
     assert not client.destroyed

@@ -7,8 +7,10 @@ import pytest
 from support.planner_loop import TICK, Loop
 from support.planner_phases import executing, stub_of
 
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.status import Notice, PlannerState, Severity
+from spacerobot_ros.planning.methods.optimal import OptimalGait
 
 
 def flown(ticks: int = 8, **options: float) -> Loop:
@@ -82,3 +84,24 @@ def test_an_abort_leaves_the_braking_to_the_controller() -> None:
     loop.tick(5)
     assert loop.abort() == "The joints' controller has 2.5 s to bring them to rest."
     assert loop.executive.phase is Phase.BRAKING
+
+
+OWN = OptimalGait.Options().effort_limits
+
+
+@pytest.mark.parametrize(
+    ("output", "links", "effort_limits"),
+    [
+        ("commands", ("end_effector",), OWN),
+        ("reference", (), 1),
+        ("trajectory", ("end_effector",), OWN),
+    ],
+)
+def test_only_plans_for_a_controller_keep_a_reserve_of_efforts(
+    output: str, links: tuple[str, ...], effort_limits: int
+) -> None:
+    config = PlannerConfig(output=output)
+    assert config.goal_links == links
+    optimal = config.method_options.get("optimal", OptimalGait.Options())
+    assert optimal.effort_limits == effort_limits
+    assert OWN != 1
