@@ -11,10 +11,11 @@ from spacerobot_ros.version import __version__
 
 if TYPE_CHECKING:
     from spacerobot_ros.bag import read_bag
+    from spacerobot_ros.campaign.sweep import sweep
     from spacerobot_ros.flight.api import fly, plan
     from spacerobot_ros.scenario import load_scenario
 
-__all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag"]
+__all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag", "sweep"]
 
 
 __getattr__ = lazy_names(
@@ -24,6 +25,7 @@ __getattr__ = lazy_names(
         "load_scenario": "spacerobot_ros.scenario",
         "plan": "spacerobot_ros.flight.api",
         "read_bag": "spacerobot_ros.bag",
+        "sweep": "spacerobot_ros.campaign.sweep",
     },
 )
 

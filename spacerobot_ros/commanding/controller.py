@@ -12,7 +12,7 @@ from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHo
 from spacerobot_ros.commanding.plant_state import Pairing, PlantChange, Stamped
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.controller import OwnLaw, build_controller
 from spacerobot_ros.control.executive import GOAL_KEYS, ControlExecutive
 from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.servicing import Task
@@ -49,9 +49,11 @@ class ControllerCommander(Commander):
         config: ControllerConfig,
         host: CommanderHost,
         *,
+        own_law: OwnLaw | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
+        self._own_law = own_law
         self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
         self._target: RobotDescription | None = None
@@ -122,7 +124,7 @@ class ControllerCommander(Commander):
 
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         self.executive = ControlExecutive(
-            build_controller(robot, self.config),
+            build_controller(robot, self.config, self._own_law),
             self.config,
             self._publish_status,
             self._goal_file,
@@ -137,7 +139,8 @@ class ControllerCommander(Commander):
 
     def _change_masses(self, robot: SpaceRobot) -> None:
         assert self.executive is not None
-        self.executive.use_controller(build_controller(robot, self.config), self._held)
+        controller = build_controller(robot, self.config, self._own_law)
+        self.executive.use_controller(controller, self._held)
 
     def _stop_executive(self) -> None:
         assert self.executive is not None

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import Enum
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -423,8 +424,14 @@ class CoordinatedController:
         return law.command(state, reference)
 
 
-def build_controller(robot: SpaceRobot, config: ControllerConfig) -> CoordinatedController:
-    """Return the controller of a robot that a configuration describes.
+OwnLaw = tuple[type[ControlLaw], Any]
+"""A law that is in no registry, and an instance of its ``Options``."""
+
+
+def build_controller(
+    robot: SpaceRobot, config: ControllerConfig, own_law: OwnLaw | None = None
+) -> CoordinatedController:
+    """Return the controller of a robot that a configuration describes, or one with another law.
 
     The law of a robot with reaction wheels controls its gyrostat, without the wheels as joints.
 
@@ -433,7 +440,8 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
     ParameterError
         The robot does not have the outputs that are named, or the law cannot drive them.
     """
-    law_type, thrust = LAWS[config.law], config.use_thrusters
+    law_type, options = own_law or (LAWS[config.law], config.options[config.law])
+    thrust = config.use_thrusters
     force, torque = config.max_force or math.inf, config.max_torque or math.inf
     if not thrust:
         force = torque = 0.0
@@ -456,7 +464,7 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
     if not thrust:
         _require_torque(outputs, robot, wheels)
     return CoordinatedController(
-        law_type(robot, outputs, config.gains, config.options[config.law], thrust=thrust),
+        law_type(robot, outputs, config.gains, options, thrust=thrust),
         ActuatorLimits(force, torque, robot.effort_limit),
         JointRateLimits(robot, config.joint_rates * robot.velocity_limit, config.control_period),
         PROFILES[config.profile],

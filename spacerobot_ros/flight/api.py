@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
@@ -12,13 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros import planning
+from spacerobot_ros.control.laws.law import ControlLaw
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.flight.flight import Flight
-from spacerobot_ros.flight.lockstep import fly_scenario
+from spacerobot_ros.flight.lockstep import Robots, fly_scenario
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.parameters import configured, require_known
 from spacerobot_ros.planning import GaitSchedule, Goal
 from spacerobot_ros.planning.api import EndEffectorValues, end_effector_goals
-from spacerobot_ros.planning.core.goal import POSE, Controlled
+from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.resources import resource_names
@@ -40,8 +42,14 @@ def fly(
     what: SpaceRobot | Scenario | str | Path,
     goal: Goal | npt.ArrayLike | None = None,
     *,
+    position: npt.ArrayLike | None = None,
     rotvec: npt.ArrayLike | None = None,
+    end_effector_position: EndEffectorValues | None = None,
+    end_effector_pose: EndEffectorValues | None = None,
+    end_effector: str = "",
     method: str | None = None,
+    law: type[ControlLaw] | None = None,
+    law_options: Mapping[str, Any] | None = None,
     seed: int | None = None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Flight:
@@ -58,10 +66,16 @@ def fly(
     goal
         Goal pose of the base; or its position (3,), m, or position and quaternion (7,). None: the
         goal of the scenario.
-    rotvec
-        Attitude of the goal (3,), rad, as exponential coordinates; replaces that of ``goal``.
+    position, rotvec
+        Position (3,), m, and attitude (3,), rad, as exponential coordinates; they replace those of
+        ``goal``.
+    end_effector_position, end_effector_pose, end_effector
+        Goal of an end-effector, as for :func:`plan`.
     method
         A gait method or a control law; None: that of the scenario.
+    law, law_options
+        A class of a control law that is in no registry, and its options by name; the scenario has
+        a controller, whose gains it takes.
     seed
         Seed of the noise of sensors and actuators.
     parameters
@@ -74,7 +88,8 @@ def fly(
     GoalError
         The goal is no pose.
     """
-    scenario = _with_goal(_scenario_to_fly(what), goal, None, rotvec)
+    hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
+    scenario = scenario_to_fly(what, goal, position, rotvec, hands)
     if not scenario.has_goal:
         raise ParameterError(
             f"'{scenario.name}' is a robot and has no goal: give one, for instance "
@@ -85,7 +100,19 @@ def fly(
         scenario = scenario.with_method(method)
     if seed is not None:
         scenario = scenario.with_overrides("plant", {"sensors.seed": seed})
-    return fly_scenario(scenario)
+    if law is None:
+        if law_options is not None:
+            raise ParameterError("law_options are those of a law: give it as law=MyLaw.")
+        return fly_scenario(scenario)
+    if "coordinated_control" not in scenario.commanders:
+        raise ParameterError(
+            f"'{scenario.name}' has no controller that could use the law '{law.name}': it flies "
+            f"with {' and '.join(scenario.commanders)}."
+        )
+    values = {} if law_options is None else law_options
+    require_known(law.name, law.Options, values)
+    own_law = law, configured(law.Options, values)
+    return fly_scenario(scenario, robots=replace(Robots.of(scenario), own_law=own_law))
 
 
 def plan(
@@ -162,12 +189,7 @@ def plan(
             method = "optimal" if of_method else PlannerConfig().method
         return planning.plan(what, goal, method=method, **{**chosen, **options})
     scenario = what if isinstance(what, Scenario) else load_scenario(str(what))
-    scenario = _with_goal(scenario, goal, position, rotvec)
-    if hands:
-        asked: set[Controlled] = set() if goal is None else set(POSE)
-        asked |= set() if position is None else {"position"}
-        asked |= set() if rotvec is None else {"attitude"}
-        scenario = scenario.with_end_effectors(hands, frozenset(asked))
+    scenario = _with_goals(scenario, goal, position, rotvec, hands)
     settings: dict[str, Any] = {} if method is None else {"method": method}
     name = method or scenario.planner.method
     method_options(
@@ -190,15 +212,47 @@ def _is_scenario(what: SpaceRobot | Scenario | str | Path, *, aimed: bool) -> bo
     return name in scenario_names() and not (aimed and name in resource_names("urdf", ".urdf"))
 
 
-def _scenario_to_fly(what: SpaceRobot | Scenario | str | Path) -> Scenario:
-    """Return the scenario to fly; a robot alone is a scenario without a goal."""
+def scenario_to_fly(
+    what: SpaceRobot | Scenario | str | Path,
+    goal: Goal | npt.ArrayLike | None = None,
+    position: npt.ArrayLike | None = None,
+    rotvec: npt.ArrayLike | None = None,
+    hands: Sequence[EndEffectorGoal] = (),
+) -> Scenario:
+    """Return the scenario to fly, with the given goals; a robot alone is one without a goal.
+
+    Raises
+    ------
+    ParameterError
+        There is no such scenario or robot.
+    GoalError
+        A goal is no pose.
+    """
     match what:
         case Scenario():
-            return what
+            scenario = what
         case SpaceRobot():
-            return scenario_of(what.description)
+            scenario = scenario_of(what.description)
         case _:
-            return scenario_or_robot(str(what))
+            scenario = scenario_or_robot(str(what))
+    return _with_goals(scenario, goal, position, rotvec, hands)
+
+
+def _with_goals(
+    scenario: Scenario,
+    goal: Goal | npt.ArrayLike | None,
+    position: npt.ArrayLike | None,
+    rotvec: npt.ArrayLike | None,
+    hands: Sequence[EndEffectorGoal],
+) -> Scenario:
+    """Return a scenario with other goals of its base, and of end-effectors."""
+    scenario = _with_goal(scenario, goal, position, rotvec)
+    if not hands:
+        return scenario
+    asked: set[Controlled] = set() if goal is None else set(POSE)
+    asked |= set() if position is None else {"position"}
+    asked |= set() if rotvec is None else {"attitude"}
+    return scenario.with_end_effectors(hands, frozenset(asked))
 
 
 def _with_goal(scenario: Scenario, *given: Any) -> Scenario:

@@ -372,8 +372,12 @@ class Flight:
         if self.gait is not None and self.gait.method:
             return self.gait.method
         scenario = self.scenario
-        plans = "planner" in scenario.commanders
-        return scenario.planner.method if plans else scenario.controller.law
+        if "planner" in scenario.commanders:
+            return scenario.planner.method
+        for _, status in reversed(self.statuses):
+            if isinstance(status, ControllerStatus) and status.command is not None:
+                return status.command.law
+        return scenario.controller.law
 
     def tolerance(self, part: Literal["position", "attitude"]) -> float | None:
         """Return the largest error of a part of a reached goal, m or rad; None where a bag has no

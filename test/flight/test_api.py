@@ -15,7 +15,10 @@ from support.sentences import assert_one_sentence
 
 import spacerobot_ros
 from spacerobot_ros import fly, load_scenario, plan, read_bag
+from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.errors import GoalError, ParameterError, RecordingError
+from spacerobot_ros.flight import api
 from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.planning import Goal
@@ -204,6 +207,89 @@ def test_a_flight_is_saved_once_unless_it_may_replace_what_is_there(tmp_path: Pa
     np.testing.assert_array_equal(
         read_bag(file)["joint_states"].field("position"), flight.q, strict=True
     )
+
+
+class _HalfLaw(TransposedJacobianLaw):
+    """A law that is in no registry."""
+
+    name = "half"
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
+    """Scenario and robots of flights, which are not flown."""
+    found: list[tuple[Any, Any]] = []
+
+    def fly_none(scenario: Any, robots: Any = None) -> None:
+        found.append((scenario, robots))
+
+    monkeypatch.setattr(api, "fly_scenario", fly_none)
+    return found
+
+
+def test_a_flight_takes_a_law_that_is_in_no_registry(asked: list[tuple[Any, Any]]) -> None:
+    fly("coordinated_control", law=_HalfLaw, law_options={"singular_value_threshold": 0.25})
+    fly("coordinated_control", law=_HalfLaw)
+    fly("coordinated_control")
+    (_, first), (_, second), (_, third) = asked
+    assert [robots.own_law[0] for robots in (first, second)] == [_HalfLaw] * 2
+    thresholds = [robots.own_law[1].singular_value_threshold for robots in (first, second)]
+    assert thresholds == [0.25, 0.1]
+    assert third is None
+    controller = build_controller(
+        first.controller, asked[0][0].controller, (_HalfLaw, first.own_law[1])
+    )
+    assert type(controller.law) is _HalfLaw
+    assert controller.law.options.singular_value_threshold == 0.25
+    assert build_controller(first.controller, asked[0][0].controller).law.name != "half"
+
+
+@pytest.mark.slow
+def test_a_law_of_ones_own_flies_and_is_named() -> None:
+    class Fast(_HalfLaw):
+        name = "fast"
+
+    own, known = fly("coordinated_control", law=Fast), fly("coordinated_control")
+    np.testing.assert_array_equal(own.pose, known.pose)
+    assert own.method == "fast"
+    assert known.method == "transposed_jacobian"
+
+
+@pytest.mark.parametrize(
+    ("scenario", "given", "words"),
+    [
+        ("sliding_masses", {"law": _HalfLaw}, ("'half'", "planner")),
+        ("coordinated_control", {"law_options": {"a": 1}}, ("law=MyLaw",)),
+        ("coordinated_control", {"law": _HalfLaw, "law_options": {"a": 1}}, ("half", "'a'")),
+    ],
+)
+def test_a_law_that_nothing_can_use_is_refused(
+    scenario: str, given: dict[str, Any], words: tuple[str, ...]
+) -> None:
+    with pytest.raises(ParameterError) as refused:
+        fly(scenario, **given)
+    assert_one_sentence(str(refused.value), *words)
+
+
+def test_a_flight_takes_the_goals_that_a_plan_takes(asked: list[tuple[Any, Any]]) -> None:
+    at, hand = (0.25, -0.5, 0.125), (1.0, 2.0, 3.0)
+    fly("sliding_masses", position=at)
+    fly("reach", end_effector_position=hand, end_effector="hand")
+    fly("reach", end_effector_position=hand, end_effector="hand", position=at)
+    fly("reach", end_effector_position=hand, end_effector="hand", rotvec=(0.0, 0.0, 0.5))
+    fly("reach", (*at, 0.0, 0.0, 0.0, 1.0), end_effector_position=hand, end_effector="hand")
+    goals = [scenario.goal for scenario, _ in asked]
+    np.testing.assert_allclose(goals[0].position, at)
+    for goal in goals[1:]:
+        (aim,) = goal.end_effectors
+        assert aim.link == "hand"
+        np.testing.assert_allclose(aim.position, hand)
+    assert [set(goal.base) for goal in goals[1:]] == [
+        set(),
+        {"position"},
+        {"attitude"},
+        {"position", "attitude"},
+    ]
 
 
 def test_the_package_names_what_it_offers() -> None:
