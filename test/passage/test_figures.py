@@ -145,6 +145,8 @@ UNITS = {
         "end-effector attitude": "rad",
     },
     "efforts": {"thruster force": "N", "thruster torque": "N m", "joint effort": "N m"},
+    "clearance": {"smallest distance": "m"},
+    "momentum_budget": {"angular momentum": "N m s"},
     "momentum": {"change of the total momenta": "kg m/s, kg m²/s", "kinetic energy": "J"},
     "thrusters": {
         "thrusters": "share of each tick that they are on",
@@ -155,11 +157,17 @@ UNITS = {
 """The unit of each label of an axis, by figure; those of joints depend on their kind."""
 
 
+COMPUTED = ("clearance", "link_errors", "momentum_budget")
+"""Figures of numbers that are computed from those of the bag, and that no message of it has."""
+
+
 def unit_of(name: str, figure: str, label: str) -> str:
     if figure == "joints":
         return units_of_joints(name)
     if figure == "velocities":
         return f"{units_of_joints(name)}/s"
+    if figure == "link_errors":
+        return {"distance": "m", "angle": "rad"}[label.partition(" of ")[0]]
     return UNITS[figure][label]
 
 
@@ -169,6 +177,8 @@ def test_every_trace_has_the_numbers_of_the_bag_in_the_unit_of_its_axis(name: st
         for group in drawn.groups:
             about = f"{figure}: {group.label}"
             assert group.unit == unit_of(name, figure, group.label), about
+            if figure in COMPUTED:
+                continue
             values, numbers = group.signal.values, expected(figure, group, messages_of(name))
             if group.unit == "rad" and len(group.names) == 3 and "rotation" in group.label:
                 turns = Rotation.from_rotvec(values).inv() * Rotation.from_rotvec(numbers)
@@ -178,6 +188,31 @@ def test_every_trace_has_the_numbers_of_the_bag_in_the_unit_of_its_axis(name: st
                 scale = np.abs(numbers).max()
                 last = numbers[len(numbers) - len(values) :]  # A goal comes after the first states.
                 np.testing.assert_allclose(values, last, rtol=0, atol=1e-9 * scale, err_msg=about)
+
+
+@pytest.mark.slow
+def test_smallest_distances_are_those_that_the_plant_published() -> None:
+    compared = 0
+    for name in NAMES:
+        figure = figures_of(name).get("clearance")
+        for message in messages_of(name).get("/clearance", ()) if figure else ():
+            told = {each.key: float(each.value) for each in message.values[:2]}
+            signal = figure.groups[0].signal  # type: ignore[union-attr]
+            at = int(np.argmin(np.abs(signal.time - signal.time[0] - told["time"])))
+            if abs(signal.time[at] - signal.time[0] - told["time"]) < 1e-6:
+                assert signal.values[at, 0] == pytest.approx(told["distance"], abs=1e-7), name
+                compared += 1
+    assert compared > 20
+
+
+@pytest.mark.slow
+def test_budgets_of_momentum_have_the_sum_that_the_plant_published() -> None:
+    for name in ("capture", "servicing", "wheels"):
+        (group,) = figures_of(name)["momentum_budget"].groups
+        L_W = numbers(messages_of(name)["/momentum"])[:, 3:6]
+        np.testing.assert_allclose(
+            group.signal.values[:, -1], np.linalg.norm(L_W, axis=1), atol=1e-12, err_msg=name
+        )
 
 
 @pytest.mark.parametrize("name", SOME_QUICK)
