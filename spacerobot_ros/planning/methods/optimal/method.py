@@ -457,7 +457,7 @@ class OptimalGait(GaitMethod):
 
         The drift may lead away from the goal faster than the joints turn the base back; later, it
         leads past it. At first a manoeuvre is looked for that ends before the base has turned far,
-        then any, and then a short one after the joints have rested.
+        then such a one after the joints have rested, and at last any.
         """
         state, q, h = request.state, request.state.q, self.control_period
         specification = self._kind_of(request.goal).specification
@@ -467,12 +467,9 @@ class OptimalGait(GaitMethod):
         every = max(_MIN_COASTING_TICKS, round(_COASTING_ANGLE / rate / h))
         last = min(chosen.longest, _COASTING_TURNS * 2 * math.pi / rate)
         brief = replace(chosen, longest=min(chosen.longest, 2 * every * h))
-        tries = ((brief, _STARTS_BEFORE_COASTING), (replace(chosen, longest=last), sys.maxsize))
-        for options, in_vain in tries:
-            try:
-                return self._begin_now(request, boundary, limits, options, cancellation, in_vain)
-            except NotFoundError as refusal:
-                first = refusal
+        budget = cancellation, _STARTS_BEFORE_COASTING
+        with suppress(NotFoundError):
+            return self._begin_now(request, boundary, limits, brief, *budget)
         most = math.ceil(last / h)
         coasting = np.tile(q, (most + 1, 1))
         attitudes = self._prediction.attitudes(coasting, state.quaternion, state.angular_momentum)
@@ -507,7 +504,9 @@ class OptimalGait(GaitMethod):
             return replace(
                 found, positions=positions, notes={**found.notes, "coasting_time": ticks * h}
             )
-        raise first
+        return self._begin_now(
+            request, boundary, limits, replace(chosen, longest=last), cancellation
+        )
 
     def _plan_in_motion(
         self,
