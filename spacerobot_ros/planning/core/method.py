@@ -355,7 +355,7 @@ class GaitMethod(ABC):
                 "shape changes cannot remove it, and optimal plans for robots that drift."
             )
 
-    def _significant(self, momentum: Array) -> Array:
+    def significant(self, momentum: Array) -> Array:
         """Return a total momentum (3,), kg m/s or kg m^2/s; zero where it counts as zero."""
         if np.linalg.norm(momentum) > _REST_MOMENTUM * self.robot.total_mass:
             return momentum

@@ -11,6 +11,7 @@ Other modules do the work of a phase: :mod:`.tracker` computes the commands alon
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -72,6 +73,13 @@ _MAX_GAP, _MAX_GAP_PERIODS = 1.0, 10
 _MAX_IN_MOTION_ATTEMPTS = 2
 """Largest number of plans in motion for one goal: each takes over twice as late as the one
 before."""
+
+_COASTING_TIME, _COASTING_FACTOR = 2.0, 2.0
+"""Rest with which a plan in the background begins where the robot drifts, s, and, where that was
+too short, the factor of the time from its start to the end of planning."""
+
+_MAX_COASTING_TIME = 600.0
+"""Longest such time, s."""
 
 _LATE_TIME_SHARE = 1 / 3
 """Share of a motion's duration that remains when the motion counts as late."""
@@ -231,6 +239,24 @@ class Teleoperation:
     """Stamp of that state, ns."""
 
 
+@dataclass(frozen=True)
+class _Coasting:
+    """A rest at the start of a plan that is made while the robot drifts.
+
+    ``begins_ns`` is the stamp of the state that the ``planned`` task begins from, ``duration`` that
+    of the rest, s: the gait begins where the base has drifted to by then.
+    """
+
+    planned: PlanningTask
+    begins_ns: int
+    duration: float
+
+    def task(self, period: float) -> PlanningTask:
+        """Return the task of a plan that begins with the rest, in control periods, s."""
+        ticks = math.ceil(self.duration / period - 1e-9)
+        return replace(self.planned, braking=np.tile(self.planned.request.state.q, (ticks + 1, 1)))
+
+
 class Executive:
     """Brings a robot to successive goals, and answers every state with a setpoint.
 
@@ -285,6 +311,8 @@ class Executive:
         """Number of late or refused plans in motion for the new goal."""
         self._pending_plan: PlanJob | ReadyPlan | None = None
         """The requested plan, or the plan that waits for its tick (``TAKING_OVER``)."""
+        self._coasting: _Coasting | None = None
+        """The rest that the requested plan begins with, because the base drifts meanwhile."""
         self._active_goal: ActiveGoal | None = None
         """The goal that is executed or evaluated."""
         self._replan_ns = 0
@@ -974,7 +1002,11 @@ class Executive:
         task = PlanningTask(request, braking=braking, take_over=take_over)
         if active is not None:
             task = replace(task, stuck=active.stuck_positions, required=active.required)
-        self._pending_plan = job
+        self._pending_plan, self._coasting = job, None
+        at_rest = braking is None and take_over is None
+        if at_rest and self._worker.plans_in_background and self._worker.drifts(state):
+            self._coasting = _Coasting(task, self._stamp_ns, _COASTING_TIME)
+            task = self._coasting.task(self.config.control_period)
         self._worker.submit(task)
         self._take_plan_result()
 
@@ -983,8 +1015,27 @@ class Executive:
         result = self._worker.poll()
         if result is None:
             return
-        job = self._pending_plan
+        job, coasting = self._pending_plan, self._coasting
         assert isinstance(job, PlanJob)
+        if isinstance(result, Planned) and coasting is not None:
+            elapsed = (self._stamp_ns - coasting.begins_ns) / 1e9
+            if elapsed > coasting.duration and elapsed <= _MAX_COASTING_TIME:
+                # The base has drifted past the start of the plan.
+                self._coasting = replace(coasting, duration=_COASTING_FACTOR * elapsed)
+                self._total_plan_time += result.wall_time
+                self._add_notice(
+                    Severity.INFO,
+                    f"The plan came {elapsed - coasting.duration:.3g} s after its start, while the "
+                    "robot drifts: it is made again, to begin later.",
+                )
+                self._worker.submit(self._coasting.task(self.config.control_period))
+                return
+            if elapsed > coasting.duration:
+                result = Refused(
+                    f"The robot drifts, and {elapsed:.3g} s of planning were not enough for a plan "
+                    "that begins in time; smaller optimal.starts take less",
+                    result.wall_time,
+                )
         self._pending_plan = None
         self._total_plan_time += result.wall_time
         self._plan_count += 1
@@ -1069,6 +1120,8 @@ class Executive:
         active, config = self._active_goal, self.config
         assert active is not None
         begins, event, start = self._stamp_ns, Event.PLANNED, ""
+        if self._coasting is not None:
+            begins, self._coasting = self._coasting.begins_ns, None
         if take_over_ns is not None:
             begins, event, start = take_over_ns, Event.TAKEN_OVER, ", which begins in motion"
         self._subtract_remainder(active, begins)

@@ -101,8 +101,8 @@ class PlanningTask:
     required
         Parts of the goal that a plan without them must control.
     braking
-        (K + 1, n) shapes at the ticks, m or rad, in which the joints brake before the gait; None:
-        they rest.
+        (K + 1, n) shapes at the ticks, m or rad, in which the joints brake before the gait, or rest
+        while the base drifts; None: the gait begins at once.
     take_over
         When the plan takes over from a schedule that is tracked until then; None: it begins at
         rest, or with the braking. The state of the request is that of now.
@@ -189,6 +189,11 @@ class PlanningWorker:
     def is_busy(self) -> bool:
         """Whether a plan is in work, its result waits, or its thread still runs."""
         return self._job is not None
+
+    def drifts(self, state: RobotState) -> bool:
+        """Whether the base moves on while the joints of a robot rest."""
+        momenta = state.linear_momentum, state.angular_momentum
+        return any(self._method.significant(each).any() for each in momenta)
 
     def starts_in_motion(self, schedule: GaitSchedule) -> bool:
         """Whether a plan may take over from a schedule: the methods of both allow for it."""

@@ -276,8 +276,8 @@ class OptimalGait(GaitMethod):
         state = replace(
             request.state,
             q=q,
-            linear_momentum=self._significant(request.state.linear_momentum),
-            angular_momentum=self._significant(request.state.angular_momentum),
+            linear_momentum=self.significant(request.state.linear_momentum),
+            angular_momentum=self.significant(request.state.angular_momentum),
         )
         request = replace(request, state=state, goal=goal)
         if not state.linear_momentum.any():
@@ -388,7 +388,7 @@ class OptimalGait(GaitMethod):
             chosen = replace(chosen, duration=duration)
         searched = request, boundary, limits, chosen, cancellation
         # The clearance of a base that coasts on among obstacles is not checked.
-        if boundary.drifts and chosen.duration == 0 and not (correction or self._has_obstacles):
+        if boundary.drifts and chosen.duration == 0 and not self._has_obstacles:
             found = self._begin_now_or_coast(*searched)
         else:
             found = self._begin_now(*searched)
