@@ -469,3 +469,8 @@ def test_a_paused_plant_and_a_busy_planner_are_given_their_time(stand: Stand) ->
     assert [note[0] for note in stand.notes] == ["Goal sent."]
     stand.draw(after=0.25)
     assert len(stand.notes) == 2
+
+
+def test_a_viewer_that_ends_says_so_on_its_page(stand: Stand) -> None:
+    stand.node.cleanup()
+    assert stand.shown[-1] == "end"
