@@ -5,6 +5,7 @@ Solvers, distances and held commands are stand-ins; a manoeuvre is told by its d
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -349,6 +350,41 @@ def test_drifting_robots_hold_whole_ticks_and_others_stretch(model: ManoeuvreMod
         search._make_held_commands(drifting, path(5.0))
     with pytest.raises(CandidateError, match="no path"):
         search._make_held_commands(drifting, None)
+
+
+@pytest.mark.parametrize(
+    ("rate", "duration", "given", "expected"),
+    [
+        # The bound is 0.1 rad/s.
+        (0.0999, 5.0, 0.0, 5.0),
+        (0.104, 5.0, 0.0, 5.25),
+        (0.109, 5.0, 0.0, 5.5),
+        (0.111, 5.0, 0.0, None),
+        (0.104, 5.0, 5.0, None),
+    ],
+)
+def test_commands_that_turn_the_base_a_little_too_fast_are_made_slower(
+    model: ManoeuvreModel, rate: float, duration: float, given: float, expected: float | None
+) -> None:
+    """5 s times 1.04 and a reserve of 2 in 1000 are 5.21 s, in ticks of 0.05 s: 5.25 s."""
+    search: Any = Search(model)
+    search._constraints = PathConstraints(base_rate=0.1)
+
+    class Turning:
+        def hold(self, trajectory: Trajectory, *_: object, **__: object) -> HeldCommands:
+            ticks = math.ceil(trajectory.duration / 0.05 - 1e-9)
+            about = rate * duration / trajectory.duration * 0.05 * np.arange(ticks + 1) / 2
+            turns = np.column_stack([np.zeros((ticks + 1, 2)), np.sin(about), np.cos(about)])
+            return HeldCommands(trajectory.at_ticks(ticks), turns, 0.0)
+
+    search._holder = Turning()
+    asked = progress(Kept({}, {}), duration=given)
+    if expected is None:
+        with pytest.raises(CandidateError, match="the base turns at"):
+            search._make_held_commands(asked, path(duration))
+    else:
+        found = search._make_held_commands(asked, path(duration))
+        assert found.duration == pytest.approx(expected)
 
 
 def test_the_aim_is_turned_by_the_difference_of_solution_and_commands() -> None:

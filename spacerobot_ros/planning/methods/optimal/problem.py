@@ -505,6 +505,12 @@ class PathConstraints:
         """The bound on the base rate at the steps of a solution, rad/s."""
         return self.base_rate * (1 - _CONSTRAINT_RESERVE)
 
+    def excess_rate(self, quaternions: Array, period: float) -> float:
+        """Return the largest base rate between attitudes (N + 1, 4) over the bound; 0: none."""
+        if self.base_rate == 0:
+            return 0.0
+        return _largest_base_rate(quaternions, period) / self.base_rate
+
     def slowed(self, guess: Trajectory) -> Trajectory:
         """Return a guess slowed to the bound on the base rate."""
         if self.base_rate == 0:

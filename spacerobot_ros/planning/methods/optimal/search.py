@@ -135,6 +135,10 @@ keeps all limits."""
 _AGREEING_SOLUTIONS_IN_MOTION = 3
 """In motion: solutions of the same duration that end the search."""
 
+_MAX_RATE_EXCESS, _RATE_RESERVE = 1.1, 1.002
+"""Largest excess of the base rate of held commands over its bound at which they are made slower, as
+the bound is imposed at the steps of a solution alone, and the factor of that excess."""
+
 _MIN_TICKS_IN_MOTION = 4
 """Control periods that a manoeuvre in motion takes at least."""
 
@@ -664,6 +668,12 @@ class ManoeuvreSearch:
             held = self._hold_in_whole_ticks(progress, trajectory)
         else:
             held = self._holder.hold(trajectory, progress.boundary, progress.limits, fixed=fixed)
+            if held is not None and not fixed:
+                excess = self._constraints.excess_rate(held.quaternions, self._period)
+                if 1 < excess <= _MAX_RATE_EXCESS:
+                    # At zero momentum the base turns as much slower as the joints move.
+                    slower = trajectory.retimed(excess * _RATE_RESERVE)
+                    held = self._holder.hold(slower, progress.boundary, progress.limits)
         if held is None:
             raise CandidateError(_NO_HELD_COMMANDS)
         attitudes = quaternion_multiply(progress.quaternion, held.quaternions)
