@@ -118,6 +118,11 @@ DRIFTING_CASES ?= 7
 drifting-plans: $(STAMP)/test ## plan DRIFTING_CASES random cases each of three robots and three drifts, flown by Pinocchio, and list durations
 	SPACEROBOT_DRIFTING_CASES=$(DRIFTING_CASES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_drifting_plans.py
 
+FLOWN_TIMES ?= 10
+.PHONY: flown-times
+flown-times: $(STAMP)/test ## compare the times of FLOWN_TIMES plans each of ten robots with those of the solutions
+	SPACEROBOT_FLOWN_TIMES=$(FLOWN_TIMES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_flown_times.py
+
 CLEAR_FLIGHTS ?= 100
 .PHONY: clear-flights
 clear-flights: $(STAMP)/test ## fly CLEAR_FLIGHTS draws each of four robots with noise, wrong masses and corrections, and list the smallest distances

@@ -167,7 +167,8 @@ def test_widths_of_figures_are_taken_in_any_unit(
     assert (bag, folder, names) == (Path("a.mcap"), Path("a_figures"), [])
     assert options.pop("width") == pytest.approx(width)
     assert options == {
-        **{"format": PictureFormat.PDF, "style": None, "events": False, "namespace": None}
+        **{"format": PictureFormat.PDF, "style": None, "events": False, "namespace": None},
+        "degrees": False,
     }
 
 
