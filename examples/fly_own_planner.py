@@ -31,6 +31,7 @@ class FeedbackPlanner(rclpy.node.Node):
     def __init__(self, robot: SpaceRobot, **options: Any) -> None:
         super().__init__("planner", **options)
         self.robot, self.tolerance, self.state = robot, 1e-3, "idle"
+        self.odom: Odometry | None = None
         self.commands = self.create_publisher(JointState, "joint_commands", 10)
         self.statuses = self.create_publisher(DiagnosticStatus, "planner/status", 10)
         self.create_subscription(PoseStamped, "goal_pose", self.on_goal, 10)
@@ -48,10 +49,10 @@ class FeedbackPlanner(rclpy.node.Node):
 
     def on_joints(self, joints: JointState) -> None:
         """Answer every state, with its stamp: the plant refuses any other."""
-        names, rates = self.robot.joint_names, np.zeros(self.robot.n)
-        if self.state == "executing" and self.odom.header.stamp == joints.header.stamp:
+        names, rates, odom = self.robot.joint_names, np.zeros(self.robot.n), self.odom
+        if self.state == "executing" and odom and odom.header.stamp == joints.header.stamp:
             q = np.array([joints.position[joints.name.index(name)] for name in names])
-            (r_WB, R_WB), (r_goal, R_goal) = arrays(self.odom.pose.pose), self.goal
+            (r_WB, R_WB), (r_goal, R_goal) = arrays(odom.pose.pose), self.goal
             error_B = R_WB.inv().apply(r_goal - r_WB), (R_WB.inv() * R_goal).as_rotvec()
             if max(map(np.linalg.norm, error_B)) <= self.tolerance:
                 self.tell("reached")
@@ -76,5 +77,5 @@ if __name__ == "__main__":
         executor.add_node(node)
     while planner.state != "reached":
         executor.spin_once(timeout_sec=1.0)
-    print(f"{planner.state} after {plant.time_ns / 1e9:g} s\nbase  {plant.plant.pose.round(4)}")
+    print(f"{planner.state} after {plant.time_ns / 1e9:g} s, base {plant.plant.pose.round(4)}")
     print(f"masses {plant.plant.q.round(4)} m")
