@@ -78,4 +78,3 @@ if __name__ == "__main__":
     while planner.state != "reached":
         executor.spin_once(timeout_sec=1.0)
     print(f"{planner.state} after {plant.time_ns / 1e9:g} s, base {plant.plant.pose.round(4)}")
-    print(f"masses {plant.plant.q.round(4)} m")

@@ -149,6 +149,7 @@ def test_stepped_lanes_are_plants_with_resets_and_other_masses(
     assert at_stops > 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("actuation", ["velocity", "effort"])
 def test_flights_without_lanes_are_plants_too(sliders: SpaceRobot, actuation: str) -> None:
     flights, _ = fly_with_resets(sliders, actuation, 0.02, 16, in_lanes=False, link="mass_3")

@@ -151,6 +151,7 @@ def test_flights_in_lanes_are_interrupted_or_left_to_the_controller() -> None:
     assert {lanes[number].fallback for number in lost} == {"lost control"}
 
 
+@pytest.mark.slow
 def test_a_draw_that_is_refused_leaves_the_others_of_its_batch_in_lanes() -> None:
     """Each has its own reason: a start beyond the joint limits, noise below zero."""
     refused: dict[str, Any] = {

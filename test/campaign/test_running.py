@@ -104,6 +104,7 @@ def test_a_scheduler_that_is_not_there_is_refused_before_a_folder_is_made(
     assert run_campaign(small(flights=3), folder).done == 3, "the folder is free"
 
 
+@pytest.mark.slow
 def test_the_numbers_of_a_row_are_those_of_its_flight(tmp_path: Path) -> None:
     made = small(flights=2)
     run_campaign(made, tmp_path)

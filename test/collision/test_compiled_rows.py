@@ -82,6 +82,7 @@ def test_rows_from_the_cache_derive_none_for_a_trial(
     assert float(again.rows(3).values(q)) == float(first.rows(3).values(q))
 
 
+@pytest.mark.slow
 def test_wrong_functions_are_not_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

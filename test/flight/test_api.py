@@ -167,6 +167,7 @@ def test_arrays_are_copies() -> None:
     assert flight.summary()["final_joint_positions"] == flight.q[-1].tolist()
 
 
+@pytest.mark.slow
 def test_an_animation_shows_every_frame(tmp_path: Path) -> None:
     flight = fly("faults/stuck_slider", parameters=QUICK)
     shown = flight.animate(seconds=1.0, frames=3)

@@ -23,9 +23,7 @@ BAGS = Path(__file__).resolve().parents[2] / "bags"
 NAMES = sorted(path.stem for path in BAGS.glob("*.mcap"))
 
 SOME_QUICK = [
-    name
-    if name in ("servicer_thrusters", "sliding_masses")
-    else pytest.param(name, marks=pytest.mark.slow)
+    name if name == "servicer_thrusters" else pytest.param(name, marks=pytest.mark.slow)
     for name in NAMES
 ]
 

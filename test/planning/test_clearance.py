@@ -93,6 +93,7 @@ def test_a_plan_that_is_clear_stays_the_same(arm: SpaceRobot) -> None:
     assert np.array_equal(plain.positions, clear.positions)
 
 
+@pytest.mark.slow
 def test_a_plan_in_motion_keeps_clear(arm: SpaceRobot) -> None:
     goal = (0.09, -0.26, -0.21), np.zeros(3)
     clearance = Clearance(arm.description, 0.01)

@@ -78,6 +78,7 @@ def assert_flies(
     return flight
 
 
+@pytest.mark.slow
 def test_a_chain_keeps_a_tenth_of_its_efforts() -> None:
     free = SpaceRobot.from_urdf(CHAIN)
     asked: dict[str, Any] = {"rotvec": CHAIN_TURN, "start": CHAIN_START, **QUICK}

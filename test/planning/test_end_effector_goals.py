@@ -267,6 +267,7 @@ def test_methods_of_loops_leave_the_goal_to_optimal(method: str) -> None:
             planner.plan(request)
 
 
+@pytest.mark.slow
 def test_a_cached_plan_is_that_of_the_same_goal_alone(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -100,6 +100,7 @@ def refusal(robot: SpaceRobot, state: RobotState, goal: Goal, **options: Any) ->
 KINDS = ["tree", "chain", "planar", "sliders"]
 
 
+@pytest.mark.slow
 @settings(max_examples=2, deadline=None)
 @given(seed=SEEDS)
 @pytest.mark.parametrize("kind", KINDS)

@@ -25,7 +25,7 @@ from spacerobot_ros.simulation import mujoco_engine
 pytest.importorskip("mujoco")
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
-QUICK = ("coordinated_control", "reach")
+QUICK = ("coordinated_control",)
 LARGEST = {"reach": 2e-10, "two_hands": 5e-11}
 """Errors of the position, m, by steps of 10 ms in fast motions; all others are below 2e-11."""
 
