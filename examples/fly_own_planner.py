@@ -77,4 +77,4 @@ if __name__ == "__main__":
         executor.add_node(node)
     while planner.state != "reached":
         executor.spin_once(timeout_sec=1.0)
-    print(f"{planner.state} after {plant.time_ns / 1e9:g} s, base {plant.plant.pose.round(4)}")
+    print(f"{planner.state} at {plant.time_ns / 1e9:g} s", plant.plant.pose, plant.plant.q, sep="\n")
