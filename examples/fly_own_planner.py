@@ -77,4 +77,4 @@ if __name__ == "__main__":
         executor.add_node(node)
     while planner.state != "reached":
         executor.spin_once(timeout_sec=1.0)
-    print(f"{planner.state} at {plant.time_ns / 1e9:g} s", plant.plant.pose, plant.plant.q, sep="\n")
+    print(planner.state, f"{plant.time_ns / 1e9:g} s", plant.plant.pose, plant.plant.q, sep="\n")
