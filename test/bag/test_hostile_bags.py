@@ -44,6 +44,7 @@ def assert_all_refused(found: list[dict[str, Any]]) -> None:
     assert not faults, "\n".join(faults)
 
 
+@pytest.mark.slow
 def test_hostile_bags_do_no_harm(tmp_path: Path) -> None:
     found = attempts(tmp_path, "everything", "QUICK")
     assert {o["case"] for o in found} == set(QUICK)

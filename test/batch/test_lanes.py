@@ -128,6 +128,7 @@ def test_velocity_flights_in_lanes_are_those_of_the_plant(
     assert not here.fallback_ticks.any()
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_effort_flights_in_lanes_are_those_of_the_plant(robots: dict[str, SpaceRobot]) -> None:
     flights = effort_flights(robots["sliding_masses"], 19)

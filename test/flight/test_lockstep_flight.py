@@ -141,6 +141,7 @@ def test_what_is_saved_is_verified_and_read_back(tmp_path: Path) -> None:
         flight.save(tmp_path / "saved.mcap")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("quantity", "noise", "topic"),
     [

@@ -15,7 +15,7 @@ TESTS = Path(__file__).resolve().parents[1]
 
 NODES = ("plant", "planner", "coordinated_control")
 
-_QUICK = ("hand", "square", "loops")
+_QUICK = ("hand", "square")
 """Flights that need no solver and take a few tenths of a second."""
 
 _LONG = {
