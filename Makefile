@@ -69,6 +69,18 @@ OLDEST := click lxml lz4 matplotlib numpy pin pyarrow pyparsing PyYAML scipy zst
 viewer-test: $(STAMP)/test ## fly from the viewer's page in Chromium, and look at recordings there
 	$(BIN)/python3 -m pytest -m 'slow or not slow' test/viewer
 
+# The wheel carries axe-core's script; what it depends on is not needed.
+AXE := axe-playwright-python==0.1.8
+$(STAMP)/axe.min.js: | $(STAMP)/test
+	@$(PIP) download --no-deps --dest $(STAMP) $(AXE)
+	@$(BIN)/python3 -m zipfile -e $(STAMP)/axe_playwright_python-*.whl $(STAMP)/axe
+	@cp $(STAMP)/axe/axe_playwright_python/axe.min.js $@
+	@rm -rf $(STAMP)/axe $(STAMP)/axe_playwright_python-*.whl
+
+.PHONY: accessibility
+accessibility: $(STAMP)/test $(STAMP)/axe.min.js ## check contrast, names and keys of all pages with axe-core; pictures in out/pages
+	SPACEROBOT_PICTURES=out/pages $(BIN)/python3 -m pytest -m slow -rs test/viewer/test_accessibility.py
+
 .PHONY: fuzz
 fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send, and count them
 	SPACEROBOT_FUZZ=long $(BIN)/python3 -m pytest -q test/fuzz
@@ -100,8 +112,8 @@ attacks: $(STAMP)/test ## try files and words that were made to harm or mislead,
 	$(BIN)/python3 -m pytest -q -m "slow or not slow" test/attacks
 
 .PHONY: reports
-reports: $(STAMP)/test ## fly every scenario, make its report, open it in Chromium at desktop and phone width
-	$(BIN)/python3 -m pytest -m slow -rP test/report/test_every_report.py
+reports: $(STAMP)/test ## fly every scenario, make its report, open it in Chromium at desktop and phone width; pictures in out/reports
+	SPACEROBOT_PICTURES=out/reports $(BIN)/python3 -m pytest -m slow -rP test/report/test_every_report.py
 
 DRAWS ?= 1000
 .PHONY: servicing-campaign
@@ -142,6 +154,11 @@ INTERLEAVINGS ?= 200
 action-interleavings: $(STAMP)/test ## send goals by actions and topics, abort, cancel, change life, INTERLEAVINGS times from SEED, with interfaces built here
 	SPACEROBOT_INTERLEAVINGS=$(INTERLEAVINGS) SPACEROBOT_INTERLEAVINGS_SEED=$(SEED) \
 	    $(BIN)/python3 -m pytest -q -s -m slow test/packaging/test_real_actions.py
+
+.PHONY: rosdep-keys
+rosdep-keys: $(STAMP)/test ## compare the keys of the manifests with ROSDISTRO, a checkout of ros/rosdistro
+	@test -n "$(ROSDISTRO)" || { echo "name a checkout: make rosdep-keys ROSDISTRO=PATH" >&2; exit 1; }
+	SPACEROBOT_ROSDISTRO=$(ROSDISTRO) $(BIN)/python3 -m pytest -q -s -m "slow or not slow" test/packaging/test_rosdep_keys.py
 
 .PHONY: first-flights
 first-flights: $(STAMP)/test ## fly robots of others from their URDFs to a goal by `spacerobot new`, with minutes taken
@@ -213,6 +230,10 @@ docs: $(STAMP)/docs ## build the documentation site; see out/docs/index.html
 figures: $(STAMP)/docs ## compute the numbers of the documents again: docs/figures.json
 	$(BIN)/python3 -m docs_build.figures
 	$(BIN)/python3 -m docs_build.singularities
+
+.PHONY: animation
+animation: $(STAMP)/demo ## fly the satellite of the documents' first picture and draw it again: docs/images/turning.gif
+	$(BIN)/python3 -m docs_build.animation
 
 .PHONY: structure
 structure: ## count lines, modules and unclear words of the package; AGAINST=PATH: of another checkout too

@@ -74,6 +74,7 @@ setup(
             "collision/*.c",
             "report/*.css",
             "report/*.js",
+            "viewer/*.js",
             "report/*.mplstyle",
             "report/vendor/*",
             "session/*.xml",

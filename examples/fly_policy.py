@@ -14,67 +14,65 @@ from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
 import spacerobot_ros.environments  # noqa: F401 - registers the environments
+from spacerobot_ros.environments.policy import Policy
 from spacerobot_ros.environments.tasks import RobotStates, Task, action_scale, command_of
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.scenario import load_scenario
 
-HOLD, STEPS = 10, 20
+HOLD, STEPS = 5, 60
 
 
 class PolicyNode(rclpy.node.Node):
     """Answers each state of the plant with the action that the policy holds."""
 
-    def __init__(self, task: Task, goal: Array, weights: Array) -> None:
+    def __init__(self, task: Task, goal: Array, policy: Policy) -> None:
         super().__init__("policy")
-        self.task, self.goal, self.weights, self.ticks = task, goal, weights, 0
-        self.observations: list[Array] = []
+        self.task, self.goal, self.policy, self.ticks = task, goal, policy, 0
+        self.odoms, self.observations = list[Odometry](), list[Array]()
         self.scale = action_scale(task.robot, "velocity", 0.0, 0.0)
         self.commands = self.create_publisher(JointState, "joint_commands", 100)
-        self.create_subscription(Odometry, "odom", self.on_odom, 100)
+        self.create_subscription(Odometry, "odom", self.odoms.append, 100)
         self.create_subscription(JointState, "joint_states", self.on_joints, 100)
 
-    def on_odom(self, message: Odometry) -> None:
-        """Keep the pose, which comes before the joints of the same tick."""
-        p, q = message.pose.pose.position, message.pose.pose.orientation
-        self.pose = np.array([[p.x, p.y, p.z, q.x, q.y, q.z, q.w]])
-        v, w = message.twist.twist.linear, message.twist.twist.angular
-        self.twist = np.array([[v.x, v.y, v.z, w.x, w.y, w.z]])
-
     def on_joints(self, joints: JointState) -> None:
-        """Observe at every tenth state, and command the policy's action for it."""
-        if self.ticks % HOLD == 0:
-            q, qdot = np.array([[joints.position], [joints.velocity]])
-            states = RobotStates(self.pose, self.twist, q, qdot)
-            seen = self.task.observe(states, self.task.remaining(states, self.goal))
-            self.observations.append(seen[0])
-            action = np.tanh(self.weights @ seen[0])
-            self.command = command_of([action], self.scale, range(len(self.scale)))[0]
-        self.ticks += 1
-        velocity = self.command.tolist()
-        self.commands.publish(JointState(header=joints.header, name=joints.name, velocity=velocity))
+        """Observe at every fifth state, and command the policy's action for it."""
+        rates = np.zeros(len(joints.name))
+        if self.odoms and self.odoms[-1].header.stamp == joints.header.stamp:  # Odom comes first.
+            if self.ticks % HOLD == 0:
+                base, twist = self.odoms[-1].pose.pose, self.odoms[-1].twist.twist
+                p, o, v, w = base.position, base.orientation, twist.linear, twist.angular
+                pose, rate = [p.x, p.y, p.z, o.x, o.y, o.z, o.w], [v.x, v.y, v.z, w.x, w.y, w.z]
+                parts = pose, rate, joints.position, joints.velocity
+                states = RobotStates(*(np.array([part]) for part in parts))
+                seen = self.task.observe(states, self.task.remaining(states, self.goal))
+                self.observations.append(seen[0])
+                self.held = command_of(self.policy(seen), self.scale, range(len(self.scale)))[0]
+            self.ticks, rates = self.ticks + 1, self.held
+        answer = JointState(header=joints.header, name=joints.name, velocity=rates.tolist())
+        self.commands.publish(answer)
 
 
 def main(file: Path) -> None:
     """Fly in the environment and through ROS, and print the largest difference."""
-    weights, scenario = np.loadtxt(file), load_scenario("arm_attitude")
+    trained, scenario = Policy.load(file), load_scenario("arm_attitude")
     env = gymnasium.make("spacerobot/ReorientArm-v0", hold=HOLD, tolerance=1e-9).unwrapped
     seen = [env.reset(options={"goal": scenario.goal.quaternion})[0]]
     while len(seen) <= STEPS:
-        seen.append(env.step(np.tanh(weights @ seen[-1]))[0])
+        seen.append(env.step(trained(seen[-1]))[0])
     rclpy.init()
     overrides = [rclpy.Parameter(k, value=v) for k, v in scenario.parameters("plant").items()]
-    policy = PolicyNode(env.episodes.task, env.episodes.goals, weights)
+    policy = PolicyNode(env.episodes.task, env.episodes.goals, trained)
     plant, executor = PlantNode(parameter_overrides=overrides), EventsExecutor()
     for node in (plant, policy):
         executor.add_node(node)
     while len(policy.observations) <= STEPS:
         executor.spin_once(timeout_sec=1.0)
-    first, last = (np.linalg.norm(each[:3]) for each in (seen[0], policy.observations[STEPS]))
-    print(f"{STEPS * HOLD} ticks\nerror from {first:.4f} to {last:.4f} rad")
-    difference = np.array(policy.observations[: STEPS + 1]) - np.array(seen)
-    print(f"largest difference between the environment and ROS: {np.abs(difference).max():.2g}")
+    flown = np.array(policy.observations[: STEPS + 1])
+    errors, difference = np.linalg.norm(flown[:, :3], axis=1), np.abs(flown - seen).max()
+    print(f"{STEPS * HOLD} ticks\nerror from {errors[0]:.4f} to {errors.min():.4f} rad")
+    print(f"largest difference between the environment and ROS: {difference:.2g}")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if sys.argv[1:] else Path(__file__).parent / "policies/reorient_arm.txt")
+    main(Path(sys.argv[1]) if sys.argv[1:] else Path(__file__).parent / "policies/reorient_arm.npz")

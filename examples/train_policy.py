@@ -1,7 +1,6 @@
-"""Train a policy that turns a spacecraft by its arm, and compare it with planned manoeuvres.
+"""Train a policy that turns a spacecraft by its arm: PPO of stable-baselines3 on SIMD lanes.
 
-Run it with ``python examples/train_policy.py [ITERATIONS] [FILE]``: 60 iterations take minutes. The
-policy is linear in the observation; an evolution strategy gives each SIMD lane its own.
+Run it with ``python examples/train_policy.py [STEPS] [FILE]``: FILE.png is the return curve.
 """
 
 import sys
@@ -9,64 +8,73 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import matplotlib.pyplot as plt
 import numpy as np
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-import spacerobot_ros
-import spacerobot_ros.environments
-from spacerobot_ros.model.description import Array
-from spacerobot_ros.scenario import load_scenario
+from spacerobot_ros.environments.policy import Policy
 
-LANES, HOLD, NOISE, RATE = 256, 10, 0.3, 0.5
-ARGUMENTS = {"hold": HOLD, "time_limit": 30.0, "tolerance": 0.01, "spread": 0.15}
+LANES, LENGTH, WINDOW, SEED = 1024, 64, 1000, 1
 
 
-def episode_returns(env: Any, weights: Array, seed: int) -> tuple[Array, Array, Array]:
-    """Return the returns, whether the goals are reached, and the durations (s) of one episode each.
+class _Lanes(VecEnv):
+    """The vector environment as stable-baselines3 takes it."""
 
-    ``weights`` (lanes, actions, observations) are those of each lane's policy.
-    """
-    observation, _ = env.reset(seed=[seed + lane // 2 for lane in range(env.num_envs)])
-    total, duration = np.zeros(env.num_envs), np.zeros(env.num_envs)
-    running, reached = np.ones(env.num_envs, bool), np.zeros(env.num_envs, bool)
-    while running.any():
-        action = np.tanh(np.einsum("lao,lo->la", weights, observation))
-        observation, reward, terminated, truncated, _ = env.step(action)
-        total += running * reward
-        duration += running * env.unwrapped.episodes.step_duration
-        reached |= running & terminated
-        running &= ~(terminated | truncated)
-    return total, reached, duration
+    def __init__(self) -> None:
+        arguments = {"hold": 5, "time_limit": 30.0, "autoreset_mode": "SameStep"}
+        self.env: Any = gymnasium.make_vec("spacerobot/ReorientArm-v0", LANES, **arguments)
+        super().__init__(LANES, self.env.single_observation_space, self.env.single_action_space)
+
+    def reset(self) -> Any:
+        return self.env.reset(seed=SEED)[0]
+
+    def step_async(self, actions: Any) -> None:
+        self.result = self.env.step(actions)
+
+    def step_wait(self) -> tuple[Any, Any, Any, list[dict[str, Any]]]:
+        seen, rewards, terminated, truncated, infos = self.result
+        told: list[dict[str, Any]] = [{} for _ in range(LANES)]
+        for i in np.flatnonzero(ended := terminated | truncated):
+            success, last = infos["final_info"]["is_success"][i], infos["final_obs"][i]
+            told[i] = {"is_success": success, "terminal_observation": last}
+            told[i]["TimeLimit.truncated"] = truncated[i]
+        return seen, rewards, ended, told
+
+    def get_attr(self, *_: Any, **__: Any) -> list[Any]:
+        return [None] * LANES  # No lane has attributes of its own.
+
+    set_attr = env_method = env_is_wrapped = close = get_attr
 
 
-def main(iterations: int, file: Path) -> None:
-    """Train, write the policy, and print the return curve and the comparison."""
-    env = gymnasium.make_vec("spacerobot/ReorientArm-v0", num_envs=LANES, **ARGUMENTS)
-    shape = env.single_action_space.shape[0], env.single_observation_space.shape[0]
-    rng, mean = np.random.default_rng(1), np.zeros(shape)
-    size = np.array([10.0] * 3 + [1.0] * (shape[1] - 3))  # Errors of attitude are small numbers.
-    for iteration in range(iterations + 1):
-        # Two lanes fly the same goal with opposite changes of the policy.
-        change = np.repeat(rng.normal(size=(LANES // 2, *shape)), 2, axis=0)
-        change[1::2] *= -1.0
-        returns, reached, _ = episode_returns(env, size * (mean + NOISE * change), 1000 * iteration)
-        if iteration % max(1, iterations // 10) == 0:
-            print(f"{iteration}: return {returns.mean():.2f}, reached {reached.mean():.0%}")
-        rank = returns[0::2] - returns[1::2]
-        step = np.einsum("l,lao->ao", rank / (rank.std() + 1e-9), change[0::2]) / len(rank)
-        mean += RATE * NOISE * step
-    np.savetxt(file, size * mean, header="actions x observations of spacerobot/ReorientArm-v0")
-    returns, reached, duration = episode_returns(env, np.tile(size * mean, (LANES, 1, 1)), 999_999)
-    print(f"policy: return {returns.mean():.2f}, reached {reached.mean():.0%} of the goals")
-    print(f"policy: median of these {np.median(duration[reached]) if reached.any() else 0:.1f} s")
-    for method in ("optimal", "area_loop") if iterations >= 10 else ():
-        scenario = load_scenario("arm_attitude").with_method(method)
-        goals = [np.array([0, 0, 0, *goal]) for goal in env.unwrapped.episodes.goals[:20:4]]
-        flights = [spacerobot_ros.fly(scenario, goal) for goal in goals]
-        count = sum(flight.succeeded for flight in flights)
-        seconds = np.median([flight.manoeuvre_time for flight in flights])
-        print(f"{method}: reached {count} of {len(goals)}, median {seconds:.1f} s")
+def main(steps: int, file: Path) -> None:
+    """Train, and write the network and the return curve."""
+    env = VecNormalize(VecMonitor(_Lanes()), norm_reward=False)
+    curve: list[list[float]] = []
+
+    def note(known: dict[str, Any], _: Any) -> bool:
+        trained = known["self"]
+        if len(trained.ep_info_buffer) == WINDOW and trained.num_timesteps % (LANES * LENGTH) == 0:
+            ended = [each["r"] for each in trained.ep_info_buffer], trained.ep_success_buffer
+            curve.append([trained.num_timesteps, *np.mean(ended, axis=1)])
+        return True
+
+    network = {"net_arch": [32, 32], "log_std_init": -0.5}
+    ppo = PPO("MlpPolicy", env, lambda left: 1e-3 * left, LENGTH, 8192, 5, policy_kwargs=network,
+              seed=SEED, device="cpu", stats_window_size=WINDOW, verbose=1)  # fmt: skip
+    ppo.learn(steps, callback=note)
+    layers = [ppo.policy.mlp_extractor.policy_net[k] for k in (0, 2)] + [ppo.policy.action_net]
+    weights, biases = ([getattr(each, part).detach().double().numpy() for each in layers]
+                       for part in ("weight", "bias"))  # fmt: skip
+    weights[0] = weights[0] / np.sqrt(env.obs_rms.var + env.epsilon)  # It has seen normalised ones.
+    biases[0] = biases[0] - weights[0] @ env.obs_rms.mean
+    Policy(weights, biases).save(file.with_suffix(".npz"))
+    count, *means = np.array(curve).T
+    plt.plot(count, np.transpose(means), label=["mean return", "share of goals reached"])
+    plt.xlabel("steps")
+    plt.legend()
+    plt.savefig(file.with_suffix(".png"), dpi=100)
 
 
 if __name__ == "__main__":
-    words = sys.argv[1:]
-    main(int(words[0]) if words else 2, Path(words[1] if words[1:] else "policy.txt"))
+    main(int((sys.argv[1:] or ["6000000"])[0]), Path((sys.argv[2:] or ["policy.npz"])[0]))

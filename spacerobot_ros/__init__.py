@@ -13,9 +13,10 @@ if TYPE_CHECKING:
     from spacerobot_ros.bag import read_bag
     from spacerobot_ros.campaign.sweep import sweep
     from spacerobot_ros.flight.api import fly, plan
+    from spacerobot_ros.flight.reading import read_run
     from spacerobot_ros.scenario import load_scenario
 
-__all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag", "sweep"]
+__all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag", "read_run", "sweep"]
 
 
 __getattr__ = lazy_names(
@@ -25,6 +26,7 @@ __getattr__ = lazy_names(
         "load_scenario": "spacerobot_ros.scenario",
         "plan": "spacerobot_ros.flight.api",
         "read_bag": "spacerobot_ros.bag",
+        "read_run": "spacerobot_ros.flight.reading",
         "sweep": "spacerobot_ros.campaign.sweep",
     },
 )

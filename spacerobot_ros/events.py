@@ -35,7 +35,7 @@ class EventKind(str, Enum):
     """A wrench from outside begins to act."""
     DISTURBANCE_ENDED = "disturbance_ended"
     CONTACT = "contact"
-    """Two links of the robot touch; the simulation goes on through the contact."""
+    """Two links of the robot touch; the exact plant goes on through the contact."""
     CONTACT_ENDED = "contact_ended"
     CAPTURED = "captured"
     """The robot has captured the target: from now on it is another robot."""
@@ -80,6 +80,8 @@ class EventKind(str, Enum):
 
     NODE_SILENT = "node_silent"
     NODE_BACK = "node_back"
+    NODE_RESTARTED = "node_restarted"
+    """A node has died, and the command that started it starts it again."""
 
 
 CONTACTS = frozenset({EventKind.CONTACT, EventKind.CONTACT_ENDED})

@@ -15,6 +15,7 @@ import os
 import pwd
 import secrets
 import stat
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -334,6 +335,22 @@ class Cache:
             f"The cache '{self.folder}' is not used, for its files are executed and flown: {error} "
             "(SPACEROBOT_CACHE_DIR chooses another folder.)"
         )
+
+
+def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: str) -> None:
+    """Log a warning that is given once an installation; afterwards it is logged for debugging.
+
+    Parameters
+    ----------
+    folder
+        The cache, which remembers under ``name`` that the warning was given. Where it cannot, the
+        warning is given each time.
+    """
+    cache = Cache(folder)
+    known = cache.load(name, sys.prefix) is not None
+    logger.log(logging.DEBUG if known else logging.WARNING, message)
+    if not known:
+        cache.store(name, sys.prefix, b"")
 
 
 def _os_error_reason(error: OSError) -> str:

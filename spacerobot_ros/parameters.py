@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields, replace
 from functools import cache
 from typing import Any, TypeVar
 
@@ -223,7 +223,8 @@ def configured(kind: type[C], values: Mapping[str, Any]) -> C:
     ParameterError
         A value is refused; the message names the parameter.
     """
-    return _reconfigured(kind(), kind(), values, "")
+    defaults = _defaults(kind)
+    return _reconfigured(defaults, defaults, values, "")
 
 
 def reconfigured(config: C, values: Mapping[str, Any]) -> C:
@@ -236,7 +237,7 @@ def reconfigured(config: C, values: Mapping[str, Any]) -> C:
     ParameterError
         A value is refused; the message names the parameter.
     """
-    return _reconfigured(config, type(config)(), values, "")
+    return _reconfigured(config, _defaults(type(config)), values, "")
 
 
 def values_of(config: Any) -> dict[str, Value]:
@@ -257,15 +258,45 @@ def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
         raise ParameterError(f"{owner} has no option '{unknown[0]}'.")
 
 
+@cache
+def _fields(kind: Hashable) -> tuple[Field[Any], ...]:
+    return fields(kind)  # type: ignore[arg-type]
+
+
+@cache
+def _kept_defaults(kind: Hashable) -> Any:
+    """Return the defaults of a class; None where a registry, which users may extend, decides."""
+    defaults: Any = kind()  # type: ignore[operator]
+    return None if _has_registered_entries(defaults) else defaults
+
+
+def _has_registered_entries(config: Any) -> bool:
+    return any(
+        _REGISTERED in each.metadata
+        or (_GROUP in each.metadata and _has_registered_entries(getattr(config, each.name)))
+        for each in fields(config)
+    )
+
+
+def _defaults(kind: Any) -> Any:
+    """Return the defaults of a class, for which campaigns ask in every draw."""
+    kept = _kept_defaults(kind)
+    return kind() if kept is None else kept
+
+
 def _reconfigured(config: C, defaults: Any, values: Mapping[str, Any], prefix: str) -> C:
     chosen: dict[str, Any] = {}
-    for each in fields(config):  # type: ignore[arg-type]
-        name, default = f"{prefix}{each.name}", getattr(defaults, each.name)
+    kind: Any = type(config)
+    for each in _fields(kind):
+        name = f"{prefix}{each.name}"
         if _PARAMETER in each.metadata:
             if name in values:
+                default = getattr(defaults, each.name)
                 declaration = replace(each.metadata[_PARAMETER], name=name, default=default)
                 chosen[each.name] = declaration.checked(values[name])
-        elif _GROUP in each.metadata:
+            continue
+        default = getattr(defaults, each.name)
+        if _GROUP in each.metadata:
             if _has_parameter_below(f"{name}.", values):
                 before = getattr(config, each.name)
                 chosen[each.name] = _reconfigured(before, default, values, f"{name}.")

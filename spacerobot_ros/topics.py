@@ -419,7 +419,8 @@ _TOPIC_TABLE = (
         "controller/status",
         _STATUS_TYPE,
         ("coordinated_control",),
-        "state of the controller, why, its goal, errors, and what saturation cost",
+        "state of the controller, why, its goal, when it is to be reached (`ends_at_s`), "
+        "errors, and what saturation cost",
         latched=True,
     ),
     Topic(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import fcntl
 import gc
+import importlib.util
 import itertools
 import os
 import re
@@ -62,10 +63,30 @@ def pytest_collection_finish() -> None:
 
 
 OPTIONAL = {
-    *("SALib", "collada", "dask", "distributed", "gymnasium", "mermaidx", "mkdocs", "pandas"),
-    *("pyarrow", "trimesh", "viser", "websockets", "xarray", "ziamath"),
+    *("SALib", "coal", "collada", "dask", "distributed", "gymnasium", "mermaidx", "mkdocs"),
+    *("pandas", "psutil", "pyarrow", "pypdf", "trimesh", "viser", "websockets", "xarray"),
+    "ziamath",
 }
 """Packages of extras: package.xml names none of them, and the test command of colcon has none."""
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        return importlib.util.find_spec(package) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+_MISSING = re.compile(r"No module named '(\w+)|needs? (\w+), which is not installed")
+
+
+def _missing_package(error: str) -> str | None:
+    """Return the reason to skip a test that fails for want of an optional package, if it does."""
+    found = _MISSING.search(error)
+    name = found and (found[1] or found[2])
+    if name not in OPTIONAL or _is_installed(name):
+        return None
+    return f"Skipped: {name} is not installed (pip install 'spacerobot_ros[test]')"
 
 
 @pytest.hookimpl(wrapper=True)
@@ -74,11 +95,26 @@ def pytest_make_collect_report(
 ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
     """Skip a module of tests whose optional package is not installed, and say so in one line."""
     report = yield
-    found = re.search(r"No module named '(\w+)", str(report.longrepr)) if report.failed else None
-    if found is not None and found[1] in OPTIONAL:
-        reason = f"Skipped: {found[1]} is not installed (pip install 'spacerobot_ros[test]')"
+    reason = _missing_package(str(report.longrepr)) if report.failed else None
+    if reason is not None:
         report.outcome = "skipped"
         report.longrepr = (str(collector.path), 0, reason)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Skip a test that imports such a package, or asks for it, while it runs."""
+    report = yield
+    reason = None
+    if report.failed and call.excinfo is not None:
+        reason = _missing_package(str(call.excinfo.value))
+    if reason is not None:
+        path, line, _ = item.location
+        report.outcome = "skipped"
+        report.longrepr = (path, line or 0, reason)
     return report
 
 

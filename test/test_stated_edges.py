@@ -78,10 +78,10 @@ def test_yaml_may_have_a_million_characters(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize(
     ("left", "duration", "share"),
-    [(2.0, 8.0, 0.75), (9.0, 8.0, 0.0), (None, 8.0, 0.0), (2.0, 0.0, 0.0), (2.0, None, 0.0)],
+    [(2.0, 8.0, 0.75), (9.0, 8.0, 0.0), (None, 8.0, None), (2.0, 0.0, None), (2.0, None, None)],
 )
-def test_the_share_that_is_flown_is_zero_where_nothing_is_flown(
-    left: float | None, duration: float | None, share: float, monkeypatch: pytest.MonkeyPatch
+def test_there_is_no_share_where_nothing_is_flown(
+    left: float | None, duration: float | None, share: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(content, "time_to_go", lambda state: left)
     planner = None if duration is None else SimpleNamespace(manoeuvre_time_s=duration)

@@ -13,6 +13,7 @@ from spacerobot_ros.campaign.report import (
     MADE_BY,
     Results,
     figure_with_axes,
+    messages_of,
     metric_label,
     picture_part,
 )
@@ -71,11 +72,15 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     # Metrics required by one campaign only are compared too, if both have them.
     names = list(dict.fromkeys([*first.shown_metrics, *second.shown_metrics]))
     names = [name for name in names if name in first.columns and name in second.columns]
+    # A flight whose goal was refused has not moved: its numbers are those of the start.
+    flew = ~(first.refused[rows_a] | second.refused[rows_b])
+    flown_a, flown_b = rows_a[flew], rows_b[flew]
     pairs = (
-        paired_difference(name, first.columns[name][rows_a], second.columns[name][rows_b])
+        paired_difference(name, first.columns[name][flown_a], second.columns[name][flown_b])
         for name in names
     )
     found = [difference for difference in pairs if difference is not None]
+    compared = [each.metric for each in found]
     passed_a, passed_b = first.passed[rows_a], second.passed[rows_b]
     only_a, only_b, p = paired_success(passed_a, passed_b)
     a, b = first.campaign.name, second.campaign.name
@@ -83,18 +88,20 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
         f"{a} passes {int(passed_a.sum())} and {b} {int(passed_b.sum())} of {len(common)} draws; "
         f"{only_a} only {a}, {only_b} only {b} (McNemar's exact test: p = {p:.2g})."
     )
+    notes = [*_notes_on_failures(first, second), *_notes_on_control(first, second)]
     with drawing():
         body = [
             f"<header><h1>{escape(a)} and {escape(b)}</h1>",
             facts([f"{len(common)} common draws"]),
             f'<p class="outcome">{escape(sentence)}</p></header>',
+            *(f'<p class="missing">{escape(note)}</p>' for note in notes),
             *_parameters_part(first.campaign, second.campaign),
             "<h2>Paired differences</h2>",
             _difference_table(found, a, b),
-            _difference_figure(first, second, rows_a, rows_b, names[:6]),
+            _difference_figure(first, second, flown_a, flown_b, compared[:6]),
         ]
     write_output(path, html_page(f"{a} and {b}", body, MADE_BY))
-    return [sentence, *(_difference_line(each, b, a) for each in found)]
+    return [sentence, *(_difference_line(each, b, a) for each in found), *notes]
 
 
 def _parameters_part(first: Campaign, second: Campaign) -> list[str]:
@@ -108,9 +115,33 @@ def _parameters_part(first: Campaign, second: Campaign) -> list[str]:
 
 def _difference_line(each: PairedDifference, second: str, first: str) -> str:
     return (
-        f"{each.metric}: {second} minus {first} is {each.difference:.4g} "
-        f"({each.interval_low:.4g} to {each.interval_high:.4g})"
+        f"{metric_label(each.metric)}: {first} {each.first:.4g}, {second} {each.second:.4g}; "
+        f"{second} minus {first} is {each.difference:.4g} "
+        f"(95 % interval {each.interval_low:.4g} to {each.interval_high:.4g})"
     )
+
+
+def _notes_on_failures(first: Results, second: Results) -> list[str]:
+    """Return a sentence on the most frequent reason of each campaign for not reaching a goal."""
+    notes = []
+    for each in (first, second):
+        missed = [found for found in messages_of(each) if found[0] != "reached"]
+        for outcome, count, message in sorted(missed, key=lambda found: -found[1])[:1]:
+            share = f"{count} of {len(each)} flights"
+            notes.append(f"Of {each.campaign.name}, {share} have the outcome {outcome}: {message}")
+    if first.refused.any() or second.refused.any():
+        notes.append("Differences are those of draws whose goals neither campaign refused.")
+    return notes
+
+
+def _notes_on_control(first: Results, second: Results) -> list[str]:
+    """Return a sentence on the parts of the goal that each campaign does not control."""
+    return [
+        f"{each.campaign.name} does not control the {' and '.join(parts)}: that error is where "
+        "the motion ends, and is no part of passing unless a criterion names it."
+        for each in (first, second)
+        if (parts := each.not_controlled)
+    ]
 
 
 def _difference_table(found: list[PairedDifference], first: str, second: str) -> str:

@@ -155,9 +155,7 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
         if not dispersion.target.text and not math.isfinite(value):
             raise ParameterError(f"The value drawn for '{dispersion.name}' is {value}.")
         flight = dispersion.target.apply(flight, value)
-    inertial = flight.inertial
-    if inertial is not None:
-        inertial.require_physical([body.name for body in flight.nominal.bodies])
+    flight.require_physical()
     return flight
 
 

@@ -11,6 +11,8 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -43,10 +45,9 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_fr
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
-from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerStatus, describe_remaining_error
 from spacerobot_ros.scenario import Scenario
-from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
+from spacerobot_ros.simulation.config import OrbitConfig, SensorConfig, TableConfig
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
@@ -77,6 +78,7 @@ _PARAMETERS_COMMON_TO_LANES = (
     "plant.beyond_limits",
     "plant.latched_faults",
     "plant.actuation",
+    "plant.engine",
     "plant.robot",
 )
 """Prefixes of the plant's parameters that all lanes share."""
@@ -85,6 +87,7 @@ _PARAMETERS_COMMON_TO_SCHEDULES = (
     "plant.tick_rate",
     "plant.integration_step",
     "plant.actuation",
+    "plant.engine",
     "planner.tick_rate",
     "planner.averaging",
     "planner.drift",
@@ -146,6 +149,8 @@ class LanesEngine:
             return "it has faults"
         if plant.target.given:
             return "it has a target"
+        if plant.engine != "exact":
+            return f"its plant has the engine '{plant.engine}', which engine 'flights' flies"
         loads = plant.disturbances, plant.orbit, plant.table
         dispersed = any(each.name.startswith(_LOADS) for each in campaign.dispersions)
         if dispersed or loads != ((), OrbitConfig(), TableConfig()):
@@ -225,10 +230,8 @@ class _ScheduledLanes:
     """Largest number of flights of one batch."""
 
     def __init__(self) -> None:
-        self._last_plan: tuple[str, _Plan | None] | None = None
+        self._last_plan: tuple[Any, _Plan | None] | None = None
         """The last plan from a state measured without noise, and the values that determine it."""
-        self._planner: tuple[PlannerConfig, str] | None = None
-        """The planner's configuration of the last draw, mostly that of all, and its text."""
 
     def refusal(self, campaign: Campaign) -> str:
         """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
@@ -262,10 +265,7 @@ class _ScheduledLanes:
         """Return the plan for the first state; the last one if the same values determine it."""
         if _has_noise(flight):
             return _first_plan(flight)
-        planner = flight.scenario.planner
-        if self._planner is None or self._planner[0] is not planner:
-            self._planner = planner, repr(values_of(planner))
-        key = self._planner[1] + _plan_key(flight)
+        key = _plan_key(flight)
         if self._last_plan is None or self._last_plan[0] != key:
             self._last_plan = key, _first_plan(flight)
         return self._last_plan[1]
@@ -501,8 +501,13 @@ def _end_effector_error(
 
 def _has_noise(flight: DrawnFlight) -> bool:
     """Whether the first measured state may differ from draw to draw."""
-    sensors = values_of(flight.scenario.plant.sensors)
-    return any(np.any(value) for name, value in sensors.items() if name != "seed")
+    return _errs(replace(flight.scenario.plant.sensors, seed=0))
+
+
+@lru_cache
+def _errs(sensors: SensorConfig) -> bool:
+    """Whether sensors without a seed have errors."""
+    return any(np.any(value) for value in values_of(sensors).values())
 
 
 def _first_plan(flight: DrawnFlight) -> _Plan | None:
@@ -517,8 +522,8 @@ def _first_plan(flight: DrawnFlight) -> _Plan | None:
     return _Plan(schedule, first.gait)
 
 
-def _plan_key(flight: DrawnFlight) -> str:
-    """Return a text of the values, beside the planner's, that determine a plan without noise."""
+def _plan_key(flight: DrawnFlight) -> Any:
+    """Return the values that determine a plan without noise, to be compared."""
     scenario = flight.scenario
     plant = replace(scenario.plant, sensors=replace(scenario.plant.sensors, seed=0))
     # Plans from rest do not depend on the masses of the plant's robot.
@@ -528,7 +533,7 @@ def _plan_key(flight: DrawnFlight) -> str:
         masses = flight.inertial.vector.tolist()
     goal = [*scenario.goal.position, *scenario.goal.quaternion]
     shape = scenario.goal.joint_positions
-    return f"{plant} {(goal, None if shape is None else shape.tolist(), masses)}"
+    return scenario.planner, plant, goal, None if shape is None else shape.tolist(), masses
 
 
 def _pad_positions(positions: Array, ticks: int) -> Array:

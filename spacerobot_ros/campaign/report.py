@@ -67,6 +67,10 @@ _MAIN_METRICS = (
 )
 
 
+_NOT_CONTROLLED = re.compile(r"[(; ]([a-z]+(?: and [a-z]+)*) not controlled\)")
+"""The parts of the goal in the message of a flight that does not control them."""
+
+
 @dataclass(frozen=True)
 class Results:
     """The rows of a campaign as columns.
@@ -155,6 +159,18 @@ class Results:
         return [name for name in names if np.isfinite(self.columns.get(name, np.nan)).any()]
 
     @property
+    def refused(self) -> Flags:
+        """(N,) whether the goal of each flight was refused."""
+        return np.array([outcome == "refused" for outcome in self.columns["outcome"]], dtype=bool)
+
+    @property
+    def not_controlled(self) -> list[str]:
+        """Parts of the goal that a reached flight left where they came to, by its message."""
+        notes = [_NOT_CONTROLLED.search(text) for text in self.columns["reason"] if text]
+        named = {part for note in notes if note for part in note[1].split(" and ")}
+        return sorted(named)
+
+    @property
     def distributed_metrics(self) -> list[str]:
         """Metrics of the report that are not just yes or no."""
         return [name for name in self.shown_metrics if not _metric(name).yes_or_no]
@@ -234,7 +250,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     lines += [f"required    {c}: {results.requirement_share(c)}" for c in results.campaign.criteria]
     lines += [
         f"{outcome:<11} {count} of {len(results)}: {message}"
-        for outcome, count, message in _messages(results)
+        for outcome, count, message in messages_of(results)
         if message and outcome in (ERROR, Outcome.REFUSED, Outcome.ABORTED)
     ]
     drivers = results.influences()
@@ -244,17 +260,19 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     return lines
 
 
-def _messages(results: Results) -> list[tuple[str, int, str]]:
+def messages_of(results: Results) -> list[tuple[str, int, str]]:
     """Return outcomes with the numbers of flights and their most frequent messages.
 
-    Messages that differ in their numbers only are one.
+    Messages that differ in their numbers only are one, without the numbers.
     """
     kinds: dict[str, Counter[str]] = {}
+    forms: dict[str, set[str]] = {}
     for outcome, reason in zip(results.columns["outcome"], results.columns["reason"], strict=True):
         message = re.sub(r"-?\d[\d.e+-]*", "…", reason or "")
         kinds.setdefault(outcome, Counter())[message] += 1
+        forms.setdefault(message, set()).add(reason or "")
     return [
-        (outcome, count, message)
+        (outcome, count, next(iter(forms[message])) if len(forms[message]) == 1 else message)
         for outcome, counts in sorted(kinds.items(), key=lambda kind: -kind[1].total())
         for message, count in counts.most_common(_MESSAGES_SHOWN)
     ]
@@ -327,6 +345,7 @@ def _facts_section(results: Results) -> str:
         f"sampler {campaign.sampler}, seed {campaign.seed}",
         "engine " + ", ".join(f"{name} ({count})" for name, count in engines.items()),
     ]
+    found += [f"not controlled: {part}" for part in results.not_controlled]
     note = f'<p class="missing">{escape(results.bias)}</p>' if results.bias else ""
     return f"{facts(found)}{note}"
 
@@ -366,7 +385,7 @@ def _share_cells(met: Share) -> list[str]:
 
 
 def _outcomes_section(results: Results) -> str:
-    rows = [[outcome, f"{count}", reason] for outcome, count, reason in _messages(results)]
+    rows = [[outcome, f"{count}", reason] for outcome, count, reason in messages_of(results)]
     made = table("outcomes", ["outcome", "flights", "message"], rows)
     fallbacks = Counter(text for text in results.columns.get("fallback", ()) if text)
     for reason, count in fallbacks.most_common(6):

@@ -6,7 +6,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,9 @@ _PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
     *("planner.resume_file", "coordinated_control.resume_file"),
 )
 """Parameters that are the same in all flights of a campaign."""
+_LEAST_FACTOR = 1e-6
+"""Factors of masses and inertias between this and its inverse need no check of every body."""
+
 _POSE_TARGET_NAMES = ("goal", "end_effector_goal", "initial")
 
 KINDS_OF_TARGETS = (
@@ -90,6 +93,9 @@ class DrawnFlight:
         (B,) factors of the bodies; the inertia goes with the mass, and with a factor of its own.
     com
         (B, 3) offsets of the centres of mass, m.
+    parameters, physical
+        Masses, centres and inertias of the nominal robot, and whether they are those of bodies
+        without slack for rounding.
     weighs_target
         Whether the mass properties of the target are drawn.
     """
@@ -99,6 +105,8 @@ class DrawnFlight:
     mass: Array
     inertia: Array
     com: Array
+    parameters: InertialParameters
+    physical: bool
     weighs_target: bool = False
 
     @classmethod
@@ -108,19 +116,45 @@ class DrawnFlight:
             scenario.config(node)  # Known to all flights that are made of this one.
         robot = description_of(scenario)
         count = len(robot.bodies)
-        return cls(scenario, robot, np.ones(count), np.ones(count), np.zeros((count, 3)))
+        parameters = InertialParameters.of(robot)
+        return cls(
+            scenario,
+            robot,
+            mass=np.ones(count),
+            inertia=np.ones(count),
+            com=np.zeros((count, 3)),
+            parameters=parameters,
+            physical=_are_exactly_physical(parameters),
+        )
 
     def with_overrides(self, node: str, parameters: Mapping[str, Any]) -> DrawnFlight:
         """Return the flight with other parameters of a node."""
         return replace(self, scenario=self.scenario.with_overrides(node, parameters))
 
-    @property
+    @cached_property
     def inertial(self) -> InertialParameters | None:
         """Masses, centres and inertias of the bodies; None: those of the robot's description."""
         if np.all(self.mass == 1.0) and np.all(self.inertia == 1.0) and not self.com.any():
             return None
-        parameters = InertialParameters.of(self.nominal)
-        return parameters.scaled(self.mass, self.mass * self.inertia).shifted(self.com)
+        return self.parameters.scaled(self.mass, self.mass * self.inertia).shifted(self.com)
+
+    def require_physical(self) -> None:
+        """Check that drawn masses and inertias are those of bodies.
+
+        Raises
+        ------
+        RobotDescriptionError
+            They are not.
+        """
+        if self.inertial is None:
+            return
+        factors = np.concatenate([self.mass, self.inertia])
+        small, large = factors.min(), factors.max()
+        # Positive factors leave the ratios of principal moments: the dear check is not needed.
+        mild = _LEAST_FACTOR < small <= large < 1.0 / _LEAST_FACTOR
+        if self.physical and mild and np.isfinite(self.com).all():
+            return
+        self.inertial.require_physical([body.name for body in self.nominal.bodies])
 
     def with_masses_in_urdf(self) -> DrawnFlight:
         """Return the flight with its masses in the URDF of the plant.
@@ -156,6 +190,13 @@ def description_of(scenario: Scenario) -> RobotDescription:
             f"the scenario '{scenario.name}' names no robot for its plant: set plant.robot."
         )
     return _load_description(plant.robot, plant.robot_description, plant.world)
+
+
+def _are_exactly_physical(parameters: InertialParameters) -> bool:
+    """Whether all bodies have positive masses, and moments that need no slack for rounding."""
+    low, middle, high = np.linalg.eigvalsh(parameters.inertias).T
+    moments = np.all(low >= 0.0) and np.all(high <= low + middle)
+    return bool(np.all(parameters.masses > 0.0) and moments)
 
 
 @cache

@@ -88,7 +88,7 @@ def _parse_length(context: click.Context, option: click.Parameter, text: str) ->
     metavar="FILE.mplstyle",
     help="serif, a style file of matplotlib, or name of one of its styles: fonts, sizes, colours.",
 )
-@click.option("--degrees", is_flag=True, help="Show angles over time in degrees [rad].")
+@click.option("--degrees", is_flag=True, help="Show angles in degrees [rad].")
 @click.option("--events", is_flag=True, help="Show events below the time axes.")
 @out_option("Folder of the figures [BAG_figures].")
 @namespace_option

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -93,7 +94,8 @@ def run_command(
 
     if view and realtime is None:
         raise click.UsageError("--view needs --realtime: a flight in lockstep is over soon.")
-    path = bag or free_name(Path("out") / f"{chosen.name}.mcap")
+    usual = bag or Path("out") / f"{chosen.name}.mcap"
+    taken, path = os.path.lexists(usual), bag or free_name(usual)
     with viewing_if(view, chosen.parameters("viewer")), display(chosen.name) as shown:
         result = run_scenario(chosen, path, shown.fly, processes=processes, longest=longest)
     path = Path(result.summary["bag"])
@@ -109,9 +111,14 @@ def run_command(
         write_json(json_file, result.summary)
     for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):
         click.echo(line)
-    if report is not None and termination() is not None:
-        words = shlex.join(["spacerobot", "report", str(path), "--out", str(report)])
-        click.echo(f"report      none of an interrupted flight: `{words}` makes one")
+    if taken and path != usual:
+        click.echo(f"            {usual} is an earlier flight, which is kept")
+    words = ["spacerobot", "report", str(path)]
+    if report is None:
+        click.echo(f"next        `{shlex.join(words)}` draws this flight")
+    elif termination() is not None:
+        words += ["--out", str(report)]
+        click.echo(f"report      none of an interrupted flight: `{shlex.join(words)}` makes one")
     end_if_requested()
     if report is not None:
         from spacerobot_ros.report import write_report
@@ -152,11 +159,11 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         )
     drift = "not explained by thrusters: at most" if summary["has_thrust"] else "changed by at most"
     return [
-        f"{summary['scenario']}, {summary['method']}: {summary['message']}",
+        f"{summary['scenario']}, {summary['method']}: {summary['verdict']}",
         f"position    ({numbers(summary['final_position_m'])}) m{beside}",
         f"attitude    ({numbers(summary['final_attitude_rotvec_rad'])}) rad{turned}",
         *_end_effector_line(summary),
-        f"shape       ({numbers(summary['final_joint_positions'])})",
+        f"shape       ({numbers(_shape(summary))})",
         f"manoeuvre   {summary['manoeuvre_time_s']:.6g} s, "
         f"{summary['corrections']} correction(s), planned in {summary['plan_time_s']:.3f} s",
         f"flight      {summary['ticks']} ticks in {summary['wall_time_s']:.2f} s: "
@@ -167,6 +174,12 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         *_clearance_line(summary),
         f"bag         {summary['bag']} ({summary['messages_recorded']} messages)",
     ]
+
+
+def _shape(summary: dict[str, Any]) -> list[float]:
+    """Return the final positions of the joints but for wheels, whose angles mean nothing."""
+    joints = zip(summary["joint_names"], summary["final_joint_positions"], strict=True)
+    return [position for name, position in joints if name not in summary["wheel_names"]]
 
 
 def _judged(summary: dict[str, Any], part: str, unit: str) -> str:
@@ -187,8 +200,14 @@ def _end_effector_line(summary: dict[str, Any]) -> list[str]:
     if "end_effector_position_error_m" not in summary:
         return []
     position = numbers(summary["end_effector_final_position_m"])
-    error = summary["end_effector_position_error_m"]
-    return [f"end-effector ({position}) m, {error:.3g} m from its goal"]
+    error = f"{summary['end_effector_position_error_m']:.3g} m"
+    limit = summary["position_tolerance_m"]
+    limits = "" if limit is None else f"{limit:.3g} m"
+    if (turn := summary.get("end_effector_attitude_error_rad")) is not None:
+        error += f" and {turn:.3g} rad"
+        limits += f", {summary['attitude_tolerance_rad']:.3g} rad" if limits else ""
+    limits = limits and f" (tolerance {limits})"
+    return [f"end-effector ({position}) m, {error} from its goal{limits}"]
 
 
 def _propellant_line(summary: dict[str, Any]) -> list[str]:
@@ -231,6 +250,14 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
 )
 @processes_option
 @click.option(
+    "--restarts",
+    default=3,
+    show_default=True,
+    type=click.IntRange(min=0),
+    help="How often a minute viewer, and with --processes planner and controller, are started "
+    "again when they die; 0: never.",
+)
+@click.option(
     "--namespace", default="", help="Namespace of all nodes and topics, also of /clock and /tf."
 )
 @view_option
@@ -240,6 +267,7 @@ def up_command(
     bag: Path | None,
     rate: float,
     processes: bool,
+    restarts: int,
     namespace: str,
     view: bool,
 ) -> None:
@@ -253,9 +281,17 @@ def up_command(
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.session.run import run_until_stopped
 
-    with viewing_if(view, chosen.parameters("viewer"), namespace):
+    with viewing_if(view, chosen.parameters("viewer"), namespace) as viewer:
+        if viewer is not None:
+            viewer.restart_within(restarts)
         recorded = run_until_stopped(
-            chosen, bag, click.echo, processes=processes, namespace=namespace
+            chosen,
+            bag,
+            click.echo,
+            processes=processes,
+            namespace=namespace,
+            restarts=restarts if processes else 0,
+            supervise=lambda: None if viewer is None else viewer.supervise(),
         )
     if recorded is not None:
         click.echo(f"bag         {recorded}")

@@ -19,6 +19,7 @@ from spacerobot_ros.files import write_output
 if TYPE_CHECKING:
     from spacerobot_ros.planning.core.goal import Controlled, EndEffectorGoal
     from spacerobot_ros.scenario import Scenario
+    from spacerobot_ros.session.viewing import Viewer
 
     _Choice = click.Choice[str]
 else:  # click.Choice is generic only in newer versions of click.
@@ -350,15 +351,17 @@ LAWS = "spacerobot_ros.control.laws.registry:LAWS"
 
 
 @contextmanager
-def viewing_if(view: bool, parameters: Mapping[str, Any], namespace: str = "") -> Iterator[None]:
+def viewing_if(
+    view: bool, parameters: Mapping[str, Any], namespace: str = ""
+) -> Iterator[Viewer | None]:
     """Run the viewer beside a command if ``view``; its address is written to standard error."""
     if not view:
-        yield
+        yield None
         return
     from spacerobot_ros.session.viewing import viewing
 
-    with viewing(parameters, lambda line: click.echo(line, err=True), namespace):
-        yield
+    with viewing(parameters, lambda line: click.echo(line, err=True), namespace) as viewer:
+        yield viewer
 
 
 def picture_option(help: str) -> Any:

@@ -312,9 +312,11 @@ def _finite_or_none(value: float) -> float | None:
 def _distance_lines(found: Analysis) -> list[str]:
     geometry = found.geometry
     distances = geometry.distances_of_links(found.shape)
-    lines = [f"{len(distances)} pairs of links may come into contact"]
+    pairs = "1 pair" if len(distances) == 1 else f"{len(distances)} pairs"
+    lines = [f"{pairs} of links may come into contact"]
     if distances:
-        lines[0] += ", with distances at this shape of"
+        distance = "a distance" if len(distances) == 1 else "distances"
+        lines[0] += f", with {distance} at this shape of"
     lines += [f"  {d:.3g} m  {pair}" for pair, d in list(distances.items())[:_MOST_DISTANCES]]
     if len(distances) > _MOST_DISTANCES:
         lines.append(f"  and more of {len(distances) - _MOST_DISTANCES} others")

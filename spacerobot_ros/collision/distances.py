@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from spacerobot_ros.collision.rounded_box import separation
+from spacerobot_ros.files import warn_first_time
+from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
 
 if TYPE_CHECKING:
@@ -46,13 +48,16 @@ def distance_function(solids: Sequence[Solid]) -> DistanceFunction:
 
 @lru_cache(maxsize=1)
 def _coal() -> Any:
-    """Return the module coal; None: it is not installed, which is logged once."""
+    """Return the module coal; None: it is not installed, which is logged once an installation."""
     try:
         import coal
     except ImportError:
-        _LOG.warning(
+        warn_first_time(
+            _LOG,
+            cache_directory(),
+            "warned_of_coal",
             "Distances between links are those of spheres, capsules and boxes around them, since "
-            "the package coal is not installed: `pip install '.[collision]'` in the clone."
+            "the package coal is not installed: `pip install '.[collision]'` in the clone.",
         )
         return None
     return coal

@@ -89,6 +89,9 @@ class CommanderHost(Protocol):
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""
 
+    def log_of_goals(self, level: LogLevel, message: str) -> None:
+        """Write a line about a goal into the log, which has few of goals that pour in."""
+
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of odom, or of a reference, is connected."""
 
@@ -329,7 +332,9 @@ class Commander(ABC):
             return None
         self._fly_to.begin(goal_id, client, request)
         tolerance = request.tolerance_or(self._default_tolerance())
-        accepted = IdentifiedGoal(request.goal, goal_id, tolerance, resumes=False)
+        accepted = IdentifiedGoal(
+            request.goal, goal_id, tolerance, resumes=False, required=request.tolerance
+        )
         self._accept_goal(BASE_GOAL_KEY, accepted)
         return accepted
 

@@ -16,11 +16,9 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.goal import Goal, PoseError, Tolerance
+from spacerobot_ros.planning.core.goal import NO_TOLERANCE, Goal, PoseError, Tolerance
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND
-
-_NO_TOLERANCE = Tolerance(0.0, 0.0, 0.0)
 
 FEEDBACK_PERIOD_NS = SECOND // 5
 """Shortest simulated time between two feedbacks of a goal, ns."""
@@ -41,7 +39,7 @@ class FlyTo:
     """
 
     goal: Goal
-    tolerance: Tolerance = _NO_TOLERANCE
+    tolerance: Tolerance = NO_TOLERANCE
     time_limit: float = 0.0
 
     @classmethod

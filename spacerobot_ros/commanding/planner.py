@@ -32,6 +32,7 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatistics,
     PlannerStatus,
     ScheduleStart,
+    Severity,
     end_effector_values,
     goal_values,
     waypoint_counts,
@@ -348,8 +349,10 @@ class PlannerCommander(Commander):
                     self._warn_of_disturbances(self._disturbances)
                 case Event() as event:
                     host.report_event(event)
+                case Notice(Severity.ERROR, message):
+                    host.log("error", message)
                 case Notice(severity, message):
-                    host.log(severity.value, message)
+                    host.log_of_goals(severity.value, message)
                 case Transition(source, event, target):
                     host.log("debug", f"{source.value} -> {target.value}: {event.value}")
                     if self.trajectories is not None:

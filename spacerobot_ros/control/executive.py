@@ -20,7 +20,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.planning.core.goal import Goal, Tolerance
+from spacerobot_ros.planning.core.goal import Controlled, Goal, Tolerance
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
 from spacerobot_ros.times import SECOND
 
@@ -212,6 +212,7 @@ class ControlExecutive:
                 f"The law '{law.name}' does not control the {key.replace('_', '-')} of this robot; "
                 f"its outputs are {', '.join(law.outputs.labels)}."
             )
+        self._require_tolerances_met(key, goal)
         shape, wheels = goal.goal.joint_positions, self.controller.wheels
         n = law.robot.n if wheels is None else law.robot.n + len(wheels.wheels)
         if shape is not None and len(shape) != n:
@@ -219,6 +220,18 @@ class ControlExecutive:
                 f"The goal has a shape of {len(shape)} joints; robot "
                 f"'{law.robot.description.name}' has {n}."
             )
+
+    def _require_tolerances_met(self, key: str, identified: IdentifiedGoal) -> None:
+        """Raise PlanningError where the goal has a tolerance that the law does not look at."""
+        selection, goal = self.controller.law.outputs.selection, identified.goal
+        axes = selection.base if key == BASE_GOAL_KEY else selection.end_effector
+        controls: set[Controlled] = {
+            "attitude" if axis.startswith("r") else "position" for axis in axes
+        }
+        if selection.joints:
+            controls.add("shape")
+        who = f"the law '{self.controller.law.name}'"
+        identified.required.require_control(goal, frozenset(controls), who)
 
     def request(self, task: Task) -> None:
         """Do a task from the next measured state on, without a goal after it."""
@@ -604,7 +617,12 @@ class ControlExecutive:
         about = self._goal_id if goal_id is None else goal_id
         task = self.servicing.task
         name = "" if task is None else task.value
-        self._report(ControllerStatus(state, message, about, self._command_report, name))
+        ends = self.controller.reference_ends
+        settled = 0.0
+        if state is ControllerState.TRACKING and task is None and ends is not None:
+            settled = ends + self._config.settle_time
+        report = self._command_report
+        self._report(ControllerStatus(state, message, about, report, name, settled))
 
     def _report_decision(
         self, kind: EventKind, message: str, state: ControllerState, goal_id: str | None = None

@@ -102,6 +102,9 @@ class ControllerStatus:
         Report on the last command; None before the first.
     task
         What is done before the goal is pursued: ``approach`` or ``detumble``; empty: nothing.
+    ends_at_s
+        Simulated time at which the goal is to be reached, when the reference has ended and the
+        robot has settled, s; 0: not known.
     """
 
     state: ControllerState
@@ -109,6 +112,7 @@ class ControllerStatus:
     goal_id: str = ""
     command: CommandReport | None = None
     task: str = ""
+    ends_at_s: float = 0.0
 
     def to_values(self) -> dict[str, str]:
         """Return the status as the key-value pairs of a DiagnosticStatus; numbers have 6 digits."""
@@ -117,6 +121,9 @@ class ControllerStatus:
             values["goal_id"] = self.goal_id
         if self.task:
             values["task"] = self.task
+        if self.ends_at_s:
+            # Long flights have large times.
+            values["ends_at_s"] = f"{self.ends_at_s:.9g}"
         if self.command is not None:
             values["law"] = self.command.law
             values["singular"] = str(self.command.singular).lower()
@@ -156,7 +163,9 @@ class ControllerStatus:
                     dumping=values.get("dumping") == "true",
                 )
             state = ControllerState(values["state"])
-            return cls(state, message, values.get("goal_id", ""), command, values.get("task", ""))
+            goal_id, task = values.get("goal_id", ""), values.get("task", "")
+            ends_at = float(values.get("ends_at_s", 0.0))
+            return cls(state, message, goal_id, command, task, ends_at)
         except (KeyError, ValueError) as error:
             raise SpaceRobotError(f"This is no status of a controller: {error}.") from error
 

@@ -181,6 +181,7 @@ def _require_steppable(scenario: Scenario, robot: SpaceRobot) -> None:
     parts = {
         "faults": bool(plant.faults),
         "a target": plant.target.given,
+        "a plant in MuJoCo": plant.engine == "mujoco",
         "disturbances, an orbit or a table": (plant.disturbances, plant.orbit, plant.table)
         != ((), OrbitConfig(), TableConfig()),
         "thrusters that are on or off": bool(plant.thrusters),

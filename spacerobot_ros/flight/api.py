@@ -13,9 +13,10 @@ import numpy.typing as npt
 
 from spacerobot_ros import planning
 from spacerobot_ros.control.laws.law import ControlLaw
-from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import Robots, fly_scenario
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured, require_known
 from spacerobot_ros.planning import GaitSchedule, Goal
@@ -87,6 +88,8 @@ def fly(
         There is no such scenario, robot, method or parameter, or only the nodes can fly it.
     GoalError
         The goal is no pose.
+    PlanningError
+        The goal is refused, as by :func:`plan`, or by the controller.
     """
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
     scenario = scenario_to_fly(what, goal, position, rotvec, hands)
@@ -103,7 +106,7 @@ def fly(
     if law is None:
         if law_options is not None:
             raise ParameterError("law_options are those of a law: give it as law=MyLaw.")
-        return fly_scenario(scenario)
+        return _unless_refused(fly_scenario(scenario))
     if "coordinated_control" not in scenario.commanders:
         raise ParameterError(
             f"'{scenario.name}' has no controller that could use the law '{law.name}': it flies "
@@ -112,7 +115,21 @@ def fly(
     values = {} if law_options is None else law_options
     require_known(law.name, law.Options, values)
     own_law = law, configured(law.Options, values)
-    return fly_scenario(scenario, robots=replace(Robots.of(scenario), own_law=own_law))
+    robots = replace(Robots.of(scenario), own_law=own_law)
+    return _unless_refused(fly_scenario(scenario, robots=robots))
+
+
+def _unless_refused(flight: Flight) -> Flight:
+    """Return a flight whose goal was accepted.
+
+    Raises
+    ------
+    PlanningError
+        The goal was refused, and nothing moved; the message is that of :func:`plan`.
+    """
+    if flight.outcome is Outcome.REFUSED:
+        raise PlanningError(flight.message)
+    return flight
 
 
 def plan(

@@ -95,15 +95,18 @@ class FlightClearance:
             )
         ]
 
-    def contacts(self, every: int) -> list[Event]:
-        """Return the events of contacts in one state in ``every``, as the plant reports them."""
+    def contacts(self, every: int, *, pushing: bool = False) -> list[Event]:
+        """Return the events of contacts in one state in ``every``, as the plant reports them.
+
+        ``pushing``: bodies that touch push each other.
+        """
         if not self.geometry.exact:
             return []
         chosen = np.arange(0, len(self.time), every)
         distances, _ = self._nearest_at(chosen)
         touching = distances <= 0
         touching[1:] |= touching[:-1]  # Contacts end in the state after.
-        monitor = ClearanceMonitor(self.geometry, self.geometry.links)
+        monitor = ClearanceMonitor(self.geometry, self.geometry.links, pushing=pushing)
         events: list[Event] = []
         links = len(self.geometry.links)
         for row in chosen[touching].tolist():

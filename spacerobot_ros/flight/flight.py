@@ -21,6 +21,7 @@ from spacerobot_ros.control.status import CommandReport, ControllerStatus
 from spacerobot_ros.errors import PlanningError, RecordingError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.clearance import FlightClearance
+from spacerobot_ros.flight.verdict import Verdict, verdict_of
 from spacerobot_ros.measures import (
     CaptureMeasures,
     Measures,
@@ -36,7 +37,10 @@ from spacerobot_ros.model.rotations import (
     matrices_from_quaternions,
     matrix_from_quaternion,
     quaternion_from_matrix,
+    quaternion_inverse,
+    quaternion_multiply,
     rotvec_from_quaternion,
+    rotvecs_from_quaternions,
 )
 from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.core.goal import Controlled, EndEffectorGoal, uncontrolled_parts
@@ -341,6 +345,11 @@ class Flight:
         """Whether the goal was reached within tolerance, by the measured state."""
         return self.outcome is Outcome.REACHED
 
+    @cached_property
+    def verdict(self) -> Verdict:
+        """The end of the flight in a word and a sentence, by its last true state."""
+        return verdict_of(self)
+
     @property
     def sentence(self) -> str:
         """Earlier name of :attr:`message`; deprecated."""
@@ -379,7 +388,7 @@ class Flight:
                 return status.command.law
         return scenario.controller.law
 
-    def tolerance(self, part: Literal["position", "attitude"]) -> float | None:
+    def tolerance(self, part: Literal["position", "attitude", "joint"]) -> float | None:
         """Return the largest error of a part of a reached goal, m or rad; None where a bag has no
         parameters of the commander.
         """
@@ -416,6 +425,12 @@ class Flight:
         return tuple(x for x in uncontrolled_parts(self.goal, method.controls) if x != "shape")
 
     @property
+    def turns_end_effector(self) -> bool:
+        """Whether a controller turns the end-effector to an attitude."""
+        command = self.status.command if isinstance(self.status, ControllerStatus) else None
+        return command is not None and _any_begins(command.errors, "end_effector.r")
+
+    @property
     def has_thrust(self) -> bool:
         """Whether forces or torques were commanded of thrusters."""
         wrench = self.commands.get("base_wrench")
@@ -426,6 +441,18 @@ class Flight:
         """Error of the last true pose to the goal; None without a pose or a goal of the base."""
         goal = self.goal
         return None if goal is None or not goal.base else pose_error(self.signal("pose"), goal)
+
+    @property
+    def errors(self) -> Array:
+        """(N, 2) distances (m) and angles (rad) of the true poses from the goal that counts at the
+        end; without rows where there is no goal of the base.
+        """
+        if self.goal is None or not self.goal.base:
+            return np.empty((0, 2))
+        gaps = self.goal.position - self.pose[:, :3]
+        turns = quaternion_multiply(quaternion_inverse(self.pose[:, 3:]), self.goal.quaternion)
+        norms = [np.linalg.norm(each, axis=1) for each in (gaps, rotvecs_from_quaternions(turns))]
+        return np.column_stack(norms)
 
     @property
     def end_effector_error(self) -> PoseError | None:
@@ -533,7 +560,7 @@ class Flight:
         return (
             f"<Flight of {self.scenario.name} by {self.method}: {self.outcome.value} after "
             f"{self.duration:.6g} s ({len(self.time) - 1} ticks, {self.corrections} "
-            f"correction(s)){left and f'{left}the goal'}. {self.message}>"
+            f"correction(s)){left and f'{left}the goal'}. {self.verdict.sentence}>"
         )
 
     def summary(self) -> dict[str, Any]:
@@ -555,6 +582,7 @@ class Flight:
             "final_attitude_rotvec_rad": rotvec_from_quaternion(self.pose[-1, 3:]).tolist(),
             "final_joint_positions": self.q[-1].tolist(),
             "joint_names": list(self.joint_names),
+            "wheel_names": [] if self.robot is None else list(self.robot.wheel_names),
             "position_error_m": None if error is None else error.distance,
             "attitude_error_rad": None if error is None else error.angle,
             "position_tolerance_m": self.tolerance("position"),
@@ -578,6 +606,7 @@ class Flight:
             else {"duration_s": self.gait.duration_s, **self.gait.notes},
             "state": self.outcome.value,
             "message": self.message,
+            "verdict": self.verdict.sentence,
             "succeeded": self.succeeded,
         }
         if errors := self.end_effector_errors:
@@ -589,7 +618,7 @@ class Flight:
             end = self.signal("end_effector_pose").values[-1, :3]
             summary["end_effector_final_position_m"] = end.tolist()
             summary["end_effector_position_error_m"] = measures.end_effector_error.distance
-            if _turns_end_effector(self.status):
+            if self.turns_end_effector:
                 summary["end_effector_attitude_error_rad"] = measures.end_effector_error.angle
         if self.capture:
             summary["capture"] = self.capture
@@ -683,14 +712,6 @@ def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:
 
 def _any_begins(labels: Iterable[str], *beginnings: str) -> bool:
     return any(label.startswith(beginnings) for label in labels)
-
-
-def _turns_end_effector(status: Status | None) -> bool:
-    """Whether a controller turns the end-effector to an attitude."""
-    command = status.command if isinstance(status, ControllerStatus) else None
-    return command is not None and any(
-        label.startswith("end_effector.r") for label in command.errors
-    )
 
 
 def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:

@@ -65,6 +65,20 @@ class TransformTemplate:
         self._doubles[self._numbers] = poses
         return bytes(self._buffer)
 
+    def serialised_many(self, times_ns: NDArray[np.int64], poses: Array) -> list[bytes]:
+        """Return the messages of some times (m,) with the poses (m, k, 7)."""
+        size = 8 * len(self._doubles)
+        rows = np.tile(np.frombuffer(self._buffer, np.uint8, size, ENCAPSULATION), (len(poses), 1))
+        seconds, nanoseconds = np.divmod(times_ns[:, np.newaxis], SECOND)
+        rows.view(np.uint32)[:, self._stamps] = seconds
+        rows.view(np.uint32)[:, self._stamps + 1] = nanoseconds
+        rows.view(np.float64)[:, self._numbers] = poses
+        head, tail = (
+            bytes(self._buffer[:ENCAPSULATION]),
+            bytes(self._buffer[ENCAPSULATION + size :]),
+        )
+        return [bytes(head + row.tobytes() + tail) for row in rows]
+
 
 class RobotTransforms:
     """The transforms of a robot as messages.
@@ -98,6 +112,13 @@ class RobotTransforms:
             self._links.update(q)
             self._poses[1:] = self._links.transforms
         return self._template.serialised(time_ns, self._poses)
+
+    def messages(self, times_ns: NDArray[np.int64], poses: Array, q: Array) -> list[bytes]:
+        """Return the messages of some times (m,), base poses (m, 7) and joint positions (m, n)."""
+        every = poses[:, np.newaxis]
+        if self._links is not None:
+            every = np.concatenate([every, self._links.transforms_at(q)], axis=1)
+        return self._template.serialised_many(times_ns, every)
 
     def static_message(self, time_ns: int) -> bytes | None:
         """Return the message of links fixed to their parents; None without such links."""

@@ -175,22 +175,23 @@ def unit_quaternion(quaternion: npt.ArrayLike) -> Array:
 
 def quaternion_from_matrix(R: Array) -> Array:
     """Return the unit quaternion (x, y, z, w) of a rotation matrix (3, 3)."""
+    # In Python's numbers, which are faster than entries of arrays.
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
+    trace = xx + yy + zz
+    squares = (1 + 2 * xx - trace, 1 + 2 * yy - trace, 1 + 2 * zz - trace, 1 + trace)
     # The divisor is the largest of four squares, which keeps precision near half turns.
-    trace = float(R[0, 0] + R[1, 1] + R[2, 2])
-    squares = [*(1 + 2 * float(R[i, i]) - trace for i in range(3)), 1 + trace]
-    largest = max(range(4), key=squares.__getitem__)
-    s = 0.5 / math.sqrt(squares[largest])
-    q = np.empty(4)
-    if largest == 3:
-        q[:3] = (R[2, 1] - R[1, 2]) * s, (R[0, 2] - R[2, 0]) * s, (R[1, 0] - R[0, 1]) * s
-        q[3] = squares[3] * s
-        return q
-    i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-    q[i] = squares[i] * s
-    q[j] = (R[j, i] + R[i, j]) * s
-    q[k] = (R[k, i] + R[i, k]) * s
-    q[3] = (R[k, j] - R[j, k]) * s
-    return q
+    largest = max(squares)
+    s = 0.5 / math.sqrt(largest)
+    match squares.index(largest):
+        case 3:
+            q = (zy - yz) * s, (xz - zx) * s, (yx - xy) * s, largest * s
+        case 0:
+            q = largest * s, (yx + xy) * s, (zx + xz) * s, (zy - yz) * s
+        case 1:
+            q = (xy + yx) * s, largest * s, (zy + yz) * s, (xz - zx) * s
+        case _:
+            q = (xz + zx) * s, (yz + zy) * s, largest * s, (yx - xy) * s
+    return np.array(q)
 
 
 def rotation_angles(R: Array) -> Array:

@@ -662,8 +662,8 @@ def _require_type(joint: Element, where: str) -> None:
     if kind not in _JOINT_TYPES:
         raise RobotDescriptionError(
             f"The type of {where} is '{kind}'; a free-floating tree has "
-            f"{', '.join(_JOINT_TYPES[:-1])} and {_JOINT_TYPES[-1]} joints (the base floats by "
-            "itself)."
+            f"{', '.join(_JOINT_TYPES[:-1])} and {_JOINT_TYPES[-1]} joints. The base floats by "
+            "itself: leave out a joint that connects it with a world, and the link of that world."
         )
 
 

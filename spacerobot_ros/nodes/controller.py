@@ -33,7 +33,7 @@ from spacerobot_ros.messages.readers import (
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.commander import CommanderNode
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
+from spacerobot_ros.nodes.common.node import LATCHED, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.times import first_time_ns, stamp_bytes
@@ -73,13 +73,11 @@ class CoordinatedControlNode(CommanderNode):
         self.create_subscription(
             String, "target/robot_description", self._on_target_description, LATCHED
         )
-        self.create_subscription(Odometry, TARGET_ODOMETRY, self._on_target, STREAM, raw=True)
+        self.take_raw(Odometry, TARGET_ODOMETRY, self._on_target)
         self.take_goals("goal_pose")
         self.take_goals("end_effector/goal_pose", END_EFFECTOR)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
-            self._inputs[topic] = self.create_subscription(
-                kind, topic, partial(self._on_reference, topic), STREAM, raw=True
-            )
+            self._inputs[topic] = self.take_raw(kind, topic, partial(self._on_reference, topic))
 
     def start_message(self) -> str:
         """Return a log message with robot, law, rate and goal topic."""

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from numpy.typing import NDArray
 from rclpy.clock import Clock as RosClock
 from rclpy.clock import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -18,7 +20,15 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
-from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, Recording, RecordingState
+from spacerobot_ros.bag import (
+    LATCHED,
+    BagWriter,
+    Derived,
+    FirstTime,
+    QosProfile,
+    Recording,
+    RecordingState,
+)
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.errors import (
     CommandError,
@@ -124,14 +134,16 @@ class RecorderNode(FlightNode):
         self._shared_topics = {self._clock_topic, *map(self.resolve_topic_name, _SHARED_TOPICS)}
         self._parameter_requests = {}
         frames = tuple(map(self.resolve_topic_name, (TRANSFORMS, STATIC_TRANSFORMS)))
-        self._listeners: dict[str, Take] = {}
+        self._transforms: _RecordedTransforms | None = None
         if config.tf_period and self._is_chosen(frames[0], TRANSFORM_TYPE):
-            self._listeners = _RecordedTransforms(
+            self._transforms = _RecordedTransforms(
                 self.recording,
                 config.tf_period,
                 (frames[0], frames[1]),
                 lambda: frames[0] in self._recorded,
-            ).listeners(*map(self.resolve_topic_name, ("odom", "joint_states", _DESCRIPTION_TOPIC)))
+                map(self.resolve_topic_name, ("odom", "joint_states", _DESCRIPTION_TOPIC)),
+            )
+            self.recording.derive = self._transforms.derive
         self._recorded: set[str] = set()
         self._unreadable_topics: set[str] = set()
         self._diagnostics: Publisher | None = None
@@ -327,10 +339,12 @@ class RecorderNode(FlightNode):
             return
         self._recorded.add(topic)
         self._ask_for_parameters(topic, publishers)
-        record = _recording_callback(
-            recording, self._stamps, topic, kind, channel, self._clock_topic
+        listener = None
+        if self._transforms is not None:
+            listener = self._transforms.listener(topic, channel)
+        take = _recording_callback(
+            recording, self._stamps, topic, kind, channel, self._clock_topic, listener
         )
-        take = _record_and_listen(record, self._listeners.get(topic))
         qos = _subscribed_qos(offered)
         if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
             recording.latched[channel] = None
@@ -411,8 +425,9 @@ class _RecordedTransforms:
 
     A state is taken when its odom and its joint_states are there, whichever comes first; so the
     transforms have the stamps of states, and at least ``period`` s of bag time between them.
-    ``topics`` are the names of /tf and /tf_static in the bag. While ``is_published``, a node
-    publishes /tf itself: its messages are recorded, and none are written here.
+    ``topics`` are the names of /tf and /tf_static in the bag, ``sources`` those of odom,
+    joint_states and robot_description. While ``is_published``, a node publishes /tf itself: its
+    messages are recorded, and none are written here.
     """
 
     def __init__(
@@ -421,9 +436,13 @@ class _RecordedTransforms:
         period: float,
         topics: tuple[str, str],
         is_published: Callable[[], bool],
+        sources: Iterable[str],
     ) -> None:
         self._recording, self._topics, self._is_published = recording, topics, is_published
         self._period_ns = round(period * SECOND)
+        callbacks = self._on_odom, self._on_joint_states, self._on_description
+        self._callbacks = dict(zip(sources, callbacks, strict=True))
+        self._channels = dict.fromkeys(self._callbacks, -1)
         self._odom, self._joint_states = b"", b""
         self._last_ns, self._next_ns = 0, 0
         self._description: RobotDescription | None = None
@@ -431,10 +450,65 @@ class _RecordedTransforms:
         self._frames: RobotTransforms | None = None
         self._channel = -1
 
-    def listeners(self, odom: str, joint_states: str, description: str) -> dict[str, Take]:
-        """Return the callback of every message of these topics."""
-        callbacks = self._on_odom, self._on_joint_states, self._on_description
-        return dict(zip((odom, joint_states, description), callbacks, strict=True))
+    def listener(self, topic: str, channel: int) -> Take | None:
+        """Return the callback of every message of a topic that is recorded one by one."""
+        if topic in self._callbacks:
+            self._channels[topic] = channel
+        return self._callbacks.get(topic)
+
+    def derive(
+        self, channels: NDArray[np.intp], messages: Sequence[bytes], times: NDArray[np.int64]
+    ) -> list[Derived]:
+        """Return the messages that the listeners write, of messages that are written together."""
+        of_odom, of_joints, _ = self._channels.values()
+        odoms, joints = (_latest(channels == channel) for channel in (of_odom, of_joints))
+        latest = self._odom, self._joint_states
+        if odoms[-1] >= 0:
+            self._odom = messages[odoms[-1]]
+        if joints[-1] >= 0:
+            self._joint_states = messages[joints[-1]]
+        if self._state is None or not self._recording.running or self._is_published():
+            return []
+        of_state = np.flatnonzero((channels == of_odom) | (channels == of_joints))
+        odoms, joints = odoms[of_state], joints[of_state]
+        odom_ns, joints_ns = (
+            np.where(places >= 0, times[places], first_time_ns(before) if before else -1)
+            for places, before in zip((odoms, joints), latest, strict=True)
+        )
+        whole = np.flatnonzero((odom_ns == joints_ns) & (odom_ns >= 0))
+        static: list[Derived] = []
+        after, poses, positions, due = [], [], [], []
+        for k in self._due(whole, odom_ns):
+            odom = latest[0] if odoms[k] < 0 else messages[odoms[k]]
+            state = latest[1] if joints[k] < 0 else messages[joints[k]]
+            frames = self._frames
+            if self._accept(odom, state, int(odom_ns[k])):
+                if frames is None:
+                    static = self._static_messages(int(odom_ns[k]), int(of_state[k]))
+                after.append(int(of_state[k]))
+                due.append(int(odom_ns[k]))
+                poses.append(self._state.pose)
+                positions.append(self._state.q.copy())
+        if not due or self._frames is None:
+            return []
+        made = self._frames.messages(np.array(due), np.array(poses), np.array(positions))
+        return static + [
+            Derived(place, self._channel, message, time_ns)
+            for place, message, time_ns in zip(after, made, due, strict=True)
+        ]
+
+    def _due(self, states: NDArray[np.intp], times: NDArray[np.int64]) -> Iterator[int]:
+        """Yield those of some states whose transforms are due; the caller writes them."""
+        k = 0
+        ordered = bool(np.all(np.diff(times[states]) >= 0))
+        while k < len(states):
+            if self._last_ns <= times[states[k]] < self._next_ns:
+                # No state before the next time is due, unless time goes back.
+                due = np.searchsorted(times[states], self._next_ns) if ordered else k + 1
+                k = max(int(due), k + 1)
+                continue
+            yield int(states[k])
+            k += 1
 
     def _on_odom(self, raw: bytes) -> None:
         self._odom = raw
@@ -461,27 +535,48 @@ class _RecordedTransforms:
             return
         if not self._recording.running or self._is_published():
             return
-        try:
-            state.accept(self._odom, self._joint_states)
-            self._write(state, time_ns)
-        except (CommandError, RecordingError):
-            return  # The state is of another robot. A failed write is reported by the next message.
-        self._last_ns, self._next_ns = time_ns, time_ns + self._period_ns
-
-    def _write(self, state: StateFrames, time_ns: int) -> None:
-        recording = self._recording
-        if self._frames is None:
-            assert self._description is not None
-            self._frames = RobotTransforms(self._description, state.world, state.prefix, links=True)
-            self._channel = recording.writer.add_topic(
-                self._topics[0], TRANSFORM_TYPE, QosProfile(depth=100)
-            )
-            static = self._frames.static_message(time_ns)
-            if static is not None:
-                channel = recording.writer.add_topic(self._topics[1], TRANSFORM_TYPE, LATCHED)
-                recording.record(channel, static, time_ns)
+        new = self._frames is None
+        if not self._accept(self._odom, self._joint_states, time_ns):
+            return
+        assert self._frames is not None
+        static = self._static_messages(time_ns) if new else []
         message = self._frames.message(time_ns, state.pose, state.q)
-        recording.record(self._channel, message, time_ns)
+        for each in [*static, Derived(0, self._channel, message, time_ns)]:
+            self._recording.record(each.channel, each.message, each.published_ns)
+
+    def _accept(self, odom: bytes, joints: bytes, time_ns: int) -> bool:
+        """Take a state whose transforms are due; return whether it is one of the robot."""
+        state = self._state
+        assert state is not None
+        try:
+            state.accept(odom, joints)
+            if self._frames is None:
+                assert self._description is not None
+                channel = self._recording.writer.add_topic(
+                    self._topics[0], TRANSFORM_TYPE, QosProfile(depth=100)
+                )
+                self._frames = RobotTransforms(
+                    self._description, state.world, state.prefix, links=True
+                )
+                self._channel = channel
+        except (CommandError, RecordingError):
+            return False  # It is of another robot. The next message reports a failed write.
+        self._last_ns, self._next_ns = time_ns, time_ns + self._period_ns
+        return True
+
+    def _static_messages(self, time_ns: int, after: int = 0) -> list[Derived]:
+        """Return the message of the fixed links, if there are any."""
+        assert self._frames is not None
+        static = self._frames.static_message(time_ns)
+        if static is None:
+            return []
+        channel = self._recording.writer.add_topic(self._topics[1], TRANSFORM_TYPE, LATCHED)
+        return [Derived(after, channel, static, time_ns)]
+
+
+def _latest(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return for each place the last place up to there that is chosen; -1: none."""
+    return np.maximum.accumulate(np.where(chosen, np.arange(len(chosen)), -1))
 
 
 class _StampReader:
@@ -506,8 +601,12 @@ def _recording_callback(
     kind: Any,
     channel: int,
     clock: str = _CLOCK_TOPIC,
+    listener: Take | None = None,
 ) -> Take:
-    """Return the callback of a topic's messages: the clock sets the time of all others."""
+    """Return the callback of a topic's messages: the clock sets the time of all others.
+
+    ``listener`` is called after each message that is recorded alone.
+    """
     record, time_of = recording.record, stamps.time_ns
     urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
 
@@ -524,12 +623,18 @@ def _recording_callback(
             recording.attach_robot(urdf_name, urdf)
         record(channel, raw)
 
-    if topic == clock:
-        return on_clock
-    if topic.endswith(f"/{_DESCRIPTION_TOPIC}"):
-        return on_description
+    def on_other(raw: bytes) -> None:
+        record(channel, raw)
+
+    if topic.endswith(f"/{_DESCRIPTION_TOPIC}") and topic != clock:
+        return _record_and_listen(on_description, listener)
     header = next(iter(kind.get_fields_and_field_types().values()), "")
-    return on_stamped if header == "std_msgs/Header" else lambda raw: record(channel, raw)
+    first_time, take = FirstTime.NONE, on_other
+    if topic == clock:
+        first_time, take = FirstTime.CLOCK, on_clock
+    elif header == "std_msgs/Header":
+        first_time, take = FirstTime.STAMP, on_stamped
+    return recording.collector(channel, first_time, _record_and_listen(take, listener))
 
 
 def _record_and_listen(record: Take, listener: Take | None) -> Take:

@@ -110,6 +110,7 @@ _MARKS = {
     EventKind.FILE_SPLIT: _Mark("next file", "d", MUTED, 1, hollow=True),
     EventKind.NODE_SILENT: _Mark("node silent", "h", _BAD, 1),
     EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 1, hollow=True),
+    EventKind.NODE_RESTARTED: _Mark("node restarted", "h", _WARN, 1),
 }
 """Marks of events by kind; other kinds, of nodes that start and stop, are not drawn."""
 

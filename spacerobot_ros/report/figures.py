@@ -22,6 +22,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont
 from matplotlib.lines import Line2D
+from matplotlib.text import Annotation
 from matplotlib.ticker import MaxNLocator
 
 from spacerobot_ros.errors import SpaceRobotError
@@ -260,6 +261,8 @@ def sheet(
     if narrow() and left > 0.5:
         # Panels are small, so tick labels have few digits.
         left = max(left, 0.95)
+    if _lettered.get():
+        left = max(left, _LETTER_WIDTH)
     left, right, bottom, gap = (scale * x for x in (left, right, bottom + lane, gap + lane))
     heights = [scale * each for each in heights]
     top, between = 0.3 * scale, right + left - 0.1 * scale
@@ -286,6 +289,13 @@ def sheet(
     return figure, panels
 
 
+_LETTER_WIDTH = 0.32
+"""Room for the letter of a panel left of it, inches."""
+
+_LETTER = "letter"
+"""Group of the letters of panels."""
+
+
 def _letter_panels(panels: Sequence[Axes], left: float) -> None:
     """Write (a), (b) and so on ``left`` of the top of each panel, inches, if that is wanted."""
     if not _lettered.get() or len(panels) < 2:
@@ -298,7 +308,33 @@ def _letter_panels(panels: Sequence[Axes], left: float) -> None:
             xycoords="axes fraction",
             textcoords="offset points",
             annotation_clip=False,
+            gid=_LETTER,
         )
+
+
+_LEFT_EDGE = 0.03
+"""Distance of the labels from the left edge of a figure whose panels are widened, inches."""
+
+
+def widen_panels(figure: Figure) -> None:
+    """Widen panels in one column to the left, as far as their labels leave room."""
+    places = [axes.get_position() for axes in figure.axes]
+    if len({round(place.x0, 6) for place in places}) != 1:
+        return
+    if not all(axes.axison for axes in figure.axes):
+        return
+    boxes = [axes.yaxis.get_tightbbox() for axes in figure.axes]
+    ends = [box.x0 for box in boxes if box is not None]
+    spare = min(ends, default=0.0) / figure.dpi - _LEFT_EDGE
+    share = spare / float(figure.get_size_inches()[0])
+    if share <= 0:
+        return
+    for axes, place in zip(figure.axes, places, strict=True):
+        axes.set_position((place.x0 - share, place.y0, place.width + share, place.height))
+        for text in axes.texts:
+            if isinstance(text, Annotation) and text.get_gid() == _LETTER:
+                across, up = text.xyann
+                text.xyann = (across + 72.0 * spare, up)
 
 
 def new_figure(height: float) -> Figure:

@@ -57,6 +57,9 @@ SHOWN_CYCLES = 3
 
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
+_MOST_SCHEDULES = 10
+"""Schedules that are marked by lines; more of them would be a hatching."""
+
 _DUTY_ROW_HEIGHT = 0.8
 """Height of a duty cycle of one, in its row."""
 
@@ -99,6 +102,8 @@ def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
     if group.goals:
         keys.append(legend_entry(MUTED, "goal", DASHES))
     later = [status.time for status in flight.executing[1:]]
+    if len(later) > _MOST_SCHEDULES:
+        later = []
     for time in later:
         axes.axvline(time, color=FAINT, lw=1.0, zorder=1.5)
     if later:
@@ -187,7 +192,8 @@ def time_figure(
             f"the part before them, and {_close_up_text(cycles)}."
         )
     aside += f" {BAND}" if any(dense) else ""
-    caption += aside + (f" {EVENTS}" if flight.events else "")
+    aside += f" {EVENTS}" if flight.events else ""
+    caption += aside
     return ReportFigure(name, heading, caption, figure, groups, aside)
 
 
@@ -283,13 +289,26 @@ def attitude_group(flight: FlightReport) -> TraceGroup:
 
 
 def shape_groups(flight: FlightReport) -> list[TraceGroup]:
-    """Return the joint positions, in groups of one unit and at most six joints."""
+    """Return the joint positions, in groups of one unit and at most six joints, and the rates of
+    reaction wheels, whose angles mean nothing.
+    """
 
     def bounds(joint: Joint) -> list[float]:
         return [joint.limits.lower, joint.limits.upper]
 
-    units = {"m": "m", "rad": "rad"}
-    return joint_groups(flight, flight.shape, "joint position", units, bounds, most=JOINTS_A_PANEL)
+    def rate_bounds(joint: Joint) -> list[float]:
+        return [-joint.limits.velocity, joint.limits.velocity]
+
+    units, most = {"m": "m", "rad": "rad"}, JOINTS_A_PANEL
+    positions, rates = flight.shape, flight.rates
+    groups = joint_groups(
+        flight, positions, "joint position", units, bounds, most, flight.shape_columns
+    )
+    if len(rates):
+        of_wheels = flight.wheel_columns
+        units = {"rad": "rad/s"}
+        groups += joint_groups(flight, rates, "wheel rate", units, rate_bounds, most, of_wheels)
+    return groups
 
 
 def joint_groups(
@@ -299,13 +318,18 @@ def joint_groups(
     units: dict[str, str],
     bounds: Callable[[Joint], list[float]],
     most: int,
+    columns: Sequence[int] | None = None,
 ) -> list[TraceGroup]:
-    """Group the columns (N, n) of a signal by unit; ``units`` maps a position's unit to its own."""
+    """Group the columns (N, n) of a signal by unit; ``units`` maps a position's unit to its own.
+
+    ``columns``: those of these joints alone.
+    """
     unknown = " or ".join(units.values())
     each = [units.get(joint_unit(flight, name), unknown) for name in flight.joint_names]
     groups = []
     for unit in dict.fromkeys(each):
-        members = [i for i, other in enumerate(each) if other == unit]
+        shown = range(len(each)) if columns is None else columns
+        members = [i for i in shown if each[i] == unit]
         for first in range(0, len(members), most):
             chosen = members[first : first + most]
             names = [flight.joint_names[i] for i in chosen]
@@ -371,7 +395,8 @@ def shape_figure(flight: FlightReport) -> ReportFigure | str:
     """Joint positions, with the limits of the URDF that are in range."""
     if not len(flight.shape) or not flight.joint_names:
         return _why_no_joints(flight)
-    return time_figure(flight, "shape", "Shape", "Joint positions", shape_groups(flight))
+    caption = "Joint positions" + (", and rates of the wheels" if flight.wheel_columns else "")
+    return time_figure(flight, "shape", "Shape", caption, shape_groups(flight))
 
 
 def _why_no_joints(flight: FlightReport) -> str:
@@ -437,7 +462,8 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
     if cycles is not None:
         aside += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
     aside += f" {BAND}" if any(dense) else ""
-    caption += aside + (f" {EVENTS}" if flight.events else "")
+    aside += f" {EVENTS}" if flight.events else ""
+    caption += aside
     return ReportFigure("velocities", "Joint velocities", caption, figure, groups, aside)
 
 
@@ -585,7 +611,8 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
         "edge. Bottom: kinetic energy."
     )
     aside = f" {BAND}" if dense else ""
-    caption += aside + (f" {EVENTS}" if flight.events else "")
+    aside += f" {EVENTS}" if flight.events else ""
+    caption += aside
     groups = [
         TraceGroup(
             Signal(time, changes),

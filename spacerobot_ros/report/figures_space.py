@@ -52,7 +52,11 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     if flight.drawn is None:
         return flight.not_drawn
     indices = _choose_instants(flight)
-    scenes = [flight.drawn.at(flight.joints[index], flight.base_at(index)) for index in indices]
+    scenes = [
+        flight.drawn.at(flight.joints[index], flight.base_at(index))
+        + flight.target_at(flight.position.time[index])
+        for index in indices
+    ]
     across = min(len(indices), 2 if narrow() else 3)
     rows = [[1.0] * across for _ in range(0, len(indices), across)]
     sizes = {"bottom": 0.15, "left": 0.2, "gap": 0.42}
@@ -74,6 +78,8 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
         "The robot at instants from the first recorded state to the last, to one scale, from the "
         "shapes of its URDF; each moving link in the color that its joint has in the other figures."
     )
+    if flight.target is not None:
+        caption += " The target is drawn where it is, free or held."
     if flight.obstacles:
         caption += " Obstacles have the shapes by which distances are measured."
     if flight.goal is not None:
@@ -262,14 +268,19 @@ _LOOP_JOINTS = 3
 
 def loops_figure(flight: FlightReport) -> ReportFigure | str:
     """Joint positions against each other, for the first three joints in pairs."""
-    names = flight.joint_names[:_LOOP_JOINTS]
+    columns = flight.shape_columns[:_LOOP_JOINTS]
+    names = [flight.joint_names[i] for i in columns]
     if len(names) < 2:
         return "A loop in shape space takes two joints or more."
     if not len(flight.shape):
         return NO_JOINTS
     pairs = list(itertools.combinations(range(len(names)), 2))
     cycles = flight.cycles
-    part = flight.shape
+    joint_units = [joint_unit(flight, name) for name in names]
+    factor, angle = angle_unit()
+    scale = [factor if unit == "rad" else 1.0 for unit in joint_units]
+    joint_units = [angle if unit == "rad" else unit for unit in joint_units]
+    part = Signal(flight.shape.time, flight.shape.values[:, columns] * scale)
     if cycles is not None:
         part = part.between(*cycles.last(SHOWN_CYCLES))
     one = len(pairs) == 1
@@ -287,7 +298,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
         axes.plot(x[-1:], y[-1:], "o", color=colour(0), ms=2.5, zorder=4)
         set_range(axes, y)
         _set_x_range(axes, x)
-        units = [joint_unit(flight, names[k]) for k in (i, j)]
+        units = [joint_units[k] for k in (i, j)]
         axes.set_xlabel(f"{names[i]} ({units[0]})")
         axes.set_ylabel(f"{names[j]} ({units[1]})")
         if cycles is not None:
@@ -307,8 +318,8 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
             "ends at the circle and, to first order, displaces the base in proportion to the areas "
             "it encloses: those of one cycle are given, positive where it runs counter-clockwise."
         )
-    if len(flight.joint_names) > _LOOP_JOINTS:
-        caption += f" The first three of {len(flight.joint_names)} joints are shown."
+    if len(flight.shape_columns) > _LOOP_JOINTS:
+        caption += f" The first three of {len(flight.shape_columns)} joints are shown."
     heading = "Path in shape space" if cycles is None else "Loops in shape space"
     return ReportFigure("loops", heading, caption, figure)
 

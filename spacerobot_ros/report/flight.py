@@ -40,14 +40,14 @@ from spacerobot_ros.model.rotations import (
     rotation_angles,
     rotvec_from_quaternion,
 )
-from spacerobot_ros.model.visuals import Visual, meshes_from_attachments
+from spacerobot_ros.model.visuals import Visual, meshes_from_attachments, visuals_of
 from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.report.events import FlightEvent, drawn_events
 from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, rotvecs
-from spacerobot_ros.report.solids import SolidRobot
+from spacerobot_ros.report.solids import MAX_MESH_FACES, SolidRobot, Solids, obstacle_color, rgb
 from spacerobot_ros.scenario import COMMANDERS, Published
 from spacerobot_ros.times import SECOND
 
@@ -582,6 +582,19 @@ class FlightReport:
             return None
         return SolidRobot(self.robot, self.meshes, self.obstacles)
 
+    def target_at(self, time: float) -> Solids:
+        """Return the target in its pose at a time, s; empty where there is none."""
+        solids, poses = Solids(), self.target_pose
+        if self.target is None or not len(poses):
+            return solids
+        index = min(int(np.searchsorted(poses.time, time - 1e-9)), len(poses) - 1)
+        values = poses.values[index]
+        pose = Pose(matrix_from_quaternion(values[3:]), values[:3])
+        for visual in visuals_of(self.target, {}, MAX_MESH_FACES):
+            placed = pose @ self.target.frames[visual.link][1]
+            solids.add(visual, placed, rgb(obstacle_color(visual)))
+        return solids
+
     @property
     def not_drawn(self) -> str:
         """A message about data missing for a picture of the robot; empty: none is missing."""
@@ -639,16 +652,19 @@ class FlightReport:
 
     @cached_property
     def joints(self) -> Array:
-        """Joint positions (N, n), in the order of the robot description, at the base poses."""
+        """Joint positions (N, n), in the order of the robot description, at the base poses.
+
+        Those of reaction wheels are 0: a body of revolution looks the same at any angle.
+        """
         assert self.robot is not None
-        chosen = [self.joint_names.index(name) for name in self.robot.joint_names]
-        time = self.position.time
-        if not chosen:
-            return np.empty((len(time), 0))
-        if np.array_equal(time, self.shape.time):
-            return self.shape.values[:, chosen]
-        columns = [np.interp(time, self.shape.time, self.shape.values[:, i]) for i in chosen]
-        return np.column_stack(columns)
+        time, found = self.position.time, []
+        at_poses = np.array_equal(time, self.shape.time)
+        for name in self.robot.joint_names:
+            values = self.shape.values[:, self.joint_names.index(name)]
+            if name in self.robot.wheel_names:
+                values = np.zeros(len(values))
+            found.append(values if at_poses else np.interp(time, self.shape.time, values))
+        return np.column_stack(found) if found else np.empty((len(time), 0))
 
     @property
     def repeats_cycles(self) -> bool:
@@ -693,6 +709,17 @@ class FlightReport:
         are not in the bag.
         """
         return self.signal("propellant") if "propellant" in self.flight.series else None
+
+    @cached_property
+    def wheel_columns(self) -> tuple[int, ...]:
+        """Columns of the joints that carry reaction wheels."""
+        wheels = self.robot.wheel_names if self.robot is not None else ()
+        return tuple(i for i, name in enumerate(self.joint_names) if name in wheels)
+
+    @cached_property
+    def shape_columns(self) -> tuple[int, ...]:
+        """Columns of the other joints, whose positions are the shape of the robot."""
+        return tuple(i for i in range(len(self.joint_names)) if i not in self.wheel_columns)
 
     def joint(self, name: str) -> Joint | None:
         """The joint of that name in the robot description."""

@@ -21,6 +21,9 @@
     for (const box of document.querySelectorAll(".scroll")) {
       const shown = box.clientWidth > 0 && box.scrollWidth > box.clientWidth + 2;
       if (box.previousElementSibling) box.previousElementSibling.classList.toggle("needed", shown);
+      // Arrow keys scroll a box that has the focus.
+      if (shown) box.tabIndex = 0;
+      else box.removeAttribute("tabindex");
     }
   }
   // On paper everything is unfolded; afterwards each is as it was.

@@ -62,12 +62,11 @@ def page(
     beside: Sequence[FlightReport] = (),
 ) -> str:
     """Return the whole page; flights ``beside`` this one get a row in a table."""
-    charts, controls = charts_of(flight, figures), PagePart(programs=(package_file("page.js"),))
+    charts = charts_of(flight, figures)
     name = flight.scenario
     title = ", ".join(filter(None, (name, flight.method, flight.robot_name)))
     body = [
         "<header>",
-        '<button id="theme" type="button" hidden>Dark</button>',
         f"<h1>{escape(name)}</h1>",
         f"<p>{escape(flight.description)}</p>" if flight.description else "",
         _facts_html(flight),
@@ -84,7 +83,7 @@ def page(
         *_figures_html(figures),
         *_parameters_html(flight),
     ]
-    return html_page(title, body, _footer_text(flight), (player, charts, controls))
+    return html_page(title, body, _footer_text(flight), (player, charts))
 
 
 def _facts_html(flight: FlightReport) -> str:
@@ -108,16 +107,14 @@ def _outcome_html(flight: FlightReport) -> str:
             '<p class="outcome">The bag holds no status of a planner or a controller '
             "(planner/status, controller/status).</p>"
         )
-    last = flight.statuses[-1]
-    sentence = last.sentence
+    last, verdict = flight.statuses[-1], flight.flight.verdict
+    word, sentence, tone = last.state.capitalize(), last.sentence, last.state
     if last.executing:
         sentence += " The recording ends before the outcome is known."
-    word, tone = last.state.capitalize(), last.state
-    left_out = flight.flight.not_controlled
-    if last.state == "reached" and left_out:
-        word, tone = f"Reached, but for the {' and '.join(left_out)}", "reached partly"
-        if "not controlled" not in sentence:
-            sentence += f" Not controlled: {' and '.join(left_out)}."
+    if last.state in ("reached", "failed"):
+        word, sentence = verdict.word, verdict.sentence
+    if last.state == "reached" and not verdict.complete:
+        tone += " partly"
     state = f"<b>{escape(word)}</b>" if word else ""
     return f'<p class="outcome {escape(tone)}">{state}{escape(sentence)}</p>'
 

@@ -51,7 +51,7 @@ def package_file(name: str) -> str:
 
 
 def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[PagePart] = ()) -> str:
-    """Return a whole page.
+    """Return a whole page, with a button for light or dark.
 
     Parameters
     ----------
@@ -62,7 +62,8 @@ def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[Page
     parts
         Their scripts, styles and licences go into the page; their markup stands in ``body``.
     """
-    policy = "; ".join(filter(None, (_SECURITY_POLICY, _script_policy(parts))))
+    parts = (*parts, PagePart(programs=(package_file("page.js"),)))
+    policy = f"{_SECURITY_POLICY}; {_script_policy(parts)}"
     css = "".join(part.style for part in parts) + package_file("page.css")
     end = f"<footer><p>{escape(footer)}</p></footer>"
     content = "\n".join(filter(None, (*body, _licences_html(parts), end)))
@@ -72,16 +73,17 @@ def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[Page
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
         f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<main>\n"
+        '<button id="theme" type="button" hidden>Dark</button>\n'
         f"{content}\n</main>\n{_scripts_html(parts)}\n</body>\n</html>\n"
     )
 
 
 def _script_policy(parts: Sequence[PagePart]) -> str:
-    """Return the directive that allows the scripts of a page; empty if it has none."""
+    """Return the directive that allows the scripts of a page."""
     programs = [program for part in parts for program in part.programs]
     hashes = [hashlib.sha256(program.encode()).digest() for program in programs]
     allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in hashes)
-    return f"script-src {allowed}" if allowed else ""
+    return f"script-src {allowed}"
 
 
 def _scripts_html(parts: Sequence[PagePart]) -> str:

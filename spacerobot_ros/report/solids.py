@@ -170,7 +170,7 @@ class Canvas:
 
 _BASE_COLOUR = "#c4c9d2"
 EDGE_COLOUR = "#3d4450"
-_MAX_MESH_FACES = 1500
+MAX_MESH_FACES = 1500
 """Largest number of faces of a mesh: each is filled by itself."""
 
 Colour = tuple[float, float, float]
@@ -201,7 +201,7 @@ class Solids:
                 self.faces.append(Face(triangle, normal / length, fill))
         edges = visual.edges
         self.edges += [
-            Edge(line, normals[np.newaxis], _rgb(EDGE_COLOUR))
+            Edge(line, normals[np.newaxis], rgb(EDGE_COLOUR))
             for line, normals in zip(
                 edges.lines @ pose.R.T + pose.r, edges.normals @ pose.R.T, strict=True
             )
@@ -222,12 +222,12 @@ class SolidRobot:
         obstacles: Iterable[tuple[Visual, Pose]] = (),
     ) -> None:
         self.robot = robot
-        self._visuals = visuals_of(robot, meshes, _MAX_MESH_FACES)
+        self._visuals = visuals_of(robot, meshes, MAX_MESH_FACES)
         self.kinematics = ForwardKinematics(robot)
         self.surroundings = Solids()
         """Faces and edges of the obstacles."""
         for visual, pose in obstacles:
-            self.surroundings.add(visual, pose, _rgb(obstacle_color(visual)))
+            self.surroundings.add(visual, pose, rgb(obstacle_color(visual)))
 
     def link_poses(self, q: Array, base: Pose) -> dict[str, Pose]:
         """Poses of all links in the world, at joint positions ``q`` (n,) and a pose of the base."""
@@ -239,7 +239,7 @@ class SolidRobot:
         poses = self.link_poses(q, base)
         solids = Solids()
         for visual in self._visuals:
-            solids.add(visual, poses[visual.link], _rgb(body_color(visual.body)))
+            solids.add(visual, poses[visual.link], rgb(body_color(visual.body)))
         return solids
 
     def base_outlines(self, base: Pose) -> list[Array]:
@@ -252,7 +252,8 @@ class SolidRobot:
         return lines or _cross_lines(base)
 
 
-def _rgb(name: str) -> Colour:
+def rgb(name: str) -> Colour:
+    """Return a color as three shares."""
     r, g, b = to_rgb(name)
     return r, g, b
 

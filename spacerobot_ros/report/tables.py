@@ -46,11 +46,12 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         )
     if tool is not None:
         turned = set(flight.controls("end_effector")) & {3, 4, 5}
-        note = f"{tool.angle:.3g} rad" if turned else ""
+        turn = f"{tool.angle:.3g} rad" if turned else ""
+        note = _hand_note(flight, turn)
         rows.append(("End-effector error", f"{tool.distance:.3g} m", note))
     for link, left in flight.flight.end_effector_errors.items():
         turn = f"{left.angle:.3g} rad" if flight.link_goals[link].quaternion is not None else ""
-        rows.append((f"Error of {link}", f"{left.distance:.3g} m", turn))
+        rows.append((f"Error of {link}", f"{left.distance:.3g} m", _hand_note(flight, turn)))
     if flight.manoeuvre_time is not None:
         rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", _time_to_end_text(flight)))
     if flight.method:
@@ -65,6 +66,15 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         time = flight.position.time
         rows.append(("Recorded", f"{len(time) - 1} ticks", f"{time[-1] - time[0]:.6g} s"))
     return rows
+
+
+def _hand_note(flight: FlightReport, turn: str) -> str:
+    """Return the note below the distance of an end-effector: its angle, and the tolerances."""
+    units = ("position", "m"), ("attitude", "rad")
+    parts = units if turn else units[:1]
+    found = [_tolerance_text(flight, part, unit).strip(" ()") for part, unit in parts]
+    limits = ", ".join(text.removeprefix("tolerance ") for text in found if text)
+    return "; ".join(filter(None, (turn, limits and f"tolerance {limits}")))
 
 
 def _judged(
@@ -111,9 +121,9 @@ def result_table(flight: FlightReport) -> Table:
             ("Final attitude", _format_attitude(rotvec_from_quaternion(flight.quaternion[-1])))
         )
     if error is not None:
-        angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
+        angle = f"{error.angle:.3g} rad = {math.degrees(error.angle):.3g}°"
         for part, unit, left in (
-            ("position", "m", f"{error.distance:.4g} m"),
+            ("position", "m", f"{error.distance:.3g} m"),
             ("attitude", "rad", angle),
         ):
             text = f"{left}{_tolerance_text(flight, part, unit)}"
@@ -121,8 +131,8 @@ def result_table(flight: FlightReport) -> Table:
                 text = f"not controlled; {left} from the goal"
             rows.append((f"{part.capitalize()} error", text))
     if (sensed := flight.sensed_error) is not None:
-        parts = [f"{sensed.distance:.4g} m"] if flight.position_counts else []
-        rows.append(("Errors as measured", ", ".join([*parts, f"{sensed.angle:.4g} rad"])))
+        parts = [f"{sensed.distance:.3g} m"] if flight.position_counts else []
+        rows.append(("Errors as measured", ", ".join([*parts, f"{sensed.angle:.3g} rad"])))
     if flight.tool_error is not None:
         rows += _tool_rows(flight, flight.tool_error)
     rows += _link_rows(flight)
@@ -180,11 +190,13 @@ def _tool_rows(flight: FlightReport, error: PoseError) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = [
         ("End-effector goal", f"({_format_vector(goal.position)}) m"),
         ("End-effector, final", f"({_format_vector(last[:3])}) m"),
-        ("End-effector error", f"{error.distance:.4g} m"),
+        ("End-effector error", f"{error.distance:.3g} m{_tolerance_text(flight, 'position', 'm')}"),
     ]
     if set(flight.controls("end_effector")) & {3, 4, 5}:
-        angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
-        rows.append(("End-effector attitude error", angle))
+        angle = f"{error.angle:.3g} rad = {math.degrees(error.angle):.3g}°"
+        rows.append(
+            ("End-effector attitude error", angle + _tolerance_text(flight, "attitude", "rad"))
+        )
     return rows
 
 
@@ -202,10 +214,10 @@ def _link_rows(flight: FlightReport) -> list[tuple[str, ...]]:
         error = errors[link]
         at = goal.position - error.position
         rows.append((f"Final position of {link}", f"({_format_vector(at)}) m"))
-        distance = f"{error.distance:.4g} m{_tolerance_text(flight, 'position', 'm')}"
+        distance = f"{error.distance:.3g} m{_tolerance_text(flight, 'position', 'm')}"
         rows.append((f"Position error of {link}", distance))
         if goal.quaternion is not None:
-            angle = f"{error.angle:.4g} rad = {math.degrees(error.angle):.4g}°"
+            angle = f"{error.angle:.3g} rad = {math.degrees(error.angle):.3g}°"
             tolerance = _tolerance_text(flight, "attitude", "rad")
             rows.append((f"Attitude error of {link}", f"{angle}{tolerance}"))
     return rows
@@ -219,7 +231,9 @@ def joint_table(flight: FlightReport) -> Table | None:
     for i, name in enumerate(flight.joint_names):
         joint = flight.joint(name)
         unit = joint_unit(flight, name)
-        first, last = flight.shape.values[[0, -1], i]
+        ends = [_format_number(x) for x in flight.shape.values[[0, -1], i].tolist()]
+        if i in flight.wheel_columns:
+            ends = [_NO_VALUE] * 2  # The angle of a body of revolution means nothing.
         limits = limit = share = peak_text = _NO_VALUE
         if joint is not None:
             if math.isfinite(joint.limits.lower) and math.isfinite(joint.limits.upper):
@@ -237,8 +251,7 @@ def joint_table(flight: FlightReport) -> Table | None:
                 name,
                 kind,
                 unit,
-                _format_number(first),
-                _format_number(last),
+                *ends,
                 limits,
                 peak_text,
                 limit,
@@ -309,7 +322,7 @@ def _format_attitude(rotvec: Iterable[float]) -> str:
 
 def _tolerance_text(flight: FlightReport, part: str, unit: str) -> str:
     value = flight.tolerance("position" if part == "position" else "attitude")
-    return "" if value is None else f" (tolerance {value:.4g} {unit})"
+    return "" if value is None else f" (tolerance {value:.3g} {unit})"
 
 
 def _schedules_text(flight: FlightReport) -> str:

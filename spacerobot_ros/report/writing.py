@@ -20,6 +20,7 @@ from spacerobot_ros.report.figures import (
     panel,
     picture_of,
     room_for,
+    widen_panels,
 )
 from spacerobot_ros.report.figures_over_time import (
     NO_STATES,
@@ -194,6 +195,8 @@ def write_figures(
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
             try:
                 figure = FIGURES[name](flight)
+                if isinstance(figure, ReportFigure):
+                    widen_panels(figure.figure)
                 picture = (
                     picture_of(figure.figure, format) if isinstance(figure, ReportFigure) else b""
                 )

@@ -5,26 +5,33 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
 import yaml
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.client import Client
 from rclpy.experimental import EventsExecutor
+from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
+from spacerobot_ros.nodes.common.messages import diagnostic_status
+from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
 from spacerobot_ros.nodes.common.streams import Connections
 from spacerobot_ros.planning import Goal
@@ -36,6 +43,9 @@ from spacerobot_ros.times import SECOND, stamp_to_ns
 
 _LONGEST_START = 60.0
 """Longest wait for the start of all nodes, wall s."""
+
+_RESTART_PERIOD = 60.0
+"""Wall time over which restarts are counted, s."""
 
 _LONGEST_END = 10.0
 """Wall time after a signal at which a node that still runs is killed, s."""
@@ -84,17 +94,31 @@ class MultiProcessStack(Stack):
     ----------
     scenario, bag, namespace
         As of every stack.
+    restarts
+        How often a minute each planner or controller that dies is started again; it then goes on
+        with its goal.
+    show
+        Shows a line about each restart to the user.
 
     Raises
     ------
     SpaceRobotError
-        A node ended at its start; the message is the last line that it wrote.
+        A node ended at its start; the message is the last error that it wrote.
     """
 
     can_kill: ClassVar[bool] = True
 
-    def __init__(self, scenario: Scenario, bag: Path | None, namespace: str = "") -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        bag: Path | None,
+        namespace: str = "",
+        *,
+        restarts: int = 0,
+        show: Callable[[str], None] = lambda line: None,
+    ) -> None:
         super().__init__(scenario, bag, namespace)
+        self._restarts, self._show = RestartLimit(restarts), show
         self._timeline = KillTimeline(scenario.kills)
         self._time_ns = 0
         self._clock_seen = math.inf
@@ -108,6 +132,9 @@ class MultiProcessStack(Stack):
                 scenario.require_shape_of(robot)
         self._make_client(None if names is None else lambda: names)
         node = self.client.node
+        self._events: Publisher | None = None
+        if restarts:
+            self._events = node.create_publisher(DiagnosticStatus, "events", STREAM)
         node.create_subscription(Clock, f"{self.namespace}/clock", self._on_clock, 10)
         self._change_state = {
             name: node.create_client(ChangeState, f"{name}/change_state") for name in self.names
@@ -138,7 +165,7 @@ class MultiProcessStack(Stack):
             records = self.scenario.records([other for other in self.names if other != name])
             record.write_text(json.dumps(records), "utf-8")
             overrides["describe"] = str(record)
-        elif self.scenario.kills and name in COMMANDERS:
+        elif (self.scenario.kills or self._restarts.most) and name in COMMANDERS:
             overrides.setdefault("resume_file", str(Path(self._folder.name, f"{name}_goal.json")))
         if name == self.scenario.commanders[0] and self.scenario.lockstep:
             overrides["stop_when_decided"] = True
@@ -162,11 +189,13 @@ class MultiProcessStack(Stack):
         """Return the file that receives standard output and error of a node."""
         return Path(self._folder.name, f"{name}.txt")
 
-    def _last_line(self, name: str) -> str:
-        # Python ends the report of a crash with a long list of modules.
-        text = self._log_file_of(name).read_text("utf-8", errors="replace").strip()
-        lines = [line for line in text.splitlines() if not line.startswith("Extension mod")]
-        return lines[-1] if lines else "it wrote nothing."
+    def _end_message(self, name: str) -> str:
+        """Return how and why a node has ended."""
+        code = self.processes[name].returncode
+        return end_message(name, code, self._read_log(name))
+
+    def _read_log(self, name: str) -> str:
+        return self._log_file_of(name).read_text("utf-8", errors="replace")
 
     @property
     def time_ns(self) -> int:
@@ -209,9 +238,7 @@ class MultiProcessStack(Stack):
             ended |= self._end_nodes([name for name in group if name in present])
         for name, code in ended.items():
             if code != 0:
-                raise SpaceRobotError(
-                    f"Node '{name}' ended with code {code}: {self._last_line(name)}"
-                )
+                raise SpaceRobotError(end_message(name, code, self._read_log(name)))
 
     def close(self) -> None:
         """End all node processes that still run."""
@@ -226,7 +253,7 @@ class MultiProcessStack(Stack):
         self._folder.cleanup()
 
     def require_alive(self) -> None:
-        """Raise an error with the last output line of a node that has ended.
+        """Raise an error with the reason of the end of a node that has ended.
 
         Raises
         ------
@@ -235,9 +262,7 @@ class MultiProcessStack(Stack):
         """
         for name, process in self.processes.items():
             if process.poll() is not None and name not in self._timeline.away:
-                raise SpaceRobotError(
-                    f"Node '{name}' has ended (code {process.returncode}): {self._last_line(name)}"
-                )
+                raise SpaceRobotError(f"{self._end_message(name)}{self._restarts.note(name)}")
 
     def kill(self, name: str) -> None:
         """Kill a node, as a crash would."""
@@ -254,7 +279,27 @@ class MultiProcessStack(Stack):
         for name in started:
             again = {"resume_bag": str(self.bag or ""), "autostart": True}
             self.launch(name, **(again if name == "plant" else {}))
+        self._restart_commanders()
         self.require_alive()
+
+    def _restart_commanders(self) -> None:
+        """Start planner and controller again that have died, as long as the limit allows it."""
+        for name in self.scenario.commanders:
+            if self.processes[name].poll() is None or name in self._timeline.away:
+                continue
+            if not self._restarts.allows(name, time.monotonic()):
+                continue
+            message = f"{self._end_message(name)} It is started again."
+            self.launch(name, autostart=True)
+            with suppress(OSError):  # A closed terminal must not stop the robot.
+                self._show(message)
+            if self._events is not None:
+                at = self._time_ns / SECOND
+                event = Event(EventKind.NODE_RESTARTED, message, 1, at, about={"node": name})
+                values = event.to_values(time.time())
+                level = bytes([event.level])
+                status = diagnostic_status(self.client.node.get_name(), level, message, values)
+                self._events.publish(status)
 
     def _end_nodes(self, names: Sequence[str]) -> dict[str, int]:
         """End nodes together, and return their exit codes."""
@@ -283,7 +328,8 @@ class MultiProcessStack(Stack):
         answers = self._call_services(self._change_state, dict.fromkeys(names, request))
         for name, answer in answers.items():
             if not answer.success:
-                raise SpaceRobotError(f"The {name} refuses: {self._last_line(name)}")
+                error = last_error(self._read_log(name)) or _NO_ERROR
+                raise SpaceRobotError(f"The {name} refuses: {error}")
 
     def _ask_statistics(self, patience: float) -> None:
         """Request the planner's statistics; an interrupted planner may be busy."""
@@ -334,6 +380,69 @@ class MultiProcessStack(Stack):
             if time.monotonic() > deadline:
                 raise _AnswerLateError(f"Timed out after {patience:g} s waiting for {what}.")
             self.executor.spin_once(timeout_sec=0.02)
+
+
+_NO_ERROR = "it wrote no error."
+
+_LOG_PREFIX = re.compile(r"^\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]*\]: ")
+"""Level, time and name before a message in the log of a node."""
+
+
+def last_error(log: str) -> str:
+    """Return the last error in the log of a node; empty if there is none.
+
+    It is an error that the node logged, the last line of a traceback, or the first one of Python's
+    report of a crash.
+    """
+    found = ""
+    for line in log.splitlines():
+        prefix = _LOG_PREFIX.match(line)
+        if prefix is not None:
+            if prefix[1] in ("ERROR", "FATAL"):
+                found = line[prefix.end() :]
+        elif line.startswith("Fatal Python error: "):
+            return f"{line}."
+        elif line.strip() and not line[0].isspace() and not line.startswith("Extension mod"):
+            found = line.strip()
+    return found
+
+
+def end_message(name: str, code: int, log: str) -> str:
+    """Return a sentence about the end of a node: the signal or exit code, and its last error."""
+    if code < 0:
+        error = last_error(log)
+        how = f"Node '{name}' was ended by {signal.Signals(-code).name}"
+        return f"{how}: {error}" if error else f"{how}."
+    return f"Node '{name}' has ended with exit code {code}: {last_error(log) or _NO_ERROR}"
+
+
+class RestartLimit:
+    """Limit of the restarts of processes that die.
+
+    Parameters
+    ----------
+    most
+        Largest number of restarts of one process within a minute.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self._restarted: dict[str, list[float]] = {}
+
+    def allows(self, name: str, now: float) -> bool:
+        """Return whether a process may be started again at a wall time, s; it then counts."""
+        recent = [each for each in self._restarted.get(name, ()) if now - each < _RESTART_PERIOD]
+        allowed = len(recent) < self.most
+        self._restarted[name] = [*recent, now] if allowed else recent
+        return allowed
+
+    def note(self, name: str) -> str:
+        """Return a sentence about the restarts of a process, with a space before it."""
+        count = len(self._restarted.get(name, ()))
+        if not count:
+            return ""
+        times = "once" if count == 1 else f"{count} times"
+        return f" It was started again {times} within a minute, which is the limit (--restarts)."
 
 
 def node_words(

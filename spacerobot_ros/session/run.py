@@ -108,17 +108,26 @@ def ros(*, private: bool, one_process: bool = False) -> Iterator[None]:
 
 
 def make_stack(
-    scenario: Scenario, bag: Path | None, *, processes: bool, namespace: str = ""
+    scenario: Scenario,
+    bag: Path | None,
+    *,
+    processes: bool,
+    namespace: str = "",
+    restarts: int = 0,
+    show: Callable[[str], None] = lambda line: None,
 ) -> Stack:
     """Return the stack of a scenario, in this process or with a process for each node.
+
+    ``restarts`` and ``show`` are those of :class:`MultiProcessStack`.
 
     Raises
     ------
     SpaceRobotError
         A parameter or the robot is refused, or a node does not start.
     """
-    stack = MultiProcessStack if processes else InProcessStack
-    return stack(scenario, bag, namespace)
+    if processes:
+        return MultiProcessStack(scenario, bag, namespace, restarts=restarts, show=show)
+    return InProcessStack(scenario, bag, namespace)
 
 
 def run_scenario(
@@ -143,7 +152,7 @@ def run_scenario(
         A parameter, the robot or the recording is refused.
     """
     private = not processes and scenario.lockstep
-    with ros(private=private):
+    with ros(private=private, one_process=not processes):
         stack = make_stack(scenario, bag, processes=processes)
         try:
             with ended_on_request(at_once=stack.interrupt) as stopped:
@@ -229,8 +238,13 @@ def run_until_stopped(
     *,
     processes: bool,
     namespace: str = "",
+    restarts: int = 0,
+    supervise: Callable[[], None] = lambda: None,
 ) -> Path | None:
     """Run the nodes of a scenario in real time until SIGINT, SIGTERM or SIGHUP; goals by topic.
+
+    With ``processes``, planner and controller are started again when they die, each at most
+    ``restarts`` times a minute. ``supervise`` is called five times a second.
 
     Returns the bag, whose name is another one where that was taken and ``when_exists`` is next.
 
@@ -240,7 +254,9 @@ def run_until_stopped(
         A node cannot start, or has ended by itself.
     """
     with ros(private=False, one_process=not processes):
-        stack = make_stack(scenario, bag, processes=processes, namespace=namespace)
+        stack = make_stack(
+            scenario, bag, processes=processes, namespace=namespace, restarts=restarts, show=show
+        )
         try:
             with ended_on_request(at_once=stack.interrupt) as stopped:
                 stack.start(None)
@@ -251,6 +267,7 @@ def run_until_stopped(
 
                 def look() -> bool:
                     statuses.show()
+                    supervise()
                     return stopped()
 
                 stack.spin(look)

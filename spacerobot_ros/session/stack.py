@@ -28,6 +28,7 @@ from spacerobot_ros.nodes import (
     PlantNode,
     RecorderNode,
 )
+from spacerobot_ros.nodes.common.direct_delivery import DirectDelivery
 from spacerobot_ros.nodes.common.streams import Connections, unconnected_topics
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
@@ -212,6 +213,9 @@ class InProcessStack(Stack):
         As of every stack.
     context
         rclpy context to live in; None is the default one.
+    direct
+        Whether states and commands are handed over directly in lockstep
+        (:class:`~spacerobot_ros.nodes.common.direct_delivery.DirectDelivery`).
 
     Raises
     ------
@@ -226,6 +230,7 @@ class InProcessStack(Stack):
         namespace: str = "",
         *,
         context: rclpy.Context | None = None,
+        direct: bool = True,
     ) -> None:
         super().__init__(scenario, bag, namespace)
         self.executor = EventsExecutor(context=context) if context else EventsExecutor()
@@ -260,6 +265,9 @@ class InProcessStack(Stack):
             for node in self._nodes:
                 self.executor.add_node(node)
             self._connect()
+            self.delivery = DirectDelivery(self.executor, self._nodes, self.client.node)
+            if direct and scenario.lockstep:
+                self.delivery.begin()
         except BaseException:
             self.close()
             raise

@@ -11,12 +11,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.process import use_loopback_discovery
 from spacerobot_ros.nodes.viewer import node
 from spacerobot_ros.parameters import Value
-from spacerobot_ros.session.processes import node_words
+from spacerobot_ros.session.processes import RestartLimit, end_message, node_words
 from spacerobot_ros.session.stack import checked_namespace
 from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.viewer.server import require_viser
@@ -30,10 +31,90 @@ _LONGEST_END = 1.5
 _NICENESS = 5
 
 
+class Viewer:
+    """A viewer process, which is started again when it dies.
+
+    Parameters
+    ----------
+    parameters, show, namespace
+        As of :func:`viewing`.
+    folder
+        Folder for its log and parameters.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Value],
+        show: Callable[[str], None],
+        namespace: str,
+        folder: Path,
+    ) -> None:
+        self._parameters, self._show = dict(parameters), show
+        self._namespace, self._folder = namespace, folder
+        self.log = folder / "viewer.txt"
+        self.process = self._start()
+        self._restarts = RestartLimit(0)
+        self._announced = False
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        with self.log.open("wb") as errors:
+            words = node_words(
+                "viewer", node.__name__, self._parameters, self._folder, self._namespace
+            )
+            process = start_child(
+                [*words, "--log-level", "WARN"], stdout=subprocess.PIPE, stderr=errors
+            )
+        yield_to_flight(process.pid)
+        return process
+
+    def announce(self) -> None:
+        """Show the address of the page, once it is served.
+
+        Raises
+        ------
+        SpaceRobotError
+            The page cannot be served.
+        """
+        announcement = _read_announcement(self.process, self.log)
+        self._announced = True
+        self._show(announcement)
+        for line in _read_log_lines(self.log):
+            self._show(line)  # The viewer warns of an address that other machines can reach.
+        # Pages that are open come back to a viewer at the same address.
+        port = urlsplit(announcement.split()[1]).port if " " in announcement else None
+        if port is not None:
+            self._parameters["port"] = port
+
+    def restart_within(self, restarts: int) -> None:
+        """Allow so many restarts a minute."""
+        self._restarts = RestartLimit(restarts)
+
+    def supervise(self) -> None:
+        """Start the viewer again if it has died, as long as the limit allows it."""
+        if self.process.poll() is None or not self._restarts.allows("viewer", time.monotonic()):
+            return
+        message = self._end_message()
+        end_child(self.process, {})
+        self.process = self._start()
+        with suppress(OSError):  # A closed terminal must not stop the robot.
+            self._show(f"{message} It is started again.")
+
+    def end(self) -> None:
+        """End the viewer; a line reports if it had ended before."""
+        if self._announced and self.process.poll() is not None:
+            with suppress(OSError):
+                self._show(f"{self._end_message()}{self._restarts.note('viewer')}")
+        end_child(self.process, {signal.SIGINT: _LONGEST_END})
+
+    def _end_message(self) -> str:
+        text = self.log.read_text("utf-8", errors="replace")
+        return end_message("viewer", self.process.returncode, text)
+
+
 @contextmanager
 def viewing(
     parameters: Mapping[str, Value], show: Callable[[str], None], namespace: str = ""
-) -> Iterator[None]:
+) -> Iterator[Viewer]:
     """Run a viewer while the block lasts; ``show`` receives the line with its address.
 
     If the viewer ends early, the block goes on and a line at its end reports it.
@@ -56,22 +137,12 @@ def viewing(
     use_loopback_discovery()
     namespace = checked_namespace(namespace)
     with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
-        log = Path(folder, "viewer.txt")
-        with log.open("wb") as errors:
-            words = node_words("viewer", node.__name__, parameters, Path(folder), namespace)
-            process = start_child(
-                [*words, "--log-level", "WARN"], stdout=subprocess.PIPE, stderr=errors
-            )
-        yield_to_flight(process.pid)
+        viewer = Viewer(parameters, show, namespace, Path(folder))
         try:
-            show(_read_announcement(process, log))
-            for line in _read_log_lines(log):
-                show(line)  # The viewer warns of an address that other machines can reach.
-            yield
-            if process.poll() is not None:
-                show(f"The viewer ended early: {(_read_log_lines(log) or ['it was killed.'])[-1]}")
+            viewer.announce()
+            yield viewer
         finally:
-            end_child(process, {signal.SIGINT: _LONGEST_END})
+            viewer.end()
 
 
 def yield_to_flight(pid: int) -> None:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from spacerobot_ros.control.thrusters import ThrusterModulator, ThrusterTable, find_thrusters
 from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.model import SpaceRobot, integration
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.simulation import effort_plant
 from spacerobot_ros.simulation.capture import CapturePlant, Target, capture_in, load_target
 from spacerobot_ros.simulation.config import PlantConfig
@@ -482,17 +482,16 @@ def build_plant(
             "Parameters 'target.*' are set beside 'orbit.*' or 'table.*': targets feel neither the "
             "gravity gradient nor a table; leave one of them out."
         )
-    step = step or kind.integration_step
-
-    def dynamics(of: SpaceRobot, at: InitialState) -> Plant:
-        return kind.plant(of, control_period, at, step)
-
     description = load_target(config.target)
-    if description is None:
-        plant = dynamics(robot, start)
+    plant: Plant
+    if config.engine == "mujoco":
+        # Slow to import, and few plants are.
+        from spacerobot_ros.simulation import mujoco_plant
+
+        step = step or mujoco_plant.DEFAULT_INTEGRATION_STEP
+        plant = mujoco_plant.build_mujoco_plant(robot, config, start, step, description)
     else:
-        target = Target(description, config.target, control_period, step, robot)
-        plant = CapturePlant(dynamics, robot, start, target, config)
+        plant = _exact_plant(robot, config, start, step or kind.integration_step, description)
     plant = with_thrusters(plant, control_period, config.thrusters, config.thrusters_excluded)
     return FaultyPlant(
         plant,
@@ -503,3 +502,22 @@ def build_plant(
         disturbances=config.disturbances,
         surroundings=surroundings,
     )
+
+
+def _exact_plant(
+    robot: SpaceRobot,
+    config: PlantConfig,
+    start: InitialState,
+    step: float,
+    description: RobotDescription | None,
+) -> Plant:
+    """Return the plant of the package's own equations of motion, and the target beside it."""
+    kind, control_period = PLANTS[config.actuation], config.control_period
+
+    def dynamics(of: SpaceRobot, at: InitialState) -> Plant:
+        return kind.plant(of, control_period, at, step)
+
+    if description is None:
+        return dynamics(robot, start)
+    target = Target(description, config.target, control_period, step, robot)
+    return CapturePlant(dynamics, robot, start, target, config)

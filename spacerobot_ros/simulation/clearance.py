@@ -1,7 +1,7 @@
 """The clearance of a plant in flight: the smallest distance of its links, and their contacts.
 
-A plant integrates the motion of bodies that do not push each other: it goes on through a contact,
-and reports that it does.
+An exact plant integrates the motion of bodies that do not push each other: it goes on through a
+contact, and reports that it does.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair, ObstaclePair
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.files import warn_first_time
+from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array, RobotDescription
 
 _LOG = logging.getLogger(__name__)
@@ -91,10 +93,14 @@ class ClearanceMonitor:
         The solids of the robot, with at least one pair, and exact distances.
     links
         The links in the order of the poses.
+    pushing
+        Whether bodies that touch push each other, as the events say.
     """
 
-    def __init__(self, geometry: CollisionGeometry, links: tuple[str, ...]) -> None:
-        self._nearest = NearestPair(geometry, links)
+    def __init__(
+        self, geometry: CollisionGeometry, links: tuple[str, ...], *, pushing: bool = False
+    ) -> None:
+        self._nearest, self._pushing = NearestPair(geometry, links), pushing
         self._touching: frozenset[LinkPair] = frozenset()
 
     @classmethod
@@ -103,6 +109,8 @@ class ClearanceMonitor:
         robot: RobotDescription,
         links: tuple[str, ...],
         before: ClearanceMonitor | None = None,
+        *,
+        pushing: bool = False,
     ) -> ClearanceMonitor | None:
         """Return the monitor of a robot; None: none of its links could touch.
 
@@ -113,9 +121,14 @@ class ClearanceMonitor:
         if not len(geometry.pairs):
             return None
         if not geometry.exact:
-            _LOG.warning("The plant measures no clearance without the package coal.")
+            warn_first_time(
+                _LOG,
+                cache_directory(),
+                "warned_of_clearance",
+                "The plant measures no clearance without the package coal.",
+            )
             return None
-        monitor = cls(geometry, links)
+        monitor = cls(geometry, links, pushing=pushing)
         if before is not None:
             monitor._touching = before._touching
         return monitor
@@ -141,9 +154,15 @@ class ClearanceMonitor:
             return status, []
         self._touching = self._nearest.touching(link_R, link_r, pose)
         return status, [
-            *(_contact_event(each, time_s) for each in sorted(self._touching - before)),
-            *(_contact_event(each, time_s, over=True) for each in sorted(before - self._touching)),
+            *(self._begun(each, time_s) for each in sorted(self._touching - before)),
+            *(_ended(each, time_s) for each in sorted(before - self._touching)),
         ]
+
+    def _begun(self, links: LinkPair, time_s: float) -> Event:
+        then = "push each other" if self._pushing else "the simulation goes on through the contact"
+        joint = " and" if self._pushing else ";"
+        message = f"{_subject(links)} touch{joint} {then}."
+        return Event(EventKind.CONTACT, message, _ERROR, time_s, about=_names(links))
 
 
 def _subject(links: LinkPair) -> str:
@@ -151,10 +170,10 @@ def _subject(links: LinkPair) -> str:
     return links.subject[0].upper() + links.subject[1:]
 
 
-def _contact_event(links: LinkPair, time_s: float, *, over: bool = False) -> Event:
-    about = {"first": links.first, "second": links.second}
-    if over:
-        message = f"{_subject(links)} no longer touch."
-        return Event(EventKind.CONTACT_ENDED, message, _OK, time_s, about=about)
-    message = f"{_subject(links)} touch; the simulation goes on through the contact."
-    return Event(EventKind.CONTACT, message, _ERROR, time_s, about=about)
+def _ended(links: LinkPair, time_s: float) -> Event:
+    message = f"{_subject(links)} no longer touch."
+    return Event(EventKind.CONTACT_ENDED, message, _OK, time_s, about=_names(links))
+
+
+def _names(links: LinkPair) -> dict[str, str]:
+    return {"first": links.first, "second": links.second}

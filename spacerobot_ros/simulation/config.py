@@ -250,6 +250,12 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     actuation: str = parameter(
         "velocity", "what joint_commands carry", choices=("velocity", "effort")
     )
+    engine: str = parameter(
+        "exact",
+        "integrates the motion: the package's own equations, where bodies pass through each other, "
+        "or MuJoCo, where they push each other",
+        choices=("exact", "mujoco"),
+    )
     time_mode: str = parameter("realtime", "who drives time", choices=("realtime", "lockstep"))
     tick_rate: float = parameter(
         20.0, "ticks a second of simulated time", unit="Hz", minimum=0.001, maximum=100000.0

@@ -81,6 +81,36 @@ def without_environment(mujoco: Any, model: Any, step: float) -> None:
     model.opt.timestep = step
 
 
+def add_motors(mujoco: Any, spec: Any, description: RobotDescription) -> None:
+    """Add actuators to a specification: six for the wrench on the base in B, one for each joint."""
+    # The wrench turns with the base, at every stage of every step.
+    spec.worldbody.first_body().add_site(name="wrench")
+    for axis in np.eye(6):
+        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_SITE, target="wrench", gear=axis.tolist())
+    for name in description.joint_names:
+        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+
+
+def compiled_model(spec: Any, description: RobotDescription) -> Any:
+    """Return MuJoCo's model of a specification.
+
+    Raises
+    ------
+    RobotDescriptionError
+        MuJoCo refuses the robot.
+    """
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise _refused(description, error) from error
+
+
+def joint_addresses(model: Any, description: RobotDescription) -> tuple[list[int], list[int]]:
+    """Return the indices of the joints, by the order of the robot, in ``qpos`` and in ``qvel``."""
+    joints = [model.joint(name) for name in description.joint_names]
+    return [int(each.qposadr[0]) for each in joints], [int(each.dofadr[0]) for each in joints]
+
+
 def _refused(description: RobotDescription, error: ValueError) -> RobotDescriptionError:
     reason = str(error).removesuffix(".")
     return RobotDescriptionError(f"MuJoCo refuses robot '{description.name}': {reason}.")
@@ -109,22 +139,11 @@ class MujocoEngine:
     def __init__(self, description: RobotDescription, pose: Array, q: Array) -> None:
         self._mujoco = mujoco = import_mujoco()
         spec = mujoco_spec(mujoco, description)
-        # The wrench turns with the base, at every stage of every step.
-        spec.worldbody.first_body().add_site(name="wrench")
-        for axis in np.eye(6):
-            spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_SITE, target="wrench", gear=axis.tolist())
-        names = description.joint_names
-        for name in names:
-            spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
-        try:
-            self._model = spec.compile()
-        except ValueError as error:
-            raise _refused(description, error) from error
+        add_motors(mujoco, spec, description)
+        self._model = compiled_model(spec, description)
         without_environment(mujoco, self._model, EFFORT_STEP)
         self._data = mujoco.MjData(self._model)
-        joints = [self._model.joint(name) for name in names]
-        self._q = [int(joint.qposadr[0]) for joint in joints]
-        self._qdot = [int(joint.dofadr[0]) for joint in joints]
+        self._q, self._qdot = joint_addresses(self._model, description)
         self._place(pose, q)
 
     @property

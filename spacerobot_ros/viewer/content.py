@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -46,10 +47,16 @@ COLORS: Mapping[Verdict, Color] = {
 }
 """Colours of the ghost, by the verdict on its goal."""
 
-_LEVEL_COLORS = ("#2a9d5c", "#c98a00", "#d23c3c")
-"""Text colours of the levels OK, WARN and ERROR: readable on white and on black."""
+_LEVEL_COLORS = (
+    "var(--ok-color,#2a9d5c)",
+    "var(--warn-color,#c98a00)",
+    "var(--bad-color,#d23c3c)",
+)
+"""Colours of the levels OK, WARN and ERROR: those of ``page.js`` are readable in both themes."""
 
-_FAINT_COLOR = "#8a8f98"
+_FAINT_COLOR, _BAR_COLOR = "var(--faint-color,#8a8f98)", "#8a8f9855"
+
+_ENDED = "The stack has ended: none of its nodes answers."
 
 
 # -- the head of the page -----------------------------------------------------------------------
@@ -69,20 +76,27 @@ def silence_message(state: StackState) -> str:
 
 
 def time_to_go(state: StackState) -> float | None:
-    """Return the remaining time of the planned manoeuvre, s; None if none is flown."""
-    planner, measured = state.planner, state.measured
-    if planner is None or measured is None or planner.state is not PlannerState.EXECUTING:
+    """Return the time until the goal is to be reached, s; None if none is flown to.
+
+    A planner says it, or else a controller.
+    """
+    planner, controller, measured = state.planner, state.controller, state.measured
+    if measured is None:
         return None
-    if "planner" in state.absent:
+    if planner is not None and "planner" not in state.absent:
+        ends = planner.ends_at_s if planner.state is PlannerState.EXECUTING else 0.0
+    elif controller is not None and "controller" not in state.absent:
+        ends = controller.ends_at_s
+    else:
         return None
-    return max(0.0, planner.ends_at_s - measured.time_s) if planner.ends_at_s else None
+    return max(0.0, ends - measured.time_s) if ends else None
 
 
-def progress(state: StackState) -> float:
-    """Return the flown share of the planned manoeuvre, 0 to 1; 0 if none is flown."""
+def progress(state: StackState) -> float | None:
+    """Return the flown share of the planned manoeuvre, 0 to 1; None if none is flown."""
     left, planner = time_to_go(state), state.planner
     if left is None or planner is None or planner.manoeuvre_time_s <= 0.0:
-        return 0.0
+        return None
     return min(1.0, max(0.0, 1.0 - left / planner.manoeuvre_time_s))
 
 
@@ -102,7 +116,7 @@ def status_html(
             _line_html("No robot is shown: no valid robot_description has been received.", 2)
         )
     if stack_ended(state):
-        lines.append(_line_html("The stack has ended: none of its nodes answers.", 2))
+        lines.append(_line_html(_ENDED, 2))
     for name, seconds in sorted(state.silent.items()):
         lines.append(_line_html(f"Node '{name}' has been silent for {math.floor(seconds)} s.", 2))
     lines.extend(_line_html(f"Node '{name}' is not active.", 1) for name in sorted(state.inactive))
@@ -140,12 +154,31 @@ def status_html(
         control = state.controller
         word, level = control.state.value, control.state.level
         lines.append(_node_html(state, "controller", word, control.message, level))
+        left = time_to_go(state) if state.planner is None else None
+        to_go = "" if left is None else f", {left:.1f} s to go"
         lines.extend(
-            _line_html(f"{part} is {error} from its goal.", None)
+            _line_html(f"{part} is {error} from its goal{to_go}.", None)
             for part, error in (errors or {}).items()
             if not state.goals[part].end_effectors
         )
     return padded("".join(lines))
+
+
+def look_back_html(shown: StackState, live: StackState) -> str:
+    """Return the lines above an earlier state: how long ago it was, and whether the stack ended."""
+    assert shown.measured is not None
+    assert live.measured is not None
+    ago = live.measured.time_s - shown.measured.time_s
+    text = f"Looking back {ago:.1f} s. The robot is at t = {live.measured.time_s:.2f} s now."
+    lines = [_line_html(text, 1)]
+    if stack_ended(live):
+        lines.append(_line_html(_ENDED, 2))
+    return padded("".join(lines))
+
+
+def announcement_html(notice: Notice) -> str:
+    """Return a line above the state of the stack."""
+    return padded(_line_html(notice.message, notice.level))
 
 
 def stack_ended(state: StackState) -> bool:
@@ -170,7 +203,7 @@ def _node_html(state: StackState, key: str, word: str, message: str, level: int)
     """Return the status of a node; that of one that is offline is called its last one."""
     offline, color = key in state.absent, _LEVEL_COLORS[level]
     if offline:
-        word, color = f"offline, last {word}:", _FAINT_COLOR
+        word, color = f"offline, last {word}:", "inherit"
     text = (
         f'<div style="margin:2px 0"><b>{key.capitalize()}</b> '
         f'<span style="color:{color};font-weight:600">{escape(word)}</span> '
@@ -181,7 +214,7 @@ def _node_html(state: StackState, key: str, word: str, message: str, level: int)
 
 def _grey_out(html: str, *, offline: bool) -> str:
     """Return the message of a node, greyed out if the node is offline."""
-    return f'<div style="opacity:.45">{html}</div>' if offline else html
+    return f'<div style="opacity:.75">{html}</div>' if offline else html
 
 
 def _line_html(text: str, level: int | None) -> str:
@@ -232,7 +265,7 @@ def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -
         return padded("The robot has no joints.")
     style = "border-spacing:4px 2px;text-align:left;white-space:nowrap;font-size:.9em"
     table = f'<table style="{style}"><tr>{heads}</tr>{"".join(rows)}</table>'
-    return padded(f'<div style="overflow-x:auto">{table}</div>')
+    return padded(f'<div tabindex="0" style="overflow-x:auto">{table}</div>')
 
 
 def shortened(name: str) -> str:
@@ -252,7 +285,7 @@ def _bar_html(share: float, level: int) -> str:
     place = 100 * min(1.0, max(0.0, share))
     color = _LEVEL_COLORS[level]
     return (
-        f'<div style="width:44px;height:8px;background:{_FAINT_COLOR}55;border-radius:4px;'
+        f'<div style="width:44px;height:8px;background:{_BAR_COLOR};border-radius:4px;'
         f'position:relative"><div style="position:absolute;left:{place:.0f}%;top:-2px;width:4px;'
         f'height:12px;margin-left:-2px;background:{color};border-radius:2px"></div></div>'
     )
@@ -344,6 +377,27 @@ def end_effector_positions(state: StackState, kinematics: ForwardKinematics) -> 
             if pose is not None:
                 found[aim.link] = pose[:3]
     return found
+
+
+def planned_positions(
+    state: StackState, robot: RobotDescription, kinematics: ForwardKinematics
+) -> dict[Part, Array]:
+    """Return the planned positions (k, 3) in the world of end-effectors, m.
+
+    They are those of :func:`end_effector_positions`, as far as they are links of the robot.
+    """
+    motion = state.planned_motion
+    n = len(robot.joint_names)
+    if motion is None or motion.shape[1] != 7 + n:
+        return {}
+    links = {aim.link: aim.link for goal in state.goals.values() for aim in goal.end_effectors}
+    if state.tool is not None:
+        links[DEFAULT_END_EFFECTOR] = robot.end_effector()
+    return {
+        part: np.array([link_pose(kinematics, link, row[:7], row[7:])[:3] for row in motion])
+        for part, link in links.items()
+        if link in kinematics.links
+    }
 
 
 def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:
@@ -447,6 +501,52 @@ def hint_html(text: str) -> str:
 # -- over time ----------------------------------------------------------------------------------
 
 
+T = TypeVar("T")
+
+
+class Recent(Generic[T]):
+    """Items of the last minutes of simulated time, the oldest first, at least a step apart.
+
+    Parameters
+    ----------
+    span_s
+        Time from the oldest item to the latest, s of simulated time.
+    most
+        Largest number of items; beyond it every other one is dropped and the step doubled.
+    """
+
+    def __init__(self, span_s: float = 300.0, most: int = 1500) -> None:
+        self._span, self._most, self._step = span_s, most, 0.0
+        self._times: list[float] = []
+        self._items: list[T] = []
+
+    def add(self, time_s: float, item: T) -> None:
+        """Add an item; those of this time or later are dropped first (time may run back)."""
+        times = self._times
+        begin, end = (bisect_left(times, each) for each in (time_s - self._span, time_s))
+        if end - begin > 1 and times[end - 1] - times[end - 2] < self._step:
+            end -= 1  # The latest item stays alone, however near to the one before.
+        self._times, self._items = [*times[begin:end], time_s], [*self._items[begin:end], item]
+        if len(self._times) > self._most:
+            self._step = 2.0 * (time_s - self._times[0]) / self._most
+            self._times = [*self._times[:-1:2], time_s]
+            self._items = [*self._items[:-1:2], item]
+
+    @property
+    def items(self) -> Sequence[T]:
+        """The items."""
+        return self._items
+
+    @property
+    def span(self) -> tuple[float, float] | None:
+        """Times of the first and the last item, s; None: there is none."""
+        return (self._times[0], self._times[-1]) if self._times else None
+
+    def at(self, time_s: float) -> T:
+        """Return the last item until a time, or the first one of all."""
+        return self._items[max(bisect_right(self._times, time_s) - 1, 0)]
+
+
 class History:
     """Numbers over the last minutes of simulated time, one row per drawing.
 
@@ -454,35 +554,24 @@ class History:
     ----------
     width
         Numbers in a row.
-    span_s
-        Length of the history, s of simulated time.
-    most
-        Largest number of rows; beyond it every other one is dropped.
+    span_s, most
+        As of :class:`Recent`.
     """
 
     def __init__(self, width: int, span_s: float = 300.0, most: int = 600) -> None:
-        self._span, self._most = span_s, most
-        self._rows: deque[Array] = deque()
+        self._rows: Recent[Array] = Recent(span_s, most)
         self._width = width
 
     def add(self, time_s: float, values: Sequence[float] | Array) -> None:
         """Add a row; rows of this time or later are dropped first (time may run back)."""
-        while self._rows and self._rows[-1][0] >= time_s:
-            self._rows.pop()
-        self._rows.append(np.concatenate([[time_s], np.asarray(values, float)]))
-        while self._rows[0][0] < time_s - self._span:
-            self._rows.popleft()
-        if len(self._rows) > self._most:
-            # Every other one, but for the last.
-            kept = list(self._rows)
-            self._rows = deque([*kept[:-1:2], kept[-1]])
+        self._rows.add(time_s, np.concatenate([[time_s], np.asarray(values, float)]))
 
     def columns(self) -> tuple[Array, ...]:
         """Return time (k,) and each number (k,); one row of zeros if there is none yet."""
-        if not self._rows:
+        if not self._rows.items:
             # A plot without numbers has no scale.
             return tuple(np.zeros(1) for _ in range(self._width + 1))
-        table = np.array(self._rows)
+        table = np.array(self._rows.items)
         return tuple(np.ascontiguousarray(column) for column in table.T)
 
 
@@ -519,3 +608,7 @@ class Trail:
     def points(self) -> Array:
         """The points (k, 3), m."""
         return np.array(self._points).reshape(-1, 3)
+
+    def until(self, time_s: float) -> Array:
+        """Return the points (k, 3) until a time, m."""
+        return self.points[: bisect_right(self._times, time_s)]

@@ -22,7 +22,7 @@ from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.faults import FAULT_KINDS, Targets
 from spacerobot_ros.viewer import content, scene
-from spacerobot_ros.viewer.content import History, Trail
+from spacerobot_ros.viewer.content import History, Recent, Trail
 from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor
 from spacerobot_ros.viewer.server import ViewerConfig
 from spacerobot_ros.viewer.state import (
@@ -59,6 +59,12 @@ _CURVE_COLORS = (
 )
 _AXIS_COLOR = "#8a8f98"
 _PLOT_PIXELS = 170
+
+_LOOK_BACK_STEP_S = 0.1
+"""Step of the slider over the past, simulated s."""
+
+_LEAST_PAST_S = 1.0
+"""Shortest past that has a slider, simulated s."""
 
 _SLIDER_FREE_S = 1.5
 """Wall time for which the page does not move the time slider after a user has, s."""
@@ -145,6 +151,61 @@ class TimeLine:
     def _seek(self, seconds: float) -> None:
         self._left_alone_until = time.monotonic() + _SLIDER_FREE_S
         self._act(Seek(seconds))
+
+
+class LookBack:
+    """Slider over the past of a flight, and the way back to the present.
+
+    Attributes
+    ----------
+    time_s
+        Simulated time that a user looks at, s; None: the present.
+    """
+
+    def __init__(self, gui: viser.GuiApi, defer: Defer) -> None:
+        self.time_s: float | None = None
+        self._slider: Any = gui.add_slider(
+            "Look back (s)",
+            0.0,
+            _LOOK_BACK_STEP_S,
+            _LOOK_BACK_STEP_S,
+            0.0,
+            visible=False,
+            hint="Show an earlier state, of the last five minutes; the robot goes on.",
+        )
+        self._live = gui.add_button("Back to the present", color="orange", visible=False)
+
+        @self._slider.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                at, end = float(event.target.value), float(event.target.max)
+                defer(lambda: self._look(None if at >= end else at))
+
+        @self._live.on_click
+        async def _(event: Any) -> None:
+            defer(lambda: self._look(None))
+
+    def _look(self, time_s: float | None) -> None:
+        self.time_s = time_s
+
+    def show(self, span: tuple[float, float] | None) -> None:
+        """Show the slider over a span of simulated time, s; None: there is no past."""
+        if span is None or span[1] - span[0] < _LEAST_PAST_S:
+            self.time_s = None
+            self._slider.visible = self._live.visible = False
+            return
+        # Whole steps within the span.
+        low, high = (
+            round(whole(end / _LOOK_BACK_STEP_S) * _LOOK_BACK_STEP_S, 6)
+            for whole, end in ((math.ceil, span[0]), (math.floor, span[1]))
+        )
+        if self.time_s is not None:
+            self.time_s = min(max(self.time_s, low), high)
+        at = high if self.time_s is None else self.time_s
+        for name, value in (("max", high), ("min", low), ("value", at)):
+            if getattr(self._slider, name) != value:
+                setattr(self._slider, name, value)
+        self._slider.visible, self._live.visible = True, self.time_s is not None
 
 
 class Faults:
@@ -416,6 +477,9 @@ _OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Period of drawing of the slower parts, wall s."""
 
+_ANNOUNCED_S = 60.0
+"""Wall time for which an announcement is shown, s."""
+
 CAMERA = np.array([1.1, 1.4, 0.8])
 """Initial position of the camera relative to the robot, in robot lengths.
 
@@ -486,6 +550,13 @@ class Page:
         self._due: dict[str, float] = {}
         self._now = 0.0
         self._last: Measured | None = None
+        """The last state that was received, in the past of which users look back."""
+        self._drawn: Measured | None = None
+        self._looked_back = False
+        self._announced: tuple[Notice, float] | None = None
+        """The line in the head, and the wall time until which it is shown, s."""
+        self._planned: tuple[Array | None, Mapping[Part, Array]] = None, {}
+        """The planned motion whose paths of end-effectors are drawn, and those paths."""
         self._build()
 
     def _build(self) -> None:
@@ -494,6 +565,7 @@ class Page:
         # Buttons come first, so that a growing status text does not move them under the mouse.
         self._time_line = TimeLine(gui, defer, self._request)
         self._buttons = Buttons(gui, defer, self._request, self._fly)
+        self._look_back = LookBack(gui, defer)
         self._status = gui.add_html(content.status_html(StackState()))
         self._bar: Any = gui.add_progress_bar(0.0, visible=False)
         tabs = gui.add_tab_group()
@@ -571,7 +643,10 @@ class Page:
 
     def show_robot(self, robot: RobotDescription | None) -> None:
         """Start over with another robot; None: there is none."""
-        self._robot, self._table, self._drawing, self._last = robot, None, None, None
+        self._robot, self._table, self._drawing = robot, None, None
+        self._last = self._drawn = None
+        self._past: Recent[StackState] = Recent()
+        self._look_back.time_s = None
         self._kinematics = None if robot is None else ForwardKinematics(robot)
         self._around: scene.Surroundings | None = None
         self._server.scene.reset()
@@ -644,6 +719,10 @@ class Page:
         """Add a line to the log."""
         self._log.add(notice)
 
+    def announce(self, notice: Notice) -> None:
+        """Show a line in the head for a minute."""
+        self._announced = (notice, self._now + _ANNOUNCED_S)
+
     # -- drawing --------------------------------------------------------------------------------
 
     def update(self, state: StackState, now: float) -> list[Action]:
@@ -657,28 +736,33 @@ class Page:
                 self.editor.show(visible=not replays)
                 self.faults.show_menu(visible=not replays)
             if self._drawing is not None and state.measured is not None:
-                self._draw_robot(state, state.measured)
-            if self._target_drawing is not None and state.target is not None:
+                self._take(state, state.measured)
+            shown = self._shown(state)
+            if self._drawing is not None and shown.measured is not None:
+                self._draw_robot(shown, shown.measured)
+            if self._target_drawing is not None and shown.target is not None:
                 self._target_drawing.base.visible = True
-                self._target_drawing.place(state.target)
+                self._target_drawing.place(shown.target)
             self._time_line.show(state, now)
             if self._is_due("texts", _TEXTS_S):
-                self._draw_texts(state)
+                self._look_back.show(None if replays else self._past.span)
+                self._draw_texts(shown)
             if self._robot is not None and self._is_due("tables", _TABLES_S):
-                self._draw_joints(self._robot, state)
+                self._draw_joints(self._robot, shown)
             if self._is_due("plots", _PLOTS_S):
                 self._plots.draw()
         actions, self._actions = self._actions, []
         return actions
 
-    def _draw_robot(self, state: StackState, measured: Measured) -> None:
-        robot, drawing = self._robot, self._drawing
-        assert robot is not None
-        assert drawing is not None
+    def _shown(self, state: StackState) -> StackState:
+        """Return the present state, or the earlier one that a user looks back at."""
+        at = self._look_back.time_s
+        return state if at is None or self._past.span is None else self._past.at(at)
+
+    def _take(self, state: StackState, measured: Measured) -> None:
+        """Add a new state to plots, paths and the past, and tell the editor of goals."""
         if measured is self._last:
             return
-        if self._last is not None and self._follow.value:
-            self._move_cameras(measured.pose[:3] - self._last.pose[:3])
         self._last = measured
         if self._around is None:
             center = measured.pose[:3]
@@ -687,9 +771,6 @@ class Page:
             self._aim_camera(self._server.initial_camera)
             for client in self._server.get_clients().values():
                 self._aim_camera(client.camera)
-        drawing.base.visible = True
-        drawing.place(measured.pose)
-        drawing.set_joint_positions(measured.q)
         if not self.editor.placed and state.replay is None:
             self.editor.place(measured.pose, None, measured.q, self._now)
         self.editor.robot_is_at(measured.pose, measured.q)
@@ -699,30 +780,60 @@ class Page:
         for part, point in content.end_effector_positions(state, self._kinematics).items():
             trail = self._end_effector_trails.setdefault(part, Trail(0.003 * self._reach))
             trail.add(measured.time_s, point)
-        if self._is_due("paths", _PATHS_S):
-            self._around.flown.draw(self._trail.points)
-            path = state.planned_path
-            self._around.planned.draw(np.zeros((0, 3)) if path is None else path)
-            for part, trail in self._end_effector_trails.items():
-                self._around.draw_end_effector(part, trail.points)
+        if state.replay is None:
+            self._past.add(measured.time_s, state)
+
+    def _draw_robot(self, state: StackState, measured: Measured) -> None:
+        drawing, around = self._drawing, self._around
+        assert drawing is not None
+        assert around is not None
+        if measured is self._drawn:
+            return
+        if self._drawn is not None and self._follow.value:
+            self._move_cameras(measured.pose[:3] - self._drawn.pose[:3])
+        self._drawn = measured
+        drawing.base.visible = True
+        drawing.place(measured.pose)
+        drawing.set_joint_positions(measured.q)
+        # The present, too, is another time than the one that was looked at before.
+        looked_back, self._looked_back = self._looked_back, self._look_back.time_s is not None
+        if looked_back or self._looked_back or self._is_due("paths", _PATHS_S):
+            self._draw_paths(state, around, measured.time_s)
         if state.firing is not None and self._table is not None:
             names, duty = state.firing.names, state.firing.duty
-            self._around.plumes.draw_segments(
-                scene.plumes(self._table, names, duty, 0.25 * self._reach)
-            )
+            around.plumes.draw_segments(scene.plumes(self._table, names, duty, 0.25 * self._reach))
+
+    def _draw_paths(self, state: StackState, around: scene.Surroundings, until: float) -> None:
+        """Draw the planned paths, and those flown until a time."""
+        around.flown.draw(self._trail.until(until))
+        path = state.planned_path
+        around.planned.draw(np.zeros((0, 3)) if path is None else path)
+        for part, trail in self._end_effector_trails.items():
+            around.draw_end_effector(part, trail.until(until))
+        assert self._robot is not None
+        assert self._kinematics is not None
+        if self._planned[0] is not state.planned_motion:
+            paths = content.planned_positions(state, self._robot, self._kinematics)
+            self._planned = state.planned_motion, paths
+            around.draw_planned_end_effectors(paths)
 
     def _goal_errors(self, state: StackState) -> dict[Part, content.GoalDistance]:
         return {} if self._kinematics is None else content.goal_errors(state, self._kinematics)
 
-    def _draw_texts(self, state: StackState) -> None:
-        errors = self._goal_errors(state)
-        text = content.status_html(state, errors, described=self._robot is not None)
+    def _draw_texts(self, shown: StackState) -> None:
+        state, errors = self._state, self._goal_errors(shown)
+        text = content.status_html(shown, errors, described=self._robot is not None)
+        if self._announced is not None and self._now < self._announced[1]:
+            text = content.announcement_html(self._announced[0]) + text
+        if shown is not state:
+            text = content.look_back_html(shown, state) + text
         if text != self._status.content:
             self._status.content = text
-        self._bar.visible = content.time_to_go(state) is not None
-        self._bar.value = round(100 * content.progress(state), 1)
+        flown = content.progress(shown)
+        self._bar.visible = flown is not None
+        self._bar.value = 0.0 if flown is None else round(100 * flown, 1)
         self.faults.show(state)
-        self._plots.show_budget(state)
+        self._plots.show_budget(shown)
         self._log.draw()
         has_tool = content.has_tool(state)
         if has_tool and state.measured is not None and not self.editor.has_tool:
@@ -745,7 +856,8 @@ class Page:
 
     def _aim_camera(self, camera: Any, offset: Array = CAMERA) -> None:
         """Turn a camera to the robot; before its first state, to the origin."""
-        at = np.zeros(3) if self._last is None else self._last.pose[:3]
+        seen = self._last if self._drawn is None else self._drawn
+        at = np.zeros(3) if seen is None else seen.pose[:3]
         away = self._reach * offset
         if getattr(camera, "aspect", 1.0) < _PORTRAIT:
             # On a phone the panel covers the lower half: the robot is seen above it.

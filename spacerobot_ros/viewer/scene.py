@@ -7,7 +7,7 @@ some, stay out of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -41,8 +41,12 @@ _FRAME_SIZE = 0.12
 _STARS, _SKY = 900, 40.0
 """Number of stars, and their distance in robot lengths."""
 
+_SPACE = np.full((1, 1, 3), 14, np.uint8)
+"""Picture of the space behind the stars: one pixel, red, green and blue."""
+
 _SUN = np.array([0.55, 0.65, 0.52]) / np.linalg.norm([0.55, 0.65, 0.52])
 _SUN_COLOR: Color = (255, 244, 214)
+_SUN_INTENSITY, _SKY_INTENSITY = 3.0, 0.35
 
 _MIN_LINE_SEGMENTS = 32
 """Least capacity of a line, in segments."""
@@ -124,9 +128,10 @@ class RobotDrawing:
     def _add_visual(self, path: str, visual: Visual) -> Any:
         """Draw a visual in the frame of its link."""
         red, green, blue, alpha = visual.shape.rgba
-        look: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
+        solid = self._color is None
+        look: dict[str, Any] = {"cast_shadow": solid, "receive_shadow": solid}
         look["color"] = self._color or tuple(round(255 * x) for x in (red, green, blue))
-        if self._color is not None:
+        if not solid:
             look["opacity"] = GHOST_OPACITY
         elif alpha < 1.0:
             look["opacity"] = alpha
@@ -223,8 +228,6 @@ def draw_obstacles(
                 visual.mesh.faces.astype(np.uint32),
                 color=(round(255 * red), round(255 * green), round(255 * blue)),
                 flat_shading=True,
-                cast_shadow=False,
-                receive_shadow=False,
             )
         )
     return drawn
@@ -362,7 +365,7 @@ class Surroundings:
         self.planned = Lines(scene, "/planned_path", _PLANNED)
         self.flown = Lines(scene, "/flown_path", _FLOWN)
         self.plumes = Lines(scene, f"{robot_path}/plumes", _PLUME)
-        self._end_effectors: dict[str, Lines] = {}
+        self._end_effectors: dict[tuple[str, str], Lines] = {}
         self._paths_shown = True
 
     def _add_sky(self, reach: float, center: Array) -> list[Any]:
@@ -390,13 +393,21 @@ class Surroundings:
         light = self._scene.add_light_directional(
             "/sunlight",
             color=_SUN_COLOR,
-            intensity=1.5,
+            intensity=_SUN_INTENSITY,
+            cast_shadow=True,
             position=(float(_SUN[0]), float(_SUN[1]), float(_SUN[2])),
         )
-        return [stars, sun, light]
+        # Light that the stars and other bodies would give: parts in shadow stay visible.
+        fill = self._scene.add_light_ambient("/skylight", intensity=_SKY_INTENSITY)
+        return [stars, sun, light, fill]
 
     def show_setting(self, setting: Setting) -> None:
-        """Show the sky or the grid."""
+        """Show the sky, lit by the Sun alone, or the grid."""
+        indoors = setting is Setting.GRID
+        self._scene.configure_default_lights(enabled=indoors)
+        self._scene.configure_environment_map("city" if indoors else None)
+        # Space is dark on light pages too.
+        self._scene.set_background_image(None if indoors else _SPACE)
         self._grid.visible = setting is Setting.GRID
         for each in self._sky:
             each.visible = setting is Setting.SPACE
@@ -413,9 +424,21 @@ class Surroundings:
 
     def draw_end_effector(self, name: str, points: Array) -> None:
         """Draw the flown path (k, 3) of an end-effector, m."""
-        if name not in self._end_effectors:
-            path = f"/flown_path_of_end_effector{len(self._end_effectors)}"
-            line = Lines(self._scene, path, _FLOWN_END_EFFECTOR)
+        self._draw_path_of("flown", name, _FLOWN_END_EFFECTOR, points)
+
+    def draw_planned_end_effectors(self, paths: Mapping[str, Array]) -> None:
+        """Draw the planned paths (k, 3) of end-effectors, m; those of others are cleared."""
+        for kind, name in tuple(self._end_effectors):
+            if kind == "planned" and name not in paths:
+                self._end_effectors[kind, name].draw(np.zeros((0, 3)))
+        for name, points in paths.items():
+            self._draw_path_of("planned", name, _PLANNED, points)
+
+    def _draw_path_of(self, kind: str, name: str, color: Color, points: Array) -> None:
+        """Draw a path of an end-effector; ``kind``: ``flown`` or ``planned``."""
+        if (kind, name) not in self._end_effectors:
+            number = sum(each == kind for each, _ in self._end_effectors)
+            line = Lines(self._scene, f"/{kind}_path_of_end_effector{number}", color)
             line.show(visible=self._paths_shown)
-            self._end_effectors[name] = line
-        self._end_effectors[name].draw(points)
+            self._end_effectors[kind, name] = line
+        self._end_effectors[kind, name].draw(points)

@@ -8,14 +8,17 @@ in a user's browser: this page steers a robot. For the same reason no other page
 from __future__ import annotations
 
 import functools
+import gzip
 import importlib.util
 import io
 import ipaddress
+import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -67,6 +70,11 @@ _NO_FRAMING_HEADERS = {
 """HTTP headers that keep browsers from showing the page inside another one."""
 
 _PAGE_TITLE = "spacerobot"
+
+_ALIVE_PATH, _SERVER_ID = "/alive", secrets.token_hex(8)
+"""Path that open pages ask for, to learn whether the viewer still runs, and the answer: another one
+after each start.
+"""
 
 _server_start_lock = threading.Lock()
 """Held while a server starts, when a function of websockets is replaced."""
@@ -146,6 +154,15 @@ def is_own_page(origin: str | None, host: str | None, served: str) -> bool:
     return not is_loopback(served) or is_loopback(name)
 
 
+@functools.lru_cache(maxsize=2)
+def _with_script(page: bytes, *, packed: bool) -> bytes:
+    """Return viser's page (HTML, gzip if ``packed``) with our script before its own."""
+    script = Path(__file__).with_name("page.js").read_bytes()
+    html = gzip.decompress(page) if packed else page
+    html = html.replace(b"<head>", b"<head><script>" + script + b"</script>", 1)
+    return gzip.compress(html) if packed else html
+
+
 @contextmanager
 def _guarded_websockets(served: str) -> Iterator[None]:
     """Make websocket servers that start in this block refuse other origins and frames."""
@@ -163,9 +180,18 @@ def _guarded_websockets(served: str) -> Iterator[None]:
             ):
                 refusal: Response = connection.respond(403, "This page steers a robot.\n")
                 return refusal
-            answer: Response | None = process_request(connection, request)
+            answer: Response | None
+            if request.path == _ALIVE_PATH:
+                answer = connection.respond(200, _SERVER_ID)
+            else:
+                answer = process_request(connection, request)
             if answer is not None:
                 answer.headers.update(_NO_FRAMING_HEADERS)
+                if answer.headers.get("Content-Type", "").startswith("text/html"):
+                    packed = answer.headers.get("Content-Encoding") == "gzip"
+                    answer.body = _with_script(bytes(answer.body), packed=packed)
+                    del answer.headers["Content-Length"]
+                    answer.headers["Content-Length"] = str(len(answer.body))
             return answer
 
         return serve(*given, process_request=process, **options)

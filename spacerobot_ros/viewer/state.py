@@ -88,6 +88,9 @@ class StackState:
         The last status of each node; None if there is no such node.
     planned_path
         (k, 3) positions of the base predicted by the planner, m.
+    planned_motion
+        (k, 7 + n) poses of the base along the planned path, and positions of the joints there;
+        None also if the planner has published no schedule that begins with the path.
     goals
         The last goal sent by anyone, by part. A goal for a planner that is for a link has it among
         its ``end_effectors``; one for the end-effector of a controller is a pose alone.
@@ -114,6 +117,7 @@ class StackState:
     controller: ControllerStatus | None = None
     replay: ReplayStatus | None = None
     planned_path: Array | None = None
+    planned_motion: Array | None = None
     goals: Mapping[Part, Goal] = field(default_factory=dict)
     silent: Mapping[str, float] = field(default_factory=dict)
     inactive: tuple[str, ...] = ()

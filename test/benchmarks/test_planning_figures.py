@@ -309,7 +309,8 @@ def test_ticks_are_the_difference_of_two_flights(monkeypatch: pytest.MonkeyPatch
     }
     sliding = ["sliding_masses", "--method", "lie_bracket", "--set=planner.lie_bracket.cycles=301"]
     assert flown[:3] == [(sliding, 5.0), (sliding, 5.0), (sliding, 1000.0)]
-    assert flown[3:] == [(["coordinated_control"], t) for t in (5.0, 5.0, math.inf)]
+    controlled = ["coordinated_control", "--set=coordinated_control.settle_time=55"]
+    assert flown[3:] == [(controlled, t) for t in (5.0, 5.0, math.inf)]
     plans = [call for call in calls if call[0] == "plan"]
     gait = ("plan", "sliding_masses", {"method": "lie_bracket", "cycles": 301})
     assert plans[:16] == [gait] * 16, "15 after the first one"

@@ -235,12 +235,20 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     beside = campaign(set={"plant.target.robot": "block.urdf"})
     with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has a target"):
         select_engine(beside, "lanes")
+    pushing = campaign(set={"plant.engine": "mujoco"})
+    assert select_engine(pushing, "auto").name == "flights"
+    with pytest.raises(SpaceRobotError, match="its plant has the engine 'mujoco'"):
+        select_engine(pushing, "lanes")
     near = campaign(criteria={"clearance_m": {"min": 0.0}})
     assert select_engine(near, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="lanes measure no distances between links"):
         select_engine(near, "lanes")
     # What would be another kind of flight is not flown as the nominal one.
-    for name, values in (("plant.actuation", ["velocity", "effort"]), ("plant.tick_rate", [20])):
+    for name, values in (
+        ("plant.actuation", ["velocity", "effort"]),
+        ("plant.engine", ["exact", "mujoco"]),
+        ("plant.tick_rate", [20]),
+    ):
         other = campaign(disperse={name: {"choice": values}})
         assert select_engine(other, "auto").name == "flights"
     background = campaign(set={"planner.plan_in_background": True})

@@ -44,6 +44,7 @@ def filled(
     made: Campaign,
     error: Callable[[Draw], float],
     flown: Callable[[int], bool] = lambda number: True,
+    refuses: Callable[[int], bool] = lambda number: False,
     **others: float,
 ) -> Path:
     """Write a dataset whose flights have such position errors, and nothing else."""
@@ -53,9 +54,12 @@ def filled(
     for draw in (each for each in Draws(made) if flown(each.number)):
         metrics = {"position_error_m": error(draw), "manoeuvre_time_s": 4.0, **others}
         outcome = "reached" if metrics["position_error_m"] < 0.05 else "failed"
+        reason = f"{outcome}."
+        if refuses(draw.number):
+            outcome, reason = "refused", "Too far."
         ok = passes_criteria(made.criteria, outcome, metrics)
         left = "needed corrections" if draw.number % 50 == 0 else ""
-        rows.append(Row(draw, outcome, f"{outcome}.", metrics, ok, "lanes", left, 0.01, 0.0))
+        rows.append(Row(draw, outcome, reason, metrics, ok, "lanes", left, 0.01, 0.0))
     dataset.add(rows)
     dataset.close()
     return folder
@@ -198,7 +202,8 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
     interval = stats.ttest_rel(b, a).confidence_interval(0.95)
     (line,) = [line for line in lines if line.startswith("position_error_m")]
     numbers = [float(x) for x in re.findall(r"-?\d\.\d+(?:e-?\d+)?", line)]
-    assert numbers == pytest.approx([(b - a).mean(), interval.low, interval.high], rel=1e-3)
+    wanted = [a.mean(), b.mean(), (b - a).mean(), interval.low, interval.high]
+    assert numbers == pytest.approx(wanted, rel=1e-3)
     only = int(((b <= 0.03) & (a > 0.03)).sum()), int(((a <= 0.03) & (b > 0.03)).sum())
     assert only[0] > 0
     assert f"{only[1]} only short, {only[0]} only short" in lines[0]
@@ -217,12 +222,26 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
         duration_s=4.5,
     )
     again = write_comparison((filled(tmp_path / "a", made, bowl, duration_s=4.0), three), page)
-    assert "duration_s: short minus short is 0.5 (0.5 to 0.5)" in again
+    assert (
+        "duration_s: short 4, short 4.5; short minus short is 0.5 (95 % interval 0.5 to 0.5)"
+    ) in again
     reordered = campaign(
         disperse=dict(reversed(MASSES.items())), flights=120, seed=8, criteria=CRITERIA
     )
     with pytest.raises(ParameterError, match=r"'disperse' is mass.mass_1: .* mass.mass_3"):
         write_comparison((one, filled(tmp_path / "b", reordered, bowl)), page)
+    # Flights whose goal was refused have not moved: their numbers are no result.
+    barred = filled(tmp_path / "barred", made, lambda draw: 0.0, refuses=lambda number: True)
+    lines = write_comparison((one, barred), tmp_path / "barred.html")
+    assert lines[-2:] == [
+        "Of short, 120 of 120 flights have the outcome refused: Too far.",
+        "Differences are those of draws whose goals neither campaign refused.",
+    ]
+    assert not any(line.startswith("position_error_m") for line in lines)
+    half = filled(tmp_path / "half", made, better, refuses=lambda number: number < 60)
+    lines = write_comparison((one, half), tmp_path / "half.html")
+    (line,) = [line for line in lines if line.startswith("position_error_m")]
+    assert f"minus short is {(b - a)[60:].mean():.4g} " in line
     other = campaign(disperse=MASSES, flights=120, seed=9, criteria=CRITERIA)
     four = filled(tmp_path / "four", other, bowl)
     with pytest.raises(ParameterError, match="do not have the same draws: 'seed' is 8 and 9"):

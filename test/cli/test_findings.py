@@ -132,6 +132,11 @@ def test_the_nearest_pairs_of_links_are_listed() -> None:
         "distances    0 pairs of links may come into contact",
         "             A note.",
     ]
+    one = distances(1, exact=False)
+    assert one[:2] == [
+        "distances    1 pair of links may come into contact, with a distance at this shape of",
+        "               0 m  'a' and 'b0'",
+    ]
     three = distances(3, c="disabled")
     assert three == [
         "distances    3 pairs of links may come into contact, with distances at this shape of",

@@ -196,17 +196,22 @@ def test_a_library_is_of_as_many_goals_within_the_bounds_by_a_method_with_the_se
 # -- stacks -------------------------------------------------------------------------------------
 
 
+class _Viewer:
+    """A viewer that is not started; its supervision returns the limit of its restarts."""
+
+    def restart_within(self, restarts: int) -> None:
+        self.supervise = lambda: restarts
+
+
 @pytest.fixture
 def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, str]]:
     """Return whether pages are served, and the namespaces of their stacks."""
     found: list[tuple[bool, str]] = []
 
     @contextmanager
-    def viewing_if(
-        view: bool, parameters: Mapping[str, Any], namespace: str = ""
-    ) -> Iterator[None]:
+    def viewing_if(view: bool, parameters: Mapping[str, Any], namespace: str = "") -> Iterator[Any]:
         found.append((view, namespace))
-        yield
+        yield _Viewer() if view else None
 
     monkeypatch.setattr(flights, "viewing_if", viewing_if)
     return found
@@ -222,18 +227,24 @@ def test_options_of_a_stack_that_stays_up(
         return bag
 
     monkeypatch.setattr(session, "run_until_stopped", run_until_stopped)
-    line = "up planar_chain --rate 2.5 --bag b.mcap --processes --namespace left --view"
+    line = (
+        "up planar_chain --rate 2.5 --bag b.mcap --processes --namespace left --view --restarts 5"
+    )
     result = call(*line.split(), "--set", "planner.tick_rate=12.5")
     assert result.output.split() == ["bag", "b.mcap"]
     assert call("up", "planar_chain").exit_code == 0
-    (given, bag, named), (usual, none, by_default) = kept
+    (given, bag, named), (usual, none, by_default) = kept[:2]
     assert given.parameters("plant")["real_time_factor"] == 2.5
     assert usual.parameters("plant")["real_time_factor"] == 1.0
     assert given.parameters("planner")["tick_rate"] == 12.5
     assert (bag, none) == (Path("b.mcap"), None)
-    assert named == {"processes": True, "namespace": "left"}
-    assert by_default == {"processes": False, "namespace": ""}
-    assert views == [(True, "left"), (False, "")]
+    assert named.pop("supervise")() == 5
+    assert named == {"processes": True, "namespace": "left", "restarts": 5}
+    assert by_default.pop("supervise")() is None
+    assert by_default == {"processes": False, "namespace": "", "restarts": 0}
+    assert call("up", "planar_chain", "--processes").exit_code == 0
+    assert kept[-1][2]["restarts"] == 3
+    assert views == [(True, "left"), (False, ""), (False, "")]
 
 
 # -- bags ---------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ SUMMARY: dict[str, Any] = {
     "scenario": "sliding_masses",
     "method": "lie_bracket",
     "message": "The goal is reached.",
+    "verdict": "The goal is reached.",
     "state": "reached",
     "succeeded": True,
     "final_position_m": [0.1234567, -2.0, 0.5],
@@ -45,6 +46,8 @@ SUMMARY: dict[str, Any] = {
     "not_controlled": [],
     "has_thrust": False,
     "final_joint_positions": [0.4, -0.7, 1.5],
+    "joint_names": ["slider_1", "slider_2", "slider_3"],
+    "wheel_names": [],
     "manoeuvre_time_s": 12.5,
     "corrections": 3,
     "plan_time_s": 0.4567,
@@ -72,6 +75,9 @@ momentum    changed by at most 1.2e-15 kg m/s and 3.4e-14 kg m^2/s
 bag         out/a.mcap (1234 messages)
 """
 
+NEXT = "next        `spacerobot report out/a.mcap` draws this flight\n"
+
+
 PUBLISHED = """\
                             printed in the paper          here
   zf                        (-2.3784, 1.6873, -1.3377)    (-2.4000, 1.7000, -1.4000)
@@ -81,6 +87,11 @@ PUBLISHED = """\
   final_position_m          (0.2995, -0.2557, 0.0931)     (0.1235, -2.0000, 0.5000)
     likewise
 """
+
+
+@pytest.fixture(autouse=True)
+def _empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
 
 
 def run(patch: pytest.MonkeyPatch, summary: dict[str, Any], *words: str) -> Result:
@@ -96,9 +107,28 @@ GOAL = ("--goal", "0", "0", "0", "0", "0", "0", "1")
 
 def test_the_lines_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     result = run(monkeypatch, SUMMARY, *GOAL)
-    assert result.stdout == LINES
+    assert result.stdout == LINES + NEXT
     assert result.stderr == ""
     assert result.exit_code == 0
+
+
+def test_a_flight_beside_an_earlier_one_says_which_is_which(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    earlier = tmp_path / "out" / "sliding_masses.mcap"
+    earlier.parent.mkdir()
+    earlier.write_bytes(b"")
+    found = run(monkeypatch, SUMMARY | {"bag": "out/sliding_masses-1.mcap"}, *GOAL)
+    assert found.stdout.splitlines()[-3:] == [
+        "bag         out/sliding_masses-1.mcap (1234 messages)",
+        "            out/sliding_masses.mcap is an earlier flight, which is kept",
+        "next        `spacerobot report out/sliding_masses-1.mcap` draws this flight",
+    ]
+
+
+def test_angles_of_wheels_are_no_shape(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = run(monkeypatch, SUMMARY | {"wheel_names": ["slider_2"]}, *GOAL).stdout
+    assert "\nshape       (0.40000, 1.50000)\n" in found
 
 
 def test_end_effector_and_propellant_have_lines_where_there_are_some(
@@ -110,10 +140,15 @@ def test_end_effector_and_propellant_have_lines_where_there_are_some(
         "propellant_kg": 0.01234,
     }
     lines = run(monkeypatch, SUMMARY | more, *GOAL).stdout.splitlines()
-    tool, propellant = lines.pop(3), lines.pop(-2)
-    assert tool == "end-effector (1.00000, -2.00000, 3.00000) m, 0.0457 m from its goal"
+    tool, propellant = lines.pop(3), lines.pop(-3)
+    assert (
+        tool
+        == "end-effector (1.00000, -2.00000, 3.00000) m, 0.0457 m from its goal (tolerance 0.02 m)"
+    )
     assert propellant == "propellant  12.3 g"
-    assert lines == LINES.splitlines()
+    assert lines == (LINES + NEXT).splitlines()
+    turned = run(monkeypatch, SUMMARY | more | {"end_effector_attitude_error_rad": 0.01}, *GOAL)
+    assert "0.0457 m and 0.01 rad from its goal (tolerance 0.02 m, 0.06 rad)\n" in turned.stdout
     # None used is a number too.
     assert "propellant  0.0 g" in run(monkeypatch, SUMMARY | {"propellant_kg": 0.0}, *GOAL).stdout
 
@@ -126,6 +161,7 @@ def test_errors_have_their_tolerance_or_are_not_controlled(monkeypatch: pytest.M
     assert lines(not_controlled=["position", "shape"]) == [
         *(LINES.splitlines()[0], position),
         *LINES.splitlines()[2:],
+        *NEXT.splitlines(),
     ]
     attitude = LINES.splitlines()[2].replace("(tolerance 0.06 rad)", "(not controlled)")
     assert lines(not_controlled=["attitude"])[1:3] == [LINES.splitlines()[1], attitude]
@@ -157,8 +193,8 @@ def test_a_refused_goal_is_told_once_and_leaves_no_bag_that_nobody_asked_for(
 def test_the_clearance_has_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     found = {"clearance_m": 0.01234, "clearance_links": ["a", "b"], "clearance_time_s": 2.5}
     lines = run(monkeypatch, SUMMARY | found, *GOAL).stdout.splitlines()
-    assert lines.pop(-2) == "clearance   'a' and 'b' come within 0.0123 m at 2.5 s"
-    assert lines == LINES.splitlines()
+    assert lines.pop(-3) == "clearance   'a' and 'b' come within 0.0123 m at 2.5 s"
+    assert lines == (LINES + NEXT).splitlines()
     touching = run(monkeypatch, SUMMARY | found | {"clearance_m": -0.5}, *GOAL).stdout
     assert "clearance   'a' and 'b' touch, 0.5 m deep, at 2.5 s" in touching
 
@@ -190,7 +226,7 @@ def test_published_figures_stand_beside_those_of_the_published_flight(
     monkeypatch: pytest.MonkeyPatch, state: str
 ) -> None:
     result = run(monkeypatch, SUMMARY | {"state": state}, "--method", "lie_bracket")
-    assert result.stdout == LINES + PUBLISHED
+    assert result.stdout == LINES + PUBLISHED + NEXT
 
 
 @pytest.mark.parametrize(
@@ -207,7 +243,7 @@ def test_published_figures_stand_beside_those_of_the_published_flight(
 def test_no_published_figures_for_another_goal_another_method_or_no_flight(
     monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], state: str
 ) -> None:
-    assert run(monkeypatch, SUMMARY | {"state": state}, *words).stdout == LINES
+    assert run(monkeypatch, SUMMARY | {"state": state}, *words).stdout == LINES + NEXT
 
 
 def test_what_the_command_line_changes_reaches_the_flight(

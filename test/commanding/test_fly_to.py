@@ -20,10 +20,10 @@ from spacerobot_ros.commanding.fly_to import (
     Progress,
 )
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import GoalError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot
-from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal, Tolerance
+from spacerobot_ros.planning.core.goal import Controlled, EndEffectorGoal, Goal, Tolerance
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 
@@ -115,6 +115,37 @@ def test_tolerances_that_a_goal_leaves_open_are_the_parameters() -> None:
     assert FlyTo(POSE, given).tolerance_or(default) == Tolerance(0.1, 0.5, 0.3)
     given = Tolerance(0.4, 0.0, 0.6)
     assert FlyTo(POSE, given).tolerance_or(default) == Tolerance(0.4, 0.2, 0.6)
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "controls", "missing"),
+    [
+        (Tolerance(0.1, 0.2, 0.3), {"attitude", "position", "shape"}, ""),
+        (Tolerance(0.1, 0.2, 0.3), {"attitude", "shape"}, "position"),
+        (Tolerance(0.1, 0.2, 0.3), {"position", "shape"}, "attitude"),
+        (Tolerance(0.1, 0.2, 0.3), {"position"}, "attitude and joints"),
+        (Tolerance(0.0, 0.2, 0.0), {"attitude"}, ""),
+        (Tolerance(0.1, 0.2, 0.0), {"attitude"}, "position"),
+    ],
+)
+def test_tolerances_are_for_parts_that_are_controlled(
+    tolerance: Tolerance, controls: set[Controlled], missing: str
+) -> None:
+    shaped = replace(POSE, joint_positions=np.array([0.1, 0.2]))
+    if not missing:
+        tolerance.require_control(shaped, frozenset(controls), "the law")
+        return
+    with pytest.raises(GoalError) as refused:
+        tolerance.require_control(shaped, frozenset(controls), "the law")
+    assert_one_sentence(str(refused.value), f"a tolerance for its {missing}, which the law does")
+
+
+def test_tolerances_for_parts_that_a_goal_does_not_have_are_free() -> None:
+    hand = EndEffectorGoal("", np.zeros(3))
+    Tolerance(0.1, 0.2, 0.3).require_control(Goal.of_end_effectors([hand]), frozenset(), "x")
+    turned = Goal.of_end_effectors([hand], quaternion=[0.0, 0.0, 0.0, 1.0])
+    with pytest.raises(GoalError, match="for its attitude, which x"):
+        Tolerance(0.1, 0.2, 0.3).require_control(turned, frozenset({"end_effectors"}), "x")
 
 
 @pytest.fixture(scope="module")

@@ -59,6 +59,8 @@ class Rig:
     def log(self, level: str, message: str) -> None:
         pass
 
+    log_of_goals = log
+
     def has_publisher(self, topic: str) -> bool:
         return topic in self.publishers
 

@@ -161,8 +161,19 @@ def test_a_goal_is_not_reached_before_the_reference_is() -> None:
     loop.aim(base=goal_at([0.0005, 0.0, 0.0]))
     loop.answer()
     assert loop.state == "tracking", "already within the tolerance, but on its way"
+    # The largest acceleration of a quintic of length d and duration T is 10 d / (sqrt(3) T^2).
+    duration = math.sqrt(10.0 * 0.0005 / (math.sqrt(3.0) * 0.5))
+    assert loop.status.ends_at_s == pytest.approx(duration, abs=0.011)
     loop.answer(40)
     assert loop.state == "reached"
+    assert loop.status.ends_at_s == 0.0
+
+
+def test_the_settling_time_counts_until_a_goal_is_to_be_reached() -> None:
+    loop = ExecutiveLoop(settle_time=7.0)
+    loop.aim(base=goal_at(AIM))
+    loop.answer()
+    assert loop.status.ends_at_s == pytest.approx(7.0, abs=0.011)
 
 
 def test_a_goal_that_is_not_met_in_time_has_failed() -> None:
@@ -397,19 +408,21 @@ def test_a_status_is_reported_on_changes_and_every_period() -> None:
     state=st.sampled_from(ControllerState),
     goal_id=st.sampled_from(["", "12.000000345", "unstamped-2"]),
     errors=st.none() | st.fixed_dictionaries({"base.x": st.floats(-9, 9), "joint.a": st.just(1.0)}),
+    ends_at=st.sampled_from([0.0, 86_400.125]),
 )
 def test_a_status_survives_its_values(
-    state: ControllerState, goal_id: str, errors: dict[str, float] | None
+    state: ControllerState, goal_id: str, errors: dict[str, float] | None, ends_at: float
 ) -> None:
     report = None
     if errors is not None:
         report = CommandReport("model_based", True, 0.01, 0.5, 0.0, 1.5, 2.25, errors)
-    status = ControllerStatus(state, "A sentence.", goal_id, report)
+    status = ControllerStatus(state, "A sentence.", goal_id, report, ends_at_s=ends_at)
     values = status.to_values()
     assert all(isinstance(value, str) for value in values.values())
     again = ControllerStatus.from_values(values, "A sentence.")
     assert again.to_values() == values
     assert (again.state, again.goal_id, again.message) == (state, goal_id, "A sentence.")
+    assert again.ends_at_s == ends_at
     assert state.decided == (state.value in ("reached", "failed", "refused", "aborted"))
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 
 from docs_build.blocks import blocks
 
@@ -81,3 +84,23 @@ def test_tests_that_the_page_of_faults_names_exist() -> None:
     flights = [name for name in names if not (ROOT / "config" / "faults" / f"{name}.yaml").exists()]
     assert len(flights) > 10
     assert [name for name in flights if f"def test_{name}" not in source] == []
+
+
+def test_the_first_picture_is_a_short_animation() -> None:
+    """It moves, ends elsewhere than it begins, and is small."""
+    path = ROOT / "docs" / "images" / "turning.gif"
+    assert path.stat().st_size < 400_000
+    for page in (ROOT / "README.md", ROOT / "docs" / "index.md"):
+        first = re.search(r"!\[[^]]+\]\(([^)]+)\)", page.read_text(encoding="utf-8"))
+        assert first is not None
+        assert (page.parent / first[1]).resolve() == path
+    with Image.open(path) as opened:
+        pictures, times = [], []
+        for frame in ImageSequence.Iterator(opened):
+            pictures.append(np.asarray(frame.convert("L"), float))
+            times.append(frame.info["duration"])
+    assert 3000 < sum(times) < 20_000
+    assert len(pictures) > 40
+    changed = [float(np.abs(a - b).mean()) for a, b in itertools.pairwise(pictures)]
+    assert min(changed) > 0
+    assert np.abs(pictures[-1] - pictures[0]).mean() > 5 * np.median(changed)

@@ -29,7 +29,7 @@ from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.compilation import cxx_compiler
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
-from spacerobot_ros.resources import robot_file
+from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.simulation.actuators import build_plant
 
@@ -257,6 +257,18 @@ def test_goals_of_a_scenario() -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         gymnasium.make(ARM, **{"scenario": "planar_chain", **arguments})
+
+
+def test_a_plant_in_mujoco_is_refused(tmp_path: Path) -> None:
+    folder = share_directory() / "config"
+    text = (folder / "planar_chain.yaml").read_text("utf-8")
+    given = tmp_path / "pushing.yaml"
+    given.write_text(text.replace("/**/plant:\n  ros__parameters:\n", _IN_MUJOCO), "utf-8")
+    with pytest.raises(ParameterError, match="'pushing' has a plant in MuJoCo, which environments"):
+        gymnasium.make(ARM, scenario=str(given))
+
+
+_IN_MUJOCO = "/**/plant:\n  ros__parameters:\n    engine: mujoco\n"
 
 
 def test_bad_actions_goals_and_masks_are_refused() -> None:

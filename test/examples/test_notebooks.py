@@ -13,7 +13,7 @@ import pytest
 
 NOTEBOOKS = Path(__file__).resolve().parents[2] / "examples"
 PRINTS = {
-    "flight_in_python": ("optimal: 39.45 s in 789 ticks", "refused True The goal position is out"),
+    "flight_in_python": ("optimal: 39.45 s in 789 ticks", "fly: The goal position is out of reach"),
     "law_and_sweep": ("transposed_jacobian reached", "soft reached"),
 }
 

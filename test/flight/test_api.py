@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,10 @@ import spacerobot_ros
 from spacerobot_ros import fly, load_scenario, plan, read_bag
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
-from spacerobot_ros.errors import GoalError, ParameterError, RecordingError
+from spacerobot_ros.errors import GoalError, ParameterError, PlanningError, RecordingError
 from spacerobot_ros.flight import api
 from spacerobot_ros.flight.flight import Signal
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file
@@ -221,8 +223,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
     """Scenario and robots of flights, which are not flown."""
     found: list[tuple[Any, Any]] = []
 
-    def fly_none(scenario: Any, robots: Any = None) -> None:
+    def fly_none(scenario: Any, robots: Any = None) -> SimpleNamespace:
         found.append((scenario, robots))
+        return SimpleNamespace(outcome=Outcome.REACHED)
 
     monkeypatch.setattr(api, "fly_scenario", fly_none)
     return found
@@ -296,3 +299,13 @@ def test_a_flight_takes_the_goals_that_a_plan_takes(asked: list[tuple[Any, Any]]
 def test_the_package_names_what_it_offers() -> None:
     for name in spacerobot_ros.__all__:
         assert getattr(spacerobot_ros, name)
+
+
+def test_a_refused_goal_raises_the_same_error_in_plan_and_fly() -> None:
+    reasons = []
+    for ask in (plan, fly):
+        with pytest.raises(PlanningError) as refused:
+            ask(load_scenario("sliding_masses"), position=(9.0, 0.0, 0.0))
+        reasons.append(str(refused.value))
+    assert reasons[0] == reasons[1]
+    assert "out of reach" in reasons[0]

@@ -153,7 +153,8 @@ def test_a_planar_flight_determines_seven_parameters_of_the_block(capture: Fligh
     (held,) = held_bodies(capture)
     shown = ~np.isnan(found.parameters)
     true = payload_parameters(held.payload.inertia)
-    np.testing.assert_allclose(found.parameters[shown], true[shown], atol=1e-5)
+    # Normal equations square what rounding does, and it differs between processors.
+    np.testing.assert_allclose(found.parameters[shown], true[shown], atol=1e-4)
     # Without the thrust it would be another body.
     still = {**capture.commands, "base_wrench": replace(capture.commands["base_wrench"])}
     still["base_wrench"] = replace(

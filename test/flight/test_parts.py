@@ -167,7 +167,8 @@ def test_a_step_that_the_plant_cannot_take_ends_the_flight() -> None:
     assert calls[3:] == ["rest", PlantState.FAILED]
 
 
-def test_contacts_are_among_the_events_of_their_time() -> None:
+@pytest.mark.parametrize("engine", ["exact", "mujoco"])
+def test_contacts_are_among_the_events_of_their_time(engine: str) -> None:
     def event(kind: EventKind, time: float | None) -> Event:
         return Event(kind, "", time_s=time)
 
@@ -178,10 +179,10 @@ def test_contacts_are_among_the_events_of_their_time() -> None:
         event(EventKind.LATCHED, 0.5),
         event(EventKind.REARMED, 1.0),
     ]
-    asked: list[int] = []
+    asked: list[tuple[int, bool]] = []
 
-    def contacts(every: int) -> list[Event]:
-        asked.append(every)
+    def contacts(every: int, *, pushing: bool) -> list[Event]:
+        asked.append((every, pushing))
         return [event(contact, 0.5), event(contact, 0.75), event(contact, 2.0)]
 
     flight: Any = SimpleNamespace(clearance=None)
@@ -196,12 +197,12 @@ def test_contacts_are_among_the_events_of_their_time() -> None:
     given: Any = SimpleNamespace(
         clearance=SimpleNamespace(contacts=contacts),
         events=events,
-        scenario=SimpleNamespace(plant=SimpleNamespace(clearance_ticks=3)),
+        scenario=SimpleNamespace(plant=SimpleNamespace(clearance_ticks=3, engine=engine)),
     )
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(lockstep, "replace", replaced)
         assert made(given) == "flight"
-    assert asked == [3]
+    assert asked == [(3, engine == "mujoco")]
     # That of 0.5 s comes before the answers to the state of that time.
     assert [each.time_s for each in recorded] == [0.5, None, 0.5, 0.5, 0.75, 1.0, 2.0]
     assert [each.kind for each in recorded][2:5] == [contact, EventKind.LATCHED, contact]

@@ -284,9 +284,18 @@ def test_a_flight_says_how_it_ended_in_one_line() -> None:
     assert repr(FLIGHT) == (
         f"<Flight of servicer_thrusters by {FLIGHT.method}: reached after 1.25 s (2 ticks, "
         f"0 correction(s)), {off.distance:.3g} m and {off.angle:.3g} rad from the goal. "
-        "The goal is reached.>"
+        f"{FLIGHT.verdict.sentence}>"
     )
     assert repr(made_flight(goal=None)).endswith("0 correction(s)). The goal is reached.>")
+
+
+def test_errors_over_time_are_those_of_every_pose() -> None:
+    gaps = np.linalg.norm(FLIGHT.pose[:, :3] - GOAL.position, axis=1)
+    turns = (Rotation.from_quat(FLIGHT.pose[:, 3:]).inv() * TURN).magnitude()
+    np.testing.assert_allclose(FLIGHT.errors, np.column_stack([gaps, turns]), atol=1e-12)
+    off = Offset(FLIGHT)
+    assert FLIGHT.errors[-1] == pytest.approx([off.distance, off.angle])
+    assert made_flight(goal=None).errors.shape == (0, 2)
 
 
 class Offset:
@@ -339,6 +348,7 @@ def test_a_summary_has_the_measures_by_their_names() -> None:
         "final_position_m": flight.pose[-1, :3].tolist(),
         "final_joint_positions": flight.q[-1].tolist(),
         "joint_names": list(ROBOT.joint_names),
+        "wheel_names": [],
         "ticks": 2,
         "corrections": 2,
         "gait": {"duration_s": 7.5, "loops": 3},
@@ -346,6 +356,7 @@ def test_a_summary_has_the_measures_by_their_names() -> None:
         "has_thrust": True,
         "state": "reached",
         "message": "The goal is reached.",
+        "verdict": flight.verdict.sentence,
         "succeeded": True,
         "end_effector_final_position_m": end.tolist(),
     }

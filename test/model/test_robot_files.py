@@ -282,7 +282,7 @@ BROKEN = {
     ),
     "a floating joint": (
         changed('"revolute"', '"floating"'),
-        r"type of joint 'elbow' is 'floating'; .* \(the base floats by itself\)",
+        r"type of joint 'elbow' is 'floating'; .* The base floats by itself: leave out a joint",
     ),
     "no parent": (
         changed('<parent link="hull"/>', ""),

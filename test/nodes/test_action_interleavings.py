@@ -9,6 +9,8 @@ from __future__ import annotations
 import os
 import random
 from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -46,15 +48,54 @@ pytestmark = [
     pytest.mark.skipif(FLY_TO is None or NAVIGATE is None, reason="the packages are not built"),
 ]
 
-STACKS: dict[str, tuple[type[Any], dict[str, Any], dict[str, Any], str]] = {
-    "planner": (PlannerNode, PLANNER, PLANT, "planner/status"),
-    "planner_in_background": (
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of stack: the class of its commander, parameters, and goals near the start.
+
+    Attributes
+    ----------
+    commander, settings, plant, status_topic
+        Class, parameters of commander and plant, and the topic of statuses.
+    shape
+        Joint positions at the start, by name.
+    end_effector
+        Where the end-effector is then, with the base at the origin; empty: goals are for the base.
+    attitude
+        Whether goals of the end-effector have one.
+    planar
+        Whether the robot moves in a plane.
+    """
+
+    commander: type[Any]
+    settings: dict[str, Any]
+    plant: dict[str, Any]
+    status_topic: str = "planner/status"
+    shape: Mapping[str, float] = field(default_factory=dict)
+    end_effector: tuple[float, ...] = ()
+    attitude: bool = False
+    planar: bool = False
+
+
+STACKS = {
+    "planner": Kind(PlannerNode, PLANNER, PLANT),
+    "planner_in_background": Kind(PlannerNode, {**PLANNER, "plan_in_background": True}, PLANT),
+    "planner_of_an_arm": Kind(
         PlannerNode,
-        {**PLANNER, "plan_in_background": True},
-        PLANT,
-        "planner/status",
+        {
+            "robot": "three_joint_arm",
+            "tick_rate": 20.0,
+            "method": "optimal",
+            "end_effectors": ["end_effector"],
+            "optimal.answers": 1,
+            "optimal.intervals": 30,
+            "optimal.cache": 0,
+        },
+        {**PLANT, "robot": "three_joint_arm", "initial_joint_positions": [0.4, -0.9, 1.1]},
+        shape={"shoulder_yaw": 0.4, "shoulder_pitch": -0.9, "elbow_pitch": 1.1},
+        end_effector=(1.48, 0.62, 1.38),
     ),
-    "controller": (
+    "controller": Kind(
         CoordinatedControlNode,
         {
             "robot": "planar_manipulator",
@@ -71,6 +112,10 @@ STACKS: dict[str, tuple[type[Any], dict[str, Any], dict[str, Any], str]] = {
             "initial_joint_positions": [0.7, -1.1],
         },
         "controller/status",
+        shape={"shoulder": 0.7, "elbow": -1.1},
+        end_effector=(2.19, 0.25, 0.0),
+        attitude=True,
+        planar=True,
     ),
 }
 
@@ -80,20 +125,25 @@ class Interleaving:
 
     def __init__(self, harness: Harness, name: str, seed: int) -> None:
         self.harness, self.random = harness, random.Random(seed)
-        kind, settings, plant, self.status_topic = STACKS[name]
-        self.plant = harness.make(PlantNode, plant)
-        self.node = harness.make(kind, settings, name="commander")
+        self.kind = STACKS[name]
+        self.plant = harness.make(PlantNode, self.kind.plant)
+        self.node = harness.make(self.kind.commander, self.kind.settings, name="commander")
+        self.status_topic = self.kind.status_topic
         self.probe: Probe = harness.probe(
             {"odom": Odometry, "joint_states": JointState, self.status_topic: DiagnosticStatus}
         )
-        self.goals = self.probe.create_publisher(PoseStamped, "goal_pose", DEEP_LATCHED)
+        self.goals = [self.probe.create_publisher(PoseStamped, "goal_pose", DEEP_LATCHED)]
+        if self.kind.end_effector:
+            topic = "end_effector/goal_pose"
+            self.goals.append(self.probe.create_publisher(PoseStamped, topic, DEEP_LATCHED))
         self.abort = self.probe.create_client(Trigger, "commander/abort")
         self.senders = [
             Sender(harness, self.probe, FLY_TO, "commander/fly_to"),
             Sender(harness, self.probe, NAVIGATE, "commander/navigate_to_pose"),
         ]
-        self.planar = name == "controller"
         self.topic_goals = 0
+        self.kinds: Counter[str] = Counter()
+        """How many goals of each kind of FlyTo, and of NavigateToPose, were sent."""
         self.sent: list[tuple[SentGoal, bool]] = []
         """The goals of this interleaving, and whether they were cancelled."""
         harness.connect()
@@ -108,28 +158,50 @@ class Interleaving:
                 lambda: self.probe.count("joint_states") >= wanted, f"{count} ticks"
             )
 
-    def pose(self) -> PoseStamped:
-        """Return a pose near the start."""
+    def pose(self, near: Sequence[float] = (0.0, 0.0, 0.0), *, turned: bool = True) -> PoseStamped:
+        """Return a pose near a place; one that is not turned has a quaternion of zeros."""
         message = PoseStamped()
         message.header.frame_id = self.random.choice(["world", "world", "world", "moon"])
         p, o = message.pose.position, message.pose.orientation
         r = [self.random.uniform(-0.03, 0.03) for _ in range(3)]
         turn = [0.0, 0.0, 0.02 * r[0]]
-        if self.planar:
+        if self.kind.planar:
             r[2] = 0.0
-        p.x, p.y, p.z = r
-        o.x, o.y, o.z, o.w = Rotation.from_rotvec(turn).as_quat().tolist()
+        p.x, p.y, p.z = (x + dx for x, dx in zip(near, r, strict=True))
+        o.x, o.y, o.z, o.w = Rotation.from_rotvec(turn).as_quat().tolist() if turned else [0.0] * 4
         return message
+
+    def goal(self) -> dict[str, Any]:
+        """Return the poses and joint positions of a goal of FlyTo, of any kind."""
+        kinds = ["base"]
+        if self.kind.end_effector:
+            kinds += ["end_effector", "base_and_joints"]
+        kind = self.random.choice(kinds)
+        self.kinds[kind] += 1
+        if kind == "end_effector":
+            pose = self.pose(self.kind.end_effector, turned=self.kind.attitude)
+            name = self.random.choice(["end_effector", ""])
+            return {"end_effectors": [name], "end_effector_poses": [pose]}
+        fields: dict[str, Any] = {"base_pose": [self.pose()]}
+        if kind == "base_and_joints":
+            shape = {
+                name: q + self.random.uniform(-0.2, 0.2) for name, q in self.kind.shape.items()
+            }
+            names = self.random.sample(list(shape), len(shape))
+            fields["joint_positions"] = JointState(name=names, position=[shape[n] for n in names])
+        return fields
 
     def send_action(self) -> None:
         sender = self.random.choice(self.senders)
-        fields: dict[str, Any] = {"pose": self.pose()}
         if sender.kind is FLY_TO:
-            loose = {"position_tolerance": 0.02, "attitude_tolerance": 0.02}
-            fields = {"base_pose": [self.pose()]}
-            fields |= loose if self.random.random() < 0.6 else {}
+            fields = self.goal()
+            if self.random.random() < 0.6:
+                fields |= {"position_tolerance": 0.02, "attitude_tolerance": 0.02}
             if self.random.random() < 0.3:
                 fields["time_limit"] = Duration(nanosec=self.random.randrange(10**8, 10**9))
+        else:
+            self.kinds["navigate_to_pose"] += 1
+            fields = {"pose": self.pose()}
         sent = sender.post(**fields)
         if self.random.random() < 0.7:
             self.harness.spin_until(lambda: sent.handle is not None, "an answer")
@@ -137,9 +209,13 @@ class Interleaving:
 
     def send_topic(self) -> None:
         self.topic_goals += 1
-        message = self.pose()
+        topic = self.random.choice(self.goals)
+        if topic is self.goals[0]:
+            message = self.pose()
+        else:
+            message = self.pose(self.kind.end_effector, turned=self.kind.attitude)
         message.header.stamp.sec = 1000 + self.topic_goals
-        self.goals.publish(message)
+        topic.publish(message)
 
     def request_abort(self) -> None:
         self.harness.call(self.abort, Trigger.Request()) if self.node.takes_goals else None
@@ -232,5 +308,6 @@ def test_each_goal_ends_in_one_result_which_is_the_status(
     outcomes: Counter[str] = Counter()
     for _ in range(PART):
         outcomes += interleaving.run()
-    print(f"\n{name}, {PART} interleavings from {SEED + part}: {dict(sorted(outcomes.items()))}")
+    told = ", ".join(str(dict(sorted(each.items()))) for each in (outcomes, interleaving.kinds))
+    print(f"\n{name}, {PART} interleavings from {SEED + part}: {told}")
     assert np.all([outcomes[each] for each in ("refused", "aborted")])

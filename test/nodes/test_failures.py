@@ -38,7 +38,7 @@ class Fragile(FlightNode):
     def configure(self) -> None:
         self.create_subscription(JointState, "joints", self._raise, 10)
         self.take_raw(JointState, "raw", self._raise)
-        self.take_raw(JointState, "numbered", self._raise, lambda number: None)
+        self.take_raw(JointState, "numbered", self._raise, number=lambda number: None)
         self.create_service(Trigger, "~/break", lambda request, response: self._raise(request))
 
     def on_failure(self, sentence: str, error: Exception) -> None:

@@ -6,15 +6,25 @@
 from __future__ import annotations
 
 import math
+import threading
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 from builtin_interfaces.msg import Duration
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import JointState
 from support.action_clients import Sender, SentGoal, base_at
-from support.planner_flight import HERE, NEAR, TURNED, Flight, goal_at, values_of
+from support.hand_motion import end_of_motion
+from support.planner_flight import HERE, NEAR, PLANT, TURNED, Flight, goal_at, values_of
 from support.ros_harness import Harness
 
+from spacerobot_ros.nodes import CoordinatedControlNode, PlantNode
 from spacerobot_ros.nodes.common.fly_to import action_class
+from spacerobot_ros.planning import GaitSchedule
+from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 FLY_TO = action_class("spacerobot_msgs", "FlyTo")
 NAVIGATE = action_class("nav2_msgs", "NavigateToPose")
@@ -25,11 +35,30 @@ pytestmark = [
 ]
 
 
+NAMES = ("shoulder_yaw", "shoulder_pitch", "elbow_pitch")
+START, END = [0.4, -0.9, 1.1], [-0.2, -0.5, 1.6]
+ARM_URDF = Path(__file__).parents[2] / "urdf" / "three_joint_arm.urdf"
+ARM = {"robot": "three_joint_arm"}
+ARM_PLANNER = {
+    **ARM,
+    "method": "optimal",
+    "optimal.answers": 1,
+    "optimal.intervals": 30,
+    "optimal.cache": 0,
+}
+PLANAR = {"robot": "planar_manipulator", "tick_rate": 50.0}
+
+
 class ActionFlight(Flight):
     """A plant and a planner with a client of each action."""
 
-    def __init__(self, harness: Harness, planner: dict[str, Any] | None = None) -> None:
-        super().__init__(harness, planner)
+    def __init__(
+        self,
+        harness: Harness,
+        planner: dict[str, Any] | None = None,
+        plant: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__(harness, planner, plant)
         self.fly_to = Sender(harness, self.probe, FLY_TO, "planner/fly_to")
         self.navigate = Sender(harness, self.probe, NAVIGATE, "planner/navigate_to_pose")
         self.fly_to.connect()
@@ -105,6 +134,195 @@ def test_a_goal_of_a_topic_replaces_one_of_an_action(harness: Harness) -> None:
     assert sent.state == "aborted"
     assert sent.result.message == "Aborted: replaced by goal 77.000000000."
     assert values_of(flight.wait("reached"))["goal_id"] == "77.000000000"
+
+
+def arm_flight(harness: Harness) -> ActionFlight:
+    flight = ActionFlight(harness, ARM_PLANNER, {**ARM, "initial_joint_positions": START})
+    flight.start()
+    return flight
+
+
+def place_at(position: npt.ArrayLike) -> PoseStamped:
+    """Return a goal of a position alone: its quaternion is zero."""
+    message = goal_at((np.asarray(position).tolist(), [0.0, 0.0, 0.0]))
+    message.pose.orientation.w = 0.0
+    return message
+
+
+def end_of(shapes: npt.ArrayLike) -> np.ndarray[Any, Any]:
+    """Return where Pinocchio has the end-effector after a motion of the joints from the start."""
+    poses = end_of_motion(ARM_URDF.read_text("utf-8"), NAMES, np.array(shapes), ["end_effector"])
+    return poses["end_effector"][0]
+
+
+def shapes_of(flight: Flight) -> list[list[float]]:
+    return [
+        [dict(zip(m.name, m.position, strict=True))[name] for name in NAMES]
+        for m in flight.probe.messages["joint_states"]
+    ]
+
+
+@pytest.mark.parametrize("name", ["", "end_effector"])
+def test_an_end_effector_is_brought_to_a_place(harness: Harness, name: str) -> None:
+    flight = arm_flight(harness)
+    way = START + np.linspace(0, 1, 40)[:, np.newaxis] * np.subtract(END, START)
+    place = end_of(way)
+    sent = flight.fly_to.send(
+        end_effectors=[name], end_effector_poses=[place_at(place)], position_tolerance=1e-4
+    )
+    assert flight.check(sent) == "reached"
+    np.testing.assert_allclose(end_of(shapes_of(flight)), place, atol=1e-4)
+    assert sent.result.errors.end_effector_position <= 1e-4
+    for left_open in ("position", "attitude", "end_effector_attitude", "joints"):
+        assert math.isnan(getattr(sent.result.errors, left_open)), left_open
+    begun, *_, last = sent.feedback
+    farthest = float(np.linalg.norm(place - end_of([START, START])))
+    assert begun.errors.end_effector_position == pytest.approx(farthest, rel=1e-6)
+    assert last.errors.end_effector_position < farthest
+
+
+def test_the_base_is_turned_and_the_joints_are_left_in_a_shape(harness: Harness) -> None:
+    flight = arm_flight(harness)
+    turned = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.1])
+    names = ["elbow_pitch", "shoulder_yaw", "shoulder_pitch"]
+    wanted = JointState(name=names, position=[1.4, 0.2, -0.7])
+    goal = {**base_at(goal_at(turned)), "joint_positions": wanted, "joint_tolerance": 2e-3}
+    sent = flight.fly_to.send(**goal)
+    assert flight.check(sent) == "reached"
+    assert flight.error_to(turned)[1] <= 1e-3
+    np.testing.assert_allclose(shapes_of(flight)[-1], [0.2, -0.7, 1.4], atol=2e-3)
+    assert sent.result.errors.joints <= 2e-3
+    assert sent.feedback[0].errors.joints == pytest.approx(0.3, rel=1e-6)
+
+
+def test_a_tolerance_for_a_part_that_the_method_leaves_open_is_refused(harness: Harness) -> None:
+    flight = arm_flight(harness)
+    turned = base_at(goal_at(([0.01, 0.0, 0.0], [0.0, 0.0, 0.02])))
+    sent = flight.fly_to.send(**turned, position_tolerance=0.1, attitude_tolerance=0.1)
+    assert flight.check(sent) == "refused"
+    assert "a tolerance for its position, which optimal does not control" in sent.result.message
+    sent = flight.fly_to.send(**turned, attitude_tolerance=1e-4)
+    assert flight.check(sent) == "reached"
+    assert sent.result.errors.attitude <= 1e-4
+    assert sent.result.errors.position > 1e-3
+
+
+def test_a_goal_of_another_kind_replaces_one_that_is_flown(harness: Harness) -> None:
+    flight = arm_flight(harness)
+    turned = flight.fly_to.send(**base_at(goal_at(([0.0, 0.0, 0.0], [0.0, 0.1, 0.2]))))
+    flight.wait("executing")
+    flight.ticks(5)
+    place = place_at(np.add(end_of([START, START]), [-0.05, 0.04, 0.0]))
+    moved = flight.fly_to.send(end_effectors=["end_effector"], end_effector_poses=[place])
+    assert flight.check(turned) == "aborted"
+    assert turned.state == "aborted"
+    assert turned.result.message == f"Aborted: replaced by goal {moved.goal_id}."
+    assert flight.check(moved) == "reached"
+    assert flight.error_to(([0.0, 0.0, 0.0], [0.0, 0.1, 0.2]))[1] > 1e-3
+
+
+def test_goals_of_two_clients_end_one_after_the_other(harness: Harness) -> None:
+    flight = ActionFlight(harness)
+    other = harness.probe({}, name="other")
+    second = Sender(harness, other, FLY_TO, "planner/fly_to")
+    second.connect()
+    flight.start()
+    here = flight.fly_to.post(**base_at(goal_at(NEAR)))
+    there = second.post(**base_at(goal_at(TURNED)))
+    harness.spin_until(lambda: here.ended and there.ended, "both results")
+    # Whichever the planner heard last is flown.
+    outcomes = {here.result.outcome: here, there.result.outcome: there}
+    assert set(outcomes) == {"reached", "aborted"}
+    replaced = f"Aborted: replaced by goal {outcomes['reached'].goal_id}."
+    assert outcomes["aborted"].result.message == replaced
+
+
+def test_a_goal_is_cancelled_while_it_is_planned(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned, plan = threading.Event(), LieBracketGait.plan
+
+    def wait(gait: LieBracketGait, request: Any, cancellation: Any) -> GaitSchedule:
+        planned.set()
+        while True:  # A plan without end, but for its cancellation.
+            cancellation.raise_if_requested()
+
+    monkeypatch.setattr(LieBracketGait, "plan", wait)
+    flight = ActionFlight(harness, {"plan_in_background": True})
+    flight.start()
+    sent = flight.fly_to.send(**base_at(goal_at(NEAR)))
+    harness.spin_until(planned.is_set, "the planner plans")
+    sent.handle.cancel_goal_async()
+    assert flight.check(sent) == "aborted"
+    assert sent.state == "canceled"
+    assert sent.result.message == "Aborted on request. The joints rest."
+    monkeypatch.setattr(LieBracketGait, "plan", plan)
+    assert flight.check(flight.fly_to.send(**base_at(goal_at(NEAR)))) == "reached"
+
+
+def controller_client(harness: Harness) -> Sender:
+    """Return a client of a controller that flies a plant."""
+    shape = {"initial_joint_positions": [0.7, -1.1]}
+    harness.make(PlantNode, {**PLANT, **PLANAR, "actuation": "effort", **shape})
+    settings = {"settle_time": 0.1, "status_period": 0.5}
+    harness.make(CoordinatedControlNode, {**PLANAR, **settings}, name="controller")
+    sender = Sender(harness, harness.probe({}), FLY_TO, "controller/fly_to")
+    harness.connect()
+    sender.connect()
+    return sender
+
+
+def test_a_controller_takes_goals_of_base_and_end_effector(harness: Harness) -> None:
+    sender = controller_client(harness)
+    loose = {"position_tolerance": 5e-3, "attitude_tolerance": 4e-3}
+    # The end-effector is at (2.186, 0.255) while the base is at the origin, turned by -0.4 rad.
+    hand = [goal_at(([2.21, 0.24, 0.0], [0.0, 0.0, -0.38]))]
+    for fields, controlled, others in (
+        (
+            {**base_at(goal_at(([0.02, -0.01, 0.0], [0.0, 0.0, 0.03]))), **loose},
+            ("position", "attitude"),
+            ("end_effector_position", "end_effector_attitude", "joints"),
+        ),
+        (
+            {"end_effectors": [""], "end_effector_poses": hand, "position_tolerance": 5e-3},
+            ("end_effector_position",),
+            ("position", "attitude", "joints"),
+        ),
+    ):
+        sent = sender.send(**fields)
+        result = sender.end_of(sent)
+        assert (sent.state, result.outcome) == ("succeeded", "reached"), result.message
+        for name in controlled:
+            assert getattr(result.errors, name) <= 5e-3, name
+        for name in others:
+            assert math.isnan(getattr(result.errors, name)), name
+    # Its law has the end-effector's position alone: an attitude within a tolerance is refused.
+    sent = sender.send(end_effectors=[""], end_effector_poses=hand, attitude_tolerance=0.1)
+    assert sender.end_of(sent).outcome == "refused"
+    assert sent.result.message.startswith("The goal gives a tolerance for its attitude, which the")
+
+
+@pytest.mark.parametrize("kind", ["base", "end_effector"])
+def test_a_controller_is_preempted_and_cancelled(harness: Harness, kind: str) -> None:
+    sender = controller_client(harness)
+    fields = {
+        "base": base_at(goal_at(([0.3, 0.2, 0.0], [0.0, 0.0, 0.1]))),
+        "end_effector": {
+            "end_effectors": ["end_effector"],
+            "end_effector_poses": [goal_at(([2.3, 0.1, 0.0], [0.0, 0.0, -0.3]))],
+        },
+    }[kind]
+    first = sender.send(**fields)
+    harness.spin_until(lambda: len(first.feedback) > 2, "it is flown")
+    second = sender.send(**fields)
+    assert sender.end_of(first).message == f"Aborted: replaced by goal {second.goal_id}."
+    assert first.state == "aborted"
+    harness.spin_until(lambda: len(second.feedback) > 2, "it is flown")
+    second.handle.cancel_goal_async()
+    assert sender.end_of(second).message == "Aborted on request; the robot holds."
+    assert second.state == "canceled"
+    assert {each.phase for each in first.feedback + second.feedback} <= {"waiting", "tracking"}
+    assert [len(each.results) for each in (first, second)] == [1, 1]
 
 
 def test_goals_that_are_refused_have_a_result(harness: Harness) -> None:

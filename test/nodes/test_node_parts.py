@@ -137,12 +137,15 @@ def test_transforms_are_written_once_a_period_of_whole_states(
 ) -> None:
     monkeypatch.setattr(recorder, "first_time_ns", lambda raw: int(raw.split()[1]))
     monkeypatch.setattr(recorder, "HEADER_STAMP", slice(2, None))
-    recording: Any = SimpleNamespace(running=True)
+    written: list[int] = []
+    recording: Any = SimpleNamespace(
+        running=True, record=lambda channel, message, time_ns: written.append(time_ns)
+    )
     published = [False]
     topics = "/tf", "/tf_static"
-    made: Any = recorder._RecordedTransforms(recording, 0.1, topics, lambda: published[0])
-    written: list[int] = []
-    made._write = lambda state, time_ns: written.append(time_ns)
+    sources = "/odom", "/joint_states", "/robot_description"
+    made: Any = recorder._RecordedTransforms(recording, 0.1, topics, lambda: published[0], sources)
+    made._frames = SimpleNamespace(message=lambda time_ns, pose, q: b"")
     refused = [False]
 
     def accept(odom: bytes, joints: bytes) -> None:
@@ -155,7 +158,7 @@ def test_transforms_are_written_once_a_period_of_whole_states(
 
     state(0)
     assert not written, "there is no description yet"
-    made._state = SimpleNamespace(accept=accept)
+    made._state = SimpleNamespace(accept=accept, pose=None, q=None)
     # The first state is at zero; then 0.1 s have to be over, or time has gone back.
     for time_ns in (0, 1, S // 10 - 1, S // 10, S // 10 + 5, S // 5, 3, 4, S // 10 + 3):
         state(time_ns)
@@ -366,7 +369,7 @@ class Draining:
         self._tick, self.now, self.spun, self.stepped, self.rested = 5, 50.0, 0, 0, 0
         self.ticks, self.rates = ticks, iter(rates)
         self.plant = SimpleNamespace(qdot=np.array([0.0, -1.0]))
-        self.raw_streams: list[Any] = []
+        self.raw_inputs: list[Any] = []
         self._commands = SimpleNamespace(rest=self._rest)
 
     def _rest(self) -> None:

@@ -489,12 +489,12 @@ def test_readers_are_awaited_for_so_long_together(monkeypatch: pytest.MonkeyPatc
     walls = iter([50.0, 50.0, 50.5, 99.0])
     monkeypatch.setattr(publisher, "time", SimpleNamespace(monotonic=lambda: next(walls)))
     longest = publisher._LONGEST_WAIT
-    outputs = {name: Output(name) for name in "abcd"}
+    outputs = {name: Output(name, matched=name != "x") for name in "abxcd"}
     outputs["c"].received = False
     some: Any = SimpleNamespace(_outputs=outputs)
     StatePublisher.await_readers(some)
     waits = [output.waits for output in outputs.values()]
-    assert waits == [[longest], [max(0.0, longest - 0.5)], [0.0], []]
+    assert waits == [[longest], [max(0.0, longest - 0.5)], [], [0.0], []], "x has no readers"
 
 
 @pytest.mark.parametrize(("lost", "target_lost"), [(False, True), (True, False), (False, False)])

@@ -65,9 +65,9 @@ class Viewer(ViewerNode):
         self.answers: list[Callable[[Any], None]] = []
         super().__init__(**options)
 
-    def create_publisher(self, kind: type[Any], topic: str, *args: Any, **options: Any) -> Any:
-        if kind not in (PoseStamped, JointState, String, Float64):
-            return super().create_publisher(kind, topic, *args, **options)
+    def create_publisher(self, msg_type: Any, topic: str, *args: Any, **kwargs: Any) -> Any:
+        if msg_type not in (PoseStamped, JointState, String, Float64):
+            return super().create_publisher(msg_type, topic, *args, **kwargs)
         return self.sent.setdefault(topic, Publisher(topic))
 
     def count_subscribers(self, topic_name: str) -> int:

@@ -14,6 +14,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from nav_msgs.msg import Odometry, Path
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
@@ -332,6 +333,74 @@ def test_a_long_planned_path_is_thinned_and_keeps_its_ends(
     poses[-1].pose.position.y = math.inf
     viewed.heard["planned_path"](Path(poses=poses))
     assert viewed.look().planned_path is None
+
+
+def schedule(sec: int, *order: int) -> JointTrajectory:
+    """Return a schedule from ``sec`` on for 4 s; joint i moves from i to i + 4 in two steps."""
+    message = JointTrajectory(joint_names=[NAMES[i] for i in order])
+    message.header.stamp.sec = sec
+    for time in (0, 2, 4):
+        point = JointTrajectoryPoint(positions=[float(i + time) for i in order])
+        point.time_from_start.sec = time
+        message.points.append(point)
+    return message
+
+
+def planned(sec: int, *times: float) -> Path:
+    """Return a path from ``sec`` on, whose poses are at times after that, at x = 10 time."""
+    poses = []
+    for time in times:
+        pose = PoseStamped(pose=pose_of(10.0 * time, 1.0, 2.0))
+        pose.header.stamp.sec = sec + int(time)
+        pose.header.stamp.nanosec = round(1e9 * (time % 1))
+        poses.append(pose)
+    message = Path(poses=poses)
+    message.header.stamp.sec = sec
+    return message
+
+
+@pytest.mark.parametrize("path_first", [True, False])
+def test_path_and_schedule_of_one_plan_are_its_motion(viewed: Viewed, path_first: bool) -> None:
+    order = range(len(NAMES))
+    messages = [
+        ("planned_path", planned(7, 0.0, 1.5, 4.0)),
+        ("gait_schedule", schedule(7, *reversed(order))),
+    ]
+    for topic, message in messages if path_first else reversed(messages):
+        assert viewed.look().planned_motion is None
+        viewed.heard[topic](message)
+    motion = viewed.look().planned_motion
+    assert motion is not None
+    np.testing.assert_allclose(motion[:, 0], [0.0, 15.0, 40.0])
+    np.testing.assert_allclose(motion[:, 3:7], [TURNED] * 3)
+    np.testing.assert_allclose(motion[:, 7:], [[i + t for i in order] for t in (0, 1.5, 4)])
+    # The robot may come after both.
+    viewed.listener.use(ROBOT)
+    assert viewed.look().planned_motion is not None
+    viewed.heard["gait_schedule"](schedule(8, *order))
+    assert viewed.look().planned_motion is None, "it is of another plan"
+    viewed.heard["planned_path"](planned(8, *np.linspace(0.0, 4.0, 801)))
+    motion = viewed.look().planned_motion
+    assert motion is not None
+    assert len(motion) <= 201
+    np.testing.assert_allclose(motion[-1, 7:], [i + 4.0 for i in order])
+
+
+@pytest.mark.parametrize("fault", ["joints", "points", "empty", "pose"])
+def test_a_plan_that_does_not_fit_has_no_motion(viewed: Viewed, fault: str) -> None:
+    path, plan = planned(7, 0.0, 4.0), schedule(7, *range(len(NAMES)))
+    match fault:
+        case "joints":
+            plan = schedule(7, 0)
+        case "points":
+            plan.points[1].positions = [1.0]
+        case "empty":
+            plan.points = []
+        case "pose":
+            path.poses[0].pose.orientation = Quaternion(x=0.0, y=0.0, z=0.0, w=0.0)
+    viewed.heard["gait_schedule"](plan)
+    viewed.heard["planned_path"](path)
+    assert viewed.look().planned_motion is None
 
 
 def test_nodes_fall_silent_and_are_hidden_after_a_minute(viewed: Viewed) -> None:

@@ -22,31 +22,69 @@ sys.meta_path.insert(0, Finder())
 """
 
 
-def test_a_module_without_its_package_is_skipped_with_one_line(tmp_path: Path) -> None:
-    (tmp_path / "without_pandas.py").write_text(WITHOUT_PANDAS)
-    (tmp_path / "test_tables.py").write_text("import pandas.api\n\ndef test_table(): pass\n")
-    (tmp_path / "test_other.py").write_text(
-        "import atexit, sys\n\ndef test_other():\n"
-        "    atexit.register(print, 'leaked', file=sys.__stderr__, flush=True)\n"
-    )
-    (tmp_path / "test_wrong.py").write_text("import pandaz\n")
-    folders = os.pathsep.join(str(each) for each in (tmp_path, ROOT / "test", ROOT))
-    words = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(tmp_path), "-p", "without_pandas"]
-    run = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", *words, "-p", "conftest", str(tmp_path)],
-        cwd=tmp_path,
+LATER = """
+import pytest
+from spacerobot_ros.errors import SpaceRobotError
+
+def test_import():
+    import pandas
+
+@pytest.fixture
+def table():
+    raise SpaceRobotError("Tables need pandas, which is not installed: pip install it.")
+
+def test_fixture(table):
+    pass
+
+def test_required_package():
+    raise SpaceRobotError("Tables need numpy, which is not installed.")
+"""
+
+
+def run_tests(folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run the tests of a folder in a process that finds no pandas."""
+    (folder / "without_pandas.py").write_text(WITHOUT_PANDAS)
+    folders = os.pathsep.join(str(each) for each in (folder, ROOT / "test", ROOT))
+    words = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(folder), "-p", "without_pandas"]
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", *words, "-p", "conftest", str(folder)],
+        cwd=folder,
         env={**os.environ, "PYTHONPATH": folders},
         capture_output=True,
         text=True,
         timeout=120,
         check=False,
     )
+
+
+def test_a_module_without_its_package_is_skipped_with_one_line(tmp_path: Path) -> None:
+    (tmp_path / "test_tables.py").write_text("import pandas.api\n\ndef test_table(): pass\n")
+    (tmp_path / "test_other.py").write_text(
+        "import atexit, sys\n\ndef test_other():\n"
+        "    atexit.register(print, 'leaked', file=sys.__stderr__, flush=True)\n"
+    )
+    (tmp_path / "test_wrong.py").write_text("import pandaz\n")
+    run = run_tests(tmp_path)
     assert run.returncode == 2, run.stdout + run.stderr
     assert "leaked" not in run.stderr
     (line,) = [line for line in run.stdout.splitlines() if line.startswith("SKIPPED")]
     assert line.endswith("pandas is not installed (pip install 'spacerobot_ros[test]')")
     assert "test_tables.py" in line
     assert "ERROR test_wrong.py" in run.stdout, "only optional packages may be missing"
+
+
+def test_a_test_that_asks_for_a_package_is_skipped_too(tmp_path: Path) -> None:
+    (tmp_path / "test_later.py").write_text(LATER)
+    run = run_tests(tmp_path)
+    lines = run.stdout.splitlines()
+    skipped = [line for line in lines if line.startswith("SKIPPED")]
+    assert len(skipped) == 2
+    for line in skipped:
+        assert "test_later.py" in line
+        assert line.endswith("pandas is not installed (pip install 'spacerobot_ros[test]')")
+    (failed,) = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
+    assert "test_required_package" in failed
+    assert lines[-1].startswith("1 failed, 2 skipped")
 
 
 def test_the_documentation_has_the_packages_of_its_notebook() -> None:

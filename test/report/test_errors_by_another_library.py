@@ -128,7 +128,15 @@ def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
     tables = [texts[len(texts) - texts[::-1].index(name) :] for name in ("Position error",)]
     tables += [texts[len(texts) - texts[::-1].index("Attitude error") :]]
     in_table = [" ".join(x.strip() for x in table[:3]) for table in tables]
-    same(shown(in_table[0], r"(?:^| )# m"), shown(in_table[1], r"(?:^| )# rad"), 4)
+    same(shown(in_table[0], r"(?:^| )# m"), shown(in_table[1], r"(?:^| )# rad"), 3)
+
+    verdict = next(text for text in texts if text == flight.verdict.sentence)
+    assert lines[0].endswith(verdict)
+    if flight.outcome is not Outcome.ABORTED:
+        goal_errors_in = re.search(r"(?:([-+.\de]+) m and )?([-+.\de]+) rad", verdict)
+        assert goal_errors_in is not None
+        assert (goal_errors_in[1] is not None) is position_counts
+        same(float(goal_errors_in[1] or truth.distance), float(goal_errors_in[2]), 3)
 
     live = goal_errors(state_of(flight), ForwardKinematics(flight.robot))["base"]
     assert live.angle is not None
@@ -152,6 +160,24 @@ def test_errors_of_recorded_flights(name: str, position_counts: bool) -> None:
     bag = BAGS / f"{name}.mcap"
     flight = read_flight(open_flight_bag(bag))
     assert_all_say(bag, flight, position_counts=position_counts)
+
+
+def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_path: Path) -> None:
+    """The position is measured 0.1 m off; its tolerance is 0.001 m."""
+    flight, bag = fly("faults/biased_pose"), tmp_path / "biased.mcap"
+    assert flight.succeeded
+    flight.save(bag)
+    assert truth_in(bag).distance == pytest.approx(0.1, abs=1e-3)
+    read = read_flight(open_flight_bag(bag))
+    for each in (flight, read):
+        assert not each.verdict.complete
+        assert each.verdict.word == "Reached by the measured pose"
+    assert_all_say(bag, read, position_counts=True)
+    report = page(FlightReport.of(open_flight_bag(bag)), PagePart(""), [])
+    assert '<p class="outcome reached partly"><b>Reached by the measured pose</b>' in report
+    # With sensors that do not err the same goal is reached.
+    believed = fly(load_scenario("faults/biased_pose").with_overrides("plant", {"faults": [""]}))
+    assert (believed.verdict.word, believed.verdict.complete) == ("Reached", True)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.chromium import Browser, browser, chromium
+from support.chromium import Browser, browser, chromium, keep_picture
 
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.report import write_report
@@ -83,6 +83,7 @@ def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Brows
         outside = [url for url in window.requests if not url.startswith("data:")]
         assert outside == [page.as_uri()]
         assert window.evaluate("document.documentElement.scrollWidth") <= width
+        keep_picture(window, f"{name.replace('/', '-')}-{width}")
         assert window.evaluate("flightCharts.charts.length") >= 5
         assert window.evaluate("document.querySelectorAll('.lane').length") == 1
         below = lanes(window)

@@ -129,7 +129,7 @@ def test_the_tables_have_goal_and_errors_of_each_link(hands: FlightReport) -> No
     tiles = {label: (value, note) for label, value, note in headline(hands)}
     assert tiles[f"Error of {LEFT}"][0].endswith(" m")
     assert tiles[f"Error of {LEFT}"][1].endswith(" rad")
-    assert tiles[f"Error of {RIGHT}"][1] == ""
+    assert tiles[f"Error of {RIGHT}"][1] == "tolerance 0.001 m"
     assert "no goal pose" not in "".join(_numbers_html(hands))
     # A base with a goal beside those of links has rows as ever.
     flight = replace(hands.flight, goal=replace(hands.flight.goal, base=POSE))  # type: ignore[type-var]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pypdf
 import pytest
+from PIL import Image
 from support.command_line import CliRunner
 from support.flight_bags import GOAL, Story, tell
 from support.sentences import assert_one_sentence
@@ -309,3 +310,21 @@ def test_panels_have_letters_only_in_papers_and_where_there_are_several() -> Non
 
     assert letters(2, lettered=True) == ["(a)", "(b)", "(c)", "(d)"]
     assert letters(0, lettered=True) == letters(2, lettered=False) == []
+
+
+def test_panels_of_a_column_reach_its_left_edge(tmp_path: Path) -> None:
+    """Ink, as Pillow sees it, begins near the left edge of every figure, and not on it."""
+    words = ("--only", "attitude,joints,cycles", "--style", "serif", "--degrees")
+    for width, bag in (("88mm", "arm_attitude"), ("120mm", "sliding_masses")):
+        out = tmp_path / width
+        source = str(Path(__file__).parents[2] / "bags" / f"{bag}.mcap")
+        options = ("--width", width, "--format", "png", "--out", str(out))
+        result = CliRunner().invoke(main, ["figures", source, *words, *options])
+        assert result.exit_code in (0, 1), result.output
+        drawn = sorted(out.glob("*.png"))
+        assert drawn
+        for path in drawn:
+            with Image.open(path) as picture:
+                ink = np.asarray(picture.convert("L")) < 128
+            first = float(np.argmax(ink.any(axis=0))) / ink.shape[1]
+            assert 0.0005 < first < 0.04, (path.name, first)

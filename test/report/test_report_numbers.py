@@ -184,7 +184,7 @@ def test_the_numbers_of_the_run(tmp_path: Path) -> None:
         ("Final position", "(0.70000, 2.00000, 3.40000) m"),
         ("Final attitude", "rotation vector (0.00000, 0.20000, 0.00000) rad, 11.459° in all"),
         ("Position error", "0.5 m (tolerance 0.02 m)"),
-        ("Attitude error", "0.3 rad = 17.19° (tolerance 0.06 rad)"),
+        ("Attitude error", "0.3 rad = 17.2° (tolerance 0.06 rad)"),
         ("Manoeuvre time", "1.5 s, 2 schedules in the whole flight"),
         ("Recorded", "1.5 s, 3 ticks of 0.5 s"),
         ("Momentum drift", "linear 2e-08 kg m/s, angular 2.4e-08 kg m²/s"),
@@ -200,7 +200,7 @@ def test_a_position_that_is_not_controlled_is_called_so(tmp_path: Path) -> None:
     rows = rows_of(found)
     assert rows["Goal position"] == "(1.00000, 2.00000, 3.00000) m"
     assert rows["Position error"] == "not controlled; 0.5 m from the goal"
-    assert rows["Attitude error"] == "0.3 rad = 17.19°"
+    assert rows["Attitude error"] == "0.3 rad = 17.2°"
     assert position_group(found).goals == []
     assert len(attitude_group(found).goals) == 3
 
@@ -406,7 +406,7 @@ def test_a_controller_and_the_components_that_it_controls(tmp_path: Path) -> Non
     ]
     found = flight(tmp_path, turned, more=more, name="turned.mcap")
     rows = rows_of(found)
-    assert rows["End-effector attitude error"] == "0.2 rad = 11.46°"
+    assert rows["End-effector attitude error"] == "0.2 rad = 11.5°"
     assert ("End-effector error", "0.5 m", "0.2 rad") in headline(found)
     # The base is not under control: its goal, if there is one, is nobody's.
     assert "Goal attitude" not in rows

@@ -11,8 +11,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.model.visuals import visuals_of
+from spacerobot_ros.report.figures import ReportFigure, short
+from spacerobot_ros.report.figures_over_time import shape_groups
+from spacerobot_ros.report.figures_space import configurations_figure
 from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.scene import TARGET, Scene, scene_of
+from spacerobot_ros.report.tables import joint_table
 
 BAG = Path(__file__).parents[2] / "bags" / "capture.mcap"
 
@@ -24,17 +29,21 @@ def scene() -> Scene:
     return made
 
 
-@pytest.fixture(scope="module")
-def odometry() -> tuple[Any, Any, Any]:
+def odometry_in(bag: Path) -> tuple[Any, Any, Any]:
     """Times (s), positions and attitudes of the target, read message by message."""
     found = [
         (message.header.stamp, message.pose.pose)
-        for _, message in read_bag(BAG).messages("/target/odom")
+        for _, message in read_bag(bag).messages("/target/odom")
     ]
     times = np.array([stamp.sec + stamp.nanosec * 1e-9 for stamp, _ in found])
     positions = np.array([[pose.position.x, pose.position.y, pose.position.z] for _, pose in found])
     turned = [[getattr(pose.orientation, x) for x in "xyzw"] for _, pose in found]
     return times, positions, Rotation.from_quat(turned)
+
+
+@pytest.fixture(scope="module")
+def odometry() -> tuple[Any, Any, Any]:
+    return odometry_in(BAG)
 
 
 def test_the_target_has_the_solids_of_its_urdf(scene: Scene) -> None:
@@ -85,3 +94,50 @@ def test_other_flights_have_no_target() -> None:
     assert isinstance(made, Scene)
     assert "target" not in made.caption
     assert not any(command.get("path") == TARGET for command in made.commands)
+
+
+def test_pictures_draw_the_target_where_it_is_held() -> None:
+    """Corners of its solids about its odometry, as the corners of its URDF about its origin."""
+    bag = BAG.with_name("servicing.mcap")
+    report, (times, positions, attitudes) = read_report(bag), odometry_in(bag)
+    assert report.target is not None
+    corners = np.concatenate(
+        [
+            visual.mesh.vertices @ frame.R.T + frame.r
+            for visual in visuals_of(report.target, {}, 10_000)
+            for frame in [report.target.frames[visual.link][1]]
+        ]
+    )
+    gone = np.linalg.norm(positions - positions[0], axis=1)
+    assert gone[-1] > 0.5
+    for k in (0, len(times) // 2, len(times) - 1):
+        drawn = np.concatenate([face.corners for face in report.target_at(times[k]).faces])
+        wanted = positions[k] + attitudes[k].apply(corners)
+        assert np.abs(drawn[:, None] - wanted[None]).max(axis=2).min(axis=1).max() < 1e-9
+    figure = configurations_figure(report)
+    assert isinstance(figure, ReportFigure)
+    assert "free or held" in figure.caption
+
+
+def test_reaction_wheels_have_rates_and_no_angles() -> None:
+    report = read_report(BAG.with_name("servicing.mcap"))
+    wheels = {"wheel_plus_x", "wheel_plus_y", "wheel_minus_x", "wheel_minus_y"}
+    assert {report.joint_names[i] for i in report.wheel_columns} == wheels
+    bag = read_bag(BAG.with_name("servicing.mcap"))
+    recorded = [message for _, message in bag.messages("/joint_states")]
+    angles = {name: [m.position[list(m.name).index(name)] for m in recorded] for name in wheels}
+    assert max(abs(x) for each in angles.values() for x in each) > 1000
+    groups = shape_groups(report)
+    assert [group.unit for group in groups] == ["rad", "rad/s"]
+    assert not set(map(short, wheels)) & set(groups[0].names)
+    assert set(groups[1].names) == set(map(short, wheels))
+    for k, name in enumerate(groups[1].names):
+        full = next(each for each in wheels if short(each) == name)
+        rates = [m.velocity[list(m.name).index(full)] for m in recorded]
+        assert np.abs(groups[1].signal.values[:, k]).max() == pytest.approx(np.abs(rates).max())
+    # Pictures hold them still: at any angle they look the same.
+    assert np.abs(report.joints).max() < np.pi
+    table = joint_table(report)
+    assert table is not None
+    ends = {row[0]: row[3:5] for row in table.rows}
+    assert all((ends[name] == ("–", "–")) is (name in wheels) for name in ends)

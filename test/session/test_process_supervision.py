@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 import yaml
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rosgraph_msgs.msg import Clock
 from support.sentences import assert_one_sentence
@@ -194,25 +195,90 @@ def test_lost_messages_are_repeated_soon_unless_the_user_chose_otherwise(
     assert times == {"initialHeartbeatDelay": [0, 5e6], "heartbeatPeriod": [0, 1e7]}
 
 
+INFO = "[INFO] [1795476705.350247186] [planner]: Waiting for a goal pose."
+ERROR = "[ERROR] [1795476705.350247186] [planner]: The robot has no joints."
+TRACE = "Traceback (most recent call last):\n  File a, line 1\nValueError: no such joint"
+CRASH = (
+    f"{INFO}\nFatal Python error: Segmentation fault\n\nThread 7:\n  File a\nExtension modules: a"
+)
+
+
 @pytest.mark.parametrize(
-    ("written", "line"),
+    ("code", "written", "sentence"),
     [
-        (b"", "it wrote nothing."),
-        (b"one\ntwo \n\n", "two"),
-        (b"Fatal\nExtension modules: numpy, scipy\n", "Fatal"),
-        (b"broken \xff\n", "broken \N{REPLACEMENT CHARACTER}"),
+        (-9, INFO, "was ended by SIGKILL."),
+        (-9, "", "was ended by SIGKILL."),
+        (-11, CRASH, "was ended by SIGSEGV: Fatal Python error: Segmentation fault."),
+        (1, f"{INFO}\n{TRACE}\n", "has ended with exit code 1: ValueError: no such joint"),
+        (2, f"{ERROR}\n{INFO}\n", "has ended with exit code 2: The robot has no joints."),
+        (2, "one\ntwo \n\n", "has ended with exit code 2: two"),
+        (0, INFO, "has ended with exit code 0: it wrote no error."),
+        (3, "broken \udcff", "has ended with exit code 3: broken \N{REPLACEMENT CHARACTER}"),
     ],
 )
-def test_a_node_that_has_ended_is_reported_with_its_last_line(
-    make: Callable[..., MultiProcessStack], written: bytes, line: str
+def test_a_node_that_has_ended_is_reported_with_the_cause(
+    make: Callable[..., MultiProcessStack], code: int, written: str, sentence: str
 ) -> None:
     stack = make("planar_chain", bag=None)
     stack.require_alive()
-    (folder_of(stack) / "planner.txt").write_bytes(written)
-    child(stack, "planner").returncode = -11
+    (folder_of(stack) / "planner.txt").write_text(written, "utf-8", errors="surrogateescape")
+    child(stack, "planner").returncode = code
     with pytest.raises(SpaceRobotError) as caught:
         stack.require_alive()
-    assert str(caught.value) == f"Node 'planner' has ended (code -11): {line}"
+    assert str(caught.value) == f"Node 'planner' {sentence}"
+
+
+def test_commanders_that_die_are_started_again_within_the_limit(
+    make: Callable[..., MultiProcessStack], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    events: list[DiagnosticStatus] = []
+    stack = make(real_time("planar_chain"), bag=None, restarts=2, show=said.append)
+    topic: Any = SimpleNamespace(publish=events.append)
+    monkeypatch.setattr(stack, "_events", topic)
+    wall = [1000.0]
+    clock = SimpleNamespace(monotonic=lambda: wall[0], time=lambda: 5.0)
+    monkeypatch.setattr(processes, "time", clock)
+    assert parameters(stack, "planner")["resume_file"], "it goes on with its goal"
+
+    def die(name: str, code: int = -9) -> None:
+        child(stack, name).returncode = code
+        stack._supervise()
+
+    for seconds in (0.0, 1.0):
+        wall[0] += seconds
+        before = child(stack, "planner")
+        die("planner")
+        assert child(stack, "planner") is not before
+        assert child(stack, "planner").returncode is None
+        assert parameters(stack, "planner")["autostart"] is True
+    die("coordinated_control", -11)
+    killed = "Node 'planner' was ended by SIGKILL. It is started again."
+    crashed = "Node 'coordinated_control' was ended by SIGSEGV. It is started again."
+    assert said == [killed, killed, crashed]
+    values = [{pair.key: pair.value for pair in event.values} for event in events]
+    assert [each["event"] for each in values] == ["node_restarted"] * 3
+    assert [event.message for event in events] == said
+    assert events[0].level == b"\x01"
+    with pytest.raises(SpaceRobotError) as caught:
+        die("planner")
+    assert str(caught.value) == (
+        "Node 'planner' was ended by SIGKILL. It was started again 2 times within a minute, which "
+        "is the limit (--restarts)."
+    )
+    wall[0] += 59.5
+    stack._supervise()
+    assert child(stack, "planner").returncode is None, "the first one was a minute ago"
+    with pytest.raises(SpaceRobotError, match=r"^Node 'plant' was ended by SIGKILL\.$"):
+        die("plant")
+
+
+def test_nothing_is_started_again_unless_asked(make: Callable[..., MultiProcessStack]) -> None:
+    stack = make(real_time("planar_chain"), bag=None)
+    assert "resume_file" not in parameters(stack, "planner")
+    child(stack, "planner").returncode = -9
+    with pytest.raises(SpaceRobotError, match=r"^Node 'planner' was ended by SIGKILL\.$"):
+        stack._supervise()
 
 
 def test_nodes_are_activated_from_the_last_to_the_plant(
@@ -339,7 +405,7 @@ def test_a_node_that_did_not_end_well_is_named(
     (folder_of(stack) / "recorder.txt").write_text("It began.\nNo space is left.\n")
     with pytest.raises(SpaceRobotError) as caught:
         stack.finish()
-    assert str(caught.value) == "Node 'recorder' ended with code 3: No space is left."
+    assert str(caught.value) == ("Node 'recorder' has ended with exit code 3: No space is left.")
 
 
 def test_closing_ends_only_what_still_runs(
@@ -386,12 +452,12 @@ def test_a_planner_that_does_not_answer_is_waited_for_only_after_an_interrupt(
     assert stack.statistics == counted
 
 
-def test_a_node_that_refuses_is_named_with_its_last_line(
+def test_a_node_that_refuses_is_named_with_its_last_error(
     own_domain: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answers = {"plant": SimpleNamespace(success=True), "planner": SimpleNamespace(success=False)}
     stack = SimpleNamespace(
-        _change_state={}, _call_services=lambda *_: answers, _last_line=lambda name: f"{name} ends."
+        _change_state={}, _call_services=lambda *_: answers, _read_log=lambda name: f"{name} ends."
     )
     with pytest.raises(SpaceRobotError) as caught:
         MultiProcessStack._change_states(stack, 1, ["plant", "planner"])  # type: ignore[arg-type]

@@ -134,7 +134,9 @@ def test_only_lockstep_in_one_process_is_private(
     use(monkeypatch, fake, asked)
     result = run.run_scenario(scenario, Path("a.mcap"), processes=processes)
     private = mode == "lockstep" and not processes
-    assert asked == [("private", private), (Path("a.mcap"), {"processes": processes})]
+    settings = [] if processes else ["one process"]
+    made = (Path("a.mcap"), {"processes": processes})
+    assert asked == [("private", private), *settings, made]
     assert fake.done == [("start", scenario.goal), "finish", "close"]
     assert (result.succeeded, result.message) == (True, "0.75 s"), "wall time of the flight alone"
 
@@ -210,7 +212,8 @@ def test_a_stack_that_is_up_shows_each_status_once(
     use(monkeypatch, fake, asked)
     bag = run.run_until_stopped(fake.scenario, None, show, processes=True, namespace="left")
     assert bag == Path("recorded.mcap")
-    assert asked == [("private", False), (None, {"processes": True, "namespace": "left"})]
+    options = {"processes": True, "namespace": "left", "restarts": 0, "show": show}
+    assert asked == [("private", False), (None, options)]
     up = f"sliding_masses is up; goals on '{topic}', Ctrl-C ends it."
     assert shown == [up, "Planning.", "Closed.", "Reached."]
     assert looks == [False] * 5

@@ -21,6 +21,7 @@ class Viewer:
 
     def __init__(self, *texts: bytes) -> None:
         self.texts, self.pid, self.code = list(texts), 4711, None
+        self.returncode = 1
         self.stdout = SimpleNamespace(fileno=lambda: 5)
 
     def poll(self) -> int | None:
@@ -110,8 +111,39 @@ def test_a_viewer_runs_while_the_block_lasts(
         4711,
         (process, {signal.SIGINT: 1.5}),
     ]
-    assert said[1:] == (["The viewer ended early: It broke."] if code else [])
+    assert said[1:] == (["Node 'viewer' has ended with exit code 1: It broke."] if code else [])
     assert not logs[0].exists()
+
+
+def test_a_viewer_that_dies_is_started_again_at_its_address(
+    process: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ports: list[int] = []
+    ended: list[Any] = []
+
+    def words(name: str, of: str, given: Any, folder: Path, namespace: str) -> list[str]:
+        ports.append(given["port"])
+        return []
+
+    process.texts = [b"viewer      http://127.0.0.1:8091/\n"]
+    monkeypatch.setattr(viewing, "node_words", words)
+    monkeypatch.setattr(viewing, "start_child", lambda *_, **options: process)
+    monkeypatch.setattr(viewing, "yield_to_flight", lambda pid: None)
+    monkeypatch.setattr(viewing, "end_child", lambda *given: ended.append(given))
+    said: list[str] = []
+    with viewing.viewing({"port": 8080}, said.append) as viewer:
+        viewer.restart_within(2)
+        for _ in range(2):
+            viewer.supervise()
+        process.code = process.returncode = -9  # type: ignore[assignment]
+        for count in (2, 3, 3):
+            viewer.supervise()
+            assert len(ports) == count
+    assert ports == [8080, 8091, 8091]
+    killed = "Node 'viewer' was ended by SIGKILL."
+    again = f"{killed} It is started again."
+    limit = " It was started again 2 times within a minute, which is the limit (--restarts)."
+    assert said[1:] == [again, again, f"{killed}{limit}"]
 
 
 def test_a_viewer_yields_to_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:

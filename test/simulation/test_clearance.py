@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,6 +54,21 @@ def test_a_plant_goes_on_through_a_contact_and_says_so() -> None:
     assert deepest.message == f"Links 'left' and 'right' touch, {-truth.min():.3g} m deep."
 
 
+def test_a_plant_whose_bodies_push_each_other_says_so() -> None:
+    config = PlantConfig(initial_joint_positions=(0.0, 0.0))
+    plant = build_plant(SpaceRobot(parse_robot(URDF)), config)
+    links = tuple(plant.robot.link_names)
+    monitor = ClearanceMonitor.of(plant.robot.description, links, pushing=True)
+    assert monitor is not None
+    shapes = np.linspace(-0.6, 0.6, 60)
+    messages = []
+    for x in shapes:
+        plant.q[:] = 0.0
+        link_R, link_r = plant.robot.buffered("link_poses")(np.array([x, -x]))
+        messages += [e.message for e in monitor.measure(link_R, link_r, plant.pose, 0.0)[1]]
+    assert messages[:1] == ["Links 'left' and 'right' touch and push each other."]
+
+
 def test_a_clearance_is_read_again_from_its_message() -> None:
     status = ClearanceStatus(-0.0125, LinkPair("a", "b"), 12.75)
     assert ClearanceStatus.from_values(status.to_values()) == status
@@ -94,11 +110,12 @@ def test_the_nearest_pair_is_that_of_all_distances(name: str) -> None:
 
 
 def test_without_coal_or_pairs_a_plant_measures_no_clearance(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     sliders = load_robot(robot_file("sliding_masses"))
     assert ClearanceMonitor.of(sliders, ()) is None
     monkeypatch.setitem(sys.modules, "coal", None)
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path / "cache"))
     distances_module._coal.cache_clear()
     try:
         with caplog.at_level(logging.WARNING):

@@ -206,6 +206,14 @@ class Browser:
             self.frames += 1
 
 
+def keep_picture(window: Browser, name: str) -> None:
+    """Write a picture of the window where the environment names a folder for those."""
+    folder = os.environ.get("SPACEROBOT_PICTURES")
+    if folder:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        Path(folder, f"{name}.png").write_bytes(window.screenshot())
+
+
 @contextmanager
 def browser(profile: Path, *options: str) -> Iterator[Browser]:
     """A browser for the length of a block."""

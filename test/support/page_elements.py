@@ -105,6 +105,15 @@ class Elements:
     def configure_theme(self, **options: Any) -> None:
         self.themes.append(options)
 
+    def configure_default_lights(self, **options: Any) -> None:
+        self.lights = options
+
+    def configure_environment_map(self, hdri: str | None) -> None:
+        self.environment = hdri
+
+    def set_background_image(self, image: Any) -> None:
+        self.background = image
+
     def reset(self) -> None:
         self.elements.clear()
 

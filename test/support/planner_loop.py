@@ -321,7 +321,8 @@ class Loop:
 
     @property
     def transitions(self) -> list[Transition]:
-        return [output for output in self.outputs if isinstance(output, Transition)]
+        outputs = [*self.outputs, *self.executive.outputs]
+        return [output for output in outputs if isinstance(output, Transition)]
 
     @property
     def speeds(self) -> list[float]:

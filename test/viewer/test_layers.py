@@ -62,11 +62,17 @@ def test_space_is_the_setting_and_the_grid_an_option(server: Server, page: Page)
     page.update(FIRST, 1.0)
 
     def seen() -> dict[str, bool]:
-        names = ("/stars", "/sun", "/sunlight", "/grid")
+        names = ("/stars", "/sun", "/sunlight", "/skylight", "/grid")
         return {name: server.scene.named(name).visible for name in names}
 
-    space = {"/stars": True, "/sun": True, "/sunlight": True, "/grid": False}
+    space = dict.fromkeys(("/stars", "/sun", "/sunlight", "/skylight"), True) | {"/grid": False}
     assert seen() == space
+    assert (server.scene.lights, server.scene.environment) == ({"enabled": False}, None)
+    assert server.scene.background.max() < 20, "dark on a light page too"
+    assert server.scene.named("/sunlight").cast_shadow
+    solids = [each for each in server.scene.elements if each.kind == "add_mesh_simple"]
+    shaded = {str(each.name).startswith("/robot"): each.cast_shadow for each in solids}
+    assert shaded == {True: True, False: False}, "the ghost has no shadow"
     stars, sun = server.scene.named("/stars"), server.scene.named("/sun")
     for points in (stars.points, sun.points):
         np.testing.assert_allclose(np.linalg.norm(points, axis=1), 40 * REACH, rtol=1e-5)
@@ -76,6 +82,8 @@ def test_space_is_the_setting_and_the_grid_an_option(server: Server, page: Page)
     server.gui.named("Setting").use(server, "Grid")
     page.update(FIRST, 1.1)
     assert seen() == {name: not shown for name, shown in space.items()}
+    assert (server.scene.lights, server.scene.environment) == ({"enabled": True}, "city")
+    assert server.scene.background is None
     assert server.gui.themes[0]["dark_mode"] is True
 
 
@@ -108,6 +116,115 @@ def test_each_layer_is_shown_and_hidden_alone(server: Server, page: Page) -> Non
     assert [each.visible for each in lines] == [True] * 3
     assert not base.show_axes
     assert not any(each.visible for each in labels)
+
+
+def test_planned_paths_of_end_effectors_are_drawn(server: Server, page: Page) -> None:
+    link = ROBOT.links[-1].name
+    aim = EndEffectorGoal.checked(link, [1.0, 0.0, 0.0])
+    poses = np.array([[0.0, 0, 0, 0, 0, 0, 1], [1.0, 2, 3, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]])
+    motion = np.column_stack([poses, np.zeros((2, COUNT))])
+    page.update(
+        replace(FIRST, goals={link: Goal.of_end_effectors([aim])}, planned_motion=motion), 1.0
+    )
+    # At zero the links of this robot lie one behind the other: a chain of offsets.
+    offset = np.zeros(3)
+    child = {joint.child: joint for joint in ROBOT.joints}
+    at = link
+    while at in child:
+        offset = child[at].origin.R @ offset + child[at].origin.r
+        at = child[at].parent
+    turned = np.array([1.0 - offset[1], 2.0 + offset[0], 3.0 + offset[2]])
+    found = server.scene.named("/planned_path_of_end_effector0")
+    np.testing.assert_allclose(found.points[0], [offset, turned], atol=1e-6)
+    assert np.linalg.norm(offset) > 0.1
+    assert found.visible
+    page.update(replace(LATER, planned_motion=None), 2.0)
+    assert not server.scene.named("/planned_path_of_end_effector0").visible
+
+
+# -- the past -------------------------------------------------------------------------------------
+
+
+def flight(page: Page, times: Array) -> StackState:
+    """Have a page draw a robot that moves along x by 1 m/s; return the last state."""
+    state = FIRST
+    for time in times:
+        state = replace(FIRST, measured=measured(time, time, 0.0, 0.0))
+        page.update(state, float(time))
+    return state
+
+
+def farthest_flown(server: Server) -> float:
+    """Return the largest x of the flown path that is shown, m."""
+    # A longer path replaces a shorter one.
+    path = [each for each in server.scene.elements if each.shown.get("name") == "/flown_path"][-1]
+    return float(np.max(path.points[..., 0]))
+
+
+def test_a_user_looks_back_at_the_last_five_minutes(server: Server, page: Page) -> None:
+    last = flight(page, np.arange(0.0, 400.0, 0.5))
+    slider, back = server.gui.named("Look back (s)"), server.gui.named("Back to the present")
+    assert slider.visible
+    assert not back.visible
+    # The texts are drawn five times a second of wall time: a state before may be shown.
+    assert slider.min == pytest.approx(99.5, abs=0.5)
+    assert slider.max == slider.value == pytest.approx(399.5, abs=0.5)
+    slider.use(server, 250.2)
+    page.update(last, 400.0)
+    page.update(last, 401.0)
+    robot, status = server.scene.named("/robot"), page._status.content
+    np.testing.assert_allclose(robot.position, [250.0, 0.0, 0.0])
+    assert back.visible
+    assert "Looking back 149.5 s. The robot is at t = 399.50 s now." in status
+    assert "t = 250.00 s" in status
+    assert 245.0 < farthest_flown(server) <= 250.0
+    # New states change nothing of it; the earliest ones go in time.
+    flight(page, np.arange(400.0, 600.0, 0.5))
+    page.update(last, 601.0)
+    assert robot.position[0] == pytest.approx(299.5, abs=1.0)
+    back.use(server)
+    page.update(replace(FIRST, measured=measured(600.0, 600.0, 0.0, 0.0)), 602.0)
+    assert robot.position[0] == 600.0
+    assert "Looking back" not in page._status.content
+    assert farthest_flown(server) > 595.0
+
+
+def test_the_end_of_the_past_is_the_present(server: Server, page: Page) -> None:
+    last = flight(page, np.arange(0.0, 10.0, 0.25))
+    slider = server.gui.named("Look back (s)")
+    slider.use(server, slider.max)
+    page.update(replace(last, measured=measured(11.0, 11.0, 0.0, 0.0)), 11.0)
+    assert server.scene.named("/robot").position[0] == 11.0
+    slider.use(server, 5.0)
+    ended = replace(
+        last,
+        measured=measured(12.0, 12.0, 0.0, 0.0),
+        plant=PlantStatus(PlantState.RUNNING, "It flies."),
+        absent=frozenset({"plant"}),
+        silent={"/plant": 9.0},
+    )
+    page.update(ended, 12.0)
+    page.update(ended, 13.0)
+    assert server.scene.named("/robot").position[0] == 5.0
+    assert ENDED in page._status.content
+    page.show_robot(ROBOT)
+    page.update(ended, 14.0)
+    assert server.scene.named("/robot").position[0] == 12.0, "another robot has no such past"
+
+
+def test_a_past_of_many_states_is_evenly_thinned() -> None:
+    recent: content.Recent[int] = content.Recent(span_s=300.0, most=600)
+    for k in range(20_000):
+        recent.add(0.05 * k, k)
+    assert recent.span is not None
+    first, last = recent.span
+    assert last == pytest.approx(0.05 * 19_999)
+    assert first == pytest.approx(last - 300.0, abs=1.5)
+    steps = np.diff(recent.items) * 0.05
+    assert 250 <= len(recent.items) <= 600
+    assert steps[:-1].max() < 2.2 * steps[:-1].min()
+    assert recent.at(first - 1.0) == recent.items[0]
+    assert recent.at(last + 1.0) == 19_999
 
 
 def test_an_empty_line_stays_hidden_when_its_layer_is_shown(server: Any) -> None:
@@ -246,6 +363,13 @@ def test_a_controller_has_the_distances_of_base_and_end_effector() -> None:
     )
     errors = {"base": content.GoalDistance(5.0, 0.0)}
     assert "base is 5 m and 0 rad from its goal." in content.status_html(state, errors)
+    due = replace(state, controller=ControllerStatus(ControllerState.TRACKING, ends_at_s=4.25))
+    assert content.time_to_go(due) == 3.25
+    head = content.status_html(due, errors)
+    assert "base is 5 m and 0 rad from its goal, 3.2 s to go." in head
+    gone = replace(due, absent=frozenset({"controller"}))
+    assert "to go" not in content.status_html(gone, errors)
+    assert content.progress(due) is None
     assert "from its goal" not in content.status_html(state)
 
 

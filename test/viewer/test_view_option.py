@@ -62,7 +62,7 @@ def test_a_viewer_that_has_ended_by_itself_is_mentioned(
         end = time.monotonic() + 20.0
         while stat.read_text().split()[2] != "Z":
             assert time.monotonic() < end
-    assert said[1:] == ["The viewer ended early: It has lost its way."]
+    assert said[1:] == ["Node 'viewer' has ended with exit code 1: It has lost its way."]
 
 
 @contextmanager

@@ -105,7 +105,7 @@ def test_time_to_go_is_of_the_schedule_that_is_flown() -> None:
     assert content.progress(flying) == pytest.approx(0.25)
     assert "6.0 s to go" in content.status_html(flying)
     assert content.time_to_go(STATE) is None
-    assert content.progress(STATE) == 0.0
+    assert content.progress(STATE) is None
     reached = replace(STATE, planner=replace(executing, state=PlannerState.REACHED))
     assert content.time_to_go(reached) is None
     lost = replace(flying, absent=frozenset({"planner"}))
@@ -353,20 +353,20 @@ def test_the_clearance_and_its_links_are_shown() -> None:
     assert escape("Links 'left <arm>' and 'right' are 0.0123 m apart.") in apart
     assert "#d23c3c" not in apart
     deep = content.status_html(replace(STATE, clearance=ClearanceStatus(-0.2, links, 4.0)))
-    assert f'#d23c3c;font-weight:600;margin:2px 0">{escape("Links")}' in deep
+    assert f'#d23c3c);font-weight:600;margin:2px 0">{escape("Links")}' in deep
     assert escape("and 'right' touch, 0.2 m deep.") in deep
     gone = replace(STATE, clearance=ClearanceStatus(0.1, links, 4.0), absent=frozenset({"plant"}))
-    assert 'opacity:.45"><div style="margin:2px 0">Links' in content.status_html(gone)
+    assert 'opacity:.75"><div style="margin:2px 0">Links' in content.status_html(gone)
 
 
 def test_a_goal_reached_but_for_a_part_is_amber() -> None:
     reached = PlannerStatus(PlannerState.REACHED, "There.")
     green = content.status_html(replace(STATE, planner=reached))
-    assert 'color:#2a9d5c;font-weight:600">reached</span> There.' in green
+    assert 'color:var(--ok-color,#2a9d5c);font-weight:600">reached</span> There.' in green
     partly = replace(reached, not_controlled=("position",))
     amber = content.status_html(replace(STATE, planner=partly))
-    assert 'color:#c98a00;font-weight:600">reached</span> There.' in amber
+    assert 'color:var(--warn-color,#c98a00);font-weight:600">reached</span> There.' in amber
     flying = replace(partly, state=PlannerState.EXECUTING)
-    assert 'color:#2a9d5c;font-weight:600">executing</span>' in content.status_html(
+    assert 'color:var(--ok-color,#2a9d5c);font-weight:600">executing</span>' in content.status_html(
         replace(STATE, planner=flying)
     )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
 import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from http.client import HTTPConnection
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +18,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
+from spacerobot_ros import viewer
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.viewer.server import (
     free_port,
@@ -76,6 +79,34 @@ def test_no_page_may_frame_this_one(server: Any, path: str) -> None:
     assert response.getheader("X-Frame-Options") == "DENY"
     assert (b"<html" in response.read().lower()) == (path == "/")
     connection.close()
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "identity"])
+def test_the_page_has_its_own_script_before_that_of_viser(server: Any, encoding: str) -> None:
+    connection = HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
+    connection.request("GET", "/", headers={"Accept-Encoding": encoding})
+    response = connection.getresponse()
+    body = response.read()
+    connection.close()
+    assert response.headers.get_all("Content-Length") == [str(len(body))]
+    html = gzip.decompress(body) if encoding == "gzip" else body
+    own = Path(viewer.__file__).with_name("page.js").read_bytes()
+    page = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_bytes()
+    assert html.index(own) < html.index(b"<script data-")
+    assert html.replace(b"<script>" + own + b"</script>", b"") == page
+
+
+def test_pages_learn_whether_their_viewer_still_runs(server: Any) -> None:
+    answers = []
+    for _ in range(2):
+        connection = HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
+        connection.request("GET", "/alive")
+        response = connection.getresponse()
+        answers.append((response.status, response.read()))
+        connection.close()
+    assert answers[0] == answers[1]
+    assert answers[0][0] == 200
+    assert len(answers[0][1]) == 16
 
 
 def test_the_page_is_never_shared(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,7 +41,7 @@ from spacerobot_ros.nodes.common.messages import (
     goal_of,
 )
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
-from spacerobot_ros.nodes.common.streams import with_information
+from spacerobot_ros.nodes.common.streams import RawInput, with_information
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -113,7 +113,8 @@ class CommanderNode(FlightNode):
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
         """Name of a state topic with a publisher whose QoS the subscription does not match."""
-        self._inputs: dict[str, Subscription] = {}
+        self._inputs: dict[str, RawInput] = {}
+        """Messages of states and references by their topics."""
         self._subscribe_states()
         self.create_timer(
             _WAITING_STATE_CHECK_PERIOD,
@@ -207,13 +208,15 @@ class CommanderNode(FlightNode):
 
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of a topic of the state, or of a reference, is connected."""
-        return self._inputs[topic].get_publisher_count() > 0
+        return self._inputs[topic].has_publisher
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
         """Return the messages that wait in the subscriptions of odom and joint_states."""
-        return self._take_waiting_messages("odom", Odometry), self._take_waiting_messages(
-            "joint_states", JointState
+        odoms, joints = (
+            [Stamped(first_time_ns(raw), raw) for raw in self._inputs[topic].waiting()]
+            for topic in ("odom", "joint_states")
         )
+        return odoms, joints
 
     # -- inputs -------------------------------------------------------------------------------
 
@@ -359,12 +362,11 @@ class CommanderNode(FlightNode):
             def on_incompatible(_: Any, topic: str = topic) -> None:
                 self._unheard = topic
 
-            self._inputs[topic] = self.create_subscription(
+            self._inputs[topic] = self.take_raw(
                 kind,
                 topic,
                 callback,
-                BEST_EFFORT if self._best_effort else STREAM,
-                raw=True,
+                qos=BEST_EFFORT if self._best_effort else STREAM,
                 event_callbacks=(
                     SubscriptionEventCallbacks(incompatible_qos=on_incompatible) if auto else None
                 ),
@@ -377,16 +379,7 @@ class CommanderNode(FlightNode):
         )
         self._unheard, self._best_effort = "", True
         for topic in ("odom", "joint_states"):
-            self.destroy_subscription(self._inputs[topic])
-        self._subscribe_states()
-
-    def _take_waiting_messages(self, topic: str, kind: type[Any]) -> list[Stamped]:
-        """Return the serialised messages that wait in a subscription."""
-        handle, found = self._inputs[topic].handle, []
-        with handle:
-            while (taken := handle.take_message(kind, True)) is not None:
-                found.append(Stamped(first_time_ns(taken[0]), taken[0]))
-        return found
+            self._inputs[topic].subscribe(BEST_EFFORT)
 
     def _process_waiting_messages(self) -> None:
         """Process waiting statuses, and a postponed state once its time is accepted."""

@@ -15,6 +15,7 @@ from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy._rclpy_pybind11 import RCLError
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
@@ -32,7 +33,14 @@ from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
-from spacerobot_ros.nodes.common.streams import Connections, RawInput, RawOutput, RawStream, Take
+from spacerobot_ros.nodes.common.streams import (
+    AnnouncedPublisher,
+    Connections,
+    RawInput,
+    RawOutput,
+    RawStream,
+    Take,
+)
 from spacerobot_ros.nodes.common.watchdog import Liveness, Role, Silence
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
@@ -102,7 +110,11 @@ class FlightNode(LifecycleNode):
         self.on_end: Callable[[int], None] = lambda code: None
         """Function that a finished node calls with its exit code."""
         self.raw_streams: list[RawStream] = []
-        """Serialised streams of the node, from its configuration to its cleanup."""
+        """Serialised streams of the node that a recorder takes, from configuration to cleanup."""
+        self.raw_inputs: list[RawInput] = []
+        """Serialised messages that the node receives, likewise."""
+        self.before_cleanup: Callable[[], None] = lambda: None
+        """Function that is called before the streams of the node end."""
         self._failure, self._destroyed = "", False
         self._liveness = Liveness(self, self.role, self.depends_on, self.on_silence)
         self._event_stream = self.send_raw(DiagnosticStatus, "events")
@@ -167,9 +179,12 @@ class FlightNode(LifecycleNode):
         kind: type[Any],
         topic: str,
         callback: Take,
+        *,
+        qos: QoSProfile = STREAM,
         number: Callable[[int], None] | None = None,
-    ) -> None:
-        """Subscribe to serialised messages; a listener of the stream is shown them as well.
+        event_callbacks: SubscriptionEventCallbacks | None = None,
+    ) -> RawInput:
+        """Subscribe to serialised messages and return their stream.
 
         Parameters
         ----------
@@ -177,18 +192,28 @@ class FlightNode(LifecycleNode):
             Type of the messages and name of the topic.
         callback
             Called with each message.
+        qos, event_callbacks
+            Quality of service and event callbacks of the subscription.
         number
             Called before with the number that its publisher has given to the message, if wanted.
         """
-        stream = RawInput(self.resolve_topic_name(topic), callback)
+        # The stream guards its callback already: one call less for each message.
+        subscribe = super().create_subscription
 
-        def on_error(error: Exception) -> None:
-            self._fail(f"a message on '{topic}'", error)
+        def create(receive: Callable[..., None], qos: QoSProfile) -> Subscription:
+            return subscribe(kind, topic, receive, qos, raw=True, event_callbacks=event_callbacks)
 
-        # Guarded already: one call less for each message.
-        callback_of_stream = stream.callback(number, on_error)
-        super().create_subscription(kind, topic, callback_of_stream, STREAM, raw=True)
-        self.raw_streams.append(stream)
+        stream = RawInput(
+            self.resolve_topic_name(topic),
+            callback,
+            create=create,
+            destroy=self.destroy_subscription,
+            qos=qos,
+            on_error=lambda error: self._fail(f"a message on '{topic}'", error),
+            number=number,
+        )
+        self.raw_inputs.append(stream)
+        return stream
 
     def report_event(self, event: Event) -> None:
         """Publish an event of this node; an event without a time gets the node's time."""
@@ -204,6 +229,11 @@ class FlightNode(LifecycleNode):
         return None
 
     # -- callbacks ----------------------------------------------------------------------------
+
+    def create_publisher(self, msg_type: Any, topic: str, *args: Any, **kwargs: Any) -> Publisher:
+        """Return a new publisher, which announces what it publishes."""
+        kwargs.setdefault("publisher_class", AnnouncedPublisher)
+        return super().create_publisher(msg_type, topic, *args, **kwargs)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
@@ -525,7 +555,9 @@ class FlightNode(LifecycleNode):
     def _destroy_configured(self) -> None:
         """Destroy the entities of configure; the services of every ROS node stay."""
         self._set_parameters_read_only(fixed=False)
+        self.before_cleanup()
         self.raw_streams[:] = self._permanent_streams
+        self.raw_inputs.clear()
         destroy = {
             Timer: self.destroy_timer,
             Subscription: self.destroy_subscription,

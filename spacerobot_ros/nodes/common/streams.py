@@ -12,6 +12,8 @@ from typing import Any, Protocol
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 
 _MIDDLEWARE_TOPICS = ("/rosout", "/parameter_events")
 
@@ -96,6 +98,19 @@ def raw_publish(publisher: Publisher) -> Take:
     return function
 
 
+class AnnouncedPublisher(Publisher):
+    """A publisher that announces each publication before it happens."""
+
+    on_publish: Callable[[], None] | None = None
+    """Function that is called before each publication."""
+
+    def publish(self, msg: Any) -> None:
+        """Publish a message, or the bytes of one."""
+        if self.on_publish is not None:
+            self.on_publish()
+        super().publish(msg)
+
+
 class RawStream:
     """The messages of one topic that pass through a node.
 
@@ -112,22 +127,48 @@ class RawStream:
 
     def __init__(self, topic: str, take: Take) -> None:
         self.topic = topic
-        self.take = self._take = take
-        """``take``: called by the owner with each message; looked up every time."""
+        self.take = take
+        """Called by the owner with each message; looked up every time."""
+        self._acts: tuple[Take, ...] = (take,)
+        """What the stream does with a message, in order."""
+        self._listener: Take | None = None
 
     def add_listener(self, listener: Take) -> None:
         """Call a listener with every message before ``take``; one listener at a time."""
-        act = self._take
-
-        def take(raw: bytes) -> None:
-            listener(raw)
-            act(raw)
-
-        self.take = take
+        self._listener = listener
+        self._compose()
 
     def remove_listener(self) -> None:
         """Stop calling the listener."""
-        self.take = self._take
+        self._listener = None
+        self._compose()
+
+    def _compose(self) -> None:
+        """Make ``take`` call the listener, if there is one, and then what the stream does."""
+        listeners = () if self._listener is None else (self._listener,)
+        self.take = _one_after_another(*listeners, *self._acts)
+
+
+def _one_after_another(*acts: Take) -> Take:
+    """Return a function that does one to three things with a message, without further calls."""
+    if len(acts) == 1:
+        return acts[0]
+    first, second, *others = acts
+
+    def do_two(raw: bytes) -> None:
+        first(raw)
+        second(raw)
+
+    if not others:
+        return do_two
+    (third,) = others
+
+    def do_three(raw: bytes) -> None:
+        first(raw)
+        second(raw)
+        third(raw)
+
+    return do_three
 
 
 class RawOutput(RawStream):
@@ -151,7 +192,8 @@ class RawOutput(RawStream):
             self._last = raw
             publish(raw)
 
-        super().__init__(publisher.topic_name, keep_and_publish if latched else publish)
+        self._publish = keep_and_publish if latched else publish
+        super().__init__(publisher.topic_name, self._publish)
         self.readers: Callable[[], int] = publisher.get_subscription_count
         """Function that returns the number of matched subscriptions."""
         self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
@@ -163,38 +205,98 @@ class RawOutput(RawStream):
         if self._last is not None:
             listener(self._last)
 
+    def announce(self, on_publish: Callable[[], None] | None) -> None:
+        """Call a function before each publication; None: no longer."""
+        before = () if on_publish is None else (lambda _: on_publish(),)
+        self._acts = *before, self._publish
+        self._compose()
+
+    def hand_over(self, deliver: Take | None) -> None:
+        """Call a function with each message after its publication; None: no longer."""
+        after = () if deliver is None else (deliver,)
+        self._acts = self._publish, *after
+        self._compose()
+
 
 class RawInput(RawStream):
-    """Messages received on a topic, from any publisher: ``take`` is the node's callback."""
+    """Messages received on a topic, from any publisher: ``take`` is the node's callback.
 
-    def callback(
-        self, number: Callable[[int], None] | None, on_error: Callable[[Exception], None]
-    ) -> Callable[..., None]:
-        """Return the callback of a subscription.
+    Parameters
+    ----------
+    topic, take
+        As of every stream.
+    create, destroy
+        Create a subscription with a callback and a quality of service, and destroy one.
+    qos
+        Quality of service of the subscription.
+    on_error
+        Called with an exception of a callback: none leaves the executor.
+    number
+        Called before with the number that its publisher has given to the message, if wanted.
+    """
 
-        Parameters
-        ----------
-        number
-            Called before with the number that its publisher has given to the message, if wanted.
-        on_error
-            Called with an exception of a callback: none leaves the executor.
-        """
+    def __init__(
+        self,
+        topic: str,
+        take: Take,
+        *,
+        create: Callable[[Callable[..., None], QoSProfile], Subscription],
+        destroy: Callable[[Subscription], object],
+        qos: QoSProfile,
+        on_error: Callable[[Exception], None],
+        number: Callable[[int], None] | None = None,
+    ) -> None:
+        super().__init__(topic, take)
+        self._create, self._destroy, self._qos = create, destroy, qos
+        self.numbered = number is not None
+        """Whether the numbers are wanted, which only a subscription has."""
 
-        def take(raw: bytes) -> None:
+        def receive(raw: bytes) -> None:
             try:
                 # ``take`` is looked up for every message, because listeners come and go.
                 self.take(raw)
             except Exception as error:
                 on_error(error)
 
-        if number is None:
-            return take
+        self.receive: Take = receive
+        """Callback of the subscription, without the number of the message."""
 
-        def take_numbered(raw: bytes, information: Any) -> None:
+        def receive_numbered(raw: bytes, information: Any) -> None:
+            assert number is not None
             number(information.get("publication_sequence_number") or 0)  # 0: none.
-            take(raw)
+            receive(raw)
 
-        return with_information(take_numbered)
+        self._callback = with_information(receive_numbered) if self.numbered else receive
+        self.subscription: Subscription | None = None
+        """The subscription; None while messages are handed over without it."""
+        self.subscribe()
+
+    def subscribe(self, qos: QoSProfile | None = None) -> None:
+        """Subscribe, in place of a present subscription, with the same or another QoS."""
+        self.unsubscribe()
+        self._qos = qos or self._qos
+        self.subscription = self._create(self._callback, self._qos)
+
+    def unsubscribe(self) -> None:
+        """End the subscription."""
+        if self.subscription is not None:
+            self._destroy(self.subscription)
+            self.subscription = None
+
+    @property
+    def has_publisher(self) -> bool:
+        """Whether a publisher is connected; without a subscription one of this process is."""
+        return self.subscription is None or self.subscription.get_publisher_count() > 0
+
+    def waiting(self) -> list[bytes]:
+        """Take and return the messages that wait in the subscription."""
+        found: list[bytes] = []
+        if self.subscription is not None:
+            handle, kind = self.subscription.handle, self.subscription.msg_type
+            with handle:
+                while (taken := handle.take_message(kind, True)) is not None:
+                    found.append(taken[0])
+        return found
 
 
 class StreamingNode(Protocol):

@@ -31,7 +31,6 @@ from spacerobot_ros.model.world import among_obstacles, obstacles_from_topic
 from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.streams import RawInput
 from spacerobot_ros.nodes.common.watchdog import Role, Silence
 from spacerobot_ros.nodes.plant.publisher import (
     ClearancePublisher,
@@ -167,19 +166,27 @@ class PlantNode(FlightNode):
         )
         self._clearance = None
         if self._clearance_ticks:
-            self._clearance = ClearancePublisher.of(self, self.plant, robot.description)
+            self._clearance = ClearancePublisher.of(
+                self, self.plant, robot.description, pushing=config.engine == "mujoco"
+            )
         self._obstacles: str | None = None
         """The text on the topic obstacles; None: the robot has its own."""
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         for source in self._commands.sources:
             reader = CommandReader(source, robot, config.frame_prefix)
-            self.take_raw(
+            stream = self.take_raw(
                 message_class(TOPICS[source.topic].type),
                 source.topic,
                 partial(self._on_command, reader),
                 # In lockstep the first command of a tick counts, whichever node publishes it.
-                None if self._real_time is None else self._message_number_callback(source.senders),
+                number=(
+                    None
+                    if self._real_time is None
+                    else self._message_number_callback(source.senders)
+                ),
             )
+            # Commands are recorded as the plant receives them.
+            self.raw_streams.append(stream)
         for topic, inject in (
             ("fault_injection", self.plant.inject),
             ("disturbance_injection", self.plant.disturb),
@@ -255,9 +262,8 @@ class PlantNode(FlightNode):
         """Bring the joints to rest, because the commanders end as well."""
         if self._active is not PlantState.RUNNING or self._real_time is None:
             return
-        for stream in self.raw_streams:
-            if isinstance(stream, RawInput):
-                stream.take = lambda raw: None
+        for stream in self.raw_inputs:
+            stream.take = lambda raw: None
         self._commands.rest()
         self._look_at_status()
         end, began = time.monotonic() + _LONGEST_REST, self._tick
@@ -467,6 +473,7 @@ class PlantNode(FlightNode):
         if self._clearance_ticks:
             described = among_obstacles(self.plant.robot.description, world)
             with self.long_work():
+                # The plant in MuJoCo has the obstacles of the beginning alone.
                 self._clearance = ClearancePublisher.of(
                     self, self.plant, described, self._clearance
                 )

@@ -382,6 +382,8 @@ class StatePublisher:
         """Wait until all readers have received the states, or the time limit is over."""
         end = time.monotonic() + _LONGEST_WAIT
         for output in self._outputs.values():
+            if not output.readers():
+                continue
             left = max(0.0, end - time.monotonic())
             if not output.await_readers(Duration(seconds=left)):
                 return
@@ -478,13 +480,16 @@ class ClearancePublisher:
         plant: Plant,
         described: RobotDescription,
         before: ClearancePublisher | None = None,
+        *,
+        pushing: bool = False,
     ) -> ClearancePublisher | None:
         """Return the publisher of a plant among obstacles; None where no links could touch.
 
-        ``before`` is the publisher among those so far, whose topic goes on.
+        ``before`` is the publisher among those so far, whose topic goes on; ``pushing`` is that of
+        :class:`.ClearanceMonitor`.
         """
-        links = tuple(plant.robot.link_names)
-        monitor = ClearanceMonitor.of(described, links, None if before is None else before._monitor)
+        links, so_far = tuple(plant.robot.link_names), None if before is None else before._monitor
+        monitor = ClearanceMonitor.of(described, links, so_far, pushing=pushing)
         if monitor is None:
             return None
         return cls(node, plant, monitor, None if before is None else before._stream)

@@ -24,6 +24,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
 
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerStatus
@@ -59,6 +60,9 @@ _LONGEST_EXPECTED_DELAY_NS = SECOND
 
 _MAX_PATH_POINTS = 1000
 """Largest number of points of a planned path."""
+
+_MAX_MOTION_POINTS = 200
+"""Largest number of poses and shapes of a planned motion: links are placed at each."""
 
 M = TypeVar("M")
 
@@ -142,6 +146,11 @@ class Listener:
         """Nodes whose reports are hidden, and the node whose next heartbeat shows them again."""
         self._last_call = time.monotonic()
         self._planned: Array | None = None
+        self._path: _PlannedPath | None = None
+        self._last_schedule: JointTrajectory | None = None
+        """Latched, it may come before the robot whose joints it moves."""
+        self._schedule: _Schedule | None = None
+        self._motion: Array | None = None
         self._goals: dict[Part, Goal] = {}
         self.forget_state()
         for topic, key, read in (
@@ -154,6 +163,7 @@ class Listener:
                 DiagnosticStatus, topic, self._status_callback(key, read), LATCHED
             )
         node.create_subscription(Path, "planned_path", self._on_path, LATCHED)
+        node.create_subscription(JointTrajectory, "gait_schedule", self._on_schedule, LATCHED)
         node.create_subscription(DiagnosticStatus, "heartbeat", self._on_heartbeat, STREAM)
         parts: dict[str, Part] = {"goal_pose": "base", "end_effector/goal_pose": "end_effector"}
         for topic, part in parts.items():
@@ -179,6 +189,8 @@ class Listener:
         """Start reading the joints of a robot."""
         self._names = robot.joint_names
         self.forget_state()
+        if self._last_schedule is not None:
+            self._on_schedule(self._last_schedule)
 
     def state(self) -> StackState:
         """Take the received messages and return the state of the stack."""
@@ -197,6 +209,7 @@ class Listener:
             for key, status in self._statuses.items()
             if self._reporters[key] not in self._hidden
         }
+        planner_hidden = self._reporters.get("planner") in self._hidden
         return StackState(
             measured=self._measured,
             tool=self._tool_pose,
@@ -209,7 +222,8 @@ class Listener:
             planner=statuses.get("planner"),
             controller=statuses.get("controller"),
             replay=statuses.get("replay"),
-            planned_path=None if self._reporters.get("planner") in self._hidden else self._planned,
+            planned_path=None if planner_hidden else self._planned,
+            planned_motion=None if planner_hidden else self._motion,
             goals=dict(self._goals),
             silent=silent,
             inactive=inactive,
@@ -347,6 +361,39 @@ class Listener:
         points = [(p.pose.position.x, p.pose.position.y, p.pose.position.z) for p in kept]
         path = np.array(points).reshape(-1, 3)
         self._planned = path if np.all(np.isfinite(path)) else None
+        found = [pose_array(p.pose.position, p.pose.orientation) for p in kept]
+        whole = [pose for pose in found if pose is not None]
+        times = np.array([stamp_to_ns(p.header.stamp) for p in kept]) / SECOND
+        begin = stamp_to_ns(message.header.stamp)
+        complete = len(whole) == len(kept) > 1
+        self._path = _PlannedPath(begin, times, np.array(whole)) if complete else None
+        self._combine()
+
+    def _on_schedule(self, message: JointTrajectory) -> None:
+        self._last_schedule = message
+        places = [message.joint_names.index(n) for n in self._names if n in message.joint_names]
+        positions = [list(point.positions) for point in message.points]
+        complete = len(places) == len(self._names)
+        fitting = all(len(each) == len(message.joint_names) for each in positions)
+        self._schedule = None
+        if positions and complete and fitting:
+            begin = stamp_to_ns(message.header.stamp)
+            since = [stamp_to_ns(point.time_from_start) for point in message.points]
+            times = (np.array(since) + begin) / SECOND
+            self._schedule = _Schedule(begin, times, np.array(positions)[:, places])
+        self._combine()
+
+    def _combine(self) -> None:
+        """Combine path and schedule if they are of one plan."""
+        path, schedule = self._path, self._schedule
+        self._motion = None
+        if path is not None and schedule is not None and path.begin_ns == schedule.begin_ns:
+            step = -(-len(path.times) // _MAX_MOTION_POINTS)
+            kept = [*range(0, len(path.times) - 1, step), len(path.times) - 1]
+            times = path.times[kept]
+            shapes = [np.interp(times, schedule.times, q) for q in schedule.positions.T]
+            motion = np.column_stack([path.poses[kept], *shapes])
+            self._motion = motion if np.all(np.isfinite(motion)) else None
 
     def _on_goal(self, part: Part, message: PoseStamped) -> None:
         try:
@@ -385,6 +432,24 @@ class Listener:
                 # The recorded reports are of nodes without heartbeats here.
                 recorded = set(self._reporters.values()) - set(self._beats)
                 self._hidden.update(dict.fromkeys(recorded, name))
+
+
+@dataclass(frozen=True)
+class _PlannedPath:
+    """Poses (k, 7) of the base that a planner predicts, and their simulated times (k,), s."""
+
+    begin_ns: int
+    times: Array
+    poses: Array
+
+
+@dataclass(frozen=True)
+class _Schedule:
+    """Planned positions (m, n) of the joints, and their simulated times (m,), s."""
+
+    begin_ns: int
+    times: Array
+    positions: Array
 
 
 @dataclass(frozen=True)

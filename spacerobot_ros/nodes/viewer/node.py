@@ -308,7 +308,10 @@ class ViewerNode(FlightNode):
             event = Event.from_values(message.values, message.message, message.level)
         except SpaceRobotError:
             return
-        self._page.note(Notice(event.message, event.level, event.time_s, message.name))
+        notice = Notice(event.message, event.level, event.time_s, message.name)
+        self._page.note(notice)
+        if event.kind is EventKind.NODE_RESTARTED:
+            self._page.announce(notice)
         if event.kind in (EventKind.ACTIVATED, EventKind.NODE_BACK):
             for key, name in self._full_names.items():
                 if name == message.name and key in _NODES_WITH_PARAMETERS:

@@ -530,6 +530,25 @@ class Tolerance:
     attitude: float
     shape: float = 1e-3
 
+    def require_control(self, goal: Goal, controls: frozenset[Controlled], who: str) -> None:
+        """Refuse a goal with these tolerances, where 0 is none, if ``who`` leaves one unmet.
+
+        ``controls`` are the parts of the goal that ``who``, a method or a law, controls.
+
+        Raises
+        ------
+        GoalError
+            There is a tolerance for a part of the goal that is not controlled.
+        """
+        given = {"position": self.position, "attitude": self.attitude, "shape": self.shape}
+        missing = [part for part in uncontrolled_parts(goal, controls) if given[part]]
+        if missing:
+            named = " and ".join("joints" if part == "shape" else part for part in missing)
+            raise GoalError(
+                f"The goal gives a tolerance for its {named}, which {who} does not control here: "
+                "leave that tolerance 0 to take any error."
+            )
+
     def admits(self, error: PoseError, controls: frozenset[Controlled] = POSE) -> bool:
         """Whether an error is within tolerance in all controlled parts of the goal."""
         return (
@@ -548,3 +567,7 @@ class Tolerance:
                 )
             )
         )
+
+
+NO_TOLERANCE = Tolerance(0.0, 0.0, 0.0)
+"""Tolerances of a sender who has given none."""

@@ -1041,9 +1041,9 @@ class Executive:
         self._plan_count += 1
         self._add_notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
         if isinstance(result, Planned):
-            # A plan may aim beside the goal; its end is compared with the goal itself.
-            schedule = replace(result.schedule, goal=job.identified.goal)
-            result = replace(result, schedule=schedule)
+            result = _plan_for(job.identified, result)
+        if isinstance(result, Planned):
+            schedule = result.schedule
             self._add_event(
                 EventKind.PLAN_READY,
                 f"The plan is {_name_gait(schedule.method)} of {schedule.duration:.6g} s.",
@@ -1338,6 +1338,16 @@ class Executive:
             values["notes"] = schedule.notes
         goal = goal_values(aim)
         self.outputs.append(PlannerStatus(state, message, identified.goal_id, goal, **values))
+
+
+def _plan_for(identified: IdentifiedGoal, planned: Planned) -> Planned | Refused:
+    """Return a plan with its goal, which it may aim beside; refused if it controls too little."""
+    schedule = replace(planned.schedule, goal=identified.goal)
+    try:
+        identified.required.require_control(identified.goal, schedule.controls, schedule.method)
+    except PlanningError as refusal:
+        return Refused(str(refusal), planned.wall_time)
+    return replace(planned, schedule=schedule)
 
 
 def _name_gait(method: str) -> str:

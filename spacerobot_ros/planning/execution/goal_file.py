@@ -11,7 +11,13 @@ from typing import Any
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.files import UntrustedFileError, read_private, write_whole
-from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal, Goal, Tolerance
+from spacerobot_ros.planning.core.goal import (
+    NO_TOLERANCE,
+    POSE,
+    EndEffectorGoal,
+    Goal,
+    Tolerance,
+)
 
 BASE_GOAL_KEY = "base"
 """Key of the goal of the base in the file."""
@@ -32,12 +38,16 @@ class IdentifiedGoal:
     resumes
         Whether a restarted commander goes on with it. The client of an action is told that its
         goal has ended when the commander stops, so nothing goes on.
+    required
+        The tolerances that its sender has given, 0: none. A goal with a tolerance for a part that
+        the method or the law does not control is refused.
     """
 
     goal: Goal
     goal_id: str = ""
     tolerance: Tolerance | None = None
     resumes: bool = True
+    required: Tolerance = NO_TOLERANCE
 
 
 class GoalIds:

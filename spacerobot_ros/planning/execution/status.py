@@ -283,7 +283,9 @@ def describe_remaining_error(
         # Goals of positions alone leave no angle.
         turn = f" and {angle:.3g} rad" if angle > 0 else ""
         parts["end_effectors"] = f"{distance:.3g} m{turn} at the end-effectors"
-    remaining = " and ".join(text for part, text in parts.items() if part in controls)
+    hand = parts.pop("end_effectors", "") if "end_effectors" in controls else ""
+    body = " and ".join(text for part, text in parts.items() if part in controls)
+    remaining = ", ".join(filter(None, (body, hand)))
     notes = []
     if tolerance is not None:
         hands = "end_effectors" in controls

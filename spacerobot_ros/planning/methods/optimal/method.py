@@ -102,16 +102,25 @@ _STARTS_BEFORE_COASTING = 8
 """Guesses without a solution after which a robot that drifts coasts with its joints at rest."""
 
 _STARTS_AFTER_COASTING = 3
-"""Guesses without a solution after which it coasts on."""
+"""Guesses without a solution after which the next pass of the goal is tried."""
 
-_COASTING_ANGLE = math.radians(20.0)
-"""Angle by which the base turns meanwhile."""
+_BRIEF_ANGLE = math.radians(40.0)
+"""Angle by which the base turns in the longest manoeuvre that begins at once."""
 
-_MIN_COASTING_TICKS = 5
-"""Control periods for which it coasts at least."""
+_COASTING_ANGLE = math.radians(5.0)
+"""Angle between the attitudes at which it is looked whether the base passes the goal."""
 
-_COASTING_TURNS = 2.0
+_COASTING_TURNS = 4.0
 """Turns of the base for which it coasts at most."""
+
+_NEAR, _EVERY = math.cos(math.radians(20.0) / 2), 4
+"""Cosine of half the angle between base and goal below which every fourth of these is tried."""
+
+_MOST_PASSES = 20
+"""Passes of the goal that are tried."""
+
+_LONGEST_PASS = 2.5
+"""Longest time of a manoeuvre that ends at a pass, as multiple of that at zero momentum."""
 
 _LONGEST_FACTOR, _LONGEST_ADDITIONAL_TICKS = 1.25, 20
 """Longest duration of held commands: a factor of optimal.longest, and additional ticks."""
@@ -129,6 +138,17 @@ class _Found:
     manoeuvre: Manoeuvre
     positions: Array
     notes: Notes
+
+
+@dataclass(frozen=True)
+class _Coast:
+    """The motion of a base whose joints rest: shapes (N + 1, n), attitudes (N + 1, 4) and positions
+    (N + 1, 3) at ticks.
+    """
+
+    shapes: Array
+    attitudes: Array
+    positions: Array
 
 
 @dataclass(frozen=True)
@@ -412,8 +432,12 @@ class OptimalGait(GaitMethod):
         chosen: OptimalOptions,
         cancellation: Cancellation,
         in_vain: int = sys.maxsize,
+        guess: SolutionLibrary | None = None,
     ) -> _Found:
-        """Return a manoeuvre that begins at once; see :meth:`.ManoeuvreSearch.search`."""
+        """Return a manoeuvre that begins at once; see :meth:`.ManoeuvreSearch.search`.
+
+        A ``guess`` comes before all others.
+        """
         state, correction = request.state, request.correction
         # Libraries have manoeuvres to attitudes of the base.
         library = None if correction or request.goal.end_effectors else self._library
@@ -426,7 +450,7 @@ class OptimalGait(GaitMethod):
                 self._count_intervals(correction),
                 chosen,
                 cancellation,
-                library=library,
+                library=guess or library,
                 # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
                 gentle=correction and not boundary.drifts,
                 in_vain=in_vain,
@@ -457,55 +481,108 @@ class OptimalGait(GaitMethod):
 
         The drift may lead away from the goal faster than the joints turn the base back; later, it
         leads past it. At first a manoeuvre is looked for that ends before the base has turned far,
-        then such a one after the joints have rested, and at last any.
+        then such a one that ends when the base passes the goal, and at last any.
         """
-        state, q, h = request.state, request.state.q, self.control_period
-        specification = self._kind_of(request.goal).specification
+        state, q = request.state, request.state.q
         momenta, rest = (state.linear_momentum, state.angular_momentum), np.zeros(self.robot.n)
         _, omega = self.robot.base_twist(state.quaternion, q, rest, *momenta)
         rate = float(np.linalg.norm(omega))
-        every = max(_MIN_COASTING_TICKS, round(_COASTING_ANGLE / rate / h))
-        last = min(chosen.longest, _COASTING_TURNS * 2 * math.pi / rate)
-        brief = replace(chosen, longest=min(chosen.longest, 2 * every * h))
-        budget = cancellation, _STARTS_BEFORE_COASTING
+        brief = replace(chosen, longest=min(chosen.longest, _BRIEF_ANGLE / rate))
         with suppress(NotFoundError):
-            return self._begin_now(request, boundary, limits, brief, *budget)
-        most = math.ceil(last / h)
-        coasting = np.tile(q, (most + 1, 1))
-        attitudes = self._prediction.attitudes(coasting, state.quaternion, state.angular_momentum)
-        R_before = matrix_from_quaternion(state.quaternion)
-        for ticks in range(every, most + 1, every):
-            end = slice(ticks, ticks + 1)
-            (r_WB,) = self._prediction.positions(
-                state, np.array([ticks * h]), coasting[end], attitudes[end]
+            return self._begin_now(
+                request, boundary, limits, brief, cancellation, _STARTS_BEFORE_COASTING
             )
-            after = replace(state, position=r_WB, quaternion=attitudes[ticks])
-            R_after = matrix_from_quaternion(attitudes[ticks])
-            later = replace(request, state=after)
-            aimed = replace(
-                specification.boundary_conditions(
-                    self.robot,
-                    later,
-                    self._goal_shape(request.goal),
-                    self._limits,
-                    self._constraints.direction_W,
-                ),
-                state=after,
-                angular_momentum=R_after.T @ R_before @ boundary.angular_momentum,
-            )
-            budget = cancellation, _STARTS_AFTER_COASTING
+        last = min(chosen.longest, _COASTING_TURNS * 2 * math.pi / rate)
+        coast = self._coast(request, math.ceil(last / self.control_period))
+        step = max(1, round(_COASTING_ANGLE / rate / self.control_period))
+        for end in self._passes(request, boundary, coast, step):
             try:
-                found = self._begin_now(later, aimed, limits, brief, *budget)
-                self._constraints.check(coasting[:ticks], attitudes[:ticks], h)
+                return self._meet_pass(request, boundary, limits, chosen, cancellation, coast, end)
             except (PlanningError, CandidateError):
                 cancellation.raise_if_requested()
-                continue
-            positions = np.vstack([coasting[:ticks], found.positions])
-            return replace(
-                found, positions=positions, notes={**found.notes, "coasting_time": ticks * h}
-            )
         return self._begin_now(
             request, boundary, limits, replace(chosen, longest=last), cancellation
+        )
+
+    def _coast(self, request: PlanRequest, ticks: int) -> _Coast:
+        """Return the motion of the base while the joints rest."""
+        state, shapes = request.state, np.tile(request.state.q, (ticks + 1, 1))
+        attitudes = self._prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
+        times = self.control_period * np.arange(ticks + 1, dtype=np.float64)
+        return _Coast(
+            shapes, attitudes, self._prediction.positions(state, times, shapes, attitudes)
+        )
+
+    def _later(
+        self, request: PlanRequest, boundary: BoundaryConditions, coast: _Coast, ticks: int
+    ) -> tuple[PlanRequest, BoundaryConditions]:
+        """Return the request and its boundary conditions after some ticks of coasting."""
+        state, quaternion = request.state, coast.attitudes[ticks]
+        after = replace(state, position=coast.positions[ticks], quaternion=quaternion)
+        later = replace(request, state=after)
+        aimed = self._kind_of(request.goal).specification.boundary_conditions(
+            self.robot,
+            later,
+            self._goal_shape(request.goal),
+            self._limits,
+            self._constraints.direction_W,
+        )
+        R_BW = matrix_from_quaternion(quaternion).T
+        L_B = R_BW @ matrix_from_quaternion(state.quaternion) @ boundary.angular_momentum
+        return later, replace(aimed, state=after, angular_momentum=L_B)
+
+    def _passes(
+        self, request: PlanRequest, boundary: BoundaryConditions, coast: _Coast, step: int
+    ) -> list[int]:
+        """Return the ticks at which the coasting base is near the goal: where it is nearest, and
+        where less than 20 deg are left, the first ones.
+        """
+        grid = np.arange(0, len(coast.shapes), step)
+        turns = np.array([self._later(request, boundary, coast, int(k))[1].turn for k in grid])
+        # The cosine of half the angle that is left.
+        near = np.abs(turns[:, 3])
+        nearest = (near[1:-1] > near[:-2]) & (near[1:-1] >= near[2:])
+        every = np.arange(1, len(grid) - 1) % _EVERY == 0
+        passes = 1 + np.flatnonzero(nearest | (every & (near[1:-1] > _NEAR)))
+        return [int(tick) for tick in grid[passes][:_MOST_PASSES]]
+
+    def _meet_pass(
+        self,
+        request: PlanRequest,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        chosen: OptimalOptions,
+        cancellation: Cancellation,
+        coast: _Coast,
+        end: int,
+    ) -> _Found:
+        """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
+        ``end``. Its first guess turns the base at zero momentum by the angle that is left there.
+
+        Raises
+        ------
+        PlanningError
+            None was found.
+        CandidateError
+            Coasting violates a path constraint.
+        """
+        h = self.control_period
+        there, aimed = self._later(request, boundary, coast, end)
+        at_rest = replace(aimed, angular_momentum=np.zeros(3))
+        free = self._begin_now(there, at_rest, limits, chosen, cancellation)
+        guess = SolutionLibrary("", at_rest.turn[np.newaxis], free.positions[np.newaxis])
+        takes = len(free.positions) - 1
+        begin = max(0, end - takes)
+        later, aimed = self._later(request, boundary, coast, begin)
+        brief = replace(chosen, longest=min(chosen.longest, _LONGEST_PASS * takes * h))
+        found = self._begin_now(
+            later, aimed, limits, brief, cancellation, _STARTS_AFTER_COASTING, guess
+        )
+        self._constraints.check(coast.shapes[:begin], coast.attitudes[:begin], h)
+        return replace(
+            found,
+            positions=np.vstack([coast.shapes[:begin], found.positions]),
+            notes={**found.notes, "coasting_time": begin * h},
         )
 
     def _plan_in_motion(

@@ -1,0 +1,698 @@
+"""The plant in MuJoCo: links, obstacles and the target push each other, and a grasp is a weld.
+
+The parameter ``engine`` chooses it in place of :class:`.EffortPlant` or :class:`.VelocityPlant`;
+commands, states and topics are the same. MuJoCo integrates by Runge-Kutta 4; contacts, joint stops,
+locked joints and welds are its soft constraints, with a time constant of two steps. They are
+internal forces, so that total momentum changes by the error of the integration alone: with steps of
+1 ms about 1e-9 of its largest value in free motion, 1e-5 by a grasp.
+
+Under velocities, a change of the commanded rates takes effect within a step. Beyond that the servos
+give at most the efforts that the limits of the URDF allow: a joint that meets a contact stalls.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spacerobot_ros.collision import CollisionGeometry, Solid
+from spacerobot_ros.collision.geometry import solids_of
+from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array, Inertia, RobotDescription
+from spacerobot_ros.model.external_loads import LoadLayout
+from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, joined_momenta
+from spacerobot_ros.model.integration import count_steps
+from spacerobot_ros.model.rotations import (
+    cross,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_from_rotvec,
+    quaternion_inverse,
+    quaternion_multiply,
+    rotvec_from_quaternion,
+)
+from spacerobot_ros.simulation.capture import CapturePlant, Target, capturing_link
+from spacerobot_ros.simulation.config import PlantConfig, TargetConfig
+from spacerobot_ros.simulation.loads import PlantLoads
+from spacerobot_ros.simulation.mujoco_engine import (
+    add_motors,
+    compiled_model,
+    import_mujoco,
+    joint_addresses,
+    mujoco_spec,
+)
+from spacerobot_ros.simulation.plant import Counts, Flags, InitialState
+
+DEFAULT_INTEGRATION_STEP = 0.001
+"""Longest Runge-Kutta step, s."""
+
+_STIFFNESS = 2.0
+"""Time constant of contacts, stops and welds, in steps: the least that MuJoCo recommends."""
+
+_AT_STOP = 1e-4
+"""Distance from its limit, m or rad, at which a joint counts as stopped: stops are soft."""
+
+_STEPS_OF_IMPULSE = 5
+"""Integration steps over which the impulse of a wrench is added up at once."""
+
+_TARGET = "target/"
+"""Before the names of the target's bodies and shapes."""
+
+_OBSTACLE = "obstacle/"
+"""Before the names of the shapes of obstacles."""
+
+
+class MujocoPlant:
+    """A free-floating robot in MuJoCo, and the target beside it.
+
+    After :meth:`step`, the attributes are those of :class:`.Plant`, and
+
+    ``wrench``
+        (6,) force (N) over torque (N m) of the last tick at the origin of the base link, base
+        components.
+    ``holds_target``
+        Whether the target is welded to the robot: momenta are those of both, then.
+
+    Parameters
+    ----------
+    robot
+        The model; MuJoCo reads its URDF, from which masses must not differ.
+    control_period
+        Duration of a tick, s.
+    initial
+        Initial state.
+    integration_step
+        Longest Runge-Kutta step within a tick, s.
+    actuation
+        ``velocity`` or ``effort``, as the parameter.
+    target
+        The target, and the link that captures it; None: there is none.
+
+    Raises
+    ------
+    ParameterError
+        The initial state is refused.
+    RobotDescriptionError
+        MuJoCo refuses the robot or the target, or a joint follows another one.
+    SpaceRobotError
+        MuJoCo is not installed.
+    """
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        control_period: float,
+        initial: InitialState | None = None,
+        integration_step: float = DEFAULT_INTEGRATION_STEP,
+        *,
+        actuation: str = "effort",
+        target: tuple[MujocoTarget, str] | None = None,
+    ) -> None:
+        self.robot, self.control_period = robot, control_period
+        self.initial = initial or InitialState()
+        self._steps = count_steps(control_period, integration_step)
+        self._velocity = actuation == "velocity"
+        self._mujoco = mujoco = import_mujoco()
+        self._target = target[0] if target else None
+        spec, shapes = _specification(mujoco, robot.description, target)
+        self._model = model = compiled_model(spec, robot.description)
+        _set_options(mujoco, model, control_period / self._steps)
+        self._data = mujoco.MjData(model)
+        self._q, self._qdot = joint_addresses(model, robot.description)
+        self._link_poses = robot.buffered("link_poses")
+        self._bodies = np.array([model.body(name).id for name in robot.link_names])
+        self._root = int(model.body(robot.base_link).id)
+        self._target_body = -1
+        if self._target is not None:
+            root = self._target.description.base_link
+            self._target_body = int(model.body(f"{_TARGET}{root}").id)
+        self._locks = [model.equality(f"lock {name}").id for name in robot.joint_names]
+        self._target_shapes = [model.geom(name).id for name in shapes]
+        n, wheels = robot.n, robot.description.wheel_names
+        self._is_wheel = np.array([name in wheels for name in robot.joint_names], dtype=bool)
+        self.pose, self.twist = np.zeros(7), np.zeros(6)
+        self.q, self.qdot, self.effort = np.zeros((3, n))
+        self.wrench, self.momentum = np.zeros(6), np.zeros(7)
+        self.link_R, self.link_r = (
+            np.zeros((3, 3 * len(robot.link_names))),
+            np.zeros((3, len(robot.link_names))),
+        )
+        self.expected_momenta = np.zeros(6)
+        """Linear over angular momentum (6,) in W: from the beginning, by thrust and loads."""
+        self.limit_counts: dict[str, Counts] = {
+            kind: np.zeros(n, dtype=np.int64)
+            for kind in ("rate" if self._velocity else "effort", "stroke")
+        }
+        self.holds_target = False
+        self._aim = np.zeros(n)
+        """Rates that the servos aim at, from the last tick on."""
+        self._held: Flags = np.zeros(n, dtype=np.bool_)
+        self._loads: PlantLoads | None = None
+        self.reset()
+
+    @property
+    def name(self) -> str:
+        """Name and version of the engine."""
+        return f"MuJoCo {self._mujoco.__version__}"
+
+    # -- the plant ----------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Return to the initial state, without efforts; the limit counters go on."""
+        start, robot, data = self.initial, self.robot, self._data
+        rates = start.rates(robot)
+        if self._velocity and rates.any():
+            raise ParameterError(
+                "Joints under velocity commands start at rest: leave the initial joint velocities "
+                "out, or command them."
+            )
+        quaternion, q, momenta = start.attitude(), start.shape(robot), start.momenta()
+        self._mujoco.mj_resetData(self._model, data)
+        R_WB = matrix_from_quaternion(quaternion)
+        data.qpos[:3] = start.system_position(robot) - R_WB @ robot.center_of_mass(q)
+        data.qpos[3:7] = np.roll(quaternion, 1)
+        data.qpos[self._q], data.qvel[self._qdot] = q, rates
+        v_WB_B, omega_WB_B = robot.base_twist(quaternion, q, rates, momenta[:3], momenta[3:])
+        data.qvel[:3], data.qvel[3:6] = R_WB @ v_WB_B, omega_WB_B
+        if self._target is not None:
+            self._place_target(self._target.initial)
+        self.holds_target = False
+        self._model.geom_conaffinity[self._target_shapes] = 1
+        self.expected_momenta[:] = momenta
+        self.effort[:] = self.wrench[:] = self._aim[:] = 0.0
+        self.hold(self._held)
+        self._update()
+
+    def hold(self, joints: Flags) -> None:
+        """Lock the marked joints (n,) at their positions, and release all other joints."""
+        for joint in np.flatnonzero(joints & ~self._held | (joints & (self._locked() == 0))):
+            self._model.eq_data[self._locks[joint], 0] = self._data.qpos[self._q[joint]]
+        self._data.eq_active[self._locks] = joints
+        self._held = joints.copy()
+
+    def load(self, loads: PlantLoads) -> None:
+        """Step under external loads from now on; their numbers may change before each step."""
+        self._loads = loads
+
+    def step(self, command: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
+        """Advance one tick under joint velocities, or joint efforts and a wrench (6,) on the base.
+
+        Returns whether any joint was limited.
+
+        Raises
+        ------
+        CommandError
+            A command is not finite; the tick is not taken.
+        SpaceRobotError
+            The motion is no longer finite.
+        """
+        n, robot = self.robot.n, self.robot
+        wanted = np.broadcast_to(np.asarray(command, dtype=float), (n,))
+        pushed = np.broadcast_to(np.asarray(wrench, dtype=float), (6,))
+        if not (np.all(np.isfinite(wanted)) and np.all(np.isfinite(pushed))):
+            raise CommandError(f"A command is not finite: {[*wanted.tolist(), *pushed.tolist()]}.")
+        loaded = self._loads is not None and self._loads.act
+        if not loaded:
+            self._data.xfrc_applied[:] = 0.0
+        self._data.ctrl[:6] = self.wrench[:] = pushed
+        if self._velocity:
+            realised = np.clip(wanted, -robot.velocity_limit, robot.velocity_limit)
+            self._step_to_rates(realised, loaded=loaded)
+        else:
+            lowest, highest = self._effort_bounds()
+            realised = np.clip(wanted, lowest, highest)
+            self._data.ctrl[6:] = self.effort[:] = realised
+            self._step_under_efforts(loaded=loaded)
+        if not np.all(np.isfinite(self._data.qpos)):
+            raise SpaceRobotError(
+                "The motion is no longer finite: the commands drive the robot too fast for the "
+                "integration step. Reduce the commands, or parameter 'integration_step'."
+            )
+        self._update()
+        clipped = realised != wanted
+        q = self.q
+        stopped = (q <= robot.lower + _AT_STOP) | (q >= robot.upper - _AT_STOP)
+        for kind, limited in zip(self.limit_counts, (clipped, stopped), strict=True):
+            self.limit_counts[kind] += limited
+        return bool(clipped.any() or stopped.any())
+
+    # -- the target ---------------------------------------------------------------------------
+
+    def weld(self) -> None:
+        """Weld the target to the link that captures it, where both are, and have both ignore each
+        other's contacts.
+        """
+        model, data = self._model, self._data
+        weld = model.equality("grasp").id
+        link, target = model.eq_obj1id[weld], model.eq_obj2id[weld]
+        R = data.xmat[link].reshape(3, 3)
+        model.eq_data[weld, :3] = 0.0
+        model.eq_data[weld, 3:6] = R.T @ (data.xpos[target] - data.xpos[link])
+        relative = np.zeros(4)
+        self._mujoco.mju_negQuat(relative, data.xquat[link])
+        self._mujoco.mju_mulQuat(relative, relative.copy(), data.xquat[target])
+        model.eq_data[weld, 6:10] = relative
+        data.eq_active[weld] = 1
+        model.geom_conaffinity[self._target_shapes] = 0
+        self.holds_target = True
+
+    def unweld(self) -> None:
+        """Let the target float freely."""
+        self._data.eq_active[self._model.equality("grasp").id] = 0
+        self._model.geom_conaffinity[self._target_shapes] = 1
+        self.holds_target = False
+
+    @property
+    def target_motion(self) -> BodyMotion:
+        """The present motion of the target's root link."""
+        joint, data = self._model.joint(f"{_TARGET}free"), self._data
+        at, rate = int(joint.qposadr[0]), int(joint.dofadr[0])
+        R = matrix_from_quaternion(np.roll(data.qpos[at + 3 : at + 7], -1))
+        omega = R @ data.qvel[rate + 3 : rate + 6]
+        return BodyMotion(
+            R, data.qpos[at : at + 3].copy(), data.qvel[rate : rate + 3].copy(), omega
+        )
+
+    def _place_target(self, motion: BodyMotion) -> None:
+        joint, data = self._model.joint(f"{_TARGET}free"), self._data
+        at, rate = int(joint.qposadr[0]), int(joint.dofadr[0])
+        data.qpos[at : at + 3] = motion.r_WT
+        data.qpos[at + 3 : at + 7] = np.roll(quaternion_from_matrix(motion.R_WT), 1)
+        data.qvel[rate : rate + 3] = motion.v
+        data.qvel[rate + 3 : rate + 6] = motion.R_WT.T @ motion.omega
+
+    # -- a tick -------------------------------------------------------------------------------
+
+    def _locked(self) -> npt.NDArray[np.uint8]:
+        return np.asarray(self._data.eq_active[self._locks])
+
+    def _effort_bounds(self) -> tuple[Array, Array]:
+        """Return the least and the largest efforts (n,); a wheel at its largest rate gets no
+        faster.
+        """
+        limit, rate = self.robot.effort_limit, self.robot.velocity_limit
+        slowest, fastest = (
+            self._is_wheel & (self.qdot <= -rate),
+            self._is_wheel & (self.qdot >= rate),
+        )
+        return np.where(slowest, 0.0, -limit), np.where(fastest, 0.0, limit)
+
+    def _step_under_efforts(self, *, loaded: bool) -> None:
+        """Advance a tick under the present controls."""
+        if not loaded and not self.wrench.any():
+            self._mujoco.mj_step(self._model, self._data, self._steps)
+            return
+        at_once = 1 if loaded else _STEPS_OF_IMPULSE
+        for step in range(0, self._steps, at_once):
+            count = min(at_once, self._steps - step)
+            if loaded:
+                self._apply_loads(step)
+            before = self._system()
+            self._mujoco.mj_step(self._model, self._data, count)
+            if self.wrench.any():
+                self._mujoco.mj_fwdPosition(self._model, self._data)
+                self._add_impulse(before, count * self._model.opt.timestep)
+
+    def _step_to_rates(self, rates: Array, *, loaded: bool) -> None:
+        """Advance a tick in which servos bring the joints to these rates (n,)."""
+        model, data, mujoco, robot = self._model, self._data, self._mujoco, self.robot
+        h, T = model.opt.timestep, self.control_period
+        # A joint that would pass its limit within the tick ends on it.
+        aim = np.clip(rates, (robot.lower - self.q) / T, (robot.upper - self.q) / T)
+        aim[self._held] = 0.0
+        jump, self._aim = aim - self._aim, aim
+        M, total = np.zeros((model.nv, model.nv)), np.zeros(robot.n)
+        own = [*range(6), *self._qdot]
+        for step in range(self._steps):
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            if loaded:
+                self._apply_loads(step)
+            mujoco.mj_fullM(model, data, M)
+            H, bias = M[np.ix_(own, own)], data.qfrc_bias[own]
+            # The base is pushed by nothing but the reaction of the joints.
+            by_base = np.linalg.solve(H[:6, :6], np.column_stack([H[:6, 6:], bias[:6]]))
+            K = H[6:, 6:] - H[6:, :6] @ by_base[:, :-1]
+            reaction = bias[6:] - H[6:, :6] @ by_base[:, -1]
+            lacking = (aim - data.qvel[self._qdot]) / h
+            commanded = K @ jump / h if step == 0 else np.zeros(robot.n)
+            regulated = K @ lacking + reaction - commanded
+            limit = robot.effort_limit
+            data.ctrl[6:] = commanded + np.clip(regulated, -limit, limit)
+            total += data.ctrl[6:]
+            mujoco.mj_step(model, data)
+        self.effort[:] = total / self._steps
+
+    def _apply_loads(self, step: int) -> None:
+        """Apply the loads at the beginning of a step of the tick to all bodies, and add their
+        impulse to the expected momenta. Formulas are those of :mod:`.model.external_loads`.
+        """
+        assert self._loads is not None
+        model, data, loads = self._model, self._data, self._loads
+        h, layout = model.opt.timestep, LoadLayout(len(self.robot.link_names))
+        self._mujoco.mj_fwdPosition(model, data)
+        self._mujoco.mj_fwdVelocity(model, data)
+        data.xfrc_applied[:] = 0.0
+        (n,), (friction,) = loads.vector[layout.mean_motion], loads.vector[layout.friction]
+        R_WO = matrix_from_quaternion(loads.vector[layout.quaternion_WO])
+        turned = n * (loads.time + step * h)
+        outward = R_WO @ np.array([math.cos(turned), math.sin(turned), 0.0])
+        gravity_W = loads.vector[layout.gravity_W]
+        velocity = np.zeros(6)
+        for row, body in enumerate(self._bodies):
+            r, m = data.xipos[body], model.body_mass[body]
+            R, axes = data.xmat[body].reshape(3, 3), data.ximat[body].reshape(3, 3)
+            inertia = (axes * model.body_inertia[body]) @ axes.T
+            self._mujoco.mj_objectVelocity(
+                model, data, self._mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0
+            )
+            force = R @ loads.in_link[row, :3] + loads.in_world[row, :3]
+            torque = R @ loads.in_link[row, 3:] + loads.in_world[row, 3:]
+            torque = torque + cross(data.xpos[body] - r, force)
+            force = force + m * (gravity_W + n**2 * (3 * outward * (outward @ r) - r))
+            force -= friction * m * velocity[3:]
+            torque += 3 * n**2 * cross(outward, inertia @ outward)
+            torque -= friction * (inertia @ velocity[:3])
+            data.xfrc_applied[body] = np.concatenate([force, torque])
+        F, T = data.xfrc_applied[self._bodies].T.reshape(2, 3, -1)
+        self.expected_momenta[:3] += h * F.sum(axis=1)
+        arms = data.xipos[self._bodies] - self._center()
+        self.expected_momenta[3:] += h * (T.sum(axis=1) + cross(arms, F.T).sum(axis=0))
+
+    def _add_impulse(self, before: tuple[Array, Array], duration: float) -> None:
+        """Add the impulse of the wrench since a state to the expected momenta (Simpson)."""
+        (arm, quaternion), (arm_after, quaternion_after) = before, self._system()
+        turn = rotvec_from_quaternion(
+            quaternion_multiply(quaternion_inverse(quaternion), quaternion_after)
+        )
+        middle = quaternion_multiply(quaternion, quaternion_from_rotvec(turn / 2))
+        for share, attitude, at in (
+            (1 / 6, quaternion, arm),
+            (4 / 6, middle, (arm + arm_after) / 2),
+            (1 / 6, quaternion_after, arm_after),
+        ):
+            R = matrix_from_quaternion(attitude)
+            force, torque = R @ self.wrench[:3], R @ self.wrench[3:]
+            self.expected_momenta[:3] += share * duration * force
+            self.expected_momenta[3:] += share * duration * (torque + cross(at, force))
+
+    def _system(self) -> tuple[Array, Array]:
+        """Return the position of the base from the centre of mass of what moves together (3,), in
+        W, and the quaternion of the base.
+        """
+        data = self._data
+        return data.qpos[:3] - self._center(), np.roll(data.qpos[3:7], -1)
+
+    def _center(self) -> Array:
+        """Return the centre of mass (3,) of what moves together."""
+        masses, centers = self._model.body_subtreemass, self._data.subtree_com
+        if not self.holds_target:
+            return np.array(centers[self._root])
+        roots = [self._root, self._target_body]
+        return np.asarray(masses[roots] @ centers[roots] / masses[roots].sum())
+
+    def _update(self) -> None:
+        """Copy the state of MuJoCo, and compute momenta and energy by it."""
+        model, data, mujoco = self._model, self._data, self._mujoco
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_subtreeVel(model, data)
+        self.pose[:3], self.pose[3:] = data.qpos[:3], np.roll(data.qpos[3:7], -1)
+        R_WB = matrix_from_quaternion(self.pose[3:])
+        self.twist[:3], self.twist[3:] = R_WB.T @ data.qvel[:3], data.qvel[3:6]
+        self.q[:], self.qdot[:] = data.qpos[self._q], data.qvel[self._qdot]
+        self.link_R[:], self.link_r[:] = self._link_poses(self.q)
+        momenta = self._momenta_of(self._root)
+        if self.holds_target:
+            target = self._target_body
+            masses = tuple(float(model.body_subtreemass[each]) for each in (self._root, target))
+            centers = tuple(data.subtree_com[each] for each in (self._root, target))
+            momenta = joined_momenta(
+                (masses[0], masses[1]),
+                (centers[0], centers[1]),
+                (momenta, self._momenta_of(target)),
+            )
+        self.momentum[:6] = momenta
+        moving = np.zeros(model.nv)
+        mujoco.mj_mulM(model, data, moving, data.qvel)
+        own = slice(None) if self.holds_target else [*range(6), *self._qdot]
+        self.momentum[6] = float(data.qvel[own] @ moving[own]) / 2
+
+    def _momenta_of(self, root: int) -> Array:
+        """Return linear over angular momentum (6,) of a tree about its own centre of mass, in W."""
+        data, mass = self._data, float(self._model.body_subtreemass[root])
+        return np.concatenate([mass * data.subtree_linvel[root], data.subtree_angmom[root]])
+
+
+class MujocoTarget(Target):
+    """The target as a body of a :class:`MujocoPlant`, which moves it.
+
+    Attributes
+    ----------
+    initial
+        Its motion at the beginning.
+    """
+
+    def __init__(
+        self, description: RobotDescription, config: TargetConfig, robot: SpaceRobot
+    ) -> None:
+        super().__init__(description, config, 1.0, 1.0, robot)
+        self.initial = self._initial
+        self.plant: MujocoPlant | None = None
+
+    @property
+    def momenta(self) -> Array:
+        """Linear over angular momentum (6,) about its centre of mass, in W."""
+        return np.concatenate(self.motion.momenta(self.inertia))
+
+    def reset(self) -> None:
+        """Return to the initial state, which the plant has done."""
+        self.step()
+
+    def release(self, motion: BodyMotion) -> None:
+        """Float freely from the present motion on."""
+        assert self.plant is not None
+        self.plant.unweld()
+        self.step()
+
+    def step(self) -> None:
+        """Copy the state of the plant."""
+        assert self.plant is not None
+        motion = self.plant.target_motion
+        self.pose[:3], self.pose[3:] = motion.r_WT, quaternion_from_matrix(motion.R_WT)
+        self.twist[:3] = motion.R_WT.T @ motion.v
+        self.twist[3:] = motion.R_WT.T @ motion.omega
+
+
+class MujocoCapturePlant(CapturePlant):
+    """A plant in MuJoCo beside a target, to which a weld holds it."""
+
+    def __init__(
+        self,
+        plant: MujocoPlant,
+        target: MujocoTarget,
+        config: PlantConfig,
+    ) -> None:
+        self._engine = plant
+        self._joined: SpaceRobot | None = None
+        target.plant = plant
+        target.step()
+        super().__init__(lambda *_: plant, plant.robot, plant.initial, target, config)
+
+    @property
+    def present_robot(self) -> SpaceRobot:
+        """The robot alone, or with the mass properties of the target."""
+        return self._joined or self._alone.robot
+
+    def reset(self) -> None:
+        """Return robot and target to their initial states."""
+        self._joined = None
+        super().reset()
+
+    def _continue(self, robot: SpaceRobot, motion: RobotMotion, momenta: Array) -> None:
+        engine = self._engine
+        if robot is self._alone.robot:
+            self._joined = None
+        else:
+            self._joined = robot
+            engine.weld()
+        engine.expected_momenta[:] = momenta
+
+    def _body(self) -> BodyMotion:
+        return self._engine.target_motion
+
+
+# -- MuJoCo's model -----------------------------------------------------------------------------
+
+
+def _specification(
+    mujoco: Any, robot: RobotDescription, target: tuple[MujocoTarget, str] | None
+) -> tuple[Any, list[str]]:
+    """Return the specification of robot, obstacles and target, and the names of the target's
+    shapes.
+    """
+    spec = mujoco_spec(mujoco, robot)
+    spec.compiler.fusestatic = False
+    add_motors(mujoco, spec, robot)
+    _set_masses(spec, robot)
+    geometry = CollisionGeometry(robot)
+    names = [
+        _add_shape(mujoco, spec, solid, f"{_OBSTACLE if solid.is_obstacle else ''}{index}")
+        for index, solid in enumerate(geometry.solids)
+    ]
+    pairs = [(names[i], names[j]) for i, j in geometry.pairs]
+    shapes: list[str] = []
+    if target is not None:
+        body, link = target
+        _add_target(mujoco, spec, body.description)
+        solids, _ = solids_of(body.description)
+        shapes = [
+            _add_shape(mujoco, spec, solid, f"{_TARGET}{index}", _TARGET)
+            for index, solid in enumerate(solids)
+        ]
+        hand = robot.frames[link][0]
+        for name, solid in zip(names, geometry.solids, strict=True):
+            if solid.body != hand:
+                pairs += [(name, shape) for shape in shapes]
+            else:
+                # Not by pairs, which could not be switched off while the hand holds the target.
+                spec.geom(name).contype = 1
+        for shape in shapes:
+            spec.geom(shape).conaffinity = 1
+        grasp = spec.add_equality(
+            name="grasp",
+            type=mujoco.mjtEq.mjEQ_WELD,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            name1=link,
+            name2=f"{_TARGET}{body.description.base_link}",
+            active=False,
+        )
+        grasp.data[10] = 1.0  # Torque counts as much as force.
+    for first, second in pairs:
+        spec.add_pair(geomname1=first, geomname2=second)
+    for name in robot.joint_names:
+        spec.add_equality(
+            name=f"lock {name}",
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            name1=name,
+            active=False,
+        )
+    return spec, shapes
+
+
+def _set_masses(spec: Any, robot: RobotDescription) -> None:
+    """Give each rigid body the mass properties of the description, which may not be its URDF's."""
+    bodies = {body.name: body.inertia for body in robot.bodies}
+    for link in robot.links:
+        body, inertia = spec.body(link.name), bodies.get(link.name)
+        body.explicitinertial = True
+        body.mass = 0.0 if inertia is None else inertia.mass
+        if inertia is not None:
+            _set_inertia(body, inertia)
+
+
+def _set_inertia(body: Any, inertia: Inertia) -> None:
+    moments, axes = np.linalg.eigh(inertia.about_com)
+    axes = axes * np.linalg.det(axes)
+    body.mass, body.ipos = inertia.mass, inertia.com
+    body.fullinertia = np.full(6, np.nan)  # Not given.
+    body.inertia, body.iquat = moments, np.roll(quaternion_from_matrix(axes), 1)
+
+
+def _add_target(mujoco: Any, spec: Any, target: RobotDescription) -> None:
+    body = spec.worldbody.add_body(name=f"{_TARGET}{target.base_link}")
+    joint = body.add_freejoint()
+    joint.name = f"{_TARGET}free"
+    body.explicitinertial = True
+    _set_inertia(body, target.bodies[0].inertia)
+    for name, (_, pose) in target.frames.items():
+        if name != target.base_link:
+            body.add_body(
+                name=f"{_TARGET}{name}",
+                pos=pose.r,
+                quat=np.roll(quaternion_from_matrix(pose.R), 1),
+            )
+
+
+def _add_shape(mujoco: Any, spec: Any, solid: Solid, name: str, prefix: str = "") -> str:
+    """Add a solid to its body, without mass, and return the name of its geometry."""
+    body = spec.worldbody if solid.is_obstacle else spec.body(f"{prefix}{solid.link}")
+    kinds, size = mujoco.mjtGeom, solid.shape.size
+    # Pairs that push are named one by one.
+    about: dict[str, Any] = {"name": name, "mass": 0.0, "contype": 0, "conaffinity": 0}
+    if solid.vertices is not None:
+        spec.add_mesh(name=name, uservert=solid.vertices.ravel().tolist())
+        body.add_geom(type=kinds.mjGEOM_MESH, meshname=name, **about)
+        return name
+    kind, numbers = {
+        "box": (kinds.mjGEOM_BOX, [length / 2 for length in size]),
+        "sphere": (kinds.mjGEOM_SPHERE, [size[0], 0.0, 0.0]),
+        "cylinder": (kinds.mjGEOM_CYLINDER, [size[0], size[-1] / 2, 0.0]),
+    }[solid.shape.kind]
+    pose = solid.shape.pose
+    body.add_geom(
+        type=kind,
+        size=numbers,
+        pos=pose.r,
+        quat=np.roll(quaternion_from_matrix(pose.R), 1),
+        **about,
+    )
+    return name
+
+
+def _set_options(mujoco: Any, model: Any, step: float) -> None:
+    """Have a model integrate by Runge-Kutta 4 with steps of ``step`` s, with contacts alone."""
+    for flag in ("GRAVITY", "SENSOR", "SPRING", "DAMPER", "FRICTIONLOSS", "ISLAND", "AUTORESET"):
+        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"))
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    model.opt.timestep = step
+    # The plant clips efforts itself; servos exceed the limits where commanded rates jump.
+    model.jnt_actfrclimited[:] = 0
+    stiff = [_STIFFNESS * step, 1.0]
+    for soft in (model.eq_solref, model.jnt_solref, model.pair_solref):
+        soft[:] = stiff
+
+
+def build_mujoco_plant(
+    robot: SpaceRobot,
+    config: PlantConfig,
+    initial: InitialState,
+    step: float,
+    target: RobotDescription | None,
+) -> MujocoPlant | MujocoCapturePlant:
+    """Return the plant of a configuration, without thrusters and faults.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    config
+        The parameters of the plant.
+    initial
+        Initial state.
+    step
+        Longest Runge-Kutta step, s.
+    target
+        The target; None: there is none.
+
+    Raises
+    ------
+    ParameterError
+        The robot has no end-effector to capture the target with, or the initial state is refused.
+    RobotDescriptionError
+        MuJoCo refuses the robot or the target.
+    SpaceRobotError
+        MuJoCo is not installed.
+    """
+    period, actuation = config.control_period, config.actuation
+    if target is None:
+        return MujocoPlant(robot, period, initial, step, actuation=actuation)
+    body = MujocoTarget(target, config.target, robot)
+    link = capturing_link(robot.description, config)
+    plant = MujocoPlant(robot, period, initial, step, actuation=actuation, target=(body, link))
+    return MujocoCapturePlant(plant, body, config)

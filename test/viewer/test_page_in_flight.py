@@ -1,0 +1,213 @@
+"""The page beside `spacerobot up --processes`: paths, shadows, the past, and nodes that die."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from support.chromium import browser, chromium
+from support.viewer_page import ROOT, Page
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(chromium() is None, reason="no Chromium to open the page with"),
+]
+
+COMMAND = (sys.executable, "-m", "spacerobot_ros.cli.main")
+PATIENCE = 60.0
+
+
+class Up:
+    """`spacerobot up`, and the lines that it prints."""
+
+    def __init__(self, folder: Path, domain: int, *words: str) -> None:
+        self._domain = domain
+        self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": str(ROOT)}
+        self.process = subprocess.Popen(
+            [*COMMAND, "up", *words, "--view", "--set", "viewer.port=0"],
+            env=self.environment,
+            cwd=folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._goals: list[subprocess.Popen[bytes]] = []
+        self.lines: list[str] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        self.url = self.wait_for("viewer  ").split()[1]
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        self.lines.extend(line.rstrip() for line in iter(self.process.stdout.readline, ""))
+
+    def wait_for(self, words: str, count: int = 1) -> str:
+        """Return the last of so many lines with some words."""
+        end = time.monotonic() + PATIENCE
+        while len(found := [line for line in self.lines if words in line]) < count:
+            assert time.monotonic() < end, (words, self.lines)
+            self._reader.join(0.05)
+        return found[-1]
+
+    def goal(self, *words: str) -> None:
+        """Send a goal without waiting for its result."""
+        command = [*COMMAND, "goal", *words]
+        nothing = subprocess.DEVNULL
+        self._goals.append(
+            subprocess.Popen(command, env=self.environment, stdout=nothing, stderr=nothing)
+        )
+
+    def kill(self, name: str, number: int = signal.SIGKILL) -> None:
+        """Send a signal to the latest process of a node."""
+        os.kill(max(self._pids(f"__node:={name}")), number)
+
+    def kill_until(self, name: str, words: str) -> None:
+        """Kill a node whenever it has begun again, until there is a line with some words.
+
+        A slow machine starts fewer nodes within a minute.
+        """
+        end = time.monotonic() + PATIENCE
+        while not any(words in line for line in self.lines):
+            assert time.monotonic() < end, (words, self.lines)
+            with suppress(ValueError, ProcessLookupError):  # Between two lives it has no process.
+                self.kill(name)
+            self._reader.join(0.5)
+
+    def _pids(self, word: str) -> list[int]:
+        found = []
+        for folder in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                state = (folder / "stat").read_text().rpartition(")")[2].split()[0]
+                ours = f"ROS_DOMAIN_ID={self._domain}\0" in (folder / "environ").read_text()
+                if ours and state != "Z" and word in (folder / "cmdline").read_text():
+                    found.append(int(folder.name))
+        return found
+
+    def close(self) -> None:
+        for goal in self._goals:
+            goal.kill()
+            goal.wait()
+        self.process.send_signal(signal.SIGINT)
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(20)
+        self.process.kill()
+        self.process.wait()
+        self._reader.join()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def up(tmp_path: Path, ros_domain: int) -> Iterator[Up]:
+    stack = Up(tmp_path, ros_domain, "reach", "--processes")
+    yield stack
+    stack.close()
+
+
+_SCENE = """
+(() => {
+  const nodes = window.__viserMutable.nodeRefFromName, found = {lines: [], ghosts: [], casts: []};
+  for (const [name, node] of Object.entries(nodes)) {
+    if (!node) continue;
+    if (/_path/.test(name)) node.traverse(each => {
+      if (each.isLineSegments2) found.lines.push([each.material.depthTest, each.renderOrder > 0]);
+    });
+    if (name === "/goal/ghost") node.traverse(each => {
+      if (each.isMesh) found.ghosts.push([each.material.polygonOffset, each.material.depthWrite]);
+    });
+    if (/^\\/robot\\/\\d+$/.test(name)) node.traverse(each => {
+      if (each.isMesh) found.casts.push(each.castShadow && each.receiveShadow);
+    });
+  }
+  found.suns = window.__viserMutable.scene.children
+    .filter(each => each.isDirectionalLight && each.castShadow).length;
+  found.background = window.__viserMutable.scene.background;
+  return found;
+})()
+"""
+
+
+def test_paths_are_in_front_and_the_sun_casts_shadows(up: Up, tmp_path: Path) -> None:
+    with browser(tmp_path / "profile") as window:
+        page = Page(window, up.url)
+        page.wait_for_text("Waiting for a goal pose.")
+        up.goal("--end-effector-position", "1.0", "0.6", "0.7", "--end-effector", "link_7")
+        page.wait_for_text("reached", "link_7 is")
+        page.press("Front")
+        page.draw()
+        found = window.evaluate(_SCENE)
+        # Paths of the base and of the end-effector, planned and flown.
+        assert len(found["lines"]) >= 4
+        assert found["lines"] == [[False, True]] * len(found["lines"])
+        assert found["ghosts"]
+        assert found["ghosts"] == [[True, False]] * len(found["ghosts"])
+        assert found["casts"]
+        assert all(found["casts"])
+        assert found["suns"] > 0
+
+        # The flight is looked back at, and the present comes back.
+        page.slide(0.02)
+        page.wait_for_text("Looking back", "Waiting for a goal pose.", "Back to the present")
+        page.press("Back to the present")
+        page.wait_for_text("reached", without="Looking back")
+        assert window.complaints == []
+
+
+def test_nodes_that_die_are_started_again_and_the_page_says_so(up: Up, tmp_path: Path) -> None:
+    with browser(tmp_path / "profile") as window:
+        page = Page(window, up.url)
+        page.wait_for_text("Waiting for a goal pose.")
+        up.goal("--end-effector-position", "1.0", "0.6", "0.7", "--end-effector", "link_7")
+        page.wait_for_text("executing")
+        up.kill("planner")
+        words = "Node 'planner' was ended by SIGKILL. It is started again."
+        up.wait_for(words)
+        page.wait_for_text(words)
+        # It goes on with its goal.
+        page.wait_for_text("reached", "link_7 is", without="has been silent")
+
+        # The page comes back to a viewer that was killed.
+        window.evaluate("window.stale = true")
+        up.kill("viewer")
+        up.wait_for("Node 'viewer' was ended by SIGKILL. It is started again.")
+        with suppress(AssertionError):  # A question during the change of pages has no answer.
+            window.wait_for("window.stale === undefined")
+        page.wait_for_text("reached", without="was ended by SIGKILL")
+
+        # A crash has its cause on the terminal; a fourth death within a minute is the end.
+        up.kill("planner", signal.SIGSEGV)
+        up.wait_for("'planner' was ended by SIGSEGV: Fatal Python error: Segmentation fault.")
+        page.wait_for_text("was ended by SIGSEGV")
+        page.wait_for_text("Waiting for a goal pose.", without="has been silent")
+        up.kill_until("planner", "3 times within a minute, which is the limit (--restarts).")
+        assert up.process.wait(PATIENCE) == 2
+        # By the last words of the viewer, or because nobody answers.
+        page.wait_for_text("This page shows its last state, and steers nothing")
+        assert "Planner executing" not in page.text()
+
+
+def test_the_page_of_a_viewer_that_is_killed_is_grey(ros_domain: int, tmp_path: Path) -> None:
+    up = Up(tmp_path, ros_domain, "sliding_masses", "--restarts", "0")
+    try:
+        with browser(tmp_path / "profile") as window:
+            page = Page(window, up.url)
+            page.wait_for_text("Waiting for a goal pose.")
+            up.kill("viewer")
+            page.wait_for_text(
+                "The viewer does not answer. This page shows its last state, and steers nothing."
+            )
+            style = "getComputedStyle(document.documentElement).filter"
+            assert window.evaluate(style) == "grayscale(1)"
+        up.process.send_signal(signal.SIGINT)
+        assert up.process.wait(PATIENCE) == 0
+        up.wait_for("Node 'viewer' was ended by SIGKILL.")
+    finally:
+        up.close()
