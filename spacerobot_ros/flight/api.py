@@ -125,7 +125,7 @@ def _unless_refused(flight: Flight) -> Flight:
     Raises
     ------
     PlanningError
-        The goal was refused, and nothing moved; the message is that of :func:`plan`.
+        The goal was refused; the message is the commander's reason.
     """
     if flight.outcome is Outcome.REFUSED:
         raise PlanningError(flight.message)

@@ -1,7 +1,8 @@
 """A second opinion on a recorded flight: its commands flown by another engine.
 
 The engine gets the joint rates, or the efforts and the wrench, that the plant's actuators have
-realised in each tick, after limits and faults; its states are compared with those in the bag.
+realised in each tick, after limits and faults, and the external loads of the tick; its states are
+compared with those in the bag.
 """
 
 from __future__ import annotations
@@ -58,10 +59,6 @@ class SecondOpinion:
         return max(self.position, self.attitude, self.joints) <= AGREEMENT
 
 
-def _loads_act(plant: FaultyPlant) -> bool:
-    return plant.loads is not None and plant.loads.act
-
-
 class EngineFlight:
     """Flies a robot in MuJoCo beside a plant, tick by tick.
 
@@ -88,7 +85,7 @@ class EngineFlight:
         self._engine.move(plant.twist, plant.qdot)
         self._momenta = plant.expected_momenta.copy()
         self._stopped = plant.limit_counts["stroke"].copy()
-        self._faults, self._loads_act = plant.active, _loads_act(plant)
+        self._faults = plant.active
         self._first = plant.tick
         self._poses, self._shapes = [self._engine.pose], [self._engine.q]
         self._until = ""
@@ -97,14 +94,12 @@ class EngineFlight:
         """Fly the tick that the plant has just taken."""
         if self._until:
             return
-        plant = self._effort_plant
-        acted, self._loads_act = self._loads_act, _loads_act(self._plant)
-        if acted or self._loads_act:
-            time = f"{self._plant.time:.9g} s"
-            self._until = f"external loads act at {time}, which the engine does not model"
-            return
+        plant, loads = self._effort_plant, self._plant.loads
+        self._engine.load(None if loads is None else loads.last)
         if plant is None:
-            self._engine.step_under_velocities(self._plant.qdot, self._momenta, self._period)
+            self._momenta = self._engine.step_under_velocities(
+                self._plant.qdot, self._momenta, self._period
+            )
         elif reason := self._unknown_force():
             self._until = f"{reason} at {self._plant.time:.9g} s, which the engine does not model"
             return

@@ -356,6 +356,7 @@ class FaultyPlant(WrappedPlant):
         if self.tick >= self._next_disturbance:
             self._apply_active_disturbances()  # The owner may have set the tick.
         self.loads.time = self.time
+        self.loads.last[:] = self.loads.vector
         limited = self._step(*commands)
         if self.tick >= self._next_disturbance:
             self._apply_active_disturbances()

@@ -128,12 +128,14 @@ class PlantLoads:
     in_link, in_world
         (L, 6) force (N) over torque (N m) at the origin of every link, in the order of
         ``robot.link_names``: in components of the link, and in those of W.
+    last
+        ``vector`` of the last tick.
     """
 
     def __init__(self, robot: SpaceRobot, surroundings: Surroundings | None = None) -> None:
         count = len(robot.link_names)
         layout = LoadLayout(count)
-        self.vector = np.zeros(layout.size)
+        self.vector, self.last = np.zeros((2, layout.size))
         self.in_link = self.vector[layout.in_link].reshape(count, 6)
         self.in_world = self.vector[layout.in_world].reshape(count, 6)
         self._acting = [

@@ -12,7 +12,6 @@ give at most the efforts that the limits of the URDF allow: a joint that meets a
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from spacerobot_ros.collision.geometry import solids_of
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Inertia, RobotDescription
-from spacerobot_ros.model.external_loads import LoadLayout
 from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, joined_momenta
 from spacerobot_ros.model.integration import count_steps
 from spacerobot_ros.model.rotations import (
@@ -39,6 +37,7 @@ from spacerobot_ros.simulation.capture import CapturePlant, Target, capturing_li
 from spacerobot_ros.simulation.config import PlantConfig, TargetConfig
 from spacerobot_ros.simulation.loads import PlantLoads
 from spacerobot_ros.simulation.mujoco_engine import (
+    MujocoLoads,
     add_motors,
     compiled_model,
     import_mujoco,
@@ -124,7 +123,7 @@ class MujocoPlant:
         self._data = mujoco.MjData(model)
         self._q, self._qdot = joint_addresses(model, robot.description)
         self._link_poses = robot.buffered("link_poses")
-        self._bodies = np.array([model.body(name).id for name in robot.link_names])
+        self._applied = MujocoLoads(mujoco, model, self._data, robot.link_names)
         self._root = int(model.body(robot.base_link).id)
         self._target_body = -1
         if self._target is not None:
@@ -349,39 +348,15 @@ class MujocoPlant:
 
     def _apply_loads(self, step: int) -> None:
         """Apply the loads at the beginning of a step of the tick to all bodies, and add their
-        impulse to the expected momenta. Formulas are those of :mod:`.model.external_loads`.
+        impulse to the expected momenta.
         """
         assert self._loads is not None
-        model, data, loads = self._model, self._data, self._loads
-        h, layout = model.opt.timestep, LoadLayout(len(self.robot.link_names))
-        self._mujoco.mj_fwdPosition(model, data)
-        self._mujoco.mj_fwdVelocity(model, data)
-        data.xfrc_applied[:] = 0.0
-        (n,), (friction,) = loads.vector[layout.mean_motion], loads.vector[layout.friction]
-        R_WO = matrix_from_quaternion(loads.vector[layout.quaternion_WO])
-        turned = n * (loads.time + step * h)
-        outward = R_WO @ np.array([math.cos(turned), math.sin(turned), 0.0])
-        gravity_W = loads.vector[layout.gravity_W]
-        velocity = np.zeros(6)
-        for row, body in enumerate(self._bodies):
-            r, m = data.xipos[body], model.body_mass[body]
-            R, axes = data.xmat[body].reshape(3, 3), data.ximat[body].reshape(3, 3)
-            inertia = (axes * model.body_inertia[body]) @ axes.T
-            self._mujoco.mj_objectVelocity(
-                model, data, self._mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0
-            )
-            force = R @ loads.in_link[row, :3] + loads.in_world[row, :3]
-            torque = R @ loads.in_link[row, 3:] + loads.in_world[row, 3:]
-            torque = torque + cross(data.xpos[body] - r, force)
-            force = force + m * (gravity_W + n**2 * (3 * outward * (outward @ r) - r))
-            force -= friction * m * velocity[3:]
-            torque += 3 * n**2 * cross(outward, inertia @ outward)
-            torque -= friction * (inertia @ velocity[:3])
-            data.xfrc_applied[body] = np.concatenate([force, torque])
-        F, T = data.xfrc_applied[self._bodies].T.reshape(2, 3, -1)
-        self.expected_momenta[:3] += h * F.sum(axis=1)
-        arms = data.xipos[self._bodies] - self._center()
-        self.expected_momenta[3:] += h * (T.sum(axis=1) + cross(arms, F.T).sum(axis=0))
+        h = self._model.opt.timestep
+        self._mujoco.mj_fwdPosition(self._model, self._data)
+        self._mujoco.mj_fwdVelocity(self._model, self._data)
+        self._data.xfrc_applied[:] = 0.0
+        self._applied.apply(self._loads.vector, self._loads.time + step * h)
+        self.expected_momenta += h * self._applied.momentum_rates(self._center())
 
     def _add_impulse(self, before: tuple[Array, Array], duration: float) -> None:
         """Add the impulse of the wrench since a state to the expected momenta (Simpson)."""
@@ -536,7 +511,6 @@ def _specification(
     shapes.
     """
     spec = mujoco_spec(mujoco, robot)
-    spec.compiler.fusestatic = False
     add_motors(mujoco, spec, robot)
     _set_masses(spec, robot)
     geometry = CollisionGeometry(robot)

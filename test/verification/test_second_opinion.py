@@ -16,11 +16,15 @@ from support.slow import some_fast
 from spacerobot_ros import fly
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.flight.second_opinion import SecondOpinion
+from spacerobot_ros.flight.second_opinion import EngineFlight, SecondOpinion
 from spacerobot_ros.flight.verification import verify_bag
-from spacerobot_ros.model import parse_robot
+from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.resources import resource_names, robot_file
 from spacerobot_ros.simulation import mujoco_engine
+from spacerobot_ros.simulation.actuators import FaultyPlant
+from spacerobot_ros.simulation.loads import Surroundings
+from spacerobot_ros.simulation.plant import InitialState
+from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 pytest.importorskip("mujoco")
 
@@ -41,13 +45,13 @@ def verify(path: Path) -> Result:
     return CliRunner().invoke(main, ["verify", str(path), "--engine", "mujoco"])
 
 
-LOADED = ("capture", "gravity_gradient", "servicing")
-"""Bags with a target, or with loads from outside, which MuJoCo does not model."""
+CAPTURES = ("capture", "servicing")
+"""Bags with a target, which MuJoCo does not model here."""
 
 
 @pytest.mark.parametrize(
     "name",
-    some_fast([each for each in resource_names("bags", ".mcap") if each not in LOADED], *QUICK),
+    some_fast([each for each in resource_names("bags", ".mcap") if each not in CAPTURES], *QUICK),
 )
 def test_mujoco_flies_reference_bags_to_the_same_states(name: str) -> None:
     path = BAGS / f"{name}.mcap"
@@ -99,12 +103,64 @@ def test_faults_are_flown_and_held_joints_end_the_comparison(tmp_path: Path) -> 
     assert max(found.position, found.attitude, found.joints) < 1e-10
 
 
-def test_a_disturbance_ends_the_comparison(tmp_path: Path) -> None:
-    pushed = ["link_1 force 0 2 0 at 0.3"]
-    found = opinion_of(flown(tmp_path, 0.5, disturbances=pushed))
-    assert found.until == "external loads act at 0.3 s, which the engine does not model"
-    assert found.ticks == 29
-    assert found.joints < 1e-10
+@pytest.mark.parametrize(
+    "plant",
+    [
+        {
+            "disturbances": [
+                "link_1 force 0.4 2 0 at 0.13 until 0.37",
+                "link_2 torque 0 0 -0.3 in link at 0.2",
+            ]
+        },
+        {"orbit.mean_motion": 0.7, "orbit.orientation": [0.0, 0.6, 0.0, 0.8]},
+        {"table.tilt": 0.02, "table.direction": 0.7, "table.friction": 0.3},
+    ],
+    ids=["wrenches", "gradient", "table"],
+)
+def test_external_loads_are_flown(tmp_path: Path, plant: dict[str, Any]) -> None:
+    path = flown(tmp_path, 0.5, **plant)
+    found = opinion_of(path)
+    assert (found.until, found.ticks) == ("", 51)
+    assert max(found.position, found.attitude, found.joints) < 1e-10
+
+
+@pytest.mark.parametrize(
+    "surroundings",
+    [
+        Surroundings(mean_motion=0.7, quaternion_WO=(0.0, 0.6, 0.0, 0.8)),
+        Surroundings(gravity_W=(0.3, -0.1, 0.2), friction=0.4),
+    ],
+    ids=["gradient", "table"],
+)
+def test_external_loads_are_flown_under_velocities(surroundings: Surroundings) -> None:
+    """Where joint rates are given, loads change the momenta."""
+    robot = SpaceRobot.from_file(robot_file("three_joint_arm"))
+    start = InitialState(
+        position=np.array([0.3, -0.2, 0.5]),
+        quaternion=np.array([0.1, -0.5, 0.5, 0.7]),
+        joint_positions=np.array([-0.4, -0.5, 0.2]),
+        angular_momentum=np.array([0.2, -0.3, 0.1]),
+    )
+    period, pushed = 0.013, [f"{robot.link_names[2]} force 0 2 0.5 at 0.1"]
+    plant = FaultyPlant(
+        VelocityPlant(robot, period, start),
+        (),
+        period,
+        wrench=False,
+        disturbances=pushed,
+        surroundings=surroundings,
+    )
+    flight = EngineFlight(plant, period)
+    poses, shapes = [plant.pose.copy()], [plant.q.copy()]
+    for tick in range(30):
+        plant.step(0.2 * np.cos(np.arange(robot.n) + 0.1 * tick))
+        flight.follow()
+        poses.append(plant.pose.copy())
+        shapes.append(plant.q.copy())
+    found = flight.compared(np.arange(31), np.array(poses), np.array(shapes))
+    assert (found.until, found.ticks) == ("", 30)
+    assert np.linalg.norm(plant.momentum[:3]) > 0.1
+    assert max(found.position, found.attitude, found.joints) < 1e-10
 
 
 def test_a_joint_at_its_stop_ends_the_comparison(tmp_path: Path) -> None:

@@ -113,10 +113,7 @@ _COASTING_ANGLE = math.radians(5.0)
 _COASTING_TURNS = 4.0
 """Turns of the base for which it coasts at most."""
 
-_NEAR, _EVERY = math.cos(math.radians(20.0) / 2), 4
-"""Cosine of half the angle between base and goal below which every fourth of these is tried."""
-
-_MOST_PASSES = 20
+_MOST_PASSES = 10
 """Passes of the goal that are tried."""
 
 _LONGEST_PASS = 2.5
@@ -534,17 +531,14 @@ class OptimalGait(GaitMethod):
     def _passes(
         self, request: PlanRequest, boundary: BoundaryConditions, coast: _Coast, step: int
     ) -> list[int]:
-        """Return the ticks at which the coasting base is near the goal: where it is nearest, and
-        where less than 20 deg are left, the first ones.
-        """
+        """Return the ticks at which the coasting base passes the goal, the closest pass first."""
         grid = np.arange(0, len(coast.shapes), step)
         turns = np.array([self._later(request, boundary, coast, int(k))[1].turn for k in grid])
         # The cosine of half the angle that is left.
         near = np.abs(turns[:, 3])
-        nearest = (near[1:-1] > near[:-2]) & (near[1:-1] >= near[2:])
-        every = np.arange(1, len(grid) - 1) % _EVERY == 0
-        passes = 1 + np.flatnonzero(nearest | (every & (near[1:-1] > _NEAR)))
-        return [int(tick) for tick in grid[passes][:_MOST_PASSES]]
+        passes = 1 + np.flatnonzero((near[1:-1] > near[:-2]) & (near[1:-1] >= near[2:]))
+        closest = passes[np.argsort(-near[passes], kind="stable")]
+        return [int(tick) for tick in grid[closest][:_MOST_PASSES]]
 
     def _meet_pass(
         self,
