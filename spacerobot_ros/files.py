@@ -347,10 +347,12 @@ def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: st
         warning is given each time.
     """
     cache = Cache(folder)
-    known = cache.load(name, sys.prefix) is not None
+    # Installations that share a cache have a file each.
+    entry = f"{name}-{hashlib.sha256(sys.prefix.encode()).hexdigest()[:32]}"
+    known = cache.load(entry, sys.prefix) is not None
     logger.log(logging.DEBUG if known else logging.WARNING, message)
     if not known:
-        cache.store(name, sys.prefix, b"")
+        cache.store(entry, sys.prefix, b"")
 
 
 def _os_error_reason(error: OSError) -> str:

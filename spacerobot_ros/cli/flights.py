@@ -193,21 +193,26 @@ def _judged(summary: dict[str, Any], part: str, unit: str) -> str:
 def _end_effector_line(summary: dict[str, Any]) -> list[str]:
     if "end_effectors" in summary:
         return [
-            f"{link}: {each['position_error_m']:.3g} m and {each['attitude_error_rad']:.3g} rad "
-            "from its goal"
+            f"{link}: "
+            + _end_effector_errors(summary, each["position_error_m"], each["attitude_error_rad"])
             for link, each in summary["end_effectors"].items()
         ]
     if "end_effector_position_error_m" not in summary:
         return []
     position = numbers(summary["end_effector_final_position_m"])
-    error = f"{summary['end_effector_position_error_m']:.3g} m"
-    limit = summary["position_tolerance_m"]
+    distance = summary["end_effector_position_error_m"]
+    errors = _end_effector_errors(summary, distance, summary.get("end_effector_attitude_error_rad"))
+    return [f"end-effector ({position}) m, {errors}"]
+
+
+def _end_effector_errors(summary: dict[str, Any], distance: float, angle: float | None) -> str:
+    """Return the errors of an end-effector with their tolerances; None: its attitude is free."""
+    error, limit = f"{distance:.3g} m", summary["position_tolerance_m"]
     limits = "" if limit is None else f"{limit:.3g} m"
-    if (turn := summary.get("end_effector_attitude_error_rad")) is not None:
-        error += f" and {turn:.3g} rad"
+    if angle is not None:
+        error += f" and {angle:.3g} rad"
         limits += f", {summary['attitude_tolerance_rad']:.3g} rad" if limits else ""
-    limits = limits and f" (tolerance {limits})"
-    return [f"end-effector ({position}) m, {error} from its goal{limits}"]
+    return f"{error} from its goal" + (limits and f" (tolerance {limits})")
 
 
 def _propellant_line(summary: dict[str, Any]) -> list[str]:

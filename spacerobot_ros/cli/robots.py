@@ -210,10 +210,14 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
     from spacerobot_ros.model.description import JointKind
 
     joints, bodies = robot.description.moving_joints, robot.description.bodies[1:]
-    width = max([5, *(len(joint.name) for joint in joints[:_MAX_LISTED_JOINTS])])
-    head = f"{'joint':<{width}}  {'kind':<11}{'on':<16}{'limits':>19}{'speed':>12}{'effort':>10}"
+    listed = joints[:_MAX_LISTED_JOINTS]
+    width = max([5, *(len(joint.name) for joint in listed)])
+    wide = max([15, *(len(joint.parent) for joint in listed)])
+    head = (
+        f"{'joint':<{width}}  {'kind':<11}{'on':<{wide}} {'limits':>19}{'speed':>12}{'effort':>10}"
+    )
     rows = [f"{head}{'mass':>12}"]
-    for joint, body in list(zip(joints, bodies, strict=True))[:_MAX_LISTED_JOINTS]:
+    for joint, body in zip(listed, bodies, strict=False):
         unit, effort_unit = ("m", "N") if joint.kind is JointKind.PRISMATIC else ("rad", "N m")
         limits = joint.limits
         turns = unit == "rad"
@@ -229,7 +233,7 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
         speed, effort = f"{limits.velocity:.3g} {unit}/s", f"{limits.effort:.4g} {effort_unit}"
         follows = joint.mimic
         rows.append(
-            f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent[:15]:<16}{range_text:>19}"
+            f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent:<{wide}} {range_text:>19}"
             f"{speed:>12}{effort:>10}{body.inertia.mass:>9.4g} kg{degrees}"
             + (f"  follows {follows.joint}" if follows is not None else "")
         )

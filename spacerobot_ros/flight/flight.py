@@ -610,8 +610,17 @@ class Flight:
             "succeeded": self.succeeded,
         }
         if errors := self.end_effector_errors:
+            assert self.robot is not None
+            turned = {
+                aim.link
+                for aim in goal.for_robot(self.robot).end_effectors
+                if aim.quaternion is not None
+            }
             summary["end_effectors"] = {
-                link: {"position_error_m": each.distance, "attitude_error_rad": each.angle}
+                link: {
+                    "position_error_m": each.distance,
+                    "attitude_error_rad": each.angle if link in turned else None,
+                }
                 for link, each in errors.items()
             }
         elif measures.end_effector_error is not None:

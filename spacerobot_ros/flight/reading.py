@@ -277,7 +277,9 @@ class FlightBag:
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
         goals, ids = [], GoalIds()
+        shapes = self._goal_shapes() if topic == "goal_pose" else []
         for time_ns, message in self.messages(topic):
+            shape = next((each for since, each in reversed(shapes) if since <= time_ns), None)
             stamp = message.header.stamp
             goal_id = ids.of(stamp.sec, stamp.nanosec)
             aim, frame = message, message.header.frame_id
@@ -292,12 +294,24 @@ class FlightBag:
                 # Zeros ask for the position of an end-effector alone.
                 attitude = _NO_GOAL.quaternion.tolist()
             try:
-                goal = Goal.checked([p.x, p.y, p.z], attitude)
+                goal = Goal.checked([p.x, p.y, p.z], attitude, shape)
             except PlanningError:
                 continue
             if not world or frame in ("", world):
                 goals.append(SentGoal(time_ns / SECOND, goal, goal_id))
         return tuple(goals)
+
+    def _goal_shapes(self) -> list[tuple[int, list[float] | None]]:
+        """Return the shapes that goals after a time (ns) are to end in; None: any."""
+        names = self.names("joint_states")
+        shapes: list[tuple[int, list[float] | None]] = []
+        for time_ns, message in self.messages("goal_joint_states"):
+            given = dict(zip(message.name, map(float, message.position), strict=False))
+            if not given:
+                shapes.append((time_ns, None))
+            elif given.keys() == set(names):
+                shapes.append((time_ns, [given[name] for name in names]))
+        return shapes
 
     def commands(self, scenario: Scenario) -> Mapping[str, Commands]:
         """Return the commands by topic."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import RobotDescription, SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, Joint
 from spacerobot_ros.model.meshes import mesh_file
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_quaternion
 from spacerobot_ros.model.urdf import describe_inertia_flaw
@@ -69,37 +69,61 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
             f"The base '{robot.base_link}' is a point mass: give it an <inertia>, for a box of "
             "sides a, b, c ixx = m (b^2 + c^2) / 12 and so on."
         )
-    for joint in robot.movable_joints:
-        limits = joint.limits
-        if limits.velocity == 0:
-            yield (
-                f"The joint '{joint.name}' has the velocity limit 0, so that it cannot move: give "
-                f'<limit velocity="..."/> in {joint.unit}/s.'
-            )
-        elif (
-            math.isfinite(limits.velocity)
-            and not _LEAST_USUAL_SPEED <= limits.velocity <= _LARGEST_USUAL_SPEED
-        ):
-            yield (
-                f"The joint '{joint.name}' moves at up to {limits.velocity:.4g} {joint.unit}/s: "
-                f"check the unit of its velocity limit."
-            )
-        reach = max(-limits.lower, limits.upper)
-        if joint.unit == "rad" and math.isfinite(reach) and reach > _MAX_USUAL_LIMIT:
-            yield (
-                f"The joint '{joint.name}' turns from {limits.lower:.4g} to {limits.upper:.4g} "
-                "rad: limits of a URDF are in rad, not in degrees."
-            )
-        if limits.effort == 0:
-            yield (
-                f"The joint '{joint.name}' has the effort limit 0: driven by velocities it moves, "
-                'driven by efforts it cannot. Give <limit effort="..."/> in N or N m.'
-            )
+    for remark in (_still_joint, _odd_speed, _many_turns, _no_effort):
+        found = [text for joint in robot.movable_joints if (text := remark(joint))]
+        if found:
+            yield found[0] + _same_for_others(len(found) - 1)
     for link in robot.links:
         # A body with such an inertia is refused; a welded link is not.
         if flaw := describe_inertia_flaw(link.inertia.about_com):
             yield f"The inertia of link '{link.name}' {flaw} The links welded to it make up for it."
     yield from _visual_remarks(robot)
+
+
+def _same_for_others(count: int) -> str:
+    """Return a sentence that extends a remark about one joint to others."""
+    if not count:
+        return ""
+    return f" The same holds for {count} other joint{'s' if count > 1 else ''}."
+
+
+def _still_joint(joint: Joint) -> str:
+    if joint.limits.velocity != 0:
+        return ""
+    return (
+        f"The joint '{joint.name}' has the velocity limit 0, so that it cannot move: give "
+        f'<limit velocity="..."/> in {joint.unit}/s.'
+    )
+
+
+def _odd_speed(joint: Joint) -> str:
+    speed = joint.limits.velocity
+    if speed == 0 or math.isinf(speed) or _LEAST_USUAL_SPEED <= speed <= _LARGEST_USUAL_SPEED:
+        return ""
+    return (
+        f"The joint '{joint.name}' moves at up to {speed:.4g} {joint.unit}/s: check the unit of "
+        "its velocity limit."
+    )
+
+
+def _many_turns(joint: Joint) -> str:
+    limits = joint.limits
+    reach = max(-limits.lower, limits.upper)
+    if joint.unit != "rad" or math.isinf(reach) or reach <= _MAX_USUAL_LIMIT:
+        return ""
+    return (
+        f"The joint '{joint.name}' turns from {limits.lower:.4g} to {limits.upper:.4g} rad: limits "
+        "of a URDF are in rad, not in degrees."
+    )
+
+
+def _no_effort(joint: Joint) -> str:
+    if joint.limits.effort != 0:
+        return ""
+    return (
+        f"The joint '{joint.name}' has the effort limit 0: driven by velocities it moves, driven "
+        'by efforts it cannot. Give <limit effort="..."/> in N or N m.'
+    )
 
 
 def _visual_remarks(robot: RobotDescription) -> Iterator[str]:

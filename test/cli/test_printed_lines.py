@@ -153,6 +153,21 @@ def test_end_effector_and_propellant_have_lines_where_there_are_some(
     assert "propellant  0.0 g" in run(monkeypatch, SUMMARY | {"propellant_kg": 0.0}, *GOAL).stdout
 
 
+def test_each_end_effector_has_its_errors_with_their_tolerances(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hands = {
+        "left": {"position_error_m": 0.045678, "attitude_error_rad": 0.01},
+        # Its attitude is free.
+        "right": {"position_error_m": 0.5, "attitude_error_rad": None},
+    }
+    lines = run(monkeypatch, SUMMARY | {"end_effectors": hands}, *GOAL).stdout.splitlines()
+    assert lines[3:5] == [
+        "left: 0.0457 m and 0.01 rad from its goal (tolerance 0.02 m, 0.06 rad)",
+        "right: 0.5 m from its goal (tolerance 0.02 m)",
+    ]
+
+
 def test_errors_have_their_tolerance_or_are_not_controlled(monkeypatch: pytest.MonkeyPatch) -> None:
     def lines(**changed: Any) -> list[str]:
         return run(monkeypatch, SUMMARY | changed, *GOAL).stdout.splitlines()

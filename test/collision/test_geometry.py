@@ -240,6 +240,23 @@ def test_without_coal_distances_are_bounds(
     assert 0.001 < loose < 0.3
 
 
+def test_installations_that_share_a_cache_are_each_told_once_that_coal_is_missing(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "coal", None)
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path / "cache"))
+    told = []
+    for prefix in ("/opt/first", "/opt/second", "/opt/first"):
+        monkeypatch.setattr(sys, "prefix", prefix)
+        distances_module._coal.cache_clear()
+        caplog.clear()
+        assert distances_module._coal() is None
+        told.append([each.message.split(",")[0] for each in caplog.records])
+    distances_module._coal.cache_clear()
+    sentence = "Distances between links are those of spheres"
+    assert told == [[sentence], [sentence], []]
+
+
 def test_a_robot_without_shapes_has_no_pairs() -> None:
     robot: RobotDescription = parse_robot(chain((), (), ()))
     geometry = CollisionGeometry(robot)

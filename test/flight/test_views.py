@@ -457,6 +457,7 @@ def test_errors_of_named_end_effectors_are_those_of_their_links() -> None:
     assert (summary["position_error_m"], summary["attitude_error_rad"]) == (None, None)
     assert summary["end_effectors"][links[1]]["position_error_m"] == pytest.approx(2.0)
     assert summary["end_effectors"][links[0]]["attitude_error_rad"] == pytest.approx(angle)
+    assert summary["end_effectors"][links[1]]["attitude_error_rad"] is None
     assert "end_effector_final_position_m" not in summary
 
 

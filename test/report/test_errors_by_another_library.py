@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros import fly
+from spacerobot_ros import fly, read_run
 from spacerobot_ros.cli.flights import _summary_lines
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight
@@ -70,6 +70,21 @@ def truth_in(bag: Path) -> Truth:
     turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_quat(goal[3:])
     distance = float(np.linalg.norm(goal[:3] - pose[:3]))
     return Truth(distance, float(turn.magnitude()), pose, goal)
+
+
+def shape_error_in(bag: Path) -> np.ndarray:
+    """Return the errors of the joints (n,) at the end of a bag with one shape to end in."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    last: dict[str, dict[str, float]] = {}
+    with bag.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        topics = ["/joint_states", "/joint_states_true", "/goal_joint_states"]
+        for _, channel, _, message in reader.iter_decoded_messages(topics):
+            last[channel.topic] = dict(zip(message.name, message.position, strict=True))
+    shape = last.get("/joint_states_true", last["/joint_states"])
+    return np.array([value - shape[name] for name, value in last["/goal_joint_states"].items()])
 
 
 class Cells(HTMLParser):
@@ -160,6 +175,11 @@ def test_errors_of_recorded_flights(name: str, position_counts: bool) -> None:
     bag = BAGS / f"{name}.mcap"
     flight = read_flight(open_flight_bag(bag))
     assert_all_say(bag, flight, position_counts=position_counts)
+    # The report reads the goals in the messages, the terminal that of the scenario.
+    assert flight.verdict.sentence == read_run(bag).verdict.sentence
+    if name == "planar_chain":
+        error = np.abs(shape_error_in(bag)).max()
+        assert f" and {error:.3g} at the joints from the goal" in flight.verdict.sentence
 
 
 def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_path: Path) -> None:

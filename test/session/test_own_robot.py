@@ -75,6 +75,17 @@ def test_unusual_values_are_told(robot: Any, note: str | None) -> None:
         assert note in each
 
 
+@pytest.mark.parametrize(("others", "said"), [
+    (0, "not in degrees."),
+    (1, "not in degrees. The same holds for 1 other joint."),
+    (5, "not in degrees. The same holds for 5 other joints."),
+])  # fmt: skip
+def test_a_note_on_many_joints_is_told_once(others: int, said: str) -> None:
+    joints = [joint(), *(joint(upper=90.0) for _ in range(others + 1))]
+    (note,) = urdf_remarks(described(movable_joints=joints))
+    assert note.endswith(said)
+
+
 @pytest.mark.parametrize(("missing", "said"), [(1, "'mesh 0' was"), (3, "'mesh 0' and 2 more was")])
 def test_meshes_that_are_missing_are_counted(
     monkeypatch: pytest.MonkeyPatch, missing: int, said: str

@@ -282,10 +282,12 @@ def describe_remaining_error(
         distance, angle = error.farthest_end_effector, error.most_turned_end_effector
         # Goals of positions alone leave no angle.
         turn = f" and {angle:.3g} rad" if angle > 0 else ""
-        parts["end_effectors"] = f"{distance:.3g} m{turn} at the end-effectors"
+        parts["end_effectors"] = f"end-effectors {distance:.3g} m{turn}"
     hand = parts.pop("end_effectors", "") if "end_effectors" in controls else ""
     body = " and ".join(text for part, text in parts.items() if part in controls)
-    remaining = ", ".join(filter(None, (body, hand)))
+    remaining = f"{body or hand} from the goal"
+    if body and hand:
+        remaining += f", {hand} from theirs"
     notes = []
     if tolerance is not None:
         hands = "end_effectors" in controls
@@ -297,7 +299,7 @@ def describe_remaining_error(
         notes.append("tolerance " + ", ".join(text for text, counts in limits if counts))
     if goal is not None and (parts_left := uncontrolled_parts(goal, controls)):
         notes.append(f"{' and '.join(parts_left)} not controlled")
-    return f"{remaining} from the goal" + (f" ({'; '.join(notes)})" if notes else "")
+    return remaining + (f" ({'; '.join(notes)})" if notes else "")
 
 
 def _format_note(note: list[float] | Array | float | str) -> str:
