@@ -324,6 +324,8 @@ class PlannerCommander(Commander):
             # The state was answered without its pose; a plan uses the pose at the next joints.
             executive.add_base_measurement(measured)
         else:
+            if self.trajectories is not None:
+                self.trajectories.watch(measured.stamp_ns)
             executive.update(measured)
             if executive.outputs:
                 self._pass_on_outputs()
@@ -356,4 +358,4 @@ class PlannerCommander(Commander):
                 case Transition(source, event, target):
                     host.log("debug", f"{source.value} -> {target.value}: {event.value}")
                     if self.trajectories is not None:
-                        self.trajectories.phase_changed(target, event)
+                        self.trajectories.phase_changed(target)

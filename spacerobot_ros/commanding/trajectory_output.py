@@ -12,8 +12,16 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Protocol
 
-from spacerobot_ros.planning.execution.executive import Event, Phase
+from spacerobot_ros.errors import printable
+from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.status import ScheduleStart
+from spacerobot_ros.times import SECOND
+
+_ANSWER_TIME_NS = 5 * SECOND
+"""Longest time until the server has accepted or rejected a schedule, ns."""
+
+_LOOK_PERIOD_NS = SECOND
+"""Time between two looks whether the server is still there, ns."""
 
 _PHASES_OF_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.PLANNING)
 """Phases in which a schedule is followed on; in PLANNING its successor replaces it."""
@@ -91,6 +99,10 @@ class TrajectoryOutput:
         self._replaced: int | None = None
         """Number of the one that it replaces, until it is accepted."""
         self._accepted = False
+        self._watched_ns: int | None = None
+        """Stamp of the first state after the latest schedule was sent, ns."""
+        self._looked_ns = 0
+        """Stamp of the last look whether the server is there, ns."""
 
     @property
     def waits(self) -> bool:
@@ -101,21 +113,37 @@ class TrajectoryOutput:
         """Send a schedule; it replaces the one that is followed."""
         self._number += 1
         self._replaced, self._sent, self._accepted = self._sent, self._number, False
+        self._watched_ns = None
         if not self._server.ready():
             self._end(MotionEnd(f"no server of the action '{self._name}' is there", final=True))
             return
         self._server.send(self._number, start)
 
-    def phase_changed(self, phase: Phase, event: Event) -> None:
+    def watch(self, now_ns: int) -> None:
+        """End a schedule whose server does not answer, or is gone, at a state of a stamp."""
+        if self._sent is None:
+            return
+        if self._watched_ns is None or now_ns < self._watched_ns:
+            self._watched_ns = self._looked_ns = now_ns
+        if not self._accepted and now_ns - self._watched_ns > _ANSWER_TIME_NS:
+            self._give_up(f"the action '{self._name}' has not answered")
+        elif now_ns - self._looked_ns >= _LOOK_PERIOD_NS:
+            self._looked_ns = now_ns
+            if not self._server.ready():
+                self._give_up(f"the server of the action '{self._name}' is gone")
+
+    def _give_up(self, why: str) -> None:
+        assert self._sent is not None
+        self._server.cancel(self._sent)
+        self._end(MotionEnd(why, final=True))
+
+    def phase_changed(self, phase: Phase) -> None:
         """Cancel the schedule if the planner has left it."""
         sent = self._sent
         if sent is None or phase in _PHASES_OF_MOTION:
             return
-        unanswered = not self._accepted
         self._sent = self._replaced = None
         self._server.cancel(sent)
-        if unanswered and event is Event.SCHEDULE_ENDED:
-            self._on_end(MotionEnd(f"the action '{self._name}' has not answered", final=True))
 
     def accepted(self, number: int) -> None:
         """Note that the server follows a schedule now."""
@@ -156,9 +184,12 @@ def _motion_end(outcome: Outcome, code: int, text: str) -> MotionEnd:
     """Return the meaning of a result."""
     if outcome is Outcome.SUCCEEDED and code == ErrorCode.SUCCESSFUL:
         return MotionEnd()
-    told = f": {text.rstrip('.')}" if text else ""
+    text = printable(text).rstrip(".")
+    told = f": {text}" if text else ""
     if outcome is Outcome.CANCELED:
         return MotionEnd(f"another client has replaced or cancelled the trajectory{told}", True)
+    if code == ErrorCode.SUCCESSFUL:
+        return MotionEnd(f"the trajectory was aborted without an error code{told}", final=True)
     try:
         name = ErrorCode(code).name
     except ValueError:

@@ -11,7 +11,11 @@ from spacerobot_ros.commanding.trajectory_output import (
     Outcome,
     TrajectoryOutput,
 )
-from spacerobot_ros.planning.execution.executive import Event, Phase
+from spacerobot_ros.planning.execution.executive import Phase
+from spacerobot_ros.times import SECOND
+
+FIRST = 40 * SECOND
+"""Stamp of the first state."""
 
 
 class Server:
@@ -52,14 +56,14 @@ def test_a_schedule_is_sent_and_ends_with_its_result() -> None:
     number = sent.start("first")
     assert sent.server.sent == [(number, "first")]
     assert sent.output.waits
-    sent.output.phase_changed(Phase.EXECUTING, Event.PLANNED)
+    sent.output.phase_changed(Phase.EXECUTING)
     sent.output.ended(number, Outcome.SUCCEEDED, 0, "")
     assert sent.ends == [MotionEnd()]
     assert not sent.output.waits
     # Each schedule ends once, and nothing that has ended is cancelled.
     sent.output.ended(number, Outcome.ABORTED, -4, "")
     sent.output.rejected(number)
-    sent.output.phase_changed(Phase.EVALUATING, Event.SCHEDULE_ENDED)
+    sent.output.phase_changed(Phase.EVALUATING)
     assert len(sent.ends) == 1
     assert sent.server.cancelled == []
 
@@ -75,7 +79,7 @@ def test_a_schedule_is_sent_and_ends_with_its_result() -> None:
         (Outcome.ABORTED, -2, "no wrist", "the trajectory has ended early by INVALID_JOINTS: "
          "no wrist", True),
         (Outcome.ABORTED, -3, "", "the trajectory has ended early by OLD_HEADER_TIMESTAMP", True),
-        (Outcome.ABORTED, 0, "", "the trajectory has ended early by SUCCESSFUL", True),
+        (Outcome.ABORTED, 0, "", "the trajectory was aborted without an error code", True),
         (Outcome.ABORTED, 17, "", "the trajectory has ended early by error code 17", True),
         (Outcome.CANCELED, -4, "new goal", "another client has replaced or cancelled the "
          "trajectory: new goal", True),
@@ -95,7 +99,7 @@ def test_what_is_left_is_cancelled_and_its_result_does_not_count() -> None:
     for phase in Phase:
         sent = Sent()
         number = sent.start()
-        sent.output.phase_changed(phase, Event.NEW_GOAL)
+        sent.output.phase_changed(phase)
         goes_on = phase in (
             Phase.EXECUTING, Phase.PLANNING, Phase.REPLANNING, Phase.TAKING_OVER
         )  # fmt: skip
@@ -133,13 +137,56 @@ def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
     assert not sent.output.waits
     sent.server.present = True
     number = sent.start(accepted=False)
-    sent.output.phase_changed(Phase.EVALUATING, Event.SCHEDULE_ENDED)
+    for second in range(6):
+        assert not sent.ends
+        sent.output.watch(FIRST + second * SECOND)
+    sent.output.watch(FIRST + 5 * SECOND + 1)
     assert sent.ends == [MotionEnd("the action '/arm/follow' has not answered", True)]
     assert sent.server.cancelled == [number]
-    # One that was accepted and has no result may be corrected; a reset is nobody's fault.
+    # One that was accepted may take any time; a schedule that is left ends nothing.
     later = sent.start()
-    sent.output.phase_changed(Phase.EVALUATING, Event.SCHEDULE_ENDED)
+    for second in range(20):
+        sent.output.watch(FIRST + second * SECOND)
+    sent.output.phase_changed(Phase.EVALUATING)
     reset = sent.start(accepted=False)
-    sent.output.phase_changed(Phase.EVALUATING, Event.PLANT_RESET)
+    sent.output.phase_changed(Phase.EVALUATING)
+    sent.output.watch(FIRST + 60 * SECOND)
     assert len(sent.ends) == 1
     assert sent.server.cancelled == [number, later, reset]
+
+
+def test_the_time_for_an_answer_begins_with_the_state_after_the_schedule() -> None:
+    sent = Sent()
+    sent.start()
+    sent.output.watch(FIRST)
+    # Planning took ten seconds, and time may jump back.
+    sent.start(accepted=False)
+    sent.output.watch(FIRST + 15 * SECOND)
+    sent.output.watch(FIRST)
+    sent.output.watch(FIRST + 5 * SECOND)
+    assert sent.ends == []
+    sent.output.watch(FIRST + 5 * SECOND + 1)
+    assert len(sent.ends) == 1
+
+
+def test_a_server_that_goes_ends_the_goal_within_a_second() -> None:
+    sent = Sent()
+    number = sent.start()
+    sent.output.watch(FIRST)
+    sent.server.present = False
+    sent.output.watch(FIRST + SECOND - 1)
+    assert sent.ends == []
+    sent.output.watch(FIRST + SECOND)
+    wanted = MotionEnd("the server of the action '/arm/follow' is gone", True)
+    assert sent.ends == [wanted]
+    # It may still drive the joints, and only this planner not see it.
+    assert sent.server.cancelled == [number]
+    sent.output.watch(FIRST + 2 * SECOND)
+    assert sent.ends == [wanted]
+
+
+def test_texts_of_the_server_are_one_line_without_control_characters() -> None:
+    sent = Sent()
+    sent.output.ended(sent.start(), Outcome.ABORTED, -6, "stop\n\x1b[31mred")
+    (end,) = sent.ends
+    assert end.message == "the trajectory has ended early by error code -6: stop \ufffd[31mred"

@@ -119,3 +119,52 @@ def test_a_node_that_is_cleaned_up_leaves_the_robot_at_rest(flight: DrivenFlight
     flight.planner.start()
     flight.find_server()
     assert flight.ended(NEAR)[0] == "reached"
+
+
+def test_a_server_that_does_not_answer_fails_the_goal(flight: DrivenFlight) -> None:
+    flight.server.server.silent = True
+    sent = flight.plant.time_ns
+    state, corrections, message = flight.ended(NEAR)
+    assert (state, corrections) == ("failed", "0")
+    assert message.endswith("follow_joint_trajectory' has not answered.")
+    assert 5e9 < flight.plant.time_ns - sent < 5.5e9
+    flight.server.server.silent = False
+    assert flight.ended(NEAR)[0] == "reached"
+    assert flight.server.ends == ["succeeded"]
+
+
+def test_a_server_that_goes_fails_the_goal_and_one_that_comes_late_flies_the_next(
+    flight: DrivenFlight,
+) -> None:
+    flight.send(NEAR)
+    flight.wait("executing")
+    flight.ticks(5)
+    flight.server.close()
+    gone = flight.plant.time_ns
+    status = flight.wait("failed")
+    assert status.message.endswith("follow_joint_trajectory' is gone.")
+    assert flight.plant.time_ns - gone < 1.5e9
+    flight.ticks(3)
+    assert np.abs(flight.plant.plant.qdot).max() == 0.0
+    assert "no server of the action" in flight.ended(NEAR)[2]
+    flight.server.open()
+    flight.find_server()
+    assert flight.ended(NEAR)[0] == "reached"
+
+
+def test_a_result_that_never_comes_is_waited_for_and_the_trajectory_cancelled(
+    flight: DrivenFlight,
+) -> None:
+    flight.server.loses_results = True
+    state, corrections, message = flight.ended(NEAR)
+    assert (state, corrections) == ("reached", "0"), message
+    flight.harness.spin_until(lambda: flight.server.ends == ["canceled"], "the cancellation")
+    (trajectory,) = flight.server.goals
+    last = trajectory.trajectory.points[-1].time_from_start
+    assert flight.plant.time_ns * 1e-9 > last.sec + last.nanosec * 1e-9 + 5.0
+
+
+def test_texts_of_servers_are_printable(flight: DrivenFlight) -> None:
+    flight.server.answer, flight.server.text = -6, "stop\n\x1b[31m pressed"
+    _, _, message = flight.ended(NEAR)
+    assert message.endswith("ended early by error code -6: stop \ufffd[31m pressed.")

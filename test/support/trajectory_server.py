@@ -18,6 +18,16 @@ Array = npt.NDArray[np.float64]
 NAME = "joint_trajectory_controller/follow_joint_trajectory"
 
 
+class _GoalServer(_Server):
+    """A server that does not answer requests of goals while it is silent."""
+
+    silent = False
+
+    async def _execute_goal_request(self, request: Any) -> None:
+        if not self.silent:
+            await super()._execute_goal_request(request)
+
+
 class TrajectoryServer:
     """Tracks trajectories by velocities, late by ``lag``, and judges tolerances.
 
@@ -38,8 +48,10 @@ class TrajectoryServer:
         """Time of a trajectory from which on the first joint does not move, once, s."""
         self.falls_short = 0.0
         """Error of the last point, as long as it is not zero, m."""
-        self.rejects, self.answer = False, 0
-        """Whether goals are rejected; error code with which they are aborted at once."""
+        self.rejects, self.answer, self.text = False, 0, "told so"
+        """Whether goals are rejected; error code and text with which they are aborted at once."""
+        self.loses_results = False
+        """Whether it ends no goal by itself."""
         self.goals: list[Any] = []
         self.ends: list[str] = []
         self.node = harness.probe({}, name="trajectory_server")
@@ -48,9 +60,13 @@ class TrajectoryServer:
         self._begin = -1
         self._frozen = False
         self.node.create_subscription(JointState, "joint_states", self._on_state, 10)
-        self._server = _Server(
+        self.open()
+
+    def open(self) -> None:
+        """Serve the action."""
+        self.server = _GoalServer(
             self.node,
-            kind,
+            self.kind,
             NAME,
             lambda handle: None,
             goal_callback=lambda _: GoalResponse.REJECT if self.rejects else GoalResponse.ACCEPT,
@@ -59,7 +75,9 @@ class TrajectoryServer:
         )
 
     def close(self) -> None:
-        self._server.destroy()
+        """Serve it no more, and let the joints rest."""
+        self._handle = None
+        self.server.destroy()
 
     def _on_goal(self, handle: ServerGoalHandle) -> None:
         self._end("aborted", -1, "Replaced.")
@@ -79,7 +97,7 @@ class TrajectoryServer:
         ]()
         self.ends.append(outcome)
         result = self.kind.Result(error_code=code, error_string=text)
-        self._server.end(handle, result)
+        self.server.end(handle, result)
 
     def _on_state(self, state: JointState) -> None:
         now, q = nanoseconds(state.header.stamp), np.array(state.position)
@@ -88,7 +106,7 @@ class TrajectoryServer:
         if self._handle is not None and self._handle.is_cancel_requested:
             self._end("canceled")
         if self._handle is not None and self.answer:
-            self._end("aborted", self.answer, "told so")
+            self._end("aborted", self.answer, self.text)
         if self._handle is not None:
             command.velocity = self._follow(self._handle.request.trajectory, state, now, q)
         self.commands.publish(command)
@@ -115,7 +133,7 @@ class TrajectoryServer:
             self.freezes_at = None
             self._end("aborted", -4, f"{state.name[0]} is off.")
             return [0.0] * len(q)
-        if since >= times[-1]:
+        if since >= times[-1] and not self.loses_results:
             if np.abs(goal - q).max() <= self.goal_tolerance:
                 self._end("succeeded")
                 return [0.0] * len(q)
