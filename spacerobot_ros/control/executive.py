@@ -442,9 +442,10 @@ class ControlExecutive:
             return
         rates = self.controller.joint_rate_limits.rates
         joint = int(np.argmax(np.abs(qdot) / rates))
-        name = self.controller.law.robot.joint_names[joint]
+        moving = self.controller.law.robot.description.movable_joints[joint]
         self._lose_control(
-            f"joint '{name}' moves at {qdot[joint]:.3g}/s instead of {rates[joint]:.3g}/s"
+            f"joint '{moving.name}' moves at {qdot[joint]:.3g} {moving.unit}/s instead of "
+            f"{rates[joint]:.3g} {moving.unit}/s"
         )
 
     def _watch_errors(self) -> None:

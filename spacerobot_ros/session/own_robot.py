@@ -69,7 +69,7 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
             f"The base '{robot.base_link}' is a point mass: give it an <inertia>, for a box of "
             "sides a, b, c ixx = m (b^2 + c^2) / 12 and so on."
         )
-    for remark in (_still_joint, _odd_speed, _many_turns, _no_effort):
+    for remark in (_still_joint, _unlimited_joint, _odd_speed, _many_turns, _no_effort):
         found = [text for joint in robot.movable_joints if (text := remark(joint))]
         if found:
             yield found[0] + _same_for_others(len(found) - 1)
@@ -93,6 +93,16 @@ def _still_joint(joint: Joint) -> str:
     return (
         f"The joint '{joint.name}' has the velocity limit 0, so that it cannot move: give "
         f'<limit velocity="..."/> in {joint.unit}/s.'
+    )
+
+
+def _unlimited_joint(joint: Joint) -> str:
+    if not math.isinf(joint.limits.velocity):
+        return ""
+    return (
+        f"The joint '{joint.name}' has no velocity limit, within which gaits are planned: give "
+        f'<limit velocity="..." effort="..."/> in {joint.unit}/s and '
+        f"{'N' if joint.unit == 'm' else 'N m'}."
     )
 
 

@@ -285,7 +285,7 @@ def test_one_joint_that_is_too_fast_for_long_enough_ends_the_goal() -> None:
     loop.answer()
     assert (loop.state, loop.status.goal_id) == ("aborted", "g")
     assert loop.status.message == (
-        "Aborted: control is lost, joint 'elbow' moves at -1.21/s instead of 0.8/s; "
+        "Aborted: control is lost, joint 'elbow' moves at -1.21 rad/s instead of 0.8 rad/s; "
         "the robot is brought to rest."
     )
     (event,) = [event for event in loop.events if event.kind is EventKind.GOAL_ABORTED]

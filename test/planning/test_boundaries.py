@@ -50,6 +50,21 @@ def test_a_joint_needs_a_speed_and_a_finite_acceleration(
     assert str(refusal.value).endswith("a finite acceleration: see m.max_acceleration.")
 
 
+def test_a_joint_without_a_velocity_limit_is_refused_with_the_remedies() -> None:
+    robot: Any = SimpleNamespace(
+        velocity_limit=np.array([1.0, np.inf]), joint_names=("a", "b"), n=2,
+        lower=np.array([-1.0, -2.0]), upper=np.array([1.0, 2.0]),
+    )  # fmt: skip
+    with pytest.raises(ParameterError) as refusal:
+        MotionLimits.of(robot, MotionOptions(), "m")
+    assert str(refusal.value) == (
+        "Joint 'b' has no velocity limit, within which m plans: give it "
+        '<limit velocity="..." effort="..."/> in the URDF, or m.max_velocity.'
+    )
+    # Either remedy is one.
+    assert MotionLimits.of(robot, MotionOptions(max_velocity=(1.0, 0.5)), "m").velocity[1] == 0.5
+
+
 def turning(rate: float) -> Array:
     """Return attitudes at three ticks of 0.5 s, the last two apart by a rate."""
     angles = np.array([0.0, 0.01, 0.01 + rate * 0.5])

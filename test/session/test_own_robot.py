@@ -57,7 +57,9 @@ def described(base: float = 30.0, total: float = 40.0, about_com: Any = None, **
         (described(movable_joints=[joint(velocity=9e-4, unit="m")]), "moves at up to 0.0009 m/s"),
         (described(movable_joints=[joint(velocity=50.0)]), None),
         (described(movable_joints=[joint(velocity=50.1)]), "moves at up to 50.1 rad/s"),
-        (described(movable_joints=[joint(velocity=math.inf)]), None),
+        (described(movable_joints=[joint(velocity=math.inf)]),
+         'has no velocity limit, within which gaits are planned: give <limit velocity="..." '
+         'effort="..."/> in rad/s and N m.'),
         (described(movable_joints=[joint(upper=12.5)]), None),
         (described(movable_joints=[joint(upper=12.6)]), "turns from -1 to 12.6 rad"),
         (described(movable_joints=[joint(lower=-90.0)]), "turns from -90 to 2 rad"),

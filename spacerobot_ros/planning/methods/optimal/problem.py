@@ -271,6 +271,11 @@ class MotionLimits:
             given = options.max_acceleration
             acceleration = per_joint(robot, "max_acceleration", given, acceleration, method)
         for name, v, a in zip(robot.joint_names, velocity, acceleration, strict=True):
+            if np.isinf(v) and not np.isfinite(a):
+                raise ParameterError(
+                    f"Joint '{name}' has no velocity limit, within which {method} plans: give it "
+                    f'<limit velocity="..." effort="..."/> in the URDF, or {method}.max_velocity.'
+                )
             if not (v > 0 and np.isfinite(a) and a > 0):
                 raise ParameterError(
                     f"Joint '{name}' is limited to {v:.4g} a second and {a:.4g} a second squared; "
