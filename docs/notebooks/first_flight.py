@@ -21,7 +21,8 @@ flight.plot()
 # All arrays are copies, for numpy; `to_pandas()` has them with names.
 
 # %%
-flight.to_pandas()[["pose.x", "pose.y", "pose.z", "q.slider_1"]].tail(3)
+places = [f"pose.pose.position.{axis}" for axis in "xyz"]
+flight.to_pandas()[[*places, "position[slider_1]"]].tail(3)
 
 # %% [markdown]
 # The same with noise of 2 mm, by another seed, and as an animation.

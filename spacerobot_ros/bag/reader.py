@@ -27,7 +27,13 @@ from spacerobot_ros.bag.mcap_reading import (
     read_summary,
 )
 from spacerobot_ros.bag.series import TopicSeries
-from spacerobot_ros.bag.tables import TopicTable, table_of, to_pandas, to_xarray
+from spacerobot_ros.bag.tables import (
+    TopicTable,
+    table_of,
+    to_pandas,
+    to_xarray,
+    with_euler_angles,
+)
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError, printable
 from spacerobot_ros.messages.definitions import MessageTypes
 from spacerobot_ros.resources import suggestion
@@ -272,37 +278,51 @@ class Bag:
         return self[topic].messages()
 
     @overload
-    def to_pandas(self, topic: str) -> pandas.DataFrame: ...
+    def to_pandas(self, topic: str, *, euler: bool = False) -> pandas.DataFrame: ...
     @overload
-    def to_pandas(self, topic: None = None) -> dict[str, pandas.DataFrame]: ...
-    def to_pandas(self, topic: str | None = None) -> pandas.DataFrame | dict[str, pandas.DataFrame]:
+    def to_pandas(
+        self, topic: None = None, *, euler: bool = False
+    ) -> dict[str, pandas.DataFrame]: ...
+    def to_pandas(
+        self, topic: str | None = None, *, euler: bool = False
+    ) -> pandas.DataFrame | dict[str, pandas.DataFrame]:
         """Return a topic as a table of pandas, or every topic by its name.
 
         The index is the log time in seconds, ``attrs["units"]`` has the units of the columns; see
-        :func:`~spacerobot_ros.bag.tables.table_of` for the columns.
+        :func:`~spacerobot_ros.bag.tables.table_of` for the columns. With ``euler`` the turns of
+        each attitude about the fixed axes x, y, z (rad) stand beside its quaternion, in columns
+        ``roll``, ``pitch`` and ``yaw``.
         """
         if topic is not None:
-            return to_pandas(self.table(topic))
-        return {name: to_pandas(self.table(name)) for name in self}
+            return to_pandas(self.table(topic, euler=euler))
+        return {name: to_pandas(self.table(name, euler=euler)) for name in self}
 
     @overload
-    def to_xarray(self, topic: str) -> xarray.Dataset: ...
+    def to_xarray(self, topic: str, *, euler: bool = False) -> xarray.Dataset: ...
     @overload
-    def to_xarray(self, topic: None = None) -> dict[str, xarray.Dataset]: ...
-    def to_xarray(self, topic: str | None = None) -> xarray.Dataset | dict[str, xarray.Dataset]:
+    def to_xarray(
+        self, topic: None = None, *, euler: bool = False
+    ) -> dict[str, xarray.Dataset]: ...
+    def to_xarray(
+        self, topic: str | None = None, *, euler: bool = False
+    ) -> xarray.Dataset | dict[str, xarray.Dataset]:
         """Return a topic as a dataset of xarray, or every topic by its name.
 
         Arrays stay arrays, over ``time`` and ``joint`` for joint states; every variable has its
-        ``units``.
+        ``units``. ``euler`` is that of :meth:`to_pandas`.
         """
         if topic is not None:
-            return to_xarray(self.table(topic))
-        return {name: to_xarray(self.table(name)) for name in self}
+            return to_xarray(self.table(topic, euler=euler))
+        return {name: to_xarray(self.table(name, euler=euler)) for name in self}
 
-    def table(self, topic: str) -> TopicTable:
-        """Return a topic as a table; the units of joints follow the URDF in the bag."""
+    def table(self, topic: str, *, euler: bool = False) -> TopicTable:
+        """Return a topic as a table; the units of joints follow the URDF in the bag.
+
+        ``euler``: whether attitudes have ``roll``, ``pitch`` and ``yaw`` as well.
+        """
         series = self[topic]
-        return table_of(series, self._prismatic_joints(series.topic.rpartition("/")[0]))
+        found = table_of(series, self._prismatic_joints(series.topic.rpartition("/")[0]))
+        return with_euler_angles(found) if euler else found
 
     def robot_descriptions(self, namespace: str = "") -> list[bytes]:
         """Return texts that may be the URDF of the robot in a namespace, the likeliest first.

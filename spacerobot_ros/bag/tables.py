@@ -12,8 +12,8 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -190,25 +190,77 @@ def _table_fields(
         texts = [x if isinstance(x, str) else json.dumps(_json_value(x)) for x in values]
         return [Field(path, _object_array(texts), ("",))]
     if values.ndim == 1:
-        return [Field(path, values, (_unit_of_path(path),))]
-    width = values.shape[1]
-    if not width:
+        return [number_field(path, values)]
+    if not values.shape[1]:
         return []
     short = series.topic.rpartition("/")[2]
+    return [array_field(short, path, values, names, prismatic)]
+
+
+def array_field(
+    topic: str, path: str, values: NDArray[Any], names: Sequence[str], prismatic: Mapping[str, bool]
+) -> Field:
+    """Return an array of the messages of a topic as a field, with labels and units.
+
+    Parameters
+    ----------
+    topic
+        Name of the topic without its namespace.
+    values
+        Numbers (N, k).
+    names
+        Names in joint states, of joints or thrusters.
+    prismatic
+        As of :func:`table_of`.
+    """
+    width = values.shape[1]
     if names and width == len(names):
-        thrusters = short == "thrusters"
+        thrusters = topic == "thrusters"
         column_kind = "thruster" if thrusters else "joint"
         units = tuple(
             _THRUSTER_UNITS.get(path, "") if thrusters else _joint_unit(path, prismatic.get(name))
             for name in names
         )
-        return [Field(path, values, units, names, column_kind)]
-    stack = TOPICS.get(short)
+        return Field(path, values, units, tuple(names), column_kind)
+    stack = TOPICS.get(topic)
     labels = stack.state[0].entries if stack is not None and stack.state else ()
     if path != "data" or len(labels) != width:
-        return [Field(path, values, ("",) * width, tuple(map(str, range(width))))]
+        return Field(path, values, ("",) * width, tuple(map(str, range(width))))
     units = tuple(_MOMENTUM_UNITS.get(label.partition("_")[0], "") for label in labels)
-    return [Field(path, values, units, labels)]
+    return Field(path, values, units, labels)
+
+
+def number_field(path: str, values: NDArray[Any]) -> Field:
+    """Return one number (N,) of each message as a field, with the unit of its path."""
+    return Field(path, values, (_unit_of_path(path),))
+
+
+def with_euler_angles(table: TopicTable) -> TopicTable:
+    """Return a table in which each attitude is given by turns about the fixed axes x, y, z as well.
+
+    The fields ``roll``, ``pitch`` and ``yaw`` (rad) stand where ``orientation`` does:
+    ``pose.pose.yaw`` beside ``pose.pose.orientation.z``.
+    """
+    values = {field.path: field.values for field in table.fields}
+    found = list(table.fields)
+    for path in values:
+        head, _, last = path.rpartition("orientation.")
+        parts = [values.get(f"{head}orientation.{axis}") for axis in "xyzw"]
+        if last != "x" or any(part is None for part in parts):
+            continue
+        turns = zip(("roll", "pitch", "yaw"), _euler_angles(np.array(parts, float)), strict=True)
+        found += [Field(f"{head}{name}", angle, ("rad",)) for name, angle in turns]
+    return replace(table, fields=tuple(found))
+
+
+def _euler_angles(quaternions: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Return roll, pitch and yaw (N,), rad, of quaternions x, y, z, w (4, N)."""
+    with np.errstate(invalid="ignore"):
+        x, y, z, w = quaternions / np.linalg.norm(quaternions, axis=0)
+    across, along = 2 * (x * y + w * z), 1 - 2 * (y * y + z * z)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arctan2(2 * (w * y - x * z), np.hypot(along, across))
+    return roll, pitch, np.arctan2(across, along)
 
 
 def _key_value_fields(path: str, values: list[Any]) -> list[Field]:
@@ -531,6 +583,6 @@ def _import_library(name: str) -> Any:
         if error.name is None or error.name.split(".")[0] != name.split(".")[0]:
             raise
         raise RecordingError(
-            f"The export needs {name.split('.')[0]}, which is not installed: "
+            f"Tables need {name.split('.')[0]}, which is not installed: "
             "pip install '.[data]' in the clone."
         ) from error

@@ -646,30 +646,49 @@ class Flight:
     def to_pandas(self, *, euler: bool = False) -> pd.DataFrame:
         """Return a table with a row a state, indexed by time (s).
 
-        ``attrs["units"]`` has the units of the columns, as with tables of bags. With ``euler`` the
-        turns of each pose about the fixed axes x, y, z (rad) stand beside its quaternion, in
-        columns ``roll``, ``pitch`` and ``yaw``.
+        Columns and their units, ``attrs["units"]``, are those of the tables of bags: of ``odom``
+        and ``joint_states`` as there, with the true state, of other topics with the topic before
+        them, as ``momentum.data[linear_x]``; ``measured`` stands before measured states that
+        differ from the true ones. With ``euler`` the turns of each attitude about the fixed axes
+        x, y, z (rad) stand beside its quaternion, in columns ``roll``, ``pitch`` and ``yaw``.
 
         Raises
         ------
         SpaceRobotError
             pandas is not installed.
         """
-        from spacerobot_ros.flight.views import table
+        from spacerobot_ros.bag.tables import to_pandas
+        from spacerobot_ros.flight.tables import table_of_flight
 
-        return table(self, euler=euler)
+        made = to_pandas(table_of_flight(self, euler=euler))
+        made.attrs = self._attributes | {"units": made.attrs["units"]}
+        return made
 
     def to_xarray(self, *, euler: bool = False) -> xr.Dataset:
         """Return the columns of :meth:`to_pandas` as variables over ``time``, with their units.
 
+        Arrays stay arrays, over ``time`` and ``joint`` for joint states, as with those of bags.
+
         Raises
         ------
         SpaceRobotError
-            pandas or xarray is not installed.
+            xarray is not installed.
         """
-        from spacerobot_ros.flight.views import dataset
+        from spacerobot_ros.bag.tables import to_xarray
+        from spacerobot_ros.flight.tables import table_of_flight
 
-        return dataset(self, euler=euler)
+        made = to_xarray(table_of_flight(self, euler=euler))
+        made.attrs = dict(self._attributes)
+        return made
+
+    @property
+    def _attributes(self) -> dict[str, str]:
+        """The flight that a table is of."""
+        return {
+            "scenario": self.scenario.name,
+            "method": self.method,
+            "message": self.message,
+        }
 
     def plot(self) -> Any:
         """Return a matplotlib figure: pose of the base and its goal, joints, efforts or rates."""

@@ -80,7 +80,7 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
     period = round(flight.control_period * SECOND)
     stamps: NDArray[np.int64] = np.arange(len(flight.time), dtype=np.int64) * period
     config, robot = flight.scenario.plant, flight.required_robot()
-    quantities = _topic_quantities(flight)
+    quantities = topic_quantities(flight)
     thrusters: tuple[str, ...] = ()
     if "thruster_duty" in quantities:
         thrusters = tuple(find_thrusters(config.thrusters, robot).names)
@@ -127,7 +127,7 @@ def _clearance_streams(flight: Flight) -> Iterator[_Stream]:
     yield _Stream(TOPICS["clearance"], times, messages)
 
 
-def _topic_quantities(flight: Flight) -> dict[str, Array]:
+def topic_quantities(flight: Flight) -> dict[str, Array]:
     """Return all quantities by the names of the table of topics."""
     true = {"pose": flight.pose, "twist": flight.twist, "q": flight.q, "qdot": flight.qdot}
     found = {**flight.quantities, "effort": flight.effort, "momentum": flight.momentum}

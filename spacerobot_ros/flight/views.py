@@ -1,4 +1,4 @@
-"""A flight to look at: a table, a figure, an animation. pandas and matplotlib are loaded here."""
+"""A flight to look at: a figure, an animation. matplotlib is loaded here."""
 
 from __future__ import annotations
 
@@ -13,17 +13,13 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrices_from_quaternions, rotvec_from_quaternion
-from spacerobot_ros.topics import TOPICS
 
 if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-
     from spacerobot_ros.flight.flight import Flight
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -32,12 +28,6 @@ _DASHES = ("-", "--", "-.", ":")
 
 _ROBOT_COLOUR, _GOAL_COLOUR = "#1f2328", "#CC79A7"
 _MAX_FRAMES = 1000
-
-_COLUMN_NAMES = {
-    "pose": ("x", "y", "z", "qx", "qy", "qz", "qw"),
-    "twist": ("vx", "vy", "vz", "wx", "wy", "wz"),
-    "momentum": ("px", "py", "pz", "Lx", "Ly", "Lz", "kinetic_energy"),
-}
 
 
 class Picture(Figure):
@@ -77,121 +67,6 @@ class Animation:
             The file cannot be written.
         """
         write_output(Path(path), f'<!DOCTYPE html>\n<meta charset="utf-8">\n{self.html}\n')
-
-
-def table(flight: Flight, *, euler: bool = False) -> pd.DataFrame:
-    """Return a table with a row a state, indexed by time (s); ``attrs["units"]`` has the units.
-
-    ``euler``: whether poses have columns ``roll``, ``pitch`` and ``yaw`` (rad) too.
-
-    Raises
-    ------
-    SpaceRobotError
-        pandas is not installed.
-    """
-    try:
-        import pandas as pd
-    except ImportError:
-        raise SpaceRobotError(
-            "Tables need pandas, which is not installed: pip install '.[data]' in the clone."
-        ) from None
-    names = flight.joint_names
-    columns: dict[str, Array] = {}
-    for quantity, words in _COLUMN_NAMES.items():
-        for word, column in zip(words, getattr(flight, quantity).T, strict=True):
-            columns[f"{quantity}.{word}"] = column
-    for quantity in ("q", "qdot", "effort"):
-        for word, column in zip(names, getattr(flight, quantity).T, strict=True):
-            columns[f"{quantity}.{word}"] = column
-    labels = _quantity_labels(flight)
-    for quantity, values in flight.quantities.items():
-        if len(values) == len(flight.time):
-            for word, column in zip(labels.get(quantity, ()), values.T, strict=False):
-                columns[f"{quantity}.{word}" if word else quantity] = column
-    if euler:
-        for quantity in [name.removesuffix(".qx") for name in columns if name.endswith(".qx")]:
-            quaternions = np.column_stack([columns[f"{quantity}.q{axis}"] for axis in "xyzw"])
-            for word, column in zip(("roll", "pitch", "yaw"), _rpy(quaternions), strict=True):
-                columns[f"{quantity}.{word}"] = column
-    made = pd.DataFrame(columns, index=pd.Index(flight.time, name="time"))
-    made.attrs["units"] = {"time": "s"} | {name: _unit(flight, name) for name in columns}
-    return made
-
-
-def dataset(flight: Flight, *, euler: bool = False) -> xr.Dataset:
-    """Return the columns of :func:`table` as variables over time, each with its units.
-
-    Raises
-    ------
-    SpaceRobotError
-        pandas or xarray is not installed.
-    """
-    columns = table(flight, euler=euler)
-    try:
-        import xarray as xr
-    except ImportError:
-        raise SpaceRobotError(
-            "Datasets need xarray, which is not installed: pip install '.[data]' in the clone."
-        ) from None
-    units = columns.attrs["units"]
-    return xr.Dataset(
-        {
-            name: ("time", values.to_numpy(), {"units": units[name]} if units[name] else {})
-            for name, values in columns.items()
-        },
-        {"time": ("time", flight.time, {"units": "s"})},
-        {"scenario": flight.scenario.name, "method": flight.method, "message": flight.message},
-    )
-
-
-def _rpy(quaternions: Array) -> tuple[Array, Array, Array]:
-    """Return the turns (N,) about the fixed axes x, y, z of quaternions (N, 4), rad."""
-    R = matrices_from_quaternions(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
-    pitch = np.arctan2(-R[:, 2, 0], np.hypot(R[:, 0, 0], R[:, 1, 0]))
-    return np.arctan2(R[:, 2, 1], R[:, 2, 2]), pitch, np.arctan2(R[:, 1, 0], R[:, 0, 0])
-
-
-_UNITS = {
-    **{"x": "m", "y": "m", "z": "m", "qx": "", "qy": "", "qz": "", "qw": ""},
-    **{"roll": "rad", "pitch": "rad", "yaw": "rad"},
-    **{"vx": "m/s", "vy": "m/s", "vz": "m/s", "wx": "rad/s", "wy": "rad/s", "wz": "rad/s"},
-    **{"px": "kg m/s", "py": "kg m/s", "pz": "kg m/s"},
-    **{"Lx": "kg m^2/s", "Ly": "kg m^2/s", "Lz": "kg m^2/s", "kinetic_energy": "J"},
-}
-"""Units of the last words of columns."""
-
-
-def _unit(flight: Flight, column: str) -> str:
-    """Return the unit of a column of :func:`table`; empty: none, or none that is known."""
-    quantity, _, word = column.partition(".")
-    kind = quantity.removeprefix("measured_")
-    if kind in ("q", "qdot", "effort"):
-        joints = flight.robot.movable_joints if flight.robot is not None else ()
-        unit = next((joint.unit for joint in joints if joint.name == word), "m or rad")
-        if kind == "effort":
-            return {"m": "N", "rad": "N m"}.get(unit, "N or N m")
-        return unit if kind == "q" else "/s or ".join(unit.split(" or ")) + "/s"
-    of_quantity = {"propellant": "kg", "thruster_on_time": "s", "thruster_force": "N"}
-    return of_quantity.get(quantity) or _UNITS.get(word, "")
-
-
-def _quantity_labels(flight: Flight) -> dict[str, tuple[str, ...]]:
-    """Return the names of the numbers in the other quantities."""
-    names: dict[str, tuple[str, ...]] = {"propellant": ("",), "pose_lost": ("",)}
-    for part in ("measured_pose", "end_effector_pose"):
-        names[part] = _COLUMN_NAMES["pose"]
-    names |= {
-        name: _COLUMN_NAMES["pose"] for name in flight.quantities if name.startswith("pose_of_")
-    }
-    names["measured_twist"] = _COLUMN_NAMES["twist"]
-    names["measured_q"] = names["measured_qdot"] = flight.joint_names
-    for name in ("momentum_expected", "base_wrench_realised"):
-        for field in TOPICS[name].state:
-            names[field.quantity] = tuple(field.entries or field.members)
-    count = flight.quantities.get("thruster_duty", np.zeros((0, 0))).shape[1]
-    for name in ("thruster_on_time", "thruster_duty", "thruster_force"):
-        names[name] = tuple(str(i) for i in range(count))
-    return names
 
 
 def figure(flight: Flight) -> Picture:

@@ -45,7 +45,7 @@ def test_plan_fly_and_plot_in_eight_lines_without_ros() -> None:
     check = (
         "import sys; assert 'rclpy' not in sys.modules\n"
         "assert figure._repr_png_()[:4] == b'\\x89PNG'\n"
-        "assert table.loc[flight.time[-1], 'q.slider_2'] == flight.q[-1, 1]\n"
+        "assert table.loc[flight.time[-1], 'position[slider_2]'] == flight.q[-1, 1]\n"
         "assert abs(flight.time[-1] - schedule.duration) < 1e-9\n"
     )
     done = subprocess.run(

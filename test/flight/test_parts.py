@@ -296,12 +296,12 @@ def test_measured_quantities_are_the_true_ones_where_no_sensor_errs() -> None:
     true = {name: object() for name in ("pose", "twist", "q", "qdot")}
     rest = {"effort": object(), "momentum": object()}
     plain: Any = SimpleNamespace(**true, **rest, quantities={})
-    found: dict[str, Any] = dict(saved._topic_quantities(plain))
+    found: dict[str, Any] = dict(saved.topic_quantities(plain))
     assert {name: found[f"measured_{name}"] for name in true} == true
     assert found["pose"] is true["pose"]
     assert not any(name.startswith("true_") for name in found)
     erring: Any = SimpleNamespace(**true, **rest, quantities={"measured_pose": 1, "measured_q": 2})
-    found = dict(saved._topic_quantities(erring))
+    found = dict(saved.topic_quantities(erring))
     assert (found["measured_pose"], found["measured_q"]) == (1, 2)
     assert found["measured_twist"] is true["twist"]
     assert {name: found[f"true_{name}"] for name in true} == true

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import matplotlib.animation
@@ -12,6 +13,7 @@ import pytest
 from matplotlib.colors import to_hex
 from scipy.spatial.transform import Rotation
 
+from spacerobot_ros import fly, read_bag, read_run
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.flight.flight import Commands, Flight, SentGoal, Signal, goal_at_end
@@ -23,6 +25,7 @@ from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import load_scenario
 
+ROOT = Path(__file__).parents[2]
 ROBOT = load_robot(robot_file("servicer"))
 N = len(ROBOT.joint_names)
 TURN = Rotation.from_rotvec([0.3, -0.2, 0.1])
@@ -77,30 +80,78 @@ def made_flight(name: str = "servicer_thrusters", **changed: Any) -> Flight:
 FLIGHT = made_flight()
 
 
+POSE = [f"position.{axis}" for axis in "xyz"] + [f"orientation.{axis}" for axis in "xyzw"]
+TWIST = [f"{kind}.{axis}" for kind in ("linear", "angular") for axis in "xyz"]
+MOMENTUM = [f"{kind}_{axis}" for kind in ("linear", "angular") for axis in "xyz"]
+
+
+def state_columns(before: str) -> dict[str, list[str]]:
+    """Return the columns of odom and joint_states by quantity, with the words before them."""
+    joints = ROBOT.joint_names
+    prefix = f"{before}." if before else ""
+    quantity = f"{before}_" if before else ""
+    return {
+        f"{quantity}pose": [f"{prefix}pose.pose.{word}" for word in POSE],
+        f"{quantity}twist": [f"{prefix}twist.twist.{word}" for word in TWIST],
+        f"{quantity}q": [f"{prefix}position[{joint}]" for joint in joints],
+        f"{quantity}qdot": [f"{prefix}velocity[{joint}]" for joint in joints],
+    }
+
+
 def test_a_table_names_every_number_and_has_a_row_a_state() -> None:
     table = FLIGHT.to_pandas()
     assert table.index.name == "time"
     assert table.index.tolist() == [0.5, 1.0, 1.75]
-    pose = ["x", "y", "z", "qx", "qy", "qz", "qw"]
-    twist = ["vx", "vy", "vz", "wx", "wy", "wz"]
-    wanted = {
-        "pose": pose,
-        "twist": twist,
-        "momentum": ["px", "py", "pz", "Lx", "Ly", "Lz", "kinetic_energy"],
-        **dict.fromkeys(("q", "qdot", "effort"), ROBOT.joint_names),
-        "measured_pose": pose,
-        "measured_twist": twist,
-        **dict.fromkeys(("measured_q", "measured_qdot"), ROBOT.joint_names),
-        "end_effector_pose": pose,
-        **dict.fromkeys(("thruster_duty", "thruster_on_time", "thruster_force"), "0123"),
+    wanted: dict[str, list[str]] = {
+        **state_columns(""),
+        **state_columns("measured"),
+        "effort": [f"effort[{joint}]" for joint in ROBOT.joint_names],
+        "momentum": [f"momentum.data[{word}]" for word in (*MOMENTUM, "kinetic_energy")],
+        "end_effector_pose": [f"end_effector_pose.pose.{word}" for word in POSE],
+        # The robot has 24 thrusters and the flight four, which have no names.
+        "thruster_duty": [f"thrusters.velocity[{i}]" for i in range(4)],
+        "thruster_on_time": [f"thrusters.position[{i}]" for i in range(4)],
+        "thruster_force": [f"thrusters.effort[{i}]" for i in range(4)],
+        "propellant": ["propellant"],
+        "pose_lost": ["pose_lost"],
     }
-    names = [f"{quantity}.{word}" for quantity, words in wanted.items() for word in words]
-    assert list(table.columns) == [*names, "propellant", "pose_lost"], "a row for every state only"
-    for quantity, words in wanted.items():
-        for k, word in enumerate(words):
-            column = table[f"{quantity}.{word}"].tolist()
-            assert column == FLIGHT.signal(quantity).values[:, k].tolist()
-    assert table["propellant"].tolist() == [0.0, 0.25, 0.625]
+    of_joints = [f"measured.effort[{joint}]" for joint in ROBOT.joint_names]
+    names = [name for each in wanted.values() for name in each]
+    assert sorted(table.columns) == sorted([*names, *of_joints]), "a row for every state only"
+    for quantity, columns in wanted.items():
+        for k, name in enumerate(columns):
+            assert table[name].tolist() == FLIGHT.signal(quantity).values[:, k].tolist()
+
+
+@pytest.mark.parametrize("scenario", ["coordinated_control", "faults/noisy_sensors"])
+def test_a_flight_and_its_bag_have_one_name_and_unit_for_one_number(
+    scenario: str, tmp_path: Path
+) -> None:
+    flight = fly(scenario)
+    flight.save(tmp_path / "flight.mcap")
+    bag = read_bag(tmp_path / "flight.mcap")
+    truth = "_true" if "odom_true" in bag else ""
+    places = {f"odom{truth}": "", f"joint_states{truth}": "", "momentum": "momentum."}
+    if truth:
+        places |= {"odom": "measured.", "joint_states": "measured."}
+    table, dataset = flight.to_pandas(euler=True), flight.to_xarray(euler=True)
+    units, seen = table.attrs["units"], set()
+    for topic, prefix in places.items():
+        recorded, arrays = bag.to_pandas(topic, euler=True), bag.to_xarray(topic, euler=True)
+        own = [str(name) for name in recorded if f"{prefix}{name}" in table]
+        seen |= {prefix + name for name in own}
+        rows = recorded.index
+        for name in own:
+            np.testing.assert_array_equal(recorded[name], table.loc[rows, prefix + name])
+            assert recorded.attrs["units"][name] == units[prefix + name]
+        for name in arrays.data_vars:
+            if prefix + name in dataset:
+                assert dataset[prefix + name].attrs == arrays[name].attrs
+                assert dataset[prefix + name].shape[1:] == arrays[name].shape[1:]
+    joint, kind = flight.joint_names[0], "pose.pose.yaw"
+    assert {f"position[{joint}]", f"velocity[{joint}]", f"effort[{joint}]", kind} <= seen
+    assert units[kind] == "rad"
+    assert {name for name in table.columns if name.startswith(("pose.", "twist."))} <= seen
 
 
 @pytest.mark.parametrize("pushed", [True, False])
@@ -248,35 +299,48 @@ def test_columns_have_units_in_tables_and_datasets() -> None:
     table, dataset = FLIGHT.to_pandas(), FLIGHT.to_xarray()
     units = table.attrs["units"]
     joint = ROBOT.joint_names[0]
-    assert list(units) == ["time", *table.columns]
+    assert list(units) == list(table.columns)
     expected = {
-        **{"time": "s", "pose.x": "m", "pose.qw": "", "twist.wz": "rad/s", "twist.vx": "m/s"},
-        **{"momentum.pz": "kg m/s", "momentum.Lx": "kg m^2/s", "momentum.kinetic_energy": "J"},
-        **{f"q.{joint}": "rad", f"qdot.{joint}": "rad/s", f"effort.{joint}": "N m"},
-        **{f"measured_q.{joint}": "rad", f"measured_qdot.{joint}": "rad/s", "propellant": "kg"},
-        **{"end_effector_pose.z": "m", "thruster_force.1": "N", "thruster_on_time.0": "s"},
-        **{"thruster_duty.0": "", "pose_lost": "", "measured_twist.wx": "rad/s"},
+        **{"pose.pose.position.x": "m", "pose.pose.orientation.w": "1"},
+        **{"twist.twist.angular.z": "rad/s", "twist.twist.linear.x": "m/s"},
+        **{"momentum.data[linear_z]": "kg m/s", "momentum.data[angular_x]": "kg m^2/s"},
+        **{"momentum.data[kinetic_energy]": "J", "propellant": "kg", "pose_lost": ""},
+        **{f"position[{joint}]": "rad", f"velocity[{joint}]": "rad/s", f"effort[{joint}]": "N m"},
+        **{f"measured.position[{joint}]": "rad", "measured.twist.twist.angular.x": "rad/s"},
+        "end_effector_pose.pose.position.z": "m",
     }
     assert {name: units[name] for name in expected} == expected
-    assert set(dataset.data_vars) == set(table.columns)
     assert dataset.time.attrs == {"units": "s"}
-    for name, values in table.items():
-        np.testing.assert_array_equal(dataset[name], values)
-        assert dataset[name].attrs == ({"units": units[name]} if units[name] else {})
-    assert dataset.attrs["scenario"] == "servicer_thrusters"
+    assert dataset["position"].sel(joint=joint).values.tolist() == FLIGHT.q[:, 0].tolist()
+    assert dataset["position"].attrs == {"units": "rad"}
+    assert dataset["momentum.data"].attrs["units"][-1] == "J"
+    np.testing.assert_array_equal(dataset["pose.pose.position.y"], FLIGHT.pose[:, 1])
+    for made in (table, dataset):
+        assert made.attrs["scenario"] == "servicer_thrusters"
+        assert made.attrs["message"] == "The goal is reached."
+
+
+def test_thrusters_have_the_names_of_the_urdf() -> None:
+    flight = read_run(ROOT / "bags" / "servicer_thrusters.mcap")
+    bag = read_bag(ROOT / "bags" / "servicer_thrusters.mcap")
+    found = [name for name in flight.to_pandas() if name.startswith("thrusters.")]
+    recorded = bag.to_pandas("thrusters")
+    assert found == [f"thrusters.{name}" for name in recorded if "[" in name]
+    units = flight.to_pandas().attrs["units"]
+    assert {units[name] for name in found} == {"s", "1", "N"}
 
 
 def test_euler_angles_are_turns_about_fixed_axes_on_request() -> None:
     assert not any(name.endswith(".roll") for name in FLIGHT.to_pandas().columns)
     table = FLIGHT.to_pandas(euler=True)
-    for quantity in ("pose", "measured_pose", "end_effector_pose"):
-        found = table[[f"{quantity}.{word}" for word in ("roll", "pitch", "yaw")]].to_numpy()
-        quaternions = table[[f"{quantity}.q{axis}" for axis in "xyzw"]].to_numpy()
+    for part in ("pose.pose", "measured.pose.pose", "end_effector_pose.pose"):
+        found = table[[f"{part}.{word}" for word in ("roll", "pitch", "yaw")]].to_numpy()
+        quaternions = table[[f"{part}.orientation.{axis}" for axis in "xyzw"]].to_numpy()
         np.testing.assert_allclose(
             found, Rotation.from_quat(quaternions).as_euler("xyz"), atol=1e-12
         )
-    assert table.attrs["units"]["measured_pose.pitch"] == "rad"
-    assert "pose.yaw" in FLIGHT.to_xarray(euler=True)
+    assert table.attrs["units"]["measured.pose.pose.pitch"] == "rad"
+    assert "pose.pose.yaw" in FLIGHT.to_xarray(euler=True)
 
 
 def test_a_flight_says_how_it_ended_in_one_line() -> None:
