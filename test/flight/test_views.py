@@ -144,10 +144,10 @@ def test_a_flight_and_its_bag_have_one_name_and_unit_for_one_number(
         for name in own:
             np.testing.assert_array_equal(recorded[name], table.loc[rows, prefix + name])
             assert recorded.attrs["units"][name] == units[prefix + name]
-        for name in arrays.data_vars:
-            if prefix + name in dataset:
-                assert dataset[prefix + name].attrs == arrays[name].attrs
-                assert dataset[prefix + name].shape[1:] == arrays[name].shape[1:]
+        for array in arrays.data_vars:
+            if f"{prefix}{array}" in dataset:
+                assert dataset[f"{prefix}{array}"].attrs == arrays[array].attrs
+                assert dataset[f"{prefix}{array}"].shape[1:] == arrays[array].shape[1:]
     joint, kind = flight.joint_names[0], "pose.pose.yaw"
     assert {f"position[{joint}]", f"velocity[{joint}]", f"effort[{joint}]", kind} <= seen
     assert units[kind] == "rad"
