@@ -212,6 +212,8 @@ class Episodes:
     """
 
     def __init__(self, config: EpisodeConfig, count: int, *, in_lanes: bool) -> None:
+        if count < 1:
+            raise ParameterError(f"There are {count} environments to make; take at least one.")
         self._config, self._weights = config, RewardWeights.of(config.reward)
         self._source = EpisodeStarts(config)
         scenario, self.robot = self._source.scenario, self._source.robot
@@ -299,7 +301,8 @@ class Episodes:
     ) -> None:
         """Begin the episodes of some rows anew, by the random generators of all rows.
 
-        ``goal`` (goal_size,) replaces the goals that are drawn.
+        ``goal``, one for all (goal_size,) or one for each row (N, goal_size), replaces the goals
+        that are drawn.
 
         Raises
         ------
@@ -307,6 +310,7 @@ class Episodes:
             A draw or the goal is refused.
         """
         chosen = np.asarray(rows, dtype=np.int64)
+        given = None if goal is None else self._checked_goals(goal)
         drawn = [self._source.draw(generators[row]) for row in chosen.tolist()]
         starts = Starts(
             *(
@@ -317,8 +321,8 @@ class Episodes:
         masses = [each.inertial for each in drawn if each.inertial is not None]
         self._flights.reset(chosen, starts, InertialParameters.stacked(masses) if masses else None)
         for row, each in zip(chosen.tolist(), drawn, strict=True):
-            if goal is not None:
-                self._goals[row] = self._checked_goal(goal)
+            if given is not None:
+                self._goals[row] = given[row]
             elif self._goals_of_scenario:
                 self._goals[row] = self._goal_of(each.scenario)
             else:
@@ -328,19 +332,21 @@ class Episodes:
         self.rewards[chosen] = 0.0
         self._observe()
 
-    def _checked_goal(self, goal: Any) -> Array:
-        values = np.asarray(goal, dtype=float)
-        if values.shape != (self.task.goal_size,) or not np.isfinite(values).all():
+    def _checked_goals(self, goal: Any) -> Array:
+        """Return the given goals (N, goal_size) of all rows."""
+        values, count, size = np.asarray(goal, dtype=float), len(self._goals), self.task.goal_size
+        if values.shape not in ((size,), (count, size)) or not np.isfinite(values).all():
             raise ParameterError(
-                f"The goal has {values.size} numbers; task '{self.task.name}' takes "
-                f"{self.task.goal_size} finite ones."
+                f"The goal is {values.shape}; task '{self.task.name}' takes {size} finite numbers, "
+                f"or ({count}, {size}) for the robots one by one."
             )
-        size = np.linalg.norm(values)
+        goals = np.broadcast_to(values, (count, size))
         if isinstance(self.task, Reorient):
-            if size < 1e-3:
+            sizes = np.linalg.norm(goals, axis=1, keepdims=True)
+            if sizes.min() < 1e-3:
                 raise ParameterError("The goal is a quaternion of zeros, which is no attitude.")
-            return np.asarray(values / size)
-        return values
+            return np.asarray(goals / sizes)
+        return goals
 
     def _goal_of(self, scenario: Scenario) -> Array:
         if isinstance(self.task, Reorient):

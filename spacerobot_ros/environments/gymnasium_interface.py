@@ -15,6 +15,7 @@ import_gymnasium()  # Says how to install it where it is missing.
 import gymnasium  # noqa: E402
 from gymnasium.error import ResetNeeded  # noqa: E402
 from gymnasium.spaces import Box  # noqa: E402
+from gymnasium.utils import EzPickle  # noqa: E402
 from gymnasium.utils.seeding import np_random  # noqa: E402
 from gymnasium.vector import AutoresetMode, VectorEnv  # noqa: E402
 from gymnasium.vector.utils import batch_space  # noqa: E402
@@ -27,22 +28,36 @@ def _spaces(episodes: Episodes) -> tuple[Any, Any]:
     return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, size, dtype=np.float64)
 
 
+def _require_no_rendering(render_mode: str | None) -> None:
+    """Refuse a render mode by the error after which libraries make environments without one."""
+    if render_mode is not None:
+        raise TypeError(
+            f"There is no render_mode '{render_mode}': environments are not rendered; leave it out."
+        )
+
+
 def _goal_in(options: dict[str, Any] | None) -> Any:
     return None if options is None else options.get("goal")
 
 
-class SpaceRobotEnv(gymnasium.Env):
+class SpaceRobotEnv(gymnasium.Env, EzPickle):
     """One robot; its step is that of the plant. The arguments are those of `EpisodeConfig`.
+
+    A copy, by pickle too, has the arguments and begins anew.
 
     Raises
     ------
     ParameterError
         An argument is refused.
+    TypeError
+        A render mode is given.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
-    def __init__(self, **arguments: Any) -> None:
+    def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
+        _require_no_rendering(render_mode)
+        EzPickle.__init__(self, **arguments)
         self.episodes = Episodes(EpisodeConfig.of(arguments), 1, in_lanes=False)
         self.observation_space, self.action_space = _spaces(self.episodes)
 
@@ -68,10 +83,11 @@ class SpaceRobotEnv(gymnasium.Env):
         return {"error": float(self.episodes.errors[0])}
 
 
-class SpaceRobotVectorEnv(VectorEnv):
+class SpaceRobotVectorEnv(VectorEnv, EzPickle):
     """Many robots in SIMD lanes, each with the episodes of :class:`SpaceRobotEnv`.
 
-    Lane i of a seed s has the episodes of one environment with the seed s + i.
+    Lane i of a seed s has the episodes of one environment with the seed s + i. A copy, by pickle
+    too, has the arguments and begins anew.
 
     Parameters
     ----------
@@ -86,14 +102,20 @@ class SpaceRobotVectorEnv(VectorEnv):
     ------
     ParameterError
         An argument is refused.
+    TypeError
+        A render mode is given.
     """
 
     def __init__(
         self,
         num_envs: int = 1,
         autoreset_mode: Any = AutoresetMode.NEXT_STEP,
+        *,
+        render_mode: str | None = None,
         **arguments: Any,
     ) -> None:
+        _require_no_rendering(render_mode)
+        EzPickle.__init__(self, num_envs, autoreset_mode, **arguments)
         self.num_envs, self.render_mode = num_envs, None
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
@@ -125,7 +147,7 @@ class SpaceRobotVectorEnv(VectorEnv):
     ) -> tuple[Any, dict[str, Any]]:
         """Begin all episodes, or those of ``options["reset_mask"]`` (num_envs,) alone.
 
-        ``options["goal"]`` replaces the goals that are drawn.
+        ``options["goal"]``, one for all or one for each robot, replaces the goals that are drawn.
         """
         mask = np.ones(self.num_envs, dtype=np.bool_)
         if options is not None and "reset_mask" in options:

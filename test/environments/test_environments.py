@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +16,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+from scipy.spatial.transform import Rotation
 
 import spacerobot_ros.environments
 from spacerobot_ros.environments.episodes import EpisodeConfig, Episodes
@@ -281,8 +285,11 @@ def test_bad_actions_goals_and_masks_are_refused() -> None:
     ):
         with pytest.raises(CommandError, match=message):
             vector.step(actions)
-    with pytest.raises(ParameterError, match="The goal has 3 numbers; task 'reorient' takes 4"):
-        vector.reset(options={"goal": [0, 0, 0]})
+    for goal in ([0, 0, 0], np.ones((3, 4)), [0, 0, 0, np.nan]):
+        with pytest.raises(ParameterError, match=r"The goal is .*; task 'reorient' takes 4 finite"):
+            vector.reset(options={"goal": goal})
+    with pytest.raises(ParameterError, match="There are 0 environments to make"):
+        gymnasium.make_vec(ARM, num_envs=0, scenario="planar_chain")
     with pytest.raises(ParameterError, match="a quaternion of zeros"):
         vector.reset(options={"goal": [0, 0, 0, 0]})
     for mask in (np.zeros(2, dtype=bool), np.ones(3, dtype=bool), np.ones(2)):
@@ -369,3 +376,57 @@ def test_registering_twice_changes_nothing_and_a_missing_package_is_named(
     monkeypatch.setitem(__import__("sys").modules, "gymnasium", None)
     with pytest.raises(SpaceRobotError, match=r"pip install '\.\[rl\]' in the clone"):
         import_gymnasium()
+
+
+def test_each_robot_may_have_a_goal_of_its_own() -> None:
+    vector: Any = gymnasium.make_vec(ARM, num_envs=3, scenario="planar_chain")
+    angles = np.array([0.1, -0.2, 0.3])
+    goals = [quaternion_from_rotvec([0.0, 0.0, angle]) for angle in angles]
+    observations, infos = vector.reset(seed=1, options={"goal": goals})
+    np.testing.assert_allclose(observations[:, 2], angles, atol=1e-12)
+    mask = np.array([False, True, False])
+    goals = [quaternion_from_rotvec([0.0, 0.0, angle]) for angle in (0.4, 0.5, 0.6)]
+    observations, infos = vector.reset(options={"goal": goals, "reset_mask": mask})
+    np.testing.assert_allclose(observations[:, 2], [0.1, 0.5, 0.3], atol=1e-12)
+    assert infos["error"][1] == pytest.approx(0.5)
+
+
+@pytest.mark.usefixtures("strict")
+def test_copies_have_the_arguments_and_begin_anew() -> None:
+    for environment in (gymnasium.make(ARM, **SHORT), gymnasium.make_vec(ARM, num_envs=2, **SHORT)):
+        wanted = environment.reset(seed=3)[0]
+        copies = copy.deepcopy(environment), pickle.loads(pickle.dumps(environment))
+        for each in copies:
+            np.testing.assert_array_equal(each.reset(seed=3)[0], wanted)
+            here, there = (of.unwrapped.episodes for of in (each, environment))
+            assert here.step_duration == there.step_duration
+            assert here is not there
+
+
+def test_environments_are_made_without_rendering_alone() -> None:
+    # Libraries pass it always, and leave it out after a TypeError.
+    for make in (gymnasium.make, gymnasium.make_vec):
+        make(ARM, scenario="planar_chain", render_mode=None)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Gymnasium may tell it before.
+            with pytest.raises(TypeError, match="There is no render_mode 'human'"):
+                make(ARM, scenario="planar_chain", render_mode="human")
+
+
+def test_the_campaign_of_the_page_draws_masses_starts_and_goals(tmp_path: Path) -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs/environments.md").read_text("utf-8")
+    (text,) = re.findall(r"```yaml\n(campaign:.*?)```", page, re.DOTALL)
+    (file := tmp_path / "arm.yaml").write_text(text.replace("5000", "20"), "utf-8")
+    config = EpisodeConfig("reorient", campaign=str(file))
+    episodes = Episodes(config, 8, in_lanes=False)
+    episodes.begin(range(8), [np.random.default_rng(seed) for seed in range(8)])
+    robot, flights = episodes.robot, episodes.flights
+    masses = flights._flights.inertial
+    assert masses is not None
+    share = masses.masses / robot.inertial.masses
+    elbows = flights.q[:, robot.joint_names.index("elbow_pitch")] - np.pi / 2
+    goal = Rotation.from_quat(load_scenario("arm_attitude").goal.quaternion)
+    turns = (goal.inv() * Rotation.from_quat(episodes.goals)).as_rotvec()
+    np.testing.assert_allclose(turns[:, :2], 0.0, atol=1e-12)
+    for values, low, high in ((share, 0.9, 1.1), (elbows, -0.3, 0.3), (turns[:, 2], -0.05, 0.05)):
+        assert low <= values.min() < low + (high - low) / 2 < values.max() <= high
