@@ -171,6 +171,7 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         f"momentum    {drift} {summary['linear_momentum_drift']:.1e} kg m/s and "
         f"{summary['angular_momentum_drift']:.1e} kg m^2/s",
         *_propellant_line(summary),
+        *_capture_line(summary),
         *_clearance_line(summary),
         f"bag         {summary['bag']} ({summary['messages_recorded']} messages)",
     ]
@@ -218,6 +219,14 @@ def _end_effector_errors(summary: dict[str, Any], distance: float, angle: float 
 def _propellant_line(summary: dict[str, Any]) -> list[str]:
     used = summary.get("propellant_kg")
     return [] if used is None else [f"propellant  {1e3 * used:.1f} g"]
+
+
+def _capture_line(summary: dict[str, Any]) -> list[str]:
+    if "capture" not in summary:
+        return []
+    capture = summary["capture"]
+    done = f"at {capture['time_s']:.6g} s" if capture["captured"] else "the target is not captured"
+    return [f"capture     {done}"]
 
 
 def _clearance_line(summary: dict[str, Any]) -> list[str]:

@@ -74,7 +74,16 @@ def verdict_of(flight: Flight) -> Verdict:
             f"The measured pose is within tolerance of the goal; the true one is {errors}.",
             complete=False,
         )
-    return Verdict(word, f"The goal is reached: {errors}.", complete=not left_out)
+    missed = _missed_capture(flight)
+    if missed:
+        word += ", but the target is not captured"
+    return Verdict(word, f"The goal is reached: {errors}.", complete=not (left_out or missed))
+
+
+def _missed_capture(flight: Flight) -> bool:
+    """Whether the plant was to capture the target by itself, and has not."""
+    automatic = flight.scenario.plant.capture.mode == "automatic"
+    return automatic and flight.capture == {"captured": False}
 
 
 def _last_error(flight: Flight) -> PoseError | None:

@@ -62,6 +62,11 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         rows.append((_momentum_label(flight), *values))
     if (propellant := flight.flight.propellant) is not None:
         rows.append(("Propellant", f"{1e3 * propellant:.3g} g", ""))
+    if capture := flight.flight.capture:
+        about = flight.flight.capture_measures
+        done = f"at {about.time:.4g} s" if capture["captured"] else "no"
+        nearest = "" if math.isnan(about.distance) else f"{about.distance:.3g} m from the grapple"
+        rows.append(("Target captured", done, nearest))
     if len(flight.position) > 1:
         time = flight.position.time
         rows.append(("Recorded", f"{len(time) - 1} ticks", f"{time[-1] - time[0]:.6g} s"))

@@ -153,6 +153,20 @@ def test_end_effector_and_propellant_have_lines_where_there_are_some(
     assert "propellant  0.0 g" in run(monkeypatch, SUMMARY | {"propellant_kg": 0.0}, *GOAL).stdout
 
 
+@pytest.mark.parametrize(
+    ("capture", "line"),
+    [
+        ({"captured": True, "time_s": 1.25}, "capture     at 1.25 s"),
+        ({"captured": False}, "capture     the target is not captured"),
+    ],
+)
+def test_the_capture_of_a_target_has_a_line(
+    monkeypatch: pytest.MonkeyPatch, capture: dict[str, Any], line: str
+) -> None:
+    lines = run(monkeypatch, SUMMARY | {"capture": capture}, *GOAL).stdout.splitlines()
+    assert lines[-3] == line
+
+
 def test_each_end_effector_has_its_errors_with_their_tolerances(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -22,9 +22,11 @@ from spacerobot_ros.flight.captures import (
     payload_estimates,
 )
 from spacerobot_ros.flight.flight import Flight, Signal
-from spacerobot_ros.flight.reading import read_run
+from spacerobot_ros.flight.reading import open_flight_bag, read_run
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.payload_estimation import PAYLOAD_PARAMETERS, payload_parameters
+from spacerobot_ros.report.flight import FlightReport
+from spacerobot_ros.report.tables import headline
 
 BAGS = Path(__file__).parents[2] / "bags"
 
@@ -231,3 +233,27 @@ def test_loads_from_outside_are_not_taken_for_a_body(capture: Flight) -> None:
         )
     assert payload_estimates(replace(capture, robot=None)) == ()
     assert payload_estimates(replace(capture, events=(loaded,))) == ()
+
+
+def test_a_goal_without_its_automatic_capture_is_not_complete(capture: Flight) -> None:
+    assert (capture.verdict.word, capture.verdict.complete) == ("Reached", True)
+    missed = replace(capture, events=())
+    assert missed.verdict.word == "Reached, but the target is not captured"
+    assert not missed.verdict.complete
+    # A target that is captured on request alone may be left where it is.
+    by_hand = capture.scenario.with_overrides("plant", {"capture.mode": "manual"})
+    assert replace(missed, scenario=by_hand).verdict.complete
+
+
+def test_a_report_has_a_card_of_the_capture() -> None:
+    report = FlightReport.of(open_flight_bag(BAGS / "capture.mcap"))
+    cards = {label: (value, note) for label, value, note in headline(report)}
+    value, note = cards["Target captured"]
+    (time,) = [each.time_s for each in report.flight.events if each.kind is EventKind.CAPTURED]
+    assert value == f"at {time:.4g} s"
+    assert float(note.split(" m from the grapple")[0]) < 0.02
+    report = replace(report, flight=replace(report.flight, events=()))
+    cards = {label: value for label, value, _ in headline(report)}
+    assert cards["Target captured"] == "no"
+    without = FlightReport.of(open_flight_bag(BAGS / "servicer.mcap"))
+    assert "Target captured" not in {label for label, _, _ in headline(without)}
