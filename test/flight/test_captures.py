@@ -253,7 +253,6 @@ def test_a_report_has_a_card_of_the_capture() -> None:
     assert value == f"at {time:.4g} s"
     assert float(note.split(" m from the grapple")[0]) < 0.02
     report = replace(report, flight=replace(report.flight, events=()))
-    cards = {label: value for label, value, _ in headline(report)}
-    assert cards["Target captured"] == "no"
+    assert ("Target captured", "no") in {card[:2] for card in headline(report)}
     without = FlightReport.of(open_flight_bag(BAGS / "servicer.mcap"))
     assert "Target captured" not in {label for label, _, _ in headline(without)}
