@@ -328,6 +328,7 @@ def test_a_controller_is_preempted_and_cancelled(harness: Harness, kind: str) ->
 def test_goals_that_are_refused_have_a_result(harness: Harness) -> None:
     flight = ActionFlight(harness)
     flight.start()
+    joints = JointState(name=["slider_1"], position=[0.1])
     for fields, words in (
         ({}, "The goal is empty"),
         (base_at(goal_at(NEAR, frame="moon")), "'moon'"),
@@ -335,6 +336,11 @@ def test_goals_that_are_refused_have_a_result(harness: Harness) -> None:
         ({**base_at(goal_at(NEAR)), "time_limit": Duration(sec=-1)}, "time limit"),
         ({"end_effectors": ["hand"], "end_effector_poses": [goal_at(NEAR)]}, "'hand'"),
         ({"end_effectors": ["hand"]}, "1 end-effector(s) and 0 pose(s)"),
+        ({"joint_positions": joints}, "The goal has joint positions alone: give it a pose"),
+        (
+            {**base_at(goal_at(NEAR)), "joint_positions": JointState(position=[0.1])},
+            "0 name(s) and 1",
+        ),
     ):
         sent = flight.fly_to.send(**fields)
         assert flight.check(sent) == "refused"

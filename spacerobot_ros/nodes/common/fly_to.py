@@ -105,17 +105,24 @@ class FlyToAction(GoalAction):
                 f"The goal has {len(links)} end-effector(s) and {len(poses)} pose(s) for them: "
                 "give each its pose."
             )
-        if not links and not request.base_pose:
+        joints = request.joint_positions
+        if len(joints.name) != len(joints.position):
             raise PlanningError(
-                "The goal is empty: give it a pose of the base, or poses of end-effectors."
+                f"The joint positions of the goal are {len(joints.name)} name(s) and "
+                f"{len(joints.position)} position(s): give each joint its position."
+            )
+        if not links and not request.base_pose:
+            alone = "has joint positions alone" if joints.name else "is empty"
+            raise PlanningError(
+                f"The goal {alone}: give it a pose of the base, or poses of end-effectors."
             )
         shape = None
-        if request.joint_positions.name:
+        if joints.name:
             if surroundings.joint_names is None:
                 raise PlanningError(
                     "The goal has joint positions, and there is no robot on robot_description yet."
                 )
-            shape = shape_of(request.joint_positions, surroundings.joint_names)
+            shape = shape_of(joints, surroundings.joint_names)
         goal, frame, pose_of = None, surroundings.world_frame, surroundings.pose_of
         if request.base_pose:
             goal = goal_of(request.base_pose[0], frame, _OF_BASE, shape, pose_of)
