@@ -79,6 +79,39 @@ def test_pairs_get_room_and_more_by_what_they_lacked() -> None:
     assert kept(library(), turn_is_known=False).copy()._turn_is_known is False
 
 
+def test_pairs_that_rows_underestimate_spend_room() -> None:
+    """Where rows say less than the distance is, they need less room by as much."""
+    among = library(Rows(0.01), Rows(0.1), Rows(0.02), Rows(1.0, of_obstacles=True), Rows(1.0))
+    required = np.array([0.01, 0.02, 0.03, 0.04, 0.05])
+    boundary = BoundaryConditions(START, TURN.as_quat(), START, FINAL, state=STATE)
+    pairs: Any = KeptDistances(among, boundary, required, turn_is_known=True)
+    shape, asked = np.array([0.5, 0.4]), list[Any]()
+
+    def approaches(positions: Array, wanted: Array, base: Any) -> list[Any]:
+        asked.append((positions, wanted, base))
+        # Rows say 0.009, 0.09, 0.018, and 0.9 of the obstacle and of the pair that is not kept.
+        distances = [0.03, 0.088, 0.019, 0.05, 0.06]
+        return [
+            SimpleNamespace(pair=pair, distance=d, shape=shape) for pair, d in enumerate(distances)
+        ]
+
+    among.clearance.approaches = approaches
+    among.base_poses = lambda *_: "base"
+    pairs.add([near(pair, 0.0) for pair in range(4)])
+    positions = np.array([START, FINAL])
+    assert pairs.spend_room(positions, np.array([IDENTITY, TURN.as_quat()])) is True
+    # The second one is nearer than its rows say, and the third farther by 1 mm, less than the room.
+    expected = {0: 0.009 - 0.03 + 0.002, 1: 0.002, 2: 0.002, 3: 0.002}
+    assert pairs._room == pytest.approx(expected)
+    ((looked_at, wanted, base),) = asked
+    assert looked_at is positions
+    np.testing.assert_allclose(wanted, required + 0.05)
+    assert base == "base"
+    # The same again spends nothing more.
+    assert pairs.spend_room(positions, np.array([IDENTITY, TURN.as_quat()])) is False
+    assert pairs._room == pytest.approx(expected)
+
+
 def test_limits_are_the_required_distances_and_their_room_but_at_the_ends() -> None:
     pairs = kept(library(Rows(1.0), Rows(0.2), Rows(9.0), Rows(9.0)))
     pairs.add([near(0, 0.0), near(1, 0.0), near(3, 0.0)])

@@ -66,10 +66,19 @@ def _scripted_guesses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Kept:
-    """Pairs that are kept apart; distances of manoeuvres by their duration."""
+    """Pairs that are kept apart; distances of manoeuvres by their duration.
 
-    def __init__(self, distances: dict[float, list[float]], rooms: dict[int, int]) -> None:
-        self.distances, self.rooms = distances, rooms
+    ``too_far``: the pairs that keep more distance than they need to, by the duration.
+    """
+
+    def __init__(
+        self,
+        distances: dict[float, list[float]],
+        rooms: dict[int, int],
+        too_far: dict[float, list[int]] | None = None,
+    ) -> None:
+        self.distances, self.rooms, self.too_far = distances, rooms, too_far or {}
+        self.spent: list[float] = []
 
     @property
     def pairs(self) -> tuple[int, ...]:
@@ -89,11 +98,19 @@ class Kept:
         self.rooms |= other.rooms
 
     def copy(self) -> Kept:
-        return Kept(self.distances, dict(self.rooms))
+        return Kept(self.distances, dict(self.rooms), self.too_far)
 
     def add(self, near: Sequence[Approach]) -> None:
         for each in near:
             self.rooms[each.pair] = self.rooms.get(each.pair, 0) + 1
+
+    def spend_room(self, positions: Array, _: Array) -> bool:
+        duration = round((len(positions) - 1) * PERIOD, 6)
+        self.spent.append(duration)
+        less = self.too_far.get(duration, [])
+        for pair in less:
+            self.rooms[pair] -= 1
+        return bool(less)
 
     def within(self, limits: MotionLimits) -> MotionLimits:
         return replace(limits, distances=np.array([float(self.rooms[p]) for p in self.pairs]))
@@ -158,6 +175,31 @@ def test_a_shallow_contact_is_solved_for_on_the_full_grid_with_a_pair_more_each_
     assert [each.kept_apart for each in found] == [2, 0]
     # Pairs of one manoeuvre are not those of the next.
     assert kept.rooms == {}
+
+
+@pytest.mark.parametrize(
+    ("solutions", "rooms", "expected"),
+    [
+        # Too near, so it gets room again; then farther than it need, and a third solution.
+        ([8.5, 8.6, 8.3], [[2, 1], [3, 2], [3, 1]], 8.3),
+        ([8.5, 8.6, 8.56], [[2, 1], [3, 2], [3, 1]], 8.6),
+        # Not a period faster than the best one; none; no more rooms to spend.
+        ([8.79], [[2, 1]], 8.8),
+        ([None], [[2, 1]], 8.8),
+        ([8.4], [[2, 1]], 8.4),
+    ],
+)
+def test_a_manoeuvre_that_keeps_more_distance_than_it_needs_to_is_made_faster(
+    model: ManoeuvreModel, solutions: list[float | None], rooms: list[list[int]], expected: float
+) -> None:
+    kept = Kept({8.5: [0.009, 0.008]}, {0: 2, 1: 2}, {8.8: [1], 8.6: [1]})
+    search = Apart(model, kept, n40=solutions)
+    asked = progress(kept, iterations=90)
+    found = search._make_closer(asked, made(8.8), 40)
+    assert found.duration == pytest.approx(expected)
+    calls = search.scripted[40].calls
+    assert [list(call.limits.distances) for call in calls] == rooms
+    assert kept.rooms == {0: 2, 1: 2}
 
 
 def test_no_slower_manoeuvre_is_freed_than_the_first(model: ManoeuvreModel) -> None:

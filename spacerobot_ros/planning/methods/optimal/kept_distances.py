@@ -33,6 +33,9 @@ _ROOM = 2e-3
 
 _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
+_WIDE = 0.05
+"""Distance beyond the clearance at which the rows of a pair are no longer compared with it, m."""
+
 _AT_ENDS = 1e-4
 """Least room at the ends, where the shape is given, m."""
 
@@ -177,6 +180,24 @@ class KeptDistances:
         for each in near:
             lacking = self._required[each.pair] - each.distance if each.pair in self._room else 0.0
             self._room[each.pair] = self._room.get(each.pair, 0.0) + max(lacking, 0.0) + _ROOM
+
+    def spend_room(self, positions: Array, turns: Array) -> bool:
+        """Give pairs as much room as the rows are wrong by where they are nearest along held
+        commands, (N + 1, n) and (N + 1, 4); return whether any gets less than it had.
+        """
+        library, base = self._library, self._library.base_poses(self._boundary, positions, turns)
+        spent = False
+        for each in library.clearance.approaches(positions, self._required + _WIDE, base):
+            if each.pair not in self._room:
+                continue
+            (rows,) = library.of([each.pair])
+            if rows.of_obstacles:
+                continue
+            value = float(rows.values(each.shape[:, np.newaxis]).full().min())
+            room = value - each.distance + _ROOM
+            if room < self._room[each.pair] - _ROOM:
+                self._room[each.pair], spent = room, True
+        return spent
 
     def within(self, limits: MotionLimits) -> MotionLimits:
         """Return limits with the distances that the rows keep."""

@@ -113,8 +113,11 @@ _COASTING_ANGLE = math.radians(5.0)
 _COASTING_TURNS = 4.0
 """Turns of the base for which it coasts at most."""
 
-_MOST_PASSES = 10
+_MOST_PASSES = 3
 """Passes of the goal that are tried."""
+
+_STARTS_TO_PASS = 8
+"""Guesses of the turn at zero momentum that is left at a pass."""
 
 _LONGEST_PASS = 2.5
 """Longest time of a manoeuvre that ends at a pass, as multiple of that at zero momentum."""
@@ -563,7 +566,8 @@ class OptimalGait(GaitMethod):
         h = self.control_period
         there, aimed = self._later(request, boundary, coast, end)
         at_rest = replace(aimed, angular_momentum=np.zeros(3))
-        free = self._begin_now(there, at_rest, limits, chosen, cancellation)
+        few = replace(chosen, starts=min(chosen.starts, _STARTS_TO_PASS))
+        free = self._begin_now(there, at_rest, limits, few, cancellation)
         guess = SolutionLibrary("", at_rest.turn[np.newaxis], free.positions[np.newaxis])
         takes = len(free.positions) - 1
         begin = max(0, end - takes)

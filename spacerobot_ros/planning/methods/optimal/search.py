@@ -22,6 +22,7 @@ from functools import partial
 
 import numpy as np
 
+from spacerobot_ros.collision import Approach
 from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -92,6 +93,9 @@ coarse grid underestimates some costs by more than others."""
 
 _MAX_ITERATIONS_APART = 80
 """Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most."""
+
+_ROUNDS_CLOSER = 3
+"""Solutions by which a manoeuvre is made to keep no more distance than is asked for."""
 
 _DISTANCE_INSTANTS = 80
 """Instants of a manoeuvre at which links are kept apart on a grid at least: between the knots of a
@@ -401,16 +405,18 @@ class ManoeuvreSearch:
         coarser = intervals // _COARSE_GRID_RATIO
         # On a coarse grid the attitude of a robot that drifts is too far off.
         on_full_grid = progress.boundary.drifts or coarser < _MIN_COARSE_INTERVALS
+        iterations = min(progress.options.iterations, _MAX_ITERATIONS_APART)
+        brief = replace(progress, options=replace(progress.options, iterations=iterations))
         if near[0].distance > _DEEP_CONTACT or on_full_grid:
-            return self._clear_on_grid(progress, manoeuvre, intervals, TOLERANCE)
+            clear = self._clear_on_grid(progress, manoeuvre, intervals, TOLERANCE)
+            return self._make_closer(brief, clear, intervals)
         # The way round is far: it is found on a coarse grid first.
         clear = self._clear_on_grid(progress, manoeuvre, coarser, _COARSE_TOLERANCE)
         try:
-            iterations = min(progress.options.iterations, _MAX_ITERATIONS_APART)
-            brief = replace(progress, options=replace(progress.options, iterations=iterations))
             refined = self._clear_on_grid(brief, clear, intervals, TOLERANCE)
         except CandidateError:
             return clear
+        refined = self._make_closer(brief, refined, intervals)
         return min(refined, clear, key=lambda one: one.duration)
 
     def _clear_on_grid(
@@ -437,6 +443,32 @@ class ManoeuvreSearch:
             if not near:
                 return replace(made, kept_apart=len(kept.pairs))
         raise CandidateError(kept.message(near[0], self._period))
+
+    def _make_closer(self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int) -> Manoeuvre:
+        """Return a faster manoeuvre near to one that keeps clear by more than it needs to, as rows
+        are not exact; that one, where none is found.
+        """
+        assert progress.kept is not None
+        kept, best = progress.kept.copy(), manoeuvre
+        near: list[Approach] = []
+        for _ in range(_ROUNDS_CLOSER):
+            held = manoeuvre.held
+            if near:
+                kept.add(near)
+            elif not kept.spend_room(held.positions, held.quaternions):
+                break
+            closer = replace(progress, kept=kept)
+            try:
+                solution = self._solve_apart(closer, manoeuvre.solution, intervals)
+                if solution.duration > best.duration - self._period:
+                    break
+                manoeuvre = self._make_held_commands(closer, solution)
+            except CandidateError:
+                break
+            near = kept.approaches(manoeuvre.held.positions, manoeuvre.held.quaternions)
+            if not near and manoeuvre.duration < best.duration:
+                best = replace(manoeuvre, kept_apart=len(kept.pairs))
+        return best
 
     def _solve_apart(
         self,
