@@ -53,6 +53,8 @@ _MAX_BADNESS = 100.0
 _MAX_HISTOGRAMS, _MAX_SCATTER_PLOTS = 9, 6
 """Largest numbers of metrics with a histogram and of drivers with a plot."""
 
+NO_DRIVERS = "no correlation is beyond chance (p < 0.05, corrected for all of them)."
+
 Flags = npt.NDArray[np.bool_]
 
 _QUANTILES_SHOWN = (0.01, 0.5, 0.99)
@@ -253,11 +255,17 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
         for outcome, count, message in messages_of(results)
         if message and outcome in (ERROR, Outcome.REFUSED, Outcome.ABORTED)
     ]
-    drivers = results.influences()
-    of_passing = [each for each in drivers if each.metric == PASSING]
-    for each in (of_passing + [each for each in drivers if each.metric != PASSING])[:3]:
-        lines.append(f"driver      {each}")
+    found = results.influences()
+    drivers = [each for each in found if each.beyond_chance]
+    lines += [f"driver      {each}" for each in _passing_first(drivers)[:3]]
+    if found and not drivers:
+        lines.append(f"driver      none: {NO_DRIVERS}")
     return lines
+
+
+def _passing_first(found: Sequence[Influence]) -> list[Influence]:
+    """Return sensitivities in their order, those of passing before the others."""
+    return sorted(found, key=lambda each: each.metric != PASSING)
 
 
 def messages_of(results: Results) -> list[tuple[str, int, str]]:
@@ -329,8 +337,7 @@ def _page_body(results: Results) -> list[str]:
             _scatter_section(results, found),
             "<h2>The worst flights</h2>",
             _worst_flights_section(results),
-            "<h2>Convergence</h2>",
-            _convergence_section(results),
+            *_convergence_section(results),
             "<h2>Dispersions</h2>",
             _dispersions_section(campaign),
         ]
@@ -449,8 +456,7 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
         return '<p class="missing">No drawn number varies with a metric.</p>'
     sobol = any(each.total is not None for each in found)
     rows = []
-    of_passing = [each for each in found if each.metric == PASSING]
-    for each in [*of_passing, *(each for each in found if each.metric != PASSING)][:15]:
+    for each in _passing_first(found)[:15]:
         cells = [each.cause, each.metric, f"{each.correlation:+.3f}", f"{each.p:.2g}"]
         cells += [f"{each.departure:+.3f}", f"{each.p_departure:.2g}"]
         if sobol:
@@ -471,6 +477,8 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
     note += "that grows to both sides correlates with the distance of the draw from its median."
     if not sobol:
         note += " The sampler 'saltelli' adds Sobol indices."
+    if not any(each.beyond_chance for each in found):
+        note += f" Here {NO_DRIVERS}"
     return f'<p class="facts">{escape(note)}</p>' + table("drivers", head, rows)
 
 
@@ -490,7 +498,7 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
         panel.set_xlabel(each.cause)
         panel.set_ylabel(metric_label(each.metric))
         panel.locator_params(axis="x", nbins=5)
-    caption = "The strongest drivers; orange: flights that did not pass."
+    caption = "The strongest correlations; orange: flights that did not pass."
     return picture_part(figure, "scatter", caption)
 
 
@@ -506,9 +514,12 @@ def _worst_flights_section(results: Results) -> str:
     return table("worst", head, rows)
 
 
-def _convergence_section(results: Results) -> str:
+def _convergence_section(results: Results) -> list[str]:
+    """Return a heading with a figure; nothing of so few flights that it would have one point."""
     count = len(results)
     at = np.unique(np.geomspace(min(10, count), count, 60).astype(int))
+    if len(at) < 2:
+        return []
     passed = np.cumsum(results.passed)
     shares = [share(int(passed[k - 1]), int(k)) for k in at]
     figure, axes = figure_with_axes(2, 2, 2.4)
@@ -536,9 +547,8 @@ def _convergence_section(results: Results) -> str:
         panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         panel.xaxis.set_minor_formatter(NullFormatter())
-    return picture_part(
-        figure, "convergence", "Convergence of the numbers with the number of flights."
-    )
+    caption = "Convergence of the numbers with the number of flights."
+    return ["<h2>Convergence</h2>", picture_part(figure, "convergence", caption)]
 
 
 def _dispersions_section(campaign: Campaign) -> str:

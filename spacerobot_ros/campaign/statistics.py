@@ -59,6 +59,10 @@ def share(count: int, total: int) -> Share:
     )
 
 
+_SIGNIFICANCE = 0.05
+"""Largest probability of what is called a driver, after the correction for many tests."""
+
+
 @dataclass(frozen=True)
 class Influence:
     """Sensitivity of a metric to a dispersion.
@@ -86,6 +90,14 @@ class Influence:
     p_departure: float = 1.0
     first: tuple[float, float] | None = None
     total: tuple[float, float] | None = None
+
+    @property
+    def beyond_chance(self) -> bool:
+        """Whether the total index, or else the larger correlation, is unlikely to be by chance."""
+        if self.total is not None:
+            return self.total[0] > self.total[1]
+        p = self.p if abs(self.correlation) >= abs(self.departure) else self.p_departure
+        return p < _SIGNIFICANCE
 
     @property
     def strength(self) -> float:

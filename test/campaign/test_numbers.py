@@ -97,6 +97,21 @@ def test_what_is_said_of_an_influence() -> None:
     assert (bare.departure, bare.p_departure, bare.first, bare.total) == (0.0, 1.0, None, None)
 
 
+@pytest.mark.parametrize(
+    ("given", "beyond"),
+    [
+        (Influence("a", "m", 0.5, 0.049, 0.25, 0.5), True),
+        (Influence("a", "m", 0.5, 0.05, 0.25, 0.01), False),
+        (Influence("a", "m", 0.2, 0.5, -0.4, 0.01), True),
+        (Influence("a", "m", 0.2, 0.01, -0.4, 0.06), False),
+        (Influence("a", "m", 0.0, 0.9, 0.0, 0.9, (0.1, 0.2), (0.3, 0.2)), True),
+        (Influence("a", "m", 0.9, 0.0, 0.0, 0.9, (0.1, 0.2), (0.2, 0.3)), False),
+    ],
+)
+def test_a_driver_is_what_is_unlikely_to_be_chance(given: Influence, beyond: bool) -> None:
+    assert given.beyond_chance is beyond
+
+
 def test_chances_are_corrected_for_the_number_of_tests() -> None:
     """By hand: the k-th smallest of n times n / k, and no larger than the ones above it."""
     given = [

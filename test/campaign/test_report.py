@@ -81,6 +81,25 @@ def test_a_report_of_flights_that_ended_early_says_that_late_ones_are_missing(
     assert sentence in unescape(page.read_text("utf-8"))
 
 
+@pytest.mark.parametrize("driven", [True, False])
+def test_only_correlations_beyond_chance_are_called_drivers(driven: bool, tmp_path: Path) -> None:
+    noise = np.random.default_rng(11).uniform(0.0, 0.04, 60)
+
+    def error(draw: Draw) -> float:
+        return 0.01 * draw.values["mass.mass_1"] if driven else float(noise[draw.number])
+
+    made = campaign(disperse=MASSES, flights=60, seed=2)
+    page = tmp_path / "page.html"
+    lines = write_campaign_report(filled(tmp_path / "made", made, error), page)
+    told = [line for line in lines if line.startswith("driver")]
+    sentence = "no correlation is beyond chance (p < 0.05, corrected for all of them)."
+    assert (sentence in unescape(page.read_text("utf-8"))) is not driven
+    if driven:
+        assert told == ["driver      mass.mass_1 of position_error_m: +1.00"]
+    else:
+        assert told == [f"driver      none: {sentence}"]
+
+
 def test_shares_of_captures_have_their_intervals(tmp_path: Path) -> None:
     """Of 40 flights 40 approach, 30 capture and none places."""
     made = campaign(flights=40, criteria={"captured": {"min": 1}})
@@ -248,7 +267,7 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
         write_comparison((one, four), tmp_path / "no.html")
 
 
-@pytest.mark.parametrize("count", [1, 24, 10_000])
+@pytest.mark.parametrize("count", [1, 10, 11, 24, 10_000])
 def test_counts_below_the_convergence_are_plain_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
@@ -273,8 +292,10 @@ def test_counts_below_the_convergence_are_plain_numbers(
         for name, values in results.columns.items()
     }
     monkeypatch.setattr(report, "picture_part", seen)
-    report._convergence_section(replace(results, columns=columns, numbers=many.astype(float)))
-    assert any(labels)
+    results = replace(results, columns=columns, numbers=many.astype(float))
+    # Of ten flights or fewer there is one point, which shows no convergence.
+    assert (report._convergence_section(results) == []) is (count <= 10)
+    assert any(labels) is (count > 10)
     assert all(re.fullmatch(r"\d*", label) for label in labels), labels
 
 
