@@ -93,11 +93,7 @@ def fly(
     """
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
     scenario = scenario_to_fly(what, goal, position, rotvec, hands)
-    if not scenario.has_goal:
-        raise ParameterError(
-            f"'{scenario.name}' is a robot and has no goal: give one, for instance "
-            "rotvec=(0, 0, 0.1)."
-        )
+    _require_goal(scenario)
     scenario = _with_parameters(scenario, {} if parameters is None else parameters)
     if method is not None:
         scenario = scenario.with_method(method)
@@ -117,6 +113,14 @@ def fly(
     own_law = law, configured(law.Options, values)
     robots = replace(Robots.of(scenario), own_law=own_law)
     return _unless_refused(fly_scenario(scenario, robots=robots))
+
+
+def _require_goal(scenario: Scenario) -> None:
+    if not scenario.has_goal and not scenario.goal.end_effectors:
+        raise ParameterError(
+            f"'{scenario.name}' is a robot and has no goal: give one, for instance "
+            "rotvec=(0, 0, 0.1)."
+        )
 
 
 def _unless_refused(flight: Flight) -> Flight:
@@ -142,6 +146,7 @@ def plan(
     end_effector_pose: EndEffectorValues | None = None,
     end_effector: str = "",
     method: str | None = None,
+    parameters: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> GaitSchedule:
     """Plan a gait for a scenario or for a robot.
@@ -169,6 +174,9 @@ def plan(
     method
         Name of a gait method; None: that of the scenario; of a robot alone ``auto``, or ``optimal``
         if there are options of a method.
+    parameters
+        Parameters of the nodes by name, as for :func:`fly`, such as
+        ``{"planner.attitude_tolerance": 0.001}``; a robot is then taken as :func:`fly` takes it.
     options
         Options of the method by name, and for a robot the other arguments of
         :func:`spacerobot_ros.planning.plan`.
@@ -181,6 +189,8 @@ def plan(
         There is no such scenario, robot, method or option, or one is refused.
     """
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
+    if parameters is not None:
+        what = _with_parameters(scenario_to_fly(what), parameters)
     aimed = bool(hands) or any(each is not None for each in (goal, position, rotvec))
     if not _is_scenario(what, aimed=aimed):
         assert not isinstance(what, Scenario)
@@ -207,6 +217,7 @@ def plan(
         return planning.plan(what, goal, method=method, **{**chosen, **options})
     scenario = what if isinstance(what, Scenario) else load_scenario(str(what))
     scenario = _with_goals(scenario, goal, position, rotvec, hands)
+    _require_goal(scenario)
     settings: dict[str, Any] = {} if method is None else {"method": method}
     name = method or scenario.planner.method
     method_options(

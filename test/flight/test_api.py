@@ -301,6 +301,30 @@ def test_the_package_names_what_it_offers() -> None:
         assert getattr(spacerobot_ros, name)
 
 
+def test_a_plan_takes_the_parameters_that_a_flight_takes() -> None:
+    given: dict[str, Any] = {"planner.lie_bracket.t1": 4.0}
+    schedule = plan("faults/stuck_slider", method="lie_bracket", parameters=given)
+    other = plan("faults/stuck_slider", method="lie_bracket")
+    assert schedule.duration != other.duration
+    flight = fly(
+        "faults/stuck_slider", method="lie_bracket", parameters={**given, "plant.faults": []}
+    )
+    assert flight.schedules[0][1].duration == schedule.duration
+    # A robot is then taken as a flight takes it, with the start of the plant.
+    goal: dict[str, Any] = {"rotvec": (0.0, 0.0, 0.02), "method": "optimal"}
+    start = {"plant.initial_joint_positions": [0.1, 0.2, 0.3, -0.1]}
+    assert plan("surveyor", parameters=start, **goal).positions[0] == pytest.approx(
+        start["plant.initial_joint_positions"]
+    )
+    words: dict[str, Any]
+    for words, message in (
+        ({"planer.x": 1}, "'planer.x' is not a parameter: give node.parameter"),
+        ({}, "'surveyor' is a robot and has no goal: give one"),
+    ):
+        with pytest.raises(ParameterError, match=message):
+            plan("surveyor", parameters=words)
+
+
 def test_a_refused_goal_raises_the_same_error_in_plan_and_fly() -> None:
     reasons = []
     for ask in (plan, fly):
