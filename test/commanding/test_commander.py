@@ -16,6 +16,7 @@ from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerComm
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.plant_state import Stamped
+from spacerobot_ros.commanding.trajectory_output import TrajectoryOutput
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.events import Event, EventKind
@@ -364,6 +365,46 @@ def test_a_commander_that_is_to_stop_with_the_decision_answers_no_later_state(
     rig.commander.deactivate()
     rig.commander.activate()
     assert rig.commander.active
+
+
+class SilentServer:
+    """A server of trajectories that answers nothing, and goes away at a tick."""
+
+    def __init__(self) -> None:
+        self.present, self.sent, self.cancelled = True, 0, list[int]()
+
+    def ready(self) -> bool:
+        return self.present
+
+    def send(self, number: int, start: Any) -> None:
+        self.sent += 1
+
+    def cancel(self, number: int) -> None:
+        self.cancelled.append(number)
+
+
+@pytest.mark.parametrize(
+    ("goes", "words", "last"),
+    [(10, "the server of the action '/arm' is gone", 24), (999, "has not answered", 106)],
+)
+def test_a_goal_fails_with_a_server_of_trajectories_that_goes_or_is_silent(
+    robot: SpaceRobot, goes: int, words: str, last: int
+) -> None:
+    rig = Rig(PlannerCommander, config(PlannerConfig, **METHOD, output="trajectory"), robot.n)
+    rig.use(robot)
+    rig.commander.activate()
+    server = SilentServer()
+    rig.commander.trajectories = TrajectoryOutput(server, "/arm", rig.commander.end_schedule)
+    rig.goal()
+    tick = 0
+    while "failed" not in rig.host.states:
+        tick += 1
+        server.present = tick < goes
+        rig.state(tick)
+        assert tick <= last
+    assert tick > last - 4
+    assert words in rig.host.statuses[-1].message
+    assert (server.sent, server.cancelled) == (1, [1])
 
 
 def test_a_controller_that_is_to_stop_with_the_decision_does(arm: SpaceRobot) -> None:
