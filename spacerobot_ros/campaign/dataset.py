@@ -261,22 +261,42 @@ class Dataset:
         ParameterError
             The dataset has no rows.
         """
+        return self.unsorted().sort_by("flight")
+
+    def unsorted(self, columns: Sequence[str] | None = None) -> Any:
+        """Return all rows as a pyarrow table, as they were written.
+
+        Columns that are not among ``columns`` are not read; those that no file has are left out.
+
+        Raises
+        ------
+        ParameterError
+            The dataset has no rows.
+        """
         arrow = require_module("pyarrow")
-        parts = [_read_row_file(part) for part in self._row_files()]
+        parts = [_read_row_file(part, columns) for part in self._row_files()]
         if not parts:
             raise ParameterError(f"The folder {self.folder} has no flights yet.")
         # Files of earlier versions may lack columns.
-        return arrow.concat_tables(parts, promote_options="default").sort_by("flight")
+        return arrow.concat_tables(parts, promote_options="default")
 
     def _row_files(self) -> Sequence[Path]:
         return sorted((self.folder / _FLIGHTS_FOLDER).glob("part-*.parquet"))
 
 
 def _read_row_file(part: Path, columns: Sequence[str] | None = None) -> Any:
-    """Return a file of rows as a pyarrow table; ParameterError for a damaged file."""
+    """Return a file of rows as a pyarrow table, with those of ``columns`` that it has.
+
+    Raises
+    ------
+    ParameterError
+        The file is damaged.
+    """
     arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
     try:
-        return parquet.read_table(part, columns=columns)
+        with parquet.ParquetFile(part) as file:
+            there = None if columns is None else [x for x in columns if x in file.schema.names]
+            return file.read(columns=there)
     except (OSError, arrow.ArrowException) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise ParameterError(
