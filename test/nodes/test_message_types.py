@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.nodes.common.messages import message_class
+from spacerobot_ros.nodes.common.messages import interface_class, message_class
 
 
 @pytest.mark.parametrize(
@@ -24,3 +24,21 @@ def test_a_type_name_imports_no_module_that_is_not_of_messages(
     with pytest.raises(SpaceRobotError, match="is not installed here"):
         message_class(name)
     assert message_class("nav_msgs/msg/Odometry").__name__ == "Odometry"
+
+
+def test_a_package_without_its_libraries_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its Python modules may be on the paths alone: then its types cannot be sent."""
+
+    class Half:
+        @classmethod
+        def __import_type_support__(cls) -> None:
+            raise RuntimeError("Could not import 'rosidl_typesupport_c' for package 'nav_msgs'")
+
+        _TYPE_SUPPORT = None
+
+    monkeypatch.setattr("nav_msgs.msg.Odometry", Half)
+    assert interface_class("nav_msgs.msg", "Odometry") is None
+    with pytest.raises(SpaceRobotError, match="its type nav_msgs/msg/Odometry is not installed"):
+        message_class("nav_msgs/msg/Odometry")
+    assert interface_class("nav_msgs.msg", "Path") is not None
+    assert interface_class("nav_msgs.msg", "Absent") is None

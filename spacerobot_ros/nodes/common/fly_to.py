@@ -6,7 +6,6 @@ interfaces, and ``nav2_msgs/action/NavigateToPose``, each where it is installed.
 
 from __future__ import annotations
 
-import importlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -16,12 +15,17 @@ from typing import Any
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.clock import Clock, ClockType
-from rclpy.type_support import check_for_type_support
 
 from spacerobot_ros.commanding.fly_to import FlyTo, FlyToResult, Progress
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.nodes.common.messages import end_effector_goal, goal_message, goal_of, shape_of
+from spacerobot_ros.nodes.common.messages import (
+    end_effector_goal,
+    goal_message,
+    goal_of,
+    interface_class,
+    shape_of,
+)
 from spacerobot_ros.planning.core.goal import Goal, Tolerance
 from spacerobot_ros.times import SECOND
 
@@ -317,12 +321,7 @@ def _goal_id(handle: ServerGoalHandle) -> str:
 
 def action_class(package: str, name: str) -> Any | None:
     """Return the class of an action; None if its package is not installed whole."""
-    try:
-        kind = getattr(importlib.import_module(f"{package}.action"), name)
-        check_for_type_support(kind)
-    except Exception:  # Several kinds tell that it, or its libraries, are not on the paths.
-        return None
-    return kind
+    return interface_class(f"{package}.action", name)
 
 
 def set_duration(message: Any, seconds: float) -> None:

@@ -13,6 +13,7 @@ from geometry_msgs.msg import Point, PoseStamped, TransformStamped
 from nav_msgs.msg import Path
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from rclpy.type_support import check_for_type_support
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -55,12 +56,27 @@ def message_class(type_name: str) -> Any:
     SpaceRobotError
         Its package is not installed; the message completes a sentence about a topic.
     """
+    kind = None
     try:
         message_definition(type_name)
         package, _, name = type_name.split("/")
-        return getattr(importlib.import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError, ValueError, RecordingError):
-        raise SpaceRobotError(f"its type {type_name} is not installed here.") from None
+    except (ValueError, RecordingError):
+        pass
+    else:
+        kind = interface_class(f"{package}.msg", name)
+    if kind is None:
+        raise SpaceRobotError(f"its type {type_name} is not installed here.")
+    return kind
+
+
+def interface_class(module: str, name: str) -> Any | None:
+    """Return the class of a message or an action; None if its package is not installed whole."""
+    try:
+        kind = getattr(importlib.import_module(module), name)
+        check_for_type_support(kind)
+    except Exception:  # Several kinds tell that it, or its libraries, are not on the paths.
+        return None
+    return kind
 
 
 def diagnostic_name(node: str, part: str) -> str:
