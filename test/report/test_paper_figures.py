@@ -21,6 +21,7 @@ from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.report import write_figures, write_picture
 from spacerobot_ros.report.figures import PictureFormat, TraceGroup, angle_unit, drawing, sheet
 from spacerobot_ros.report.figures_over_time import range_without_peaks
+from spacerobot_ros.report.writing import FIGURES
 
 MAGIC = {"png": b"\x89PNG", "pdf": b"%PDF-", "svg": b"<?xml"}
 
@@ -328,3 +329,9 @@ def test_panels_of_a_column_reach_its_left_edge(tmp_path: Path) -> None:
                 ink = np.asarray(picture.convert("L")) < 128
             first = float(np.argmax(ink.any(axis=0))) / ink.shape[1]
             assert 0.0005 < first < 0.04, (path.name, first)
+
+
+def test_the_documents_list_every_figure() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "report.md").read_text("utf-8")
+    (row,) = (line for line in page.splitlines() if line.startswith("| `--only` |"))
+    assert re.findall(r"`(\w+)`", row) == list(FIGURES)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
+import re
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -239,6 +241,17 @@ def test_on_paper_everything_is_unfolded_and_headings_stay_with_their_parts(
     assert not any(text.strip().endswith(tuple(headings)) for text in pages)
     for key, value in flight.bag.metadata["parameters/planner"].items():
         assert f"{key} {value}" in words
+    # Of tables that are no list of parameters no word is broken.
+    cells = window.evaluate(
+        "[...document.querySelectorAll('td')].filter(each => !each.closest('details'))"
+        ".map(each => each.innerText)"
+    )
+    # Paper has ligatures.
+    whole = set(unicodedata.normalize("NFKC", words).split())
+    told = unicodedata.normalize("NFKC", " ".join(cells)).split()
+    shown = {word for word in told if re.search(r"\w", word)}
+    assert "prismatic" in shown
+    assert shown <= whole
     assert "Permission is hereby granted" not in words
     assert window.evaluate("[...document.querySelectorAll('details')].every(each => !each.open)")
 
