@@ -93,15 +93,15 @@ def test_joints_are_rows() -> None:
         joint("c", JointKind.REVOLUTE, mimic=SimpleNamespace(joint="a")),
     )
     assert head == (
-        "joint      kind       on                           limits       speed    effort"
+        "joint      kind       on                                limits       speed    effort"
         "        mass"
     )
     assert slider == (
-        "a          prismatic  aaaaaaaaaaaaaaa         -1 .. 2.5 m   0.125 m/s    12.5 N"
+        "a          prismatic  aaaaaaaaaaaaaaaaaaaa         -1 .. 2.5 m   0.125 m/s    12.5 N"
         "      1.5 kg"
     )
     assert free == (
-        "long_name  continuous aaaaaaaaaaaaaaa                free 0.125 rad/s  12.5 N m"
+        "long_name  continuous aaaaaaaaaaaaaaaaaaaa                free 0.125 rad/s  12.5 N m"
         "      1.5 kg  7.16 deg/s"
     )
     assert follower.endswith("12.5 N m      1.5 kg  -57.3 .. 143.2 deg  7.16 deg/s  follows a")
@@ -264,12 +264,14 @@ def test_lines_of_end_effectors() -> None:
             "end_effectors": {
                 "left": {"position_error_m": 0.0123456, "attitude_error_rad": 0.5},
                 "right": {"position_error_m": 1.0, "attitude_error_rad": 0.0},
-            }
+            },
+            "position_tolerance_m": 0.02,
+            "attitude_tolerance_rad": 0.3,
         }
     )
     assert found == [
-        "left: 0.0123 m and 0.5 rad from its goal",
-        "right: 1 m and 0 rad from its goal",
+        "left: 0.0123 m and 0.5 rad from its goal (tolerance 0.02 m, 0.3 rad)",
+        "right: 1 m and 0 rad from its goal (tolerance 0.02 m, 0.3 rad)",
     ]
     assert flights._end_effector_line({}) == []
 

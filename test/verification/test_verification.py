@@ -196,7 +196,7 @@ def test_a_flight_under_efforts_that_begins_in_mid_flight_has_its_joint_rates(
     assert np.abs(read_bag(bag)["/joint_states"].field("velocity")[0]).min() > 1e-3
     result = verify_bag(bag, tolerance=1e-9)
     assert result.difference is None
-    assert result.ticks == 833, "of 883 ticks, 50 come before"
+    assert result.ticks == 842, "of 892 ticks, 50 come before"
 
 
 @pytest.mark.parametrize(
