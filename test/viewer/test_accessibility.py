@@ -23,6 +23,7 @@ pytestmark = [
 
 SERVICER = ("--params-file", str(ROOT / "config" / "servicer.yaml"))
 SIZES = {"desktop": (1280, 900), "phone": (390, 780)}
+LOOK_BACK = '[role=slider][aria-label="Look back (s)"]'
 
 
 @pytest.fixture
@@ -55,7 +56,9 @@ def test_every_control_of_the_live_page_has_the_focus_in_turn_and_works_by_key(
     nodes.start("coordinated_control", files=SERVICER)
     with browser(tmp_path / "profile") as window:
         page = Page(window, url, 1280, 900)
-        page.wait_for_text("Goal reachable", "Look back (s)")
+        page.wait_for_text("Goal reachable")
+        # The page names controls a moment after they appear.
+        window.wait_for(f"!!document.querySelector('{LOOK_BACK}')")
         window.evaluate("document.activeElement.blur()")
         order = focus_order(window, 50)
         wanted = (
@@ -66,6 +69,7 @@ def test_every_control_of_the_live_page_has_the_focus_in_turn_and_works_by_key(
             *("Goal for the end-effector", "Goal to the robot", "Look at the robot"),
             *("Front", "Side", "Top", "Follow the robot", "Setting", "Layers", "Dark or light"),
         )
+        assert not {*wanted} - {*order}, order
         places = [order.index(name) for name in wanted]
         assert places == sorted(places), order
 
