@@ -155,7 +155,7 @@ def test_paths_are_in_front_and_the_sun_casts_shadows(up: Up, tmp_path: Path) ->
 
         # The flight is looked back at, and the present comes back.
         page.slide(0.02)
-        page.wait_for_text("Looking back", "Waiting for a goal pose.", "Back to the present")
+        page.wait_for_text("Looking back", "Back to the present", without="reached")
         page.press("Back to the present")
         page.wait_for_text("reached", without="Looking back")
         assert window.complaints == []
