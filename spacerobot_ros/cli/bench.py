@@ -129,7 +129,8 @@ def soak(seconds: float, json_file: Path | None) -> None:
     """
     from spacerobot_ros.benchmarks.soak import soak_benchmark
 
-    picture = None if json_file is None else json_file.with_suffix(".png")
+    named = None if json_file == Path("-") else json_file
+    picture = None if named is None else named.with_suffix(".png")
     figures = soak_benchmark(seconds, click.echo, picture)
     _write_figures(json_file, figures, indent=None)
     if not figures["flat"]:

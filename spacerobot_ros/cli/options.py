@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from functools import cached_property, wraps
 from importlib import import_module
@@ -27,7 +28,10 @@ else:  # click.Choice is generic only in newer versions of click.
 
 
 class _TextPath(click.Path):
-    """Path option that refuses names that are not UTF-8, which messages and bags cannot hold."""
+    """Path option that refuses names that are not UTF-8, which messages and bags cannot hold.
+
+    The name ``-``, which stands for standard output elsewhere, is refused too, but for ``--json``.
+    """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path.
@@ -35,8 +39,10 @@ class _TextPath(click.Path):
         Raises
         ------
         click.BadParameter
-            The name has bytes that are not UTF-8.
+            The name has bytes that are not UTF-8, or is ``-``.
         """
+        if str(value) == "-" and not (param and "--json" in param.opts):
+            self.fail("'-' stands for no file here: name one.", param, ctx)
         try:
             str(value).encode()
         except UnicodeEncodeError:
@@ -63,9 +69,30 @@ def _path_option(*names: str) -> Callable[[str], Any]:
     return lambda help: click.option(*names, type=PATH, help=help)
 
 
+_STANDARD_OUTPUT = f"{__name__}.standard_output"
+
+
+def _json_destination(ctx: click.Context, _: click.Parameter, path: Path | None) -> Path | None:
+    """Leave standard output to the JSON of ``--json -``: texts for people go to standard error."""
+    if path == Path("-"):
+        ctx.meta[_STANDARD_OUTPUT] = sys.stdout
+        ctx.with_resource(redirect_stdout(sys.stderr))
+    return path
+
+
+def json_option(help: str) -> Any:
+    """Return the option ``--json`` as the argument ``json_file``, for :func:`write_json`."""
+    return click.option(
+        "--json",
+        "json_file",
+        type=PATH,
+        callback=_json_destination,
+        help=f"{help} '-' is standard output.",
+    )
+
+
 bag_argument = click.argument("bag", type=PATH)
 bag_option = _path_option("--bag")
-json_option = _path_option("--json", "json_file")
 out_option = _path_option("--out", "-o", "--output")  # --output: up to version 0.2.0.
 report_option = _path_option("--report")
 
@@ -386,8 +413,13 @@ def beside(bag: Path, ending: str) -> Path:
 
 
 def write_json(path: Path, content: Any, indent: int | None = 2) -> None:
-    """Write a JSON file and the folders that it is in."""
-    write_output(path, json.dumps(content, indent=indent) + "\n")
+    """Write a JSON file and the folders that it is in; ``-`` is standard output."""
+    text = json.dumps(content, indent=indent) + "\n"
+    if path == Path("-"):
+        output = click.get_current_context().meta[_STANDARD_OUTPUT]
+        click.echo(text, file=output, nl=False)
+    else:
+        write_output(path, text)
 
 
 def numbers(values: Iterable[float], digits: int = 5) -> str:

@@ -95,6 +95,14 @@ def test_a_domain_that_is_none_is_one_sentence(words: tuple[str, ...], domain: s
     assert_one_sentence(ended.stderr, f"ROS_DOMAIN_ID is '{domain}'", "0 to 232")
 
 
+@pytest.mark.parametrize("option", ["--bag", "--report"])
+def test_a_dash_is_no_file_to_write(option: str) -> None:
+    ended = started("run", "sliding_masses", option, "-")
+    assert ended.returncode == 2
+    assert f"Invalid value for '{option}': '-' stands for no file" in ended.stderr
+    assert not Path("-").exists()
+
+
 @pytest.mark.parametrize("option", ["--bag", "--json", "--report"])
 def test_a_path_that_is_no_text_is_refused(option: str) -> None:
     ended = started("run", "sliding_masses", option, b"out/\xff")

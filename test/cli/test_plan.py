@@ -58,6 +58,25 @@ def test_schedule_and_path_are_written_and_drawn(tmp_path: Path) -> None:
     assert written["path"]["time_s"][-1] == pytest.approx(written["manoeuvre_time_s"])
 
 
+@pytest.mark.parametrize(
+    ("words", "key", "text"),
+    [
+        (("plan", "planar_chain", "--method", "square_path"), "schedule", "planned in"),
+        (("analyze", "three_joint_arm"), "robot", "three_joint_arm"),
+    ],
+)
+def test_json_on_standard_output_is_alone_there(
+    words: tuple[str, ...], key: str, text: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--json", "-"])
+    out, err = capfd.readouterr()
+    assert ended.value.code == 0, err
+    assert key in json.loads(out)
+    assert text in err
+    assert not Path("-").exists()
+
+
 def test_every_method_that_suits_is_compared() -> None:
     result = plan("planar_chain", "--compare", *QUICK)
     assert result.exit_code == 0, result.output
