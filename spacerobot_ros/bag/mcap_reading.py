@@ -124,7 +124,7 @@ def open_bag(path: Path) -> Iterator[BinaryIO]:
     """
     with open_file(path) as file:
         try:
-            _require_both_ends(path, file)
+            _require_magic_bytes(path, file)
             yield file
         except MemoryError as error:
             raise RecordingError(
@@ -135,7 +135,7 @@ def open_bag(path: Path) -> Iterator[BinaryIO]:
             raise RecordingError(f"The bag {path} is damaged: {reason}.") from error
 
 
-def _require_both_ends(path: Path, file: BinaryIO) -> None:
+def _require_magic_bytes(path: Path, file: BinaryIO) -> None:
     size = len(MCAP0_MAGIC)
     start = file.read(size)
     if not start:
@@ -237,7 +237,9 @@ class InflationLimit:
     """
 
     def __init__(self, compressed: int) -> None:
-        self.max_bytes = max(round(1e6 * _limit_mb()), _MAX_INFLATION_RATIO * compressed)
+        self.max_bytes = max(
+            round(1e6 * _inflated_size_limit_mb()), _MAX_INFLATION_RATIO * compressed
+        )
         """Largest inflated size of all chunks together, bytes."""
         self._inflated_size = 0
 
@@ -252,7 +254,7 @@ class InflationLimit:
         self._inflated_size += size
 
 
-def _limit_mb() -> float:
+def _inflated_size_limit_mb() -> float:
     try:
         limit = float(os.environ.get(INFLATED_SIZE_VARIABLE, _DEFAULT_LIMIT_MB))
     except ValueError:

@@ -12,7 +12,7 @@ from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotErro
 from spacerobot_ros.times import SECOND
 
 _LATEST_TIME_NS = 2**63 - 1
-_MAX_AGE_SHOWN_AFTER_JUMP_NS = SECOND
+_MAX_AGE_REPUBLISHED_AFTER_SEEK_NS = SECOND
 """Greatest age of a message that is published again after a jump of the replay, ns."""
 
 _MAX_REPLAYED_TOPICS = 1000
@@ -136,7 +136,7 @@ class Timeline:
         return self._clock_ns + math.ceil((bag_ns - self._bag_ns) / self._rate)
 
 
-class ReaderWait:
+class SubscriberWait:
     """Decides when a replay may begin: when all known readers are matched and no more come.
 
     Parameters
@@ -320,7 +320,7 @@ class Playback:
             The bag turns out damaged.
         """
         at = min(max(bag_ns, self._start_ns), self._last_ns)
-        recent = max(at - _MAX_AGE_SHOWN_AFTER_JUMP_NS, self._start_ns)
+        recent = max(at - _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS, self._start_ns)
         last = {message.topic: message for message in self._latched_messages_before(at)}
         begins = at == self._start_ns and not self._timeline.running
         for message in self._messages_between(

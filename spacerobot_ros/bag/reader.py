@@ -168,7 +168,7 @@ class Bag:
         rows = self._topic_rows()
         wide = max((len(row[0]) for row in rows), default=0)
         lines = [f"  {name:<{wide}}  {count:>7}  {kind}" for name, count, kind in rows]
-        return "\n".join([f"{self._headline()}{':' if lines else ''}", *lines])
+        return "\n".join([f"{self._summary_text()}{':' if lines else ''}", *lines])
 
     def _repr_html_(self) -> str:
         rows = "".join(
@@ -176,9 +176,9 @@ class Bag:
             for name, count, kind in self._topic_rows()
         )
         head = "<tr><th>topic</th><th>messages</th><th>type</th></tr>"
-        return f"<p>{escape(self._headline())}</p><table>{head}{rows}</table>"
+        return f"<p>{escape(self._summary_text())}</p><table>{head}{rows}</table>"
 
-    def _headline(self) -> str:
+    def _summary_text(self) -> str:
         span = f", {self.end_time - self.start_time:.6g} s" if self.message_count() else ""
         return f"Bag {self.path}: {self.message_count()} messages on {len(self)} topics{span}"
 

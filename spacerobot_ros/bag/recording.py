@@ -45,7 +45,7 @@ _WAITING, _ON_CLOCK, _ON_WALL_TIME = (
     RecordingState.ON_CLOCK,
     RecordingState.ON_WALL_TIME,
 )
-_STATES_THAT_DROP_MESSAGES = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED)
+_DROPPING_STATES = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED)
 
 
 class FirstTime(Enum):
@@ -156,7 +156,7 @@ class Recording:
     @property
     def running(self) -> bool:
         """Whether messages are recorded."""
-        return self.state not in _STATES_THAT_DROP_MESSAGES
+        return self.state not in _DROPPING_STATES
 
     @property
     def messages_waiting(self) -> int:

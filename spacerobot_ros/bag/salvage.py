@@ -60,7 +60,7 @@ class Salvaged:
         Messages in it, and the time in s that they span.
     lost_chunks
         Chunks that could not be read.
-    lost_because
+    loss_reason
         Why the first lost chunk could not be read; empty if no chunk is lost.
     lost_bytes
         Bytes after the last complete record, which only the old bag has.
@@ -71,7 +71,7 @@ class Salvaged:
     duration: float
     lost_chunks: int
     lost_bytes: int
-    lost_because: str = ""
+    loss_reason: str = ""
 
 
 def salvage_bag(

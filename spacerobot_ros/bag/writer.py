@@ -343,7 +343,7 @@ class BagWriter:
             except RecordingError as error:
                 failure = failure or error
         self._file.close()
-        self._refuse_everything(self._refusal or f"The bag {self.path} is closed.")
+        self._refuse_further_writes(self._refusal or f"The bag {self.path} is closed.")
         if failure is not None and not failed_before:
             raise failure
 
@@ -393,7 +393,7 @@ class BagWriter:
         while True:
             try:
                 if any(self._limits) and not self._overwrite:
-                    self._require_no_parts()
+                    self._require_no_numbered_files()
                 return self._open_numbered_file()
             except BagExistsError:
                 if not self._next_free:
@@ -401,7 +401,7 @@ class BagWriter:
             number += 1
             self._unsplit_path = asked.with_name(f"{asked.stem}-{number}{asked.suffix}")
 
-    def _require_no_parts(self) -> None:
+    def _require_no_numbered_files(self) -> None:
         """Raise BagExistsError if numbered files of another bag with this name exist."""
         whole = self._unsplit_path
         pattern = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
@@ -484,10 +484,10 @@ class BagWriter:
         try:
             yield
         except RecordingError as error:
-            self._refuse_everything(str(error))
+            self._refuse_further_writes(str(error))
             raise
 
-    def _refuse_everything(self, reason: str) -> None:
+    def _refuse_further_writes(self, reason: str) -> None:
         self._refusal = reason
         self._chunk = bytearray()
         self._entries = {}

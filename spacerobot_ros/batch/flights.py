@@ -46,14 +46,14 @@ class Starts:
     Attributes
     ----------
     position
-        (N, 3) of the base link in W, m; with ``of_center``, of the system's centre of mass.
+        (N, 3) of the base link in W, m; with ``is_center_of_mass``, of the system's centre of mass.
     quaternion
         (N, 4) of ``R_WB`` (x, y, z, w), unit quaternions.
     q, qdot
         (N, n) joint positions and rates, m or rad (a second).
     momenta
         (N, 6) total linear (kg m/s) over angular momentum about the centre of mass (kg m^2/s), W.
-    of_center
+    is_center_of_mass
         (N,) whether ``position`` is that of the centre of mass.
     """
 
@@ -62,7 +62,7 @@ class Starts:
     q: Array
     qdot: Array
     momenta: Array
-    of_center: npt.NDArray[np.bool_]
+    is_center_of_mass: npt.NDArray[np.bool_]
 
     @classmethod
     def of(cls, robot: SpaceRobot, initial: Sequence[InitialState]) -> Starts:
@@ -73,7 +73,7 @@ class Starts:
         ParameterError
             The plant would refuse one of them.
         """
-        of_center = [each.center_of_mass is not None for each in initial]
+        is_center_of_mass = [each.center_of_mass is not None for each in initial]
         positions = [
             each.position if each.center_of_mass is None else each.center_of_mass
             for each in initial
@@ -84,7 +84,7 @@ class Starts:
             np.array([each.shape(robot) for each in initial]).reshape(-1, robot.n),
             np.array([each.rates(robot) for each in initial]).reshape(-1, robot.n),
             np.array([each.momenta() for each in initial]).reshape(-1, 6),
-            np.array(of_center, dtype=np.bool_),
+            np.array(is_center_of_mass, dtype=np.bool_),
         )
 
     @classmethod
@@ -104,16 +104,16 @@ class Starts:
 
     def initial_state(self, index: int) -> InitialState:
         """Return one row as an initial state of the plant."""
-        of_center = bool(self.of_center[index])
+        is_center_of_mass = bool(self.is_center_of_mass[index])
         state = InitialState(
             quaternion=self.quaternion[index],
             joint_positions=self.q[index],
             joint_velocities=self.qdot[index],
             linear_momentum=self.momenta[index, :3],
             angular_momentum=self.momenta[index, 3:],
-            center_of_mass=self.position[index] if of_center else None,
+            center_of_mass=self.position[index] if is_center_of_mass else None,
         )
-        return state if of_center else replace(state, position=self.position[index])
+        return state if is_center_of_mass else replace(state, position=self.position[index])
 
 
 @dataclass(frozen=True)

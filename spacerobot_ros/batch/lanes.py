@@ -63,13 +63,13 @@ def fly_lanes(flights: Flights) -> BatchResult:
     :attr:`BatchResult.engine` tells which of the two flew them.
     """
     try:
-        return _fly_in_lanes(flights)
+        return _fly_all_in_lanes(flights)
     except NoLibraryError as reason:
         warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
         return fly_one_by_one(flights)
 
 
-def _fly_in_lanes(flights: Flights) -> BatchResult:
+def _fly_all_in_lanes(flights: Flights) -> BatchResult:
     """Fly on vector registers.
 
     Raises
@@ -79,7 +79,7 @@ def _fly_in_lanes(flights: Flights) -> BatchResult:
     """
     model, p = symbolic_model_of(flights)
     tick = CompiledTick.of(flights, model)
-    fit = regular_starts(flights)
+    fit = starts_accepted_by_plant(flights)
     # The scalar plant gives the message about each irregular start.
     result = fly_one_by_one(flights, np.flatnonzero(~fit).tolist())
     failures = dict(result.failures)
@@ -100,7 +100,7 @@ def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
     return flights.robot.symbolic_model(inertial)
 
 
-def regular_starts(flights: Flights) -> Flags:
+def starts_accepted_by_plant(flights: Flights) -> Flags:
     """Return which flights (N,) start in a state that the plant accepts."""
     starts, robot = flights.starts, flights.robot
     fit = np.isfinite(starts.position).all(axis=1) & np.isfinite(starts.momenta).all(axis=1)
@@ -193,7 +193,7 @@ class Block:
         q, r = starts.q[at], starts.position[at]
         centers = model.function("center_of_mass", compile=False)(q.T, p.T).full().T
         of_base = r + _rotate_vectors(quaternion, centers)
-        r_cm = np.where(starts.of_center[at][:, None], r, of_base)
+        r_cm = np.where(starts.is_center_of_mass[at][:, None], r, of_base)
         if self._flights.actuation == "velocity":
             state = np.concatenate([q, quaternion], axis=1)
             self._write_rows("momenta", starts.momenta[at], lanes)
@@ -265,12 +265,14 @@ class Block:
         program = self._flights.program
         match program:
             case FollowedSchedule():
-                table = self._per_lane(program.positions)
+                table = self._one_table_per_lane(program.positions)
             case HeldCommands():
-                parts = [self._per_lane(program.joints)]
+                parts = [self._one_table_per_lane(program.joints)]
                 if self._flights.actuation == "effort":
                     wrench = program.wrench
-                    parts.append(np.zeros((1, 6)) if wrench is None else self._per_lane(wrench))
+                    parts.append(
+                        np.zeros((1, 6)) if wrench is None else self._one_table_per_lane(wrench)
+                    )
                 ticks = max(part.shape[-2] for part in parts)
                 each = max(part.ndim for part in parts)
                 table = np.concatenate(
@@ -284,7 +286,7 @@ class Block:
             table = np.moveaxis(grouped, 1, 3)
         return np.ascontiguousarray(table)
 
-    def _per_lane(self, table: Array) -> Array:
+    def _one_table_per_lane(self, table: Array) -> Array:
         return table if table.ndim == 2 else np.asarray(table[self._rows_of_lanes])
 
     # -- flying -------------------------------------------------------------------------------
@@ -302,7 +304,7 @@ class Block:
             end = min(begin + _CHUNK_TICKS, flights.ticks)
             # The sensors measure the state at the end, too.
             last = end + (end == flights.ticks)
-            normals = self._noise.draw_ticks(begin, last, alive)
+            normals = self._noise.draw_noise(begin, last, alive)
             if normals is not None:
                 job.normals = normals.ctypes.data
                 job.normals_from, job.normals_ticks, job.normals_width = begin, *normals.shape[1:3]
@@ -559,7 +561,7 @@ class SensorNoise:
         joints = errors.noise[self._rows, 4].any() or errors.joint_bias[self._rows].any()
         return bool(self._affects_all or joints)
 
-    def draw_ticks(self, begin: int, end: int, alive: Array) -> Array | None:
+    def draw_noise(self, begin: int, end: int, alive: Array) -> Array | None:
         """Draw the noise of the ticks from ``begin`` to before ``end``.
 
         ``alive`` (groups, lanes): whether flights are still under way. Returns the noise that the

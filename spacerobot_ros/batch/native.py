@@ -233,7 +233,7 @@ class CompiledTick:
     @classmethod
     def _compile(cls, flights: Flights, model: ModelFunctions, link: str) -> CompiledTick:
         effort, robot = flights.actuation == "effort", flights.robot
-        names, n = _TICKS[flights.actuation], robot.n
+        names, n = _TICK_VARIABLES[flights.actuation], robot.n
         make = (effort_plant if effort else velocity_plant).tick_function
         whole = make(robot, Composition(model, ca.MX), flights.substeps)
         inputs = whole.mx_in()
@@ -317,13 +317,13 @@ class CompiledTick:
             )
         if controller is not None:
             constants["EXPECTED_ROW"] = state + 2 * n + 4
-        declarations, unit = _declare_shared(rows, constants, arrays, spans), vector_unit()
+        declarations, unit = _shared_declarations(rows, constants, arrays, spans), vector_unit()
         library = _load_library(functions, declarations, unit, count)
         return cls(library, unit, rows, width, link, controller)
 
 
 @dataclass(frozen=True)
-class _TickNames:
+class _TickVariables:
     """Names of a tick function's arguments and results.
 
     ``flight`` are the results that every tick needs, ``copies`` the results that become arguments
@@ -336,8 +336,8 @@ class _TickNames:
     copies: Mapping[str, str]
 
 
-_TICKS = {
-    "velocity": _TickNames(
+_TICK_VARIABLES = {
+    "velocity": _TickVariables(
         ("state", "command", "before", "momenta", "r_cm", "h"),
         (
             "next_state",
@@ -354,7 +354,7 @@ _TICKS = {
         ("next_state", "qdot", "effort", "limited", "next_r_cm"),
         {"next_state": "state", "qdot": "before", "next_r_cm": "r_cm"},
     ),
-    "effort": _TickNames(
+    "effort": _TickVariables(
         ("state", "command", "h"),
         ("next_state", "pose", "twist", "realised", "momentum", "link_R", "link_r", "limited"),
         ("next_state", "realised", "limited"),
@@ -396,7 +396,7 @@ def _compile_library(
         declarations,
         _read_source("thrusters.hpp"),
         _read_source("driver.hpp"),
-        *map(_trial_source, given),
+        *map(_trial_function_source, given),
     ]
     # Vectors as arguments between functions of this file: no other is called with them.
     flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *unit.flags)
@@ -409,7 +409,7 @@ def _compile_library(
     return native_library(name, source, flags, (), given)
 
 
-def _declare_shared(
+def _shared_declarations(
     rows: Rows,
     constants: Mapping[str, int],
     arrays: Mapping[str, Iterable[int]],
@@ -466,7 +466,7 @@ def _define_sizes(
     return "\n".join(lines)
 
 
-def _trial_source(function: ca.Function) -> str:
+def _trial_function_source(function: ca.Function) -> str:
     """Return the C++ that gives the vector function CasADi's interface for single numbers."""
     name = function.name()
     count_in, count_out = function.n_in(), function.n_out()

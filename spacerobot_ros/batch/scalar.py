@@ -89,7 +89,7 @@ def _fly_row(
             assert controller is not None
             command = _controlled_commands(controller, row, result)
     instants = {tick: column for column, tick in enumerate(flights.instants)}
-    momenta, drift = _unexplained_momenta(plant), np.zeros(2)
+    momenta, drift = _momenta_beyond_thrust(plant), np.zeros(2)
     try:
         for tick in range(flights.ticks + 1):
             sensors.measure()
@@ -104,7 +104,7 @@ def _fly_row(
             plant.step(*commands)
             _update_peaks(plant, commands, period, result, row)
             if controller is not None:
-                drift = np.maximum(drift, momentum_change(_unexplained_momenta(plant), momenta))
+                drift = np.maximum(drift, momentum_change(_momenta_beyond_thrust(plant), momenta))
         if controller is not None:
             parts = plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum
             result.end_state[row] = np.concatenate(parts)
@@ -166,7 +166,7 @@ def _controlled_commands(controller: BatchController, row: int, result: BatchRes
     return command
 
 
-def _unexplained_momenta(plant: Plant) -> Array:
+def _momenta_beyond_thrust(plant: Plant) -> Array:
     """Return the part of the momenta (6,) that thrust does not explain."""
     return np.asarray(plant.momentum[:6] - plant.expected_momenta)
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.batch.flights import BatchResult, Counts, Flights, HeldCommands, Starts
-from spacerobot_ros.batch.lanes import Block, regular_starts, symbolic_model_of
+from spacerobot_ros.batch.lanes import Block, starts_accepted_by_plant, symbolic_model_of
 from spacerobot_ros.batch.native import CompiledTick
 from spacerobot_ros.batch.scalar import plant_of, pose_of_link
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
@@ -234,7 +234,7 @@ class SteppedFlights:
 
     def _require_regular(self, flights: Flights) -> None:
         """Refuse starts that the plant would refuse, with its message."""
-        for row in np.flatnonzero(~regular_starts(flights)).tolist():
+        for row in np.flatnonzero(~starts_accepted_by_plant(flights)).tolist():
             plant_of(flights, row)
 
     def _choose_engine(self) -> _Engine:

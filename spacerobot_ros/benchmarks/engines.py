@@ -258,7 +258,7 @@ def lanes_benchmark(show: Callable[[str], None]) -> dict[str, float | str]:
         found = _measure_case(case)
         figures["engine"] = found.pop("engine")
         figures |= {f"{case.name}: {name}": value for name, value in found.items()}
-        show(_case_text(case.name, found))
+        show(_lane_case_text(case.name, found))
     began = time.process_time()
     cases[0].campaign(_TIMED_FLIGHTS, 1)
     figures["sliders velocity: cpu_s_of_10000_flights_of_39_s"] = time.process_time() - began
@@ -292,7 +292,7 @@ def _measure_case(case: _LaneCase) -> dict[str, float | str]:
     return found
 
 
-def _case_text(name: str, found: Mapping[str, Any]) -> str:
+def _lane_case_text(name: str, found: Mapping[str, Any]) -> str:
     text = (
         f"{name}: {found['lanes_us']:.3f} us a tick of {found['steps_a_tick']} step(s) in lanes, "
         f"{found['plant_us']:.3f} us by the plant ({found['ratio_to_plant']:.1f} times)"

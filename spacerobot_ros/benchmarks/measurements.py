@@ -67,7 +67,7 @@ _FLIGHTS_PER_MEDIAN = 3
 """Number of flights without ROS of which medians are taken."""
 
 
-def gait_cycles(duration: float) -> int:
+def gait_cycles_for(duration: float) -> int:
     """Return the cycles of ``lie_bracket`` with which sliding_masses moves for a time, s."""
     return max(_MIN_CYCLES, math.ceil((duration - _TIME_BEFORE_CYCLES) / _CYCLE_PERIOD) + 1)
 
@@ -90,25 +90,27 @@ def tick_times(ticks: int) -> dict[str, float]:
     ``plan_METHOD_ms``.
     """
     package = _imported_package()
-    cycles = gait_cycles(ticks * _SLIDING_PERIOD)
+    cycles = gait_cycles_for(ticks * _SLIDING_PERIOD)
     gait = {"planner.lie_bracket.cycles": cycles}
     words = ["sliding_masses", "--method", "lie_bracket"]
     words += [f"--set={name}={value}" for name, value in gait.items()]
     figures = {
-        "stack_us": _stack_tick(words, ticks * _SLIDING_PERIOD),
-        "controlled_stack_us": _stack_tick(_CONTROLLED_FLIGHT, math.inf),
+        "stack_us": _stack_tick_time(words, ticks * _SLIDING_PERIOD),
+        "controlled_stack_us": _stack_tick_time(_CONTROLLED_FLIGHT, math.inf),
     }
     scenario = "sliding_masses"
     planning = _cpu_time(lambda: package.plan(scenario, method="lie_bracket", cycles=cycles))
-    figures["loop_us"] = _loop_tick(planning, scenario, method="lie_bracket", parameters=gait)
-    figures["controlled_loop_us"] = _loop_tick(0.0, "coordinated_control")
+    figures["loop_us"] = _lockstep_tick_time(
+        planning, scenario, method="lie_bracket", parameters=gait
+    )
+    figures["controlled_loop_us"] = _lockstep_tick_time(0.0, "coordinated_control")
     for scenario, method, options in _PLANNED_SCENARIOS:
         plan = partial(package.plan, scenario, method=method, **options)
         figures[f"plan_{method}_ms"] = 1e3 * _cpu_time(plan)
     return figures
 
 
-def _stack_tick(words: list[str], longest: float) -> float:
+def _stack_tick_time(words: list[str], longest: float) -> float:
     """Return the CPU time of a tick of ``spacerobot run`` in this process, us."""
     # The first flight imports modules and compiles functions.
     _fly_by_command(words, _SUBTRACTED_FLIGHT_TIME)
@@ -137,7 +139,7 @@ def _imported_package() -> Any:
     return import_module("spacerobot_ros")
 
 
-def _loop_tick(planning: float, scenario: str, **arguments: Any) -> float:
+def _lockstep_tick_time(planning: float, scenario: str, **arguments: Any) -> float:
     """Return the CPU time of a tick of a flight without ROS, us; ``planning`` s are subtracted."""
     fly = _imported_package().fly
     ticks = len(fly(scenario, **arguments).time) - 1

@@ -22,7 +22,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 
 from spacerobot_ros.bag import Bag, read_bag
-from spacerobot_ros.benchmarks.measurements import gait_cycles
+from spacerobot_ros.benchmarks.measurements import gait_cycles_for
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.messages.statuses import key_values
 from spacerobot_ros.model.description import Array
@@ -173,7 +173,9 @@ def real_time_flight(rate: float, duration: float) -> RealTimeFigures:
         .in_real_time(1.0)
         .with_overrides("plant", {"tick_rate": rate, "diagnostics_period": 1.0})
         .with_method("lie_bracket")
-        .with_overrides("planner", {"tick_rate": rate, "lie_bracket.cycles": gait_cycles(duration)})
+        .with_overrides(
+            "planner", {"tick_rate": rate, "lie_bracket.cycles": gait_cycles_for(duration)}
+        )
     )
     memory: list[float] = []
     with (

@@ -10,7 +10,7 @@ import numpy as np
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.report import (
-    MADE_BY,
+    FOOTER_TEXT,
     Results,
     figure_with_axes,
     messages_of,
@@ -100,7 +100,7 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
             _difference_table(found, a, b),
             _difference_figure(first, second, flown_a, flown_b, compared[:6]),
         ]
-    write_output(path, html_page(f"{a} and {b}", body, MADE_BY))
+    write_output(path, html_page(f"{a} and {b}", body, FOOTER_TEXT))
     return [sentence, *(_difference_line(each, b, a) for each in found), *notes]
 
 

@@ -64,7 +64,7 @@ campaign loses no more."""
 _END_POSITION_TOLERANCE = 1e-6
 """Largest distance of a joint from its last position at the end of a schedule, m or rad."""
 
-_LOADS = "plant.disturbances", "plant.orbit.", "plant.table."
+_EXTERNAL_LOAD_PREFIXES = "plant.disturbances", "plant.orbit.", "plant.table."
 """Prefixes of the parameters of loads from outside."""
 
 _GAIN_PREFIX = "coordinated_control.gains."
@@ -152,7 +152,9 @@ class LanesEngine:
         if plant.engine != "exact":
             return f"its plant has the engine '{plant.engine}', which engine 'flights' flies"
         loads = plant.disturbances, plant.orbit, plant.table
-        dispersed = any(each.name.startswith(_LOADS) for each in campaign.dispersions)
+        dispersed = any(
+            each.name.startswith(_EXTERNAL_LOAD_PREFIXES) for each in campaign.dispersions
+        )
         if dispersed or loads != ((), OrbitConfig(), TableConfig()):
             return "it has disturbances, an orbit or a table, which engine 'flights' flies"
         if campaign.measures_clearance:
@@ -265,7 +267,7 @@ class _ScheduledLanes:
         """Return the plan for the first state; the last one if the same values determine it."""
         if _has_noise(flight):
             return _first_plan(flight)
-        key = _plan_key(flight)
+        key = _values_that_determine_plan(flight)
         if self._last_plan is None or self._last_plan[0] != key:
             self._last_plan = key, _first_plan(flight)
         return self._last_plan[1]
@@ -413,7 +415,7 @@ class _ControlledLanes:
             until_decided=True,
         )
         return _batch_of_flights(
-            drawn, program, _ticks_until(campaign.longest, scenario.plant.period_ns)
+            drawn, program, _tick_of_interruption(campaign.longest, scenario.plant.period_ns)
         )
 
     def measures(
@@ -501,11 +503,11 @@ def _end_effector_error(
 
 def _has_noise(flight: DrawnFlight) -> bool:
     """Whether the first measured state may differ from draw to draw."""
-    return _errs(replace(flight.scenario.plant.sensors, seed=0))
+    return _has_unseeded_errors(replace(flight.scenario.plant.sensors, seed=0))
 
 
 @lru_cache
-def _errs(sensors: SensorConfig) -> bool:
+def _has_unseeded_errors(sensors: SensorConfig) -> bool:
     """Whether sensors without a seed have errors."""
     return any(np.any(value) for value in values_of(sensors).values())
 
@@ -522,7 +524,7 @@ def _first_plan(flight: DrawnFlight) -> _Plan | None:
     return _Plan(schedule, first.gait)
 
 
-def _plan_key(flight: DrawnFlight) -> Any:
+def _values_that_determine_plan(flight: DrawnFlight) -> Any:
     """Return the values that determine a plan without noise, to be compared."""
     scenario = flight.scenario
     plant = replace(scenario.plant, sensors=replace(scenario.plant.sensors, seed=0))
@@ -556,7 +558,7 @@ def _goal_poses(goals: Sequence[Goal | None]) -> Array | None:
     return np.array([np.concatenate([each.position, each.quaternion]) for each in checked])
 
 
-def _ticks_until(longest: float, period_ns: int) -> int:
+def _tick_of_interruption(longest: float, period_ns: int) -> int:
     """Return the first tick at which a flight is interrupted."""
     tick = max(1, int(longest * SECOND / period_ns) - 1)
     while tick * period_ns / SECOND < longest:

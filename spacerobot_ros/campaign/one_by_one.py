@@ -94,7 +94,7 @@ def robots_of(flight: DrawnFlight) -> Robots:
     weighing = plant_robot(flight)
     if flight.inertial is not None:
         weighing = weighing.with_inertial(flight.inertial)
-    elif flight.weighs_target:
+    elif flight.has_target_masses:
         # Robots that share their functions have targets that share them, too.
         weighing = weighing.with_masses_of(weighing.description)
     else:

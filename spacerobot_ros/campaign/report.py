@@ -40,7 +40,7 @@ from spacerobot_ros.report.figures import FAINT, INK, PALETTE, PictureFormat, dr
 from spacerobot_ros.report.page_parts import facts, figure, html_page, table, tiles
 from spacerobot_ros.version import __version__
 
-MADE_BY = f"Made by spacerobot_ros {__version__}."
+FOOTER_TEXT = f"Made by spacerobot_ros {__version__}."
 """Footer of the pages of campaigns."""
 
 PASSING = "passing"
@@ -49,20 +49,20 @@ PASSING = "passing"
 _WORST_FLIGHTS_SHOWN = 10
 _MESSAGES_SHOWN = 4
 """Messages of flights of one outcome."""
-_MAX_BADNESS = 100.0
+_MAX_BOUND_DISTANCE = 100.0
 """Distance from a bound at which the order of the worst flights saturates, standard deviations."""
 
 _MAX_HISTOGRAMS, _MAX_SCATTER_PLOTS = 9, 6
 """Largest numbers of metrics with a histogram and of drivers with a plot."""
 
-NO_DRIVERS = "no correlation is beyond chance (p < 0.05, corrected for all of them)."
+NO_INFLUENCES_TEXT = "no correlation is beyond chance (p < 0.05, corrected for all of them)."
 
 Flags = npt.NDArray[np.bool_]
 
 _QUANTILES_SHOWN = (0.01, 0.5, 0.99)
 """Quantiles shown of each distribution."""
 
-_MOST_STEPS = 2000
+_MAX_CURVE_STEPS = 2000
 """Steps of a curve of cumulative shares."""
 
 _REASON = "reason"
@@ -279,7 +279,7 @@ class Results:
         """Return the columns of the metrics of the report."""
         return {name: self.columns[name] for name in self.shown_metrics}
 
-    def requirement_share(self, criterion: Criterion) -> Share:
+    def share_meeting(self, criterion: Criterion) -> Share:
         """Return the share of flights that meet a criterion."""
         values = self.columns[criterion.metric].tolist()
         met = sum(meets_criterion(criterion, {criterion.metric: value}) for value in values)
@@ -304,14 +304,19 @@ class Results:
 
         Flights that passed are ordered by their distance from a bound, in standard deviations.
         """
-        badness = np.full(len(self), -_MAX_BADNESS)
+        badness = np.full(len(self), -_MAX_BOUND_DISTANCE)
         for criterion in self.campaign.criteria:
             x = self.columns[criterion.metric]
             spread = x[np.isfinite(x)].std() if np.isfinite(x).any() else 1.0
             over = np.maximum(x - criterion.maximum, criterion.minimum - x) / (spread or 1.0)
             # A missing metric counts as beyond its bounds.
             badness = np.maximum(
-                badness, np.clip(np.nan_to_num(over, nan=_MAX_BADNESS), -_MAX_BADNESS, _MAX_BADNESS)
+                badness,
+                np.clip(
+                    np.nan_to_num(over, nan=_MAX_BOUND_DISTANCE),
+                    -_MAX_BOUND_DISTANCE,
+                    _MAX_BOUND_DISTANCE,
+                ),
             )
         if not self.campaign.criteria:
             badness = np.nan_to_num(self.columns["position_error_m"])
@@ -333,11 +338,11 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     """
     results = Results.of(folder)
     title = f"Campaign {results.campaign.name}"
-    write_output(path, html_page(title, _page_body(results), MADE_BY))
+    write_output(path, html_page(title, _page_body(results), FOOTER_TEXT))
     lines = [f"success     {results.success}"]
     lines += [f"{name:<11} {each}" for name, each in results.shares.items()]
     lines += [f"note        {results.bias}"] if results.bias else []
-    lines += [f"required    {c}: {results.requirement_share(c)}" for c in results.campaign.criteria]
+    lines += [f"required    {c}: {results.share_meeting(c)}" for c in results.campaign.criteria]
     lines += [
         f"{outcome:<11} {count} of {len(results)}: {message}"
         for outcome, count, message in messages_of(results)
@@ -345,13 +350,13 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     ]
     found = results.influences()
     drivers = [each for each in found if each.beyond_chance]
-    lines += [f"driver      {each}" for each in _passing_first(drivers)[:3]]
+    lines += [f"driver      {each}" for each in _sort_passing_first(drivers)[:3]]
     if found and not drivers:
-        lines.append(f"driver      none: {NO_DRIVERS}")
+        lines.append(f"driver      none: {NO_INFLUENCES_TEXT}")
     return lines
 
 
-def _passing_first(found: Sequence[Influence]) -> list[Influence]:
+def _sort_passing_first(found: Sequence[Influence]) -> list[Influence]:
     """Return sensitivities in their order, those of passing before the others."""
     return sorted(found, key=lambda each: each.metric != PASSING)
 
@@ -463,7 +468,7 @@ def _criteria_section(results: Results) -> str:
     for criterion in results.campaign.criteria:
         values = percentiles(results.columns[criterion.metric])
         middle, high = values[PERCENTILES.index(50.0)], values[PERCENTILES.index(95.0)]
-        met = results.requirement_share(criterion)
+        met = results.share_meeting(criterion)
         rows.append([str(criterion), *_share_cells(met), f"{middle:.4g}", f"{high:.4g}"])
     rows.append(["all together", *_share_cells(results.success), "", ""])
     head = ["requirement", "met by", "95 % interval", "median", "95 percentile"]
@@ -526,7 +531,7 @@ def _histograms_section(results: Results) -> str:
         panel.set_ylabel("flights")
         shares = panel.twinx()
         # A curve through more points looks the same.
-        few = np.unique(np.linspace(0, len(there) - 1, _MOST_STEPS).astype(int))
+        few = np.unique(np.linspace(0, len(there) - 1, _MAX_CURVE_STEPS).astype(int))
         shares.step(np.sort(there)[few], (few + 1) / len(there), color=INK, where="post")
         shares.set_ylim(0.0, 1.02)
         shares.set_ylabel("cumulative share")
@@ -542,9 +547,9 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
         return '<p class="missing">No drawn number varies with a metric.</p>'
     sobol = any(each.total is not None for each in found)
     rows = []
-    for each in _passing_first(found)[:15]:
+    for each in _sort_passing_first(found)[:15]:
         cells = [each.cause, each.metric, f"{each.correlation:+.3f}", f"{each.p:.2g}"]
-        cells += [f"{each.departure:+.3f}", f"{each.p_departure:.2g}"]
+        cells += [f"{each.departure:+.3f}", f"{each.p_distance_from_median:.2g}"]
         if sobol:
             for index in (each.first, each.total):
                 cells.append("" if index is None else f"{index[0]:.3f} ± {index[1]:.3f}")
@@ -564,7 +569,7 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
     if not sobol:
         note += " The sampler 'saltelli' adds Sobol indices."
     if not any(each.beyond_chance for each in found):
-        note += f" Here {NO_DRIVERS}"
+        note += f" Here {NO_INFLUENCES_TEXT}"
     return f'<p class="facts">{escape(note)}</p>' + table("drivers", head, rows)
 
 

@@ -75,7 +75,7 @@ class Influence:
         Spearman's rank correlation.
     p
         Probability of a correlation at least as large by chance.
-    departure, p_departure
+    departure, p_distance_from_median
         The same for the distance of the drawn value from its median, with which a metric correlates
         that grows to both sides.
     first, total
@@ -87,7 +87,7 @@ class Influence:
     correlation: float
     p: float
     departure: float = 0.0
-    p_departure: float = 1.0
+    p_distance_from_median: float = 1.0
     first: tuple[float, float] | None = None
     total: tuple[float, float] | None = None
 
@@ -96,7 +96,7 @@ class Influence:
         """Whether the total index, or else the larger correlation, is unlikely to be by chance."""
         if self.total is not None:
             return self.total[0] > self.total[1]
-        p = self.p if abs(self.correlation) >= abs(self.departure) else self.p_departure
+        p = self.p if abs(self.correlation) >= abs(self.departure) else self.p_distance_from_median
         return p < _SIGNIFICANCE
 
     @property
@@ -137,8 +137,10 @@ def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> lis
             if np.ptp(away) > 0.0:
                 both = spearmanr(away, y)
                 numbers[2:] = float(both.statistic), float(both.pvalue)
-            correlation, p, departure, p_departure = numbers
-            found.append(Influence(cause, metric, correlation, p, departure, p_departure))
+            correlation, p, departure, p_distance_from_median = numbers
+            found.append(
+                Influence(cause, metric, correlation, p, departure, p_distance_from_median)
+            )
     return found
 
 
@@ -152,11 +154,11 @@ def corrected(found: Sequence[Influence]) -> list[Influence]:
         return []
     from scipy.stats import false_discovery_control
 
-    chances = np.array([[each.p, each.p_departure] for each in found])
+    chances = np.array([[each.p, each.p_distance_from_median] for each in found])
     adjusted = false_discovery_control(np.nan_to_num(chances, nan=1.0).ravel()).reshape(-1, 2)
     return [
-        replace(each, p=p, p_departure=p_departure)
-        for each, (p, p_departure) in zip(found, adjusted.tolist(), strict=True)
+        replace(each, p=p, p_distance_from_median=p_distance_from_median)
+        for each, (p, p_distance_from_median) in zip(found, adjusted.tolist(), strict=True)
     ]
 
 

@@ -38,7 +38,7 @@ _LEAST_FACTOR = 1e-6
 
 _POSE_TARGET_NAMES = ("goal", "end_effector_goal", "initial")
 
-KINDS_OF_TARGETS = (
+TARGET_KINDS = (
     ("NODE.PARAMETER", "a parameter of a node; NODE.PARAMETER[i] a number of a list, by joint too"),
     ("mass, mass.BODY, mass.*", "factor on mass and inertia of all bodies alike, of one, of each"),
     ("inertia, inertia.BODY, inertia.*", "factor on the inertia, likewise"),
@@ -96,7 +96,7 @@ class DrawnFlight:
     parameters, physical
         Masses, centres and inertias of the nominal robot, and whether they are those of bodies
         without slack for rounding.
-    weighs_target
+    has_target_masses
         Whether the mass properties of the target are drawn.
     """
 
@@ -107,7 +107,7 @@ class DrawnFlight:
     com: Array
     parameters: InertialParameters
     physical: bool
-    weighs_target: bool = False
+    has_target_masses: bool = False
 
     @classmethod
     def of(cls, scenario: Scenario) -> DrawnFlight:
@@ -233,7 +233,7 @@ def targets_of(name: str, scenario: Scenario) -> list[Target]:
     known = [f"{node}.{p.name}" for node in CONFIGS for p in declared(CONFIGS[node])]
     known += ["mass", "inertia", "com", "target.mass", "target.inertia", "target.com.x"]
     known += [*_POSE_TARGET_NAMES, "faults[0].at", "faults[0].until"]
-    kinds = "; ".join(names for names, _ in KINDS_OF_TARGETS)
+    kinds = "; ".join(names for names, _ in TARGET_KINDS)
     raise ParameterError(
         f"'{name}' is nothing that can be dispersed; there are {kinds}.{suggestion(name, known)}"
     )
@@ -264,7 +264,7 @@ def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Ta
     if not index:
         return _scalar_target(name, node, declaration, value)
     assert isinstance(value, tuple)
-    return _entry_target(name, node, declaration, index, scenario)
+    return _list_entry_target(name, node, declaration, index, scenario)
 
 
 def _scalar_target(name: str, node: str, declaration: Parameter, value: Any) -> Target:
@@ -276,7 +276,7 @@ def _scalar_target(name: str, node: str, declaration: Parameter, value: Any) -> 
     return Target(name, apply, declaration.unit, isinstance(value, str), frozenset({name}))
 
 
-def _entry_target(
+def _list_entry_target(
     name: str, node: str, declaration: Parameter, index: str, scenario: Scenario
 ) -> Target:
     """Return the target of a number in a list, by its index or by its joint."""
@@ -407,7 +407,7 @@ def _floating_target(name: str, part: str, scenario: Scenario) -> Target:
         parameters = InertialParameters.of(target).scaled(mass, inertia).shifted(offset)
         parameters.require_physical([target.base_link])
         text = {"target.robot_description": urdf_with(target, parameters)}
-        return replace(flight.with_overrides("plant", text), weighs_target=True)
+        return replace(flight.with_overrides("plant", text), has_target_masses=True)
 
     return Target(name, apply, "m" if column >= 0 else "1", False, frozenset({name}))
 

@@ -20,7 +20,7 @@ from spacerobot_ros.cli.options import (
     picture_option,
     topic_option,
     view_option,
-    viewing_if,
+    viewer_if_requested,
 )
 from spacerobot_ros.errors import printable
 
@@ -161,7 +161,7 @@ def replay_command(
     texts = {"bag": str(bag), "topics": " ".join(topics), "remap": " ".join(remap)}
     values = {**options, **texts, "hold": view}
     overrides = [Parameter(name, value=value) for name, value in values.items()]
-    with viewing_if(view, {}):
+    with viewer_if_requested(view, {}):
         code = run_node(lambda: ReplayNode(parameter_overrides=overrides), [])
     sys.exit(code)
 
@@ -212,7 +212,7 @@ def salvage_command(bag: Path, out: Path | None) -> None:
     click.echo(
         f"lost        {saved.lost_bytes} bytes behind the last whole record, "
         f"{saved.lost_chunks} damaged chunk(s)"
-        + (f"; the first: {saved.lost_because}" if saved.lost_because else "")
+        + (f"; the first: {saved.loss_reason}" if saved.loss_reason else "")
     )
     click.echo(f"bag         {saved.path}")
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spacerobot_ros.cli.errors import end_if_requested, fail
+from spacerobot_ros.cli.errors import exit_if_terminated, fail
 from spacerobot_ros.cli.options import PATH, DefaultGroup, bag_option, out_option, report_option
 from spacerobot_ros.errors import ParameterError
 
@@ -94,7 +94,7 @@ def fly(
     assert file is not None
     folder = _fly_campaign(file, flights, engine, cluster, out)
     _write_report(folder, report)
-    end_if_requested()
+    exit_if_terminated()
 
 
 @campaign_command.command("report")
@@ -121,7 +121,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
     result = rerun_flight(folder, number, path)
     for line in result.lines:
         click.echo(line)
-    end_if_requested()
+    exit_if_terminated()
     if not result.agrees:
         fail("The flight is another one than that in the dataset.")
 
@@ -196,7 +196,7 @@ def _compare(
     folders = []
     for file, name in zip(files, names, strict=True):
         folders.append(_fly_campaign(file, flights, engine, cluster, base / name, name))
-        end_if_requested()
+        exit_if_terminated()
     path = report or base / "report.html"
     for line in write_comparison((folders[0], folders[1]), path):
         click.echo(line)

@@ -46,7 +46,7 @@ def end(ending: Terminated) -> NoReturn:
     sys.exit(ending.exit_code)
 
 
-def end_if_requested() -> None:
+def exit_if_terminated() -> None:
     """End a command whose work a signal has cut short, after its output is written."""
     ending = termination()
     if ending is not None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.errors import end_if_requested, fail
+from spacerobot_ros.cli.errors import exit_if_terminated, fail
 from spacerobot_ros.cli.options import (
     LAWS,
     METHODS,
@@ -23,13 +23,13 @@ from spacerobot_ros.cli.options import (
     end_effector_options,
     goal_options,
     json_option,
-    note_large_angles,
     numbers,
     processes_option,
     report_option,
     settings_option,
     view_option,
-    viewing_if,
+    viewer_if_requested,
+    warn_of_large_angles,
     write_json,
 )
 from spacerobot_ros.cli.progress import display
@@ -96,7 +96,7 @@ def run_command(
         raise click.UsageError("--view needs --realtime: a flight in lockstep is over soon.")
     usual = bag or Path("out") / f"{chosen.name}.mcap"
     taken, path = os.path.lexists(usual), bag or free_name(usual)
-    with viewing_if(view, chosen.parameters("viewer")), display(chosen.name) as shown:
+    with viewer_if_requested(view, chosen.parameters("viewer")), display(chosen.name) as shown:
         result = run_scenario(chosen, path, shown.fly, processes=processes, longest=longest)
     path = Path(result.summary["bag"])
     if result.summary["state"] == "refused" and not result.summary["ticks"]:
@@ -119,7 +119,7 @@ def run_command(
     elif termination() is not None:
         words += ["--out", str(report)]
         click.echo(f"report      none of an interrupted flight: `{shlex.join(words)}` makes one")
-    end_if_requested()
+    exit_if_terminated()
     if report is not None:
         from spacerobot_ros.report import write_report
 
@@ -295,7 +295,7 @@ def up_command(
     chosen = scenario_or_robot(scenario).in_real_time(rate).with_settings(settings)
     from spacerobot_ros.session.run import run_until_stopped
 
-    with viewing_if(view, chosen.parameters("viewer"), namespace) as viewer:
+    with viewer_if_requested(view, chosen.parameters("viewer"), namespace) as viewer:
         if viewer is not None:
             viewer.restart_within(restarts)
         recorded = run_until_stopped(
@@ -350,7 +350,7 @@ def goal_command(
     else:
         goal = Goal.checked(pose[:3], pose[3:] or (0.0, 0.0, 0.0, 1.0))
         if rotvec:
-            note_large_angles(rotvec, "--goal-rpy-deg")
+            warn_of_large_angles(rotvec, "--goal-rpy-deg")
             goal = Goal.from_rotvec(pose[:3], rotvec)
         if rpy_deg:
             goal = Goal.from_rpy(pose[:3], rpy_deg)
@@ -359,7 +359,7 @@ def goal_command(
     from spacerobot_ros.session.run import send_goal
 
     outcome = send_goal(goal, click.echo, namespace=namespace, timeout=timeout)
-    end_if_requested()
+    exit_if_terminated()
     if outcome is not Outcome.REACHED:
         fail()
 

@@ -193,7 +193,7 @@ class GoalOptions:
     def apply_to(self, scenario: Scenario) -> Scenario:
         """Return a scenario with this goal; a rotation that looks like degrees is reported."""
         if self.rotvec is not None:
-            note_large_angles(self.rotvec, "--goal-rpy-deg")
+            warn_of_large_angles(self.rotvec, "--goal-rpy-deg")
         scenario = scenario.with_goal(self.pose, self.rotvec, self.rpy_deg)
         hands = self.end_effectors.goals()
         if not hands:
@@ -338,7 +338,7 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def note_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> None:
+def warn_of_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> None:
     """Report a rotation of more than a turn, which may have been meant in degrees."""
     angle = math.hypot(*rotvec)
     if 2 * math.pi < angle < math.inf:
@@ -378,7 +378,7 @@ LAWS = "spacerobot_ros.control.laws.registry:LAWS"
 
 
 @contextmanager
-def viewing_if(
+def viewer_if_requested(
     view: bool, parameters: Mapping[str, Any], namespace: str = ""
 ) -> Iterator[Viewer | None]:
     """Run the viewer beside a command if ``view``; its address is written to standard error."""

@@ -28,13 +28,13 @@ _MAX_LISTED_JOINTS = 12
 """Largest number of listed joints; further joints are only counted."""
 
 
-_MOST_RADIANS = 20.0
+_MAX_PLAUSIBLE_RADIANS = 20.0
 """Limit of a joint beyond which it is likely to be in degrees."""
 
-_MOST_DISTANCES = 3
+_MAX_LISTED_DISTANCES = 3
 """Pairs of links whose distances are listed, nearest first."""
 
-_MOST_INTERVALS = 4
+_MAX_LISTED_INTERVALS = 4
 """Intervals of distances that are listed; of more, the number and the length are."""
 
 
@@ -147,7 +147,7 @@ def _interval_text(ends: tuple[float, float]) -> str:
 def _intervals_text(intervals: Sequence[tuple[float, float]]) -> str:
     if not intervals:
         return "none found"
-    if len(intervals) > _MOST_INTERVALS:
+    if len(intervals) > _MAX_LISTED_INTERVALS:
         total = sum(high - low for low, high in intervals)
         span = _interval_text((intervals[0][0], intervals[-1][1]))
         return f"{len(intervals)} intervals from {span} m, together {total:.3g} m"
@@ -249,7 +249,7 @@ def _degree_warnings(robot: RobotDescription) -> list[str]:
         for joint in robot.movable_joints
         if joint.unit == "rad"
         and any(
-            math.isfinite(limit) and abs(limit) > _MOST_RADIANS
+            math.isfinite(limit) and abs(limit) > _MAX_PLAUSIBLE_RADIANS
             for limit in (joint.limits.lower, joint.limits.upper)
         )
     ]
@@ -257,8 +257,8 @@ def _degree_warnings(robot: RobotDescription) -> list[str]:
         return []
     names = ", ".join(f"'{name}'" for name in suspects[:_MAX_LISTED_JOINTS])
     return [
-        f"warning: the limits of {names} are beyond {_MOST_RADIANS:g} rad, several turns. Those of "
-        "a URDF are in radians: if these are degrees, divide them by 57.2958."
+        f"warning: the limits of {names} are beyond {_MAX_PLAUSIBLE_RADIANS:g} rad, several turns. "
+        "Those of a URDF are in radians: if these are degrees, divide them by 57.2958."
     ]
 
 
@@ -321,9 +321,9 @@ def _distance_lines(found: Analysis) -> list[str]:
     if distances:
         distance = "a distance" if len(distances) == 1 else "distances"
         lines[0] += f", with {distance} at this shape of"
-    lines += [f"  {d:.3g} m  {pair}" for pair, d in list(distances.items())[:_MOST_DISTANCES]]
-    if len(distances) > _MOST_DISTANCES:
-        lines.append(f"  and more of {len(distances) - _MOST_DISTANCES} others")
+    lines += [f"  {d:.3g} m  {pair}" for pair, d in list(distances.items())[:_MAX_LISTED_DISTANCES]]
+    if len(distances) > _MAX_LISTED_DISTANCES:
+        lines.append(f"  and more of {len(distances) - _MAX_LISTED_DISTANCES} others")
     lines += [f"not counted: {pair} ({why})" for pair, why in geometry.ignored.items()]
     lines += geometry.notes
     if not geometry.exact and distances:

@@ -16,13 +16,13 @@ import numpy.typing as npt
 
 from spacerobot_ros.collision.geometry import CollisionGeometry, Solid
 from spacerobot_ros.collision.rows import (
-    AWAY_FROM_ZERO,
     SHARPNESS_OF_FACES,
     SHARPNESS_OF_MINIMUM,
+    SQUARE_ROOT_OFFSET,
     DistanceRows,
     Form,
+    ball_and_field_roles,
     chain_of,
-    roles_of,
 )
 from spacerobot_ros.model.compilation import compiled_functions
 from spacerobot_ros.model.description import JointKind, Pose, RobotDescription
@@ -135,7 +135,7 @@ class _Tables:
     def add(self, links: Sequence[Solid]) -> None:
         """Add a pair of links; of none, one without rows."""
         forms = [Form.of(each) for each in links]
-        roles = roles_of(forms[0], forms[1]) if forms else []
+        roles = ball_and_field_roles(forms[0], forms[1]) if forms else []
         self._pairs.append(_structure([len(self._roles), len(roles)]))
         for balls, field in roles:
             self._add_role(links[balls], forms[balls], links[field], forms[field])
@@ -168,7 +168,7 @@ class _Tables:
             "MOST_BALLS": self._most_balls,
             "SHARPNESS_OF_MINIMUM": SHARPNESS_OF_MINIMUM,
             "SHARPNESS_OF_FACES": SHARPNESS_OF_FACES,
-            "AWAY_FROM_ZERO": AWAY_FROM_ZERO,
+            "SQUARE_ROOT_OFFSET": SQUARE_ROOT_OFFSET,
         }
         tables = {
             "Pair PAIRS[]": self._pairs,

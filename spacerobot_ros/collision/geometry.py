@@ -40,13 +40,13 @@ _HALF_RANGE = {JointKind.PRISMATIC: 1.0}
 """Half the range that is drawn from of a joint without limits, m; pi for joints that turn."""
 
 
-_WORLD = -1
+_WORLD_BODY = -1
 """Index of the body of obstacles."""
 
-_COAXIAL = 1e-9
+_COAXIAL_TOLERANCE = 1e-9
 """Largest distance (m) and tilt (rad) from the axis of a joint of a body of revolution about it."""
 
-_FAR_AWAY = 1e9
+_UNKNOWN_BASE_DISTANCE = 1e9
 """Distance of obstacles where the pose of the base is not known, m: they are not looked at."""
 
 
@@ -131,7 +131,7 @@ class Solid:
     @property
     def is_obstacle(self) -> bool:
         """Whether it is fixed in the world."""
-        return self.body == _WORLD
+        return self.body == _WORLD_BODY
 
 
 Poses = tuple[Array, Array]
@@ -192,7 +192,7 @@ class CollisionGeometry:
         if obstacles_alone:
             self.pairs = self.pairs[[self.solids[j].is_obstacle for _, j in self.pairs]]
             return
-        self._leave_out(self._always_in_contact())
+        self._exclude_pairs(self._always_in_contact())
 
     @cached_property
     def distance_function(self) -> DistanceFunction:
@@ -236,7 +236,7 @@ class CollisionGeometry:
             return R, r
         at = shapes.shape[:-1]
         R_BW = np.broadcast_to(np.eye(3), (*at, 3, 3))
-        r_BW = np.full((*at, 3), _FAR_AWAY)
+        r_BW = np.full((*at, 3), _UNKNOWN_BASE_DISTANCE)
         if base is not None:
             R_BW, r_BW = base.world
         return (
@@ -352,7 +352,7 @@ class CollisionGeometry:
                     break
         return contact
 
-    def _leave_out(self, contact: npt.NDArray[np.bool_]) -> None:
+    def _exclude_pairs(self, contact: npt.NDArray[np.bool_]) -> None:
         for pair in np.flatnonzero(contact):
             self.ignored.setdefault(self.links_of(int(pair)), "always in contact")
         self.pairs = self.pairs[~contact]
@@ -410,7 +410,9 @@ def _spins_in_place(solid: Solid, link_pose: Pose, joint: Joint) -> bool:
     placed = link_pose @ solid.shape.pose
     beside = float(np.linalg.norm(np.cross(joint.axis, placed.r)))
     tilted = float(np.linalg.norm(np.cross(joint.axis, placed.R[:, 2])))
-    return beside < _COAXIAL and (solid.shape.kind == "sphere" or tilted < _COAXIAL)
+    return beside < _COAXIAL_TOLERANCE and (
+        solid.shape.kind == "sphere" or tilted < _COAXIAL_TOLERANCE
+    )
 
 
 def _in_world(obstacle: Solid, pose: Pose) -> Solid:
@@ -418,7 +420,7 @@ def _in_world(obstacle: Solid, pose: Pose) -> Solid:
     box, vertices = obstacle.enclosure, obstacle.vertices
     return replace(
         obstacle,
-        body=_WORLD,
+        body=_WORLD_BODY,
         shape=replace(obstacle.shape, pose=pose @ obstacle.shape.pose),
         enclosure=replace(box, pose=pose @ box.pose),
         vertices=None if vertices is None else vertices @ pose.R.T + pose.r,

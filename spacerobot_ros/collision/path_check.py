@@ -16,7 +16,7 @@ import numpy as np
 from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair
 from spacerobot_ros.model.description import Array
 
-_RESOLUTION = 5e-4
+_MOTION_RESOLUTION = 5e-4
 """Motion of a pair within which its distance is not looked at any more, m."""
 
 
@@ -186,7 +186,7 @@ class PathCheck:
         d_0, d_1, v = known[index], known[index + 1], motion[starts, pair]
         while True:
             # Only where the distance may be less than any that is known, and matters.
-            open_ = ((d_0 + d_1 - v) / 2 < min(best, limit)) & (v > _RESOLUTION)
+            open_ = ((d_0 + d_1 - v) / 2 < min(best, limit)) & (v > _MOTION_RESOLUTION)
             if not open_.any():
                 break
             left, right, d_0, d_1, v = (x[open_] for x in (left, right, d_0, d_1, v))

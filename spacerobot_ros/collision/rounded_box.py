@@ -20,10 +20,10 @@ import numpy as np
 
 from spacerobot_ros.model.description import Array, Pose, Shape
 
-_PROJECTIONS = 60
+_MAX_PROJECTIONS = 60
 """Alternating projections to the nearest points; the bound holds after any number of them."""
 
-_PARALLEL = 1e-9
+_PARALLEL_TOLERANCE = 1e-9
 """Length of the cross product of two unit vectors below which they count as parallel."""
 
 
@@ -116,8 +116,8 @@ def separation(
     between = c_2 - c_1
     edges = np.cross(A[:, :, :, np.newaxis], B[:, :, np.newaxis, :], axis=1).reshape(-1, 3, 9)
     lengths = np.linalg.norm(edges, axis=1, keepdims=True)
-    parallel = lengths[:, 0] < _PARALLEL
-    edges = edges / np.where(lengths < _PARALLEL, 1.0, lengths)
+    parallel = lengths[:, 0] < _PARALLEL_TOLERANCE
+    edges = edges / np.where(lengths < _PARALLEL_TOLERANCE, 1.0, lengths)
     axes = np.concatenate([A, B, edges], axis=2)
 
     def gaps(directions: Array) -> Array:
@@ -157,7 +157,7 @@ def _nearest_points(
 ) -> tuple[Array, Array]:
     """Return about the nearest points (N, 3) of two boxes, by alternating projections."""
     x, y = c_1, c_2
-    for _ in range(_PROJECTIONS):
+    for _ in range(_MAX_PROJECTIONS):
         x = _projected(y, c_1, A, a)
         y = _projected(x, c_2, B, b)
     return x, y

@@ -9,7 +9,7 @@
  * 3 x 3 one for the Hessian.
  *
  * Before this text stand JOINTS, MOST_STEPS, MOST_BALLS, SHARPNESS_OF_MINIMUM, SHARPNESS_OF_FACES,
- * AWAY_FROM_ZERO, and the tables PAIRS, ROLES, STEPS and BALLS of the structures below.
+ * SQUARE_ROOT_OFFSET, and the tables PAIRS, ROLES, STEPS and BALLS of the structures below.
  */
 
 /* Logarithm of a weight beside 1 that counts for nothing in a double. */
@@ -93,7 +93,7 @@ static double weight(double logarithm) {
 
 /* About the distance from the axis of a rod. */
 static void from_rod(const Role *role, const double *x, Field *field) {
-  double beyond[3], active[3], sum = AWAY_FROM_ZERO;
+  double beyond[3], active[3], sum = SQUARE_ROOT_OFFSET;
   int i, j;
   for (i = 0; i < 3; ++i) {
     const double half = role->half[i], over = fabs(x[i]) - half;

@@ -31,26 +31,26 @@ from spacerobot_ros.model.kinematics import joint_positions
 SHARPNESS_OF_MINIMUM, SHARPNESS_OF_FACES = 300.0, 150.0
 """Sharpness of smooth minima over balls and of smooth maxima over faces, 1/m."""
 
-_SLENDER = 0.35
+_MAX_ROD_WIDTH_RATIO = 0.35
 """Ratio of width to length below which a box of about square section is a rod, and its sections'
 least ratio of sides."""
-_SQUARE = 0.6
+_MIN_ROD_SECTION_RATIO = 0.6
 
-_SHORT = 1.2
+_MIN_CYLINDER_LENGTH_RATIO = 1.2
 """Ratio of length to radius below which a cylinder is a box."""
 
-_END = 0.6
+_END_BALL_DISTANCE = 0.6
 """Distance of the last ball of a cylinder from its end, in radii: its rim is covered about as much
 as the ball protrudes."""
 
-_SPACING, _MOST_BALLS = 1.0, 12
+_BALL_SPACING, _MAX_BALLS = 1.0, 12
 """Distance of the balls of a rod in radii, and their largest number."""
 
-_MOST_POINTS, _THIN = 3, 0.1
+_MAX_GRID_POINTS, _MIN_EDGE_RATIO = 3, 0.1
 """Points of a grid along an edge of a box at most, and the ratio of an edge to the longest below
 which there is one."""
 
-AWAY_FROM_ZERO = 1e-10
+SQUARE_ROOT_OFFSET = 1e-10
 """Added below square roots, m^2: their derivative is infinite at zero."""
 
 
@@ -74,23 +74,25 @@ class Form:
     def of(cls, solid: Solid) -> Form:
         """Return the form of a solid."""
         shape = solid.shape
-        if shape.kind == "cylinder" and shape.size[1] >= _SHORT * shape.size[0]:
+        if shape.kind == "cylinder" and shape.size[1] >= _MIN_CYLINDER_LENGTH_RATIO * shape.size[0]:
             radius, length = shape.size
-            end = max(length / 2 - _END * radius, 0.0)
+            end = max(length / 2 - _END_BALL_DISTANCE * radius, 0.0)
             return cls._rod(RoundedBox(shape.pose, np.array([0.0, 0.0, end]), radius))
         box = solid.enclosure
         half = np.sort(box.half)
         if np.count_nonzero(box.half) < 2:
             return cls._rod(box)
-        if half[1] < _SLENDER * half[2] and half[0] > _SQUARE * half[1]:
+        if half[1] < _MAX_ROD_WIDTH_RATIO * half[2] and half[0] > _MIN_ROD_SECTION_RATIO * half[1]:
             # Between the circles in and around the section.
             radius = (half[1] + float(np.hypot(half[0], half[1]))) / 2
             longest = np.arange(3) == int(np.argmax(box.half))
-            core = np.where(longest, box.half - _END * radius, 0.0)
+            core = np.where(longest, box.half - _END_BALL_DISTANCE * radius, 0.0)
             return cls._rod(RoundedBox(box.pose, core, radius + box.radius))
         # A plate is one layer of balls.
-        thin = box.half < _THIN * box.half.max()
-        counts = np.clip(np.ceil(2 * box.half / box.half.max()) + 1, 2, _MOST_POINTS).astype(int)
+        thin = box.half < _MIN_EDGE_RATIO * box.half.max()
+        counts = np.clip(np.ceil(2 * box.half / box.half.max()) + 1, 2, _MAX_GRID_POINTS).astype(
+            int
+        )
         lines = [
             np.zeros(1) if flat else np.linspace(-x, x, k)
             for x, k, flat in zip(box.half, counts, thin, strict=True)
@@ -104,7 +106,9 @@ class Form:
     def _rod(cls, box: RoundedBox) -> Form:
         longest = int(np.argmax(box.half))
         half = box.half[longest]
-        count = int(np.clip(np.ceil(2 * half / (_SPACING * box.radius + 1e-9)), 0, _MOST_BALLS - 1))
+        count = int(
+            np.clip(np.ceil(2 * half / (_BALL_SPACING * box.radius + 1e-9)), 0, _MAX_BALLS - 1)
+        )
         points = np.zeros((count + 1, 3))
         points[:, longest] = np.linspace(-half, half, count + 1) if count else 0.0
         return cls(box, _moved(box.pose, points), box.radius)
@@ -117,7 +121,7 @@ class Form:
             beyond = [
                 ca.fmax(ca.fabs(local[i]) - half[i], 0.0) if half[i] else local[i] for i in range(3)
             ]
-            return ca.sqrt(ca.sumsqr(ca.vertcat(*beyond)) + AWAY_FROM_ZERO) - self.box.radius
+            return ca.sqrt(ca.sumsqr(ca.vertcat(*beyond)) + SQUARE_ROOT_OFFSET) - self.box.radius
         faces = ca.vertcat(local - ca.DM(half), -local - ca.DM(half))
         return -_smooth_minimum(-faces, SHARPNESS_OF_FACES) - self.box.radius
 
@@ -145,7 +149,7 @@ class DistanceRows:
         ``q -> dd/dq`` (K, n).
     hessian
         ``(q, lambda) -> `` the Hessian (n, n) of ``lambda' d``.
-    of_obstacles
+    is_of_obstacle
         Whether one of each pair is an obstacle: the functions then take ``y = [q; X]`` (n + 4) in
         place of q, with a quaternion X of any norm, and the numbers ``w`` (:func:`world_values`)
         after that.
@@ -154,7 +158,7 @@ class DistanceRows:
     values: ca.Function
     jacobian: ca.Function
     hessian: ca.Function
-    of_obstacles: bool = False
+    is_of_obstacle: bool = False
 
     @classmethod
     def of(cls, geometry: CollisionGeometry, pairs: Sequence[int]) -> DistanceRows:
@@ -198,7 +202,7 @@ class DistanceRows:
             ca.Function("distances", [y, w], [ca.cse(d)]),
             ca.Function("distances_jac", [y, w], [ca.cse(ca.jacobian(d, y))]),
             ca.Function("distances_hess", [y, w, multiplier], [ca.cse(hessian)]),
-            of_obstacles=True,
+            is_of_obstacle=True,
         )
 
 
@@ -217,7 +221,7 @@ def _row(robot: RobotDescription, first: Solid, second: Solid, q: ca.SX) -> ca.S
 def _smooth_distance(forms: tuple[Form, Form], poses: Sequence[tuple[ca.SX, ca.SX]]) -> ca.SX:
     """Return about the distance of two forms, whose links are at poses in one frame, m."""
     values = []
-    for balls, field in roles_of(*forms):
+    for balls, field in ball_and_field_roles(*forms):
         R_a, r_a = poses[balls]
         R_b, r_b = poses[field]
         for point in forms[balls].balls:
@@ -226,7 +230,7 @@ def _smooth_distance(forms: tuple[Form, Form], poses: Sequence[tuple[ca.SX, ca.S
     return _smooth_minimum(ca.vertcat(*values), SHARPNESS_OF_MINIMUM)
 
 
-def roles_of(first: Form, second: Form) -> list[tuple[int, int]]:
+def ball_and_field_roles(first: Form, second: Form) -> list[tuple[int, int]]:
     """Return which of two forms are balls and which are fields."""
     if first.is_rod and second.is_rod:
         return [(0, 1)] if len(first.balls) <= len(second.balls) else [(1, 0)]

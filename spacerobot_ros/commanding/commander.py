@@ -50,7 +50,7 @@ from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND
 
-_STANDSTILL_TIME = 0.005
+_PROCESS_DELAY_TIME = 0.005
 """Wall time (s) without an answer after which only the last waiting state is answered."""
 
 _REPORT_PERIOD = 1.0
@@ -62,7 +62,7 @@ _FAULT_LOG_PERIOD = 5.0
 LogLevel = Literal["debug", "info", "warning", "error"]
 
 
-class Activity(Enum):
+class CommanderActivity(Enum):
     """Whether a commander answers states."""
 
     INACTIVE = "inactive"
@@ -89,7 +89,7 @@ class CommanderHost(Protocol):
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""
 
-    def log_of_goals(self, level: LogLevel, message: str) -> None:
+    def log_about_goals(self, level: LogLevel, message: str) -> None:
         """Write a line about a goal into the log, which has few of goals that pour in."""
 
     def has_publisher(self, topic: str) -> bool:
@@ -200,7 +200,7 @@ class Commander(ABC):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.config, self.host, self._clock = config, host, clock
-        self.activity = Activity.INACTIVE
+        self.activity = CommanderActivity.INACTIVE
         self.robot: SpaceRobot | None = None
         self.stamps = StampFilter(config.control_period, clock)
         self.states = StateSynchroniser(pose_required=pose_required)
@@ -226,7 +226,7 @@ class Commander(ABC):
     @property
     def active(self) -> bool:
         """Whether states are answered and goals accepted."""
-        return self.activity is Activity.ACTIVE
+        return self.activity is CommanderActivity.ACTIVE
 
     def use_robot(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         """Command this robot from now on, and accept the goals that wait for it.
@@ -240,12 +240,12 @@ class Commander(ABC):
         robot = self._with_payload(robot)
         self._build_executive(robot, decoder)
         self.robot, self._decoder = robot, decoder
-        self._tell_plant_state()
+        self._forward_plant_state()
         waiting, self._waiting_goals = self._waiting_goals, {}
         for key, goal in waiting.items():
             self._submit_goal(key, goal)
 
-    def leave_robot(self, why: str) -> None:
+    def drop_robot(self, why: str) -> None:
         """Give up the goals and the robot; later goals wait for another robot."""
         if self.executive is not None:
             self._give_up_goals(PlantStopped(why))
@@ -261,15 +261,15 @@ class Commander(ABC):
             The file of goals is refused.
         """
         self._resume_goals(self._goal_file.load())
-        self.activity = Activity.ACTIVE
+        self.activity = CommanderActivity.ACTIVE
         # A lockstep plant may already wait for an answer.
         self.answer()
 
     def deactivate(self) -> None:
         """Give up the goals and stop commanding; the file of goals stays."""
-        if self.activity is not Activity.INACTIVE and self.executive is not None:
+        if self.activity is not CommanderActivity.INACTIVE and self.executive is not None:
             self._stop_executive()
-        self.activity, self._waiting_goals = Activity.INACTIVE, {}
+        self.activity, self._waiting_goals = CommanderActivity.INACTIVE, {}
         self._fly_to.settle((), "Aborted: this node was deactivated.")
 
     # -- goals --------------------------------------------------------------------------------
@@ -368,7 +368,7 @@ class Commander(ABC):
         else:
             self._submit_goal(key, goal)
         if self._fly_to:
-            self._fly_to.settle(self._pursued())
+            self._fly_to.settle(self._active_goal_ids())
 
     def _refuse_goal(self, message: str, goal_id: str) -> None:
         self._publish_decision(self._make_status("refused", message, goal_id))
@@ -390,15 +390,15 @@ class Commander(ABC):
     def _publish_status(self, status: Status) -> None:
         # What a goal replaces ends before it begins: the last status is that of the present goal.
         if self._fly_to:
-            self._fly_to.settle(self._pursued() | {status.goal_id})
+            self._fly_to.settle(self._active_goal_ids() | {status.goal_id})
         self.host.publish_status(status)
         self._fly_to.take(status)
         if status.state.decided and self.config.stop_when_decided and self.active:
-            self.activity = Activity.DECIDED
+            self.activity = CommanderActivity.DECIDED
 
     # -- goals of actions ---------------------------------------------------------------------
 
-    def _pursued(self) -> set[str]:
+    def _active_goal_ids(self) -> set[str]:
         """Return the ids of the goals that are pursued, or wait to be."""
         pursued = {goal.goal_id for goal in self._waiting_goals.values()}
         if self.active and self.executive is not None:
@@ -409,11 +409,11 @@ class Commander(ABC):
         """Tell the clients of actions the course of their goals after a state."""
         self._fly_to.advance(self.stamps.now_ns, self._progress)
         self._abort_fly_to()
-        self._fly_to.settle(self._pursued())
+        self._fly_to.settle(self._active_goal_ids())
 
     def _abort_fly_to(self) -> None:
         """Give up all goals where the client of one, or its time limit, asks for it."""
-        why = self._fly_to.to_abort(self._pursued())
+        why = self._fly_to.abort_reason(self._active_goal_ids())
         if why:
             self.abort(why)
 
@@ -466,12 +466,12 @@ class Commander(ABC):
 
     def receive_odom(self, stamp_ns: int, odom: Any) -> None:
         """Take a received odom; set it aside if its stamp belongs to another time."""
-        if self.stamps.admits_odom(stamp_ns, odom):
+        if self.stamps.accepts_odom(stamp_ns, odom):
             self.take_odom(stamp_ns, odom)
 
     def receive_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take received joints: those of another time are set aside, and late ones skipped."""
-        if self._clock() - self._answer_time > _STANDSTILL_TIME:
+        if self._clock() - self._answer_time > _PROCESS_DELAY_TIME:
             self._answer_last_state(Stamped(stamp_ns, joints))
         elif self._is_of_robot(joints) and self.stamps.admits(stamp_ns, joints):
             self.take_joints(stamp_ns, joints)
@@ -530,7 +530,7 @@ class Commander(ABC):
             ahead = newer.stamp_ns - joints.stamp_ns
             if (
                 ahead > 0
-                and self.stamps.would_admit(newer.stamp_ns)
+                and self.stamps.would_accept(newer.stamp_ns)
                 and self._is_of_robot(newer.message)
             ):
                 joints = newer
@@ -573,7 +573,7 @@ class Commander(ABC):
                 self.states.forget_pose()
             if self.executive is not None:
                 self._react_to_change(change)
-        self._tell_plant_state()
+        self._forward_plant_state()
         if self.plant.payload != self._payload:
             self._payload = self.plant.payload
             if self._described is not None:
@@ -592,7 +592,7 @@ class Commander(ABC):
             self.host.log("error", f"plant/status: {error}")
             return robot
 
-    def plant_silent(self, message: str) -> None:
+    def on_plant_silent(self, message: str) -> None:
         """Give up the goals: nothing comes from the plant any more."""
         self._give_up_goals(PlantStopped(message))
 
@@ -601,7 +601,7 @@ class Commander(ABC):
             self.executive.plant_stopped(
                 stopped.why, stopped.commanded_until_ns, stopped.rests_since_ns
             )
-            self._pass_on_outputs()
+            self._forward_outputs()
         elif self._waiting_goals and stopped.commanded_until_ns is None:
             self._abort_waiting(f"Aborted by the plant: {stopped.why}")
 
@@ -644,7 +644,7 @@ class Commander(ABC):
         """Have the executive react to a change."""
 
     @abstractmethod
-    def _tell_plant_state(self) -> None:
+    def _forward_plant_state(self) -> None:
         """Tell the executive whether the plant obeys commands."""
 
     def _awaits_odom(self) -> bool:
@@ -654,5 +654,5 @@ class Commander(ABC):
     def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:  # noqa: B027
         """Report that a goal waits, by a status with a message."""
 
-    def _pass_on_outputs(self) -> None:  # noqa: B027
+    def _forward_outputs(self) -> None:  # noqa: B027
         """Pass the collected outputs of the executive to the host."""

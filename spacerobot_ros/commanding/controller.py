@@ -8,7 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
+from spacerobot_ros.commanding.commander import (
+    Commander,
+    CommanderActivity,
+    CommanderHost,
+    StateDecoder,
+)
 from spacerobot_ros.commanding.plant_state import Pairing, PlantChange, Stamped
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
@@ -30,7 +35,7 @@ TARGET_ODOMETRY = "target/odom"
 """Topic of the measured motion of the target."""
 
 # Constants save the slow look-up of enum members for every state.
-_ACTIVE = Activity.ACTIVE
+_ACTIVE = CommanderActivity.ACTIVE
 _WHOLE = Pairing.WHOLE
 
 
@@ -178,9 +183,9 @@ class ControllerCommander(Commander):
         if change is PlantChange.RESET:
             self.executive.plant_reset()
         else:
-            self.executive.plant_obeys_again()
+            self.executive.on_plant_obeying()
 
-    def _tell_plant_state(self) -> None:
+    def _forward_plant_state(self) -> None:
         if self.executive is not None:
             self.executive.plant_blocked = bool(self.plant.blocked)
 

@@ -187,15 +187,15 @@ class FlyToClient(Protocol):
 
 
 @dataclass
-class _Served:
+class _ActionGoal:
     """A goal with a client that waits for its result."""
 
     client: FlyToClient
     request: FlyTo | None
     """None: it is refused."""
-    begun_ns: int | None = None
+    first_state_ns: int | None = None
     """Stamp of the first state after it was sent, ns."""
-    told_ns: int | None = None
+    last_feedback_ns: int | None = None
     """Stamp of the state at its last feedback, ns."""
     give_up: str = ""
     """Why it is to be given up; empty: it is not."""
@@ -220,7 +220,7 @@ class FlyToGoals:
         report_aborted: Callable[[str, str], Status],
     ) -> None:
         self._errors, self._report_aborted = errors, report_aborted
-        self._served: dict[str, _Served] = {}
+        self._served: dict[str, _ActionGoal] = {}
         """By goal id, in the order in which they came."""
         self._accepted: list[str] = []
         """Ids of the goals that were accepted and not refused, by action or by topic, in order."""
@@ -231,7 +231,7 @@ class FlyToGoals:
 
     def begin(self, goal_id: str, client: FlyToClient, request: FlyTo | None) -> None:
         """Serve a client from now on; ``request`` is None where its goal is refused."""
-        self._served[goal_id] = _Served(client, request)
+        self._served[goal_id] = _ActionGoal(client, request)
 
     def accepted(self, goal_id: str) -> None:
         """Note the goal that was accepted last."""
@@ -239,12 +239,12 @@ class FlyToGoals:
         self._accepted.append(goal_id)
 
     def request_abort(self, goal_id: str, why: str = "on request") -> None:
-        """Have a goal given up with the next :meth:`to_abort`."""
+        """Have a goal given up with the next :meth:`abort_reason`."""
         served = self._served.get(goal_id)
         if served is not None:
             served.give_up = served.give_up or why
 
-    def to_abort(self, pursued: Collection[str]) -> str:
+    def abort_reason(self, pursued: Collection[str]) -> str:
         """Return why all goals are to be given up now; empty: they are not.
 
         An abort gives up every goal. So one that is about to be replaced waits until it is
@@ -265,14 +265,22 @@ class FlyToGoals:
         for goal_id, served in self._served.items():
             if served.request is None:
                 continue
-            if served.begun_ns is None or now_ns < served.begun_ns:
-                served.begun_ns, served.told_ns = now_ns, None  # Also after a jump of time.
+            if served.first_state_ns is None or now_ns < served.first_state_ns:
+                served.first_state_ns, served.last_feedback_ns = (
+                    now_ns,
+                    None,
+                )  # Also after a jump of time.
             limit = served.request.time_limit
-            if limit and now_ns - served.begun_ns >= limit * SECOND:
+            if limit and now_ns - served.first_state_ns >= limit * SECOND:
                 self.request_abort(goal_id, f"after its time limit of {limit:g} s")
-            if served.told_ns is None or now_ns - served.told_ns >= FEEDBACK_PERIOD_NS:
-                served.told_ns = now_ns
-                served.client.feedback(progress(goal_id, served.request.goal, served.begun_ns))
+            if (
+                served.last_feedback_ns is None
+                or now_ns - served.last_feedback_ns >= FEEDBACK_PERIOD_NS
+            ):
+                served.last_feedback_ns = now_ns
+                served.client.feedback(
+                    progress(goal_id, served.request.goal, served.first_state_ns)
+                )
 
     def take(self, status: Status) -> None:
         """End the goal that a status decides, if a client waits for it."""

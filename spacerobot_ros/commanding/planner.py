@@ -8,9 +8,14 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
-from spacerobot_ros.commanding.commander import Activity, Commander, CommanderHost, StateDecoder
+from spacerobot_ros.commanding.commander import (
+    Commander,
+    CommanderActivity,
+    CommanderHost,
+    StateDecoder,
+)
 from spacerobot_ros.commanding.plant_state import Pairing, PlantChange
-from spacerobot_ros.commanding.trajectory_output import MotionEnd, TrajectoryOutput
+from spacerobot_ros.commanding.trajectory_output import TrajectoryEnd, TrajectoryOutput
 from spacerobot_ros.errors import (
     CommandError,
     PlanningError,
@@ -44,7 +49,7 @@ from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.topics import twist_topic
 
 # Constants save the slow look-up of enum members for every state.
-_ACTIVE = Activity.ACTIVE
+_ACTIVE = CommanderActivity.ACTIVE
 _WITHOUT_POSE, _LATE_POSE = Pairing.WITHOUT_POSE, Pairing.LATE_POSE
 
 
@@ -149,7 +154,7 @@ class PlannerCommander(Commander):
             described = among_obstacles(described, self._world)
         return PlanningWorker(robot, self.config, method, self._long_work, described)
 
-    def end_schedule(self, end: MotionEnd) -> None:
+    def end_schedule(self, end: TrajectoryEnd) -> None:
         """End the present schedule: the controller that follows it has ended it."""
         if self.executive is not None:
             self.executive.schedule_ended(end.message, final=end.final)
@@ -176,7 +181,7 @@ class PlannerCommander(Commander):
             method = self._method if robot is self._described else None
             with self._long_work():
                 executive.use_obstacles(lambda: self._make_worker(robot, method))
-            self._pass_on_outputs()
+            self._forward_outputs()
 
     def _change_masses(self, robot: SpaceRobot) -> None:
         assert self.executive is not None
@@ -185,10 +190,10 @@ class PlannerCommander(Commander):
         with self._long_work():
             worker = self._make_worker(robot, method)
         self.executive.use_robot(robot, worker)
-        self._pass_on_outputs()
+        self._forward_outputs()
 
-    def _pursued(self) -> set[str]:
-        pursued = super()._pursued()
+    def _active_goal_ids(self) -> set[str]:
+        pursued = super()._active_goal_ids()
         if self.executive is not None:
             # A status that waits for its publication tells the end of its own goal.
             outputs = self.executive.outputs
@@ -201,7 +206,7 @@ class PlannerCommander(Commander):
             commands = self.statistics.commands_published
             self.host.log("info", f"{commands} commands were published.")
         self.executive.stop()
-        self._pass_on_outputs()
+        self._forward_outputs()
 
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         goal = saved.get(BASE_GOAL_KEY)
@@ -268,14 +273,14 @@ class PlannerCommander(Commander):
         if self.executive is None:
             return None
         message = self.executive.abort(why)
-        self._pass_on_outputs()
+        self._forward_outputs()
         return message
 
     def _react_to_change(self, change: PlantChange) -> None:
         assert self.executive is not None
         if change is PlantChange.RESET:
             self.executive.plant_reset()
-            self._pass_on_outputs()
+            self._forward_outputs()
 
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status of the named plant."""
@@ -295,7 +300,7 @@ class PlannerCommander(Commander):
             goal_id = self._status.goal_id
             self.host.report_event(Event(EventKind.PLAN_DISTURBED, message, 1, goal_id=goal_id))
 
-    def _tell_plant_state(self) -> None:
+    def _forward_plant_state(self) -> None:
         if self.executive is not None:
             self.executive.plant_rests = self.plant.rests
 
@@ -328,7 +333,7 @@ class PlannerCommander(Commander):
                 self.trajectories.watch(measured.stamp_ns)
             executive.update(measured)
             if executive.outputs:
-                self._pass_on_outputs()
+                self._forward_outputs()
                 if self.activity is not _ACTIVE:
                     return
             self.host.send_command(measured.stamp_ns)
@@ -336,7 +341,7 @@ class PlannerCommander(Commander):
             self._log_fault("odom", f"odom: {measured.base_error}.")
             measured.base_error = None
 
-    def _pass_on_outputs(self) -> None:
+    def _forward_outputs(self) -> None:
         assert self.executive is not None
         outputs, host = self.executive.outputs, self.host
         while outputs:
@@ -354,7 +359,7 @@ class PlannerCommander(Commander):
                 case Notice(Severity.ERROR, message):
                     host.log("error", message)
                 case Notice(severity, message):
-                    host.log_of_goals(severity.value, message)
+                    host.log_about_goals(severity.value, message)
                 case Transition(source, event, target):
                     host.log("debug", f"{source.value} -> {target.value}: {event.value}")
                     if self.trajectories is not None:

@@ -31,7 +31,7 @@ _NO_MESSAGE = Stamped(_NO_STAMP, None)
 
 # -- states of the present time ---------------------------------------------------------------
 
-_MIN_JUMP_DOUBT = 0.2
+_MIN_JUMP_CONFIRMATION_TIME = 0.2
 """Shortest wall time without a state of the old time before a time jump is accepted, s."""
 
 _STEP_SLACK = 1.5
@@ -103,7 +103,7 @@ class StampFilter:
 
     def admits(self, stamp_ns: int, joints: Any) -> bool:
         """Return whether joints are of the present time; set other joints aside."""
-        if not 0 <= stamp_ns - self.now_ns <= self._max_step_ns and not self._loss_explains(
+        if not 0 <= stamp_ns - self.now_ns <= self._max_step_ns and not self._is_explained_by_loss(
             stamp_ns
         ):
             self._set_aside(Stamped(stamp_ns, joints))
@@ -114,12 +114,12 @@ class StampFilter:
             self._ignore_jump()
         return True
 
-    def would_admit(self, stamp_ns: int) -> bool:
+    def would_accept(self, stamp_ns: int) -> bool:
         """Return whether joints with a stamp would be admitted, without a change."""
         ahead = stamp_ns - self.now_ns
         return 0 <= ahead <= max(self._max_step_ns, self._max_loss_ns(self._clock()))
 
-    def admits_odom(self, stamp_ns: int, odom: Any) -> bool:
+    def accepts_odom(self, stamp_ns: int, odom: Any) -> bool:
         """Return whether a pose is of the present time; set other poses aside.
 
         It comes before the joints of its stamp, or after them.
@@ -150,7 +150,7 @@ class StampFilter:
             return None
         # While this process itself stood still, states of the old time may have come unseen.
         jump.checks += 1
-        if jump.checks < _MIN_CHECKS or self._clock() - jump.since < self._jump_doubt:
+        if jump.checks < _MIN_CHECKS or self._clock() - jump.since < self._jump_confirmation_time:
             return None
         stamp, now = jump.joints.stamp_ns, self._clock()
         size = stamp - self.now_ns
@@ -164,7 +164,7 @@ class StampFilter:
         odom, self._pending_jump, self._jump_odom = self._jump_odom, None, _NO_MESSAGE
         return (odom if odom.stamp_ns == stamp else None), jump.joints
 
-    def _loss_explains(self, stamp_ns: int) -> bool:
+    def _is_explained_by_loss(self, stamp_ns: int) -> bool:
         """Whether a stamp belongs to a first state, or lost messages explain the stamp."""
         now = self._clock()
         if self._max_step_ns < 0:
@@ -176,19 +176,21 @@ class StampFilter:
 
     def _max_loss_ns(self, now: float) -> float:
         """Return the largest plausible step at a wall time where messages were lost, ns."""
-        return self._max_step_ns + _PACE_SLACK * self._simulated_pace * (now - self._admission_wall)
+        return self._max_step_ns + _PACE_SLACK * self._simulation_pace * (
+            now - self._admission_wall
+        )
 
     @property
-    def _simulated_pace(self) -> float:
+    def _simulation_pace(self) -> float:
         """Pace of the present time: simulated ns per wall s."""
         elapsed = self._admission_wall - self._origin_wall
         return (self.now_ns - self._origin_ns) / elapsed if elapsed > 0 else 0.0
 
     @property
-    def _jump_doubt(self) -> float:
+    def _jump_confirmation_time(self) -> float:
         """Wall time (s) without a state of the old time after which a jump is accepted."""
-        pace = self._simulated_pace
-        return max(_MIN_JUMP_DOUBT, 4 * self._step_ns / pace if pace > 0 else 0.0)
+        pace = self._simulation_pace
+        return max(_MIN_JUMP_CONFIRMATION_TIME, 4 * self._step_ns / pace if pace > 0 else 0.0)
 
     def _set_aside(self, joints: Stamped) -> None:
         """Keep a state of another time, in place of an earlier kept state."""

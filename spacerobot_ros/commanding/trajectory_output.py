@@ -17,10 +17,10 @@ from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.times import SECOND
 
-_ANSWER_TIME_NS = 5 * SECOND
+_ANSWER_TIMEOUT_NS = 5 * SECOND
 """Longest time until the server has accepted or rejected a schedule, ns."""
 
-_LOOK_PERIOD_NS = SECOND
+_SERVER_CHECK_PERIOD_NS = SECOND
 """Time between two looks whether the server is still there, ns."""
 
 _PHASES_OF_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.PLANNING)
@@ -47,7 +47,7 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True)
-class MotionEnd:
+class TrajectoryEnd:
     """The end of a schedule that the robot's own controller follows.
 
     Attributes
@@ -89,7 +89,7 @@ class TrajectoryOutput:
     """
 
     def __init__(
-        self, server: TrajectoryServer, name: str, on_end: Callable[[MotionEnd], None]
+        self, server: TrajectoryServer, name: str, on_end: Callable[[TrajectoryEnd], None]
     ) -> None:
         self._server, self._name, self._on_end = server, name, on_end
         self._number = 0
@@ -115,7 +115,7 @@ class TrajectoryOutput:
         self._replaced, self._sent, self._accepted = self._sent, self._number, False
         self._watched_ns = None
         if not self._server.ready():
-            self._end(MotionEnd(f"no server of the action '{self._name}' is there", final=True))
+            self._end(TrajectoryEnd(f"no server of the action '{self._name}' is there", final=True))
             return
         self._server.send(self._number, start)
 
@@ -125,9 +125,9 @@ class TrajectoryOutput:
             return
         if self._watched_ns is None or now_ns < self._watched_ns:
             self._watched_ns = self._looked_ns = now_ns
-        if not self._accepted and now_ns - self._watched_ns > _ANSWER_TIME_NS:
+        if not self._accepted and now_ns - self._watched_ns > _ANSWER_TIMEOUT_NS:
             self._give_up(f"the action '{self._name}' has not answered")
-        elif now_ns - self._looked_ns >= _LOOK_PERIOD_NS:
+        elif now_ns - self._looked_ns >= _SERVER_CHECK_PERIOD_NS:
             self._looked_ns = now_ns
             if not self._server.ready():
                 self._give_up(f"the server of the action '{self._name}' is gone")
@@ -135,7 +135,7 @@ class TrajectoryOutput:
     def _give_up(self, why: str) -> None:
         assert self._sent is not None
         self._server.cancel(self._sent)
-        self._end(MotionEnd(why, final=True))
+        self._end(TrajectoryEnd(why, final=True))
 
     def phase_changed(self, phase: Phase) -> None:
         """Cancel the schedule if the planner has left it."""
@@ -156,7 +156,9 @@ class TrajectoryOutput:
             return
         if self._replaced is not None:
             self._server.cancel(self._replaced)
-        self._end(MotionEnd(f"the action '{self._name}' has rejected the trajectory", final=True))
+        self._end(
+            TrajectoryEnd(f"the action '{self._name}' has rejected the trajectory", final=True)
+        )
 
     def ended(self, number: int, outcome: Outcome, code: int, text: str) -> None:
         """End a schedule by the result of the server.
@@ -175,25 +177,25 @@ class TrajectoryOutput:
         if number == self._sent:
             self._end(_motion_end(outcome, code, text))
 
-    def _end(self, end: MotionEnd) -> None:
+    def _end(self, end: TrajectoryEnd) -> None:
         self._sent = self._replaced = None
         self._on_end(end)
 
 
-def _motion_end(outcome: Outcome, code: int, text: str) -> MotionEnd:
+def _motion_end(outcome: Outcome, code: int, text: str) -> TrajectoryEnd:
     """Return the meaning of a result."""
     if outcome is Outcome.SUCCEEDED and code == ErrorCode.SUCCESSFUL:
-        return MotionEnd()
+        return TrajectoryEnd()
     text = printable(text).rstrip(".")
     told = f": {text}" if text else ""
     if outcome is Outcome.CANCELED:
-        return MotionEnd(f"another client has replaced or cancelled the trajectory{told}", True)
+        return TrajectoryEnd(f"another client has replaced or cancelled the trajectory{told}", True)
     if code == ErrorCode.SUCCESSFUL:
-        return MotionEnd(f"the trajectory was aborted without an error code{told}", final=True)
+        return TrajectoryEnd(f"the trajectory was aborted without an error code{told}", final=True)
     try:
         name = ErrorCode(code).name
     except ValueError:
         name = f"error code {code}"
     clause = f"the trajectory has ended early by {name}{told}"
     violated = code in (ErrorCode.PATH_TOLERANCE_VIOLATED, ErrorCode.GOAL_TOLERANCE_VIOLATED)
-    return MotionEnd(clause, final=not violated)
+    return TrajectoryEnd(clause, final=not violated)

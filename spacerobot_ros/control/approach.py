@@ -43,7 +43,7 @@ from spacerobot_ros.parameters import parameter
 _SAMPLE_PERIOD = 0.25
 """Time between two samples of a reference whose limits are checked, s."""
 
-_COARSE = 8
+_COARSE_STRIDE = 8
 """Samples from one to the next where most references are refused."""
 
 _START_PERIOD = 1.0
@@ -55,13 +55,13 @@ _SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 4.0, 1.4, 60.0
 _CLOSING_SHARE = 0.5
 """Share of the largest acceleration for closing in; the grapple frame's own takes the rest."""
 
-_REACHED = 1e-3
+_REACHED_DISTANCE = 1e-3
 """Distance of an end-effector from its reference (m, rad) below which the arm reaches it."""
 
 _STANDOFF_FACTORS = (1.0, 2.0, 3.0)
 """Distances of the standoffs that are tried where the target is in the way, over the given one."""
 
-_MOST_BLOCKED = 100
+_MAX_BLOCKED_PATHS = 100
 """Number of paths past the body of the target that are tried."""
 
 _MAX_ITERATIONS = 30
@@ -69,7 +69,7 @@ _DAMPING = 0.02
 _LONGEST_TURN = 0.2
 """Iterations of inverse kinematics, their damping, and the largest step of a joint, m or rad."""
 
-_RATE_SHARE = 0.9
+_ARM_RATE_SHARE = 0.9
 """Share of the joint rates that the path of an arm may take."""
 
 
@@ -208,10 +208,10 @@ class ArmReach:
             before = q
             q, distance = self._solve(q, motion, k)
             shapes[k] = q
-            if distance > _REACHED:
+            if distance > _REACHED_DISTANCE:
                 return shapes, f"the end-effector stays {distance:.3g} m or rad away from it"
             rate = np.abs(q - before) / period
-            share = rate / (_RATE_SHARE * self._rates)
+            share = rate / (_ARM_RATE_SHARE * self._rates)
             if k and share.max(initial=0.0) > 1.0:
                 worst = int(share.argmax())
                 return shapes, (
@@ -227,7 +227,7 @@ class ArmReach:
         for _ in range(_MAX_ITERATIONS):
             error, J = self._error(q, motion, k)
             distance = float(np.abs(error).max())
-            if distance < 0.1 * _REACHED:
+            if distance < 0.1 * _REACHED_DISTANCE:
                 break
             step = J.T @ np.linalg.solve(J @ J.T + _DAMPING**2 * np.eye(len(error)), error)
             step *= min(1.0, _LONGEST_TURN / max(float(np.abs(step).max()), 1e-12))
@@ -306,7 +306,7 @@ def plan_approach(
             plan = ApproachPlan(start, outward, closing, options.standoff_time)
             last = first + math.ceil((plan.contact - start) / _SAMPLE_PERIOD) + 1
             # Few samples refuse most of the paths.
-            for every in (_COARSE, 1):
+            for every in (_COARSE_STRIDE, 1):
                 times = _SAMPLE_PERIOD * np.arange(first, last, every)
                 motion = grapple.part(first, last, every).carrying(plan.relative(times))
                 excess, sentence = _excess(motion, limits, axes)
@@ -316,13 +316,13 @@ def plan_approach(
             if excess > 1.0:
                 continue
             distance = reach.distance(motion, -1)
-            if distance > _REACHED:
+            if distance > _REACHED_DISTANCE:
                 failure.out_of_reach(distance, plan.contact)
                 if way:
                     continue
                 break  # A longer path meets the target later, which other start times do, too.
             near: NearestLinks | None = None
-            for every in (_COARSE, 1):
+            for every in (_COARSE_STRIDE, 1):
                 shapes, why = reach.follows(
                     motion.rows(slice(None, None, every)), every * _SAMPLE_PERIOD
                 )
@@ -339,10 +339,10 @@ def plan_approach(
                 in_the_way = True
                 failure.blocked(near, clearance.least, plan.contact)
             elif why:
-                failure.unfollowed(why, plan.contact)
+                failure.arm_cannot_follow(why, plan.contact)
             else:
                 return plan if near is None else replace(plan, distance=near.distance)
-            if failure.blocks == _MOST_BLOCKED:
+            if failure.blocks == _MAX_BLOCKED_PATHS:
                 raise PlanningError(failure.message(options.horizon))
     raise PlanningError(failure.message(options.horizon))
 
@@ -402,7 +402,7 @@ class _Failure:
         if distance < self._distance:
             self._distance, self._nearest_at = distance, contact
 
-    def unfollowed(self, why: str, contact: float) -> None:
+    def arm_cannot_follow(self, why: str, contact: float) -> None:
         self._why, self._tried_at = why, contact
 
     def blocked(self, nearest: NearestLinks, least: float, contact: float) -> None:

@@ -150,13 +150,13 @@ class CoordinatedController:
             goal = replace(goal, end_effector=end_effector)
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
-        motion = self._motion.within_thrust(self._limits, self.law.robot, state.q)
+        motion = self._motion.within_thruster_limits(self._limits, self.law.robot, state.q)
         if self.wheels is not None:
             motion = self.wheels.motion_within(motion, state.q)
         self.profile = self._profile_type(start, goal, motion)
         self._began = time
 
-    def begin_anew(self, time: float, state: ControlState) -> None:
+    def restart_motion(self, time: float, state: ControlState) -> None:
         """Restart towards the present goals from the measured pose instead of the reference."""
         goal, self.profile = self.goal, None
         joints = None if goal.joints is None else goal.joints.q
@@ -183,7 +183,7 @@ class CoordinatedController:
         """
         torque, wheels = self._limits.torque, self.wheels
         if wheels is not None:
-            torque += wheels.torque_in_every_direction
+            torque += wheels.torque_about_every_axis
         force, period = self._limits.force, self._control_period
         return Detumbling(self.law.robot, payload, force, torque, torque_limit, period)
 
@@ -294,7 +294,7 @@ class CoordinatedController:
         limits of joint rates lower it further, which only :meth:`apply_limits` can do.
         """
         realised = self._limits.expression(actuation)
-        return realised, self.joint_rate_limits.lowering_expression(omega, q, qdot, realised)
+        return realised, self.joint_rate_limits.exceeds_limits_expression(omega, q, qdot, realised)
 
     @property
     def goal(self) -> Reference:
@@ -302,7 +302,7 @@ class CoordinatedController:
         return Reference() if self.profile is None else self.profile.goal
 
     @property
-    def estimated_for(self) -> float:
+    def time_since_measurement(self) -> float:
         """Time since the base was measured last, s."""
         return self._estimator.elapsed if self._estimator is not None else 0.0
 

@@ -296,7 +296,7 @@ class ControlExecutive:
         self._report_abort()  # Reported at once: the next measured state may come late.
         return True
 
-    def plant_obeys_again(self) -> None:
+    def on_plant_obeying(self) -> None:
         """Hold the pose of the next measured state, not an earlier one."""
         self._hold_here = True
 
@@ -372,7 +372,7 @@ class ControlExecutive:
         wheels = self.controller.wheels
         if wheels is not None:
             if self.plant_blocked:
-                wheels.forget_answers()
+                wheels.reset_response_check()
             measured, q, qdot = wheels.observe(measured, q, qdot)
             reference = wheels.reference(reference)
         self._guided = reference is not None
@@ -380,8 +380,8 @@ class ControlExecutive:
             if self._abort_requested or self._hold_here or self.plant_blocked:
                 self._hold_pose(time, measured)
             elif self._begin_anew:
-                self.controller.begin_anew(time, measured)
-                self._monitor.settle_anew()
+                self.controller.restart_motion(time, measured)
+                self._monitor.restart_settling()
                 self._error_bounds = None
             self._begin_anew = False
             too_fast = self.controller.coming_to_rest and self._monitor.fast_states
@@ -438,19 +438,19 @@ class ControlExecutive:
         """Give up all goals if a joint stays far beyond its rate limit: its motor does not master
         it."""
         lost = self._monitor.check_rates(self.controller.joint_rate_limits.largest_rate_share(qdot))
-        if not lost or self._is_not_in_charge:
+        if not lost or self._is_moved_otherwise:
             return
         rates = self.controller.joint_rate_limits.rates
         joint = int(np.argmax(np.abs(qdot) / rates))
         moving = self.controller.law.robot.description.movable_joints[joint]
-        self._lose_control(
+        self._abort_on_lost_control(
             f"joint '{moving.name}' moves at {qdot[joint]:.3g} {moving.unit}/s instead of "
             f"{rates[joint]:.3g} {moving.unit}/s"
         )
 
     def _watch_errors(self) -> None:
         """Give up all goals if the errors grow far beyond the distance of the goal."""
-        if self._is_not_in_charge:
+        if self._is_moved_otherwise:
             return
         if self._error_bounds is None:
             margins = self._config.error_margin
@@ -458,14 +458,14 @@ class ControlExecutive:
         share = self.controller.law.largest_error_share(self._error_bounds)
         if self._monitor.check_errors(share):
             away = self.controller.distance_from_reference()
-            self._lose_control(f"the errors grow, the robot is {away} from the reference")
+            self._abort_on_lost_control(f"the errors grow, the robot is {away} from the reference")
 
     @property
-    def _is_not_in_charge(self) -> bool:
+    def _is_moved_otherwise(self) -> bool:
         """Whether something other than this controller's goals moves the robot."""
         return bool(self._guided or self.plant_blocked or self.controller.coming_to_rest)
 
-    def _lose_control(self, why: str) -> None:
+    def _abort_on_lost_control(self, why: str) -> None:
         """Give up every goal, and bring the robot to rest."""
         self._give_up(f"Aborted: control is lost, {why}; the robot is brought to rest.")
         self.controller.come_to_rest()
@@ -647,7 +647,7 @@ class ControlExecutive:
             case ControllerState.ABORTED:
                 return self._abort_message
             case ControllerState.ESTIMATING:
-                elapsed = self.controller.estimated_for
+                elapsed = self.controller.time_since_measurement
                 return f"The base is not measured; it is estimated since {elapsed:.3g} s."
             case ControllerState.STOPPED:
                 return "The base is not measured any more: thrusters off, joints brought to rest."

@@ -26,7 +26,7 @@ LOST_STATES = 3
 _ROUNDING = 1e-9
 """Largest rounding of a sum of control periods, s."""
 
-_NOT_WITHIN = -1.0
+_NOT_WITHIN_TOLERANCE = -1.0
 """Value of ``within_since`` while an error is beyond its tolerance."""
 
 
@@ -53,27 +53,27 @@ class GoalMonitor:
     within_since
         Time since which every error has been within its tolerance with the reference at rest, s;
         -1 while that is not so.
-    fast_states, astray_states
+    fast_states, large_error_states
         Numbers of consecutive states in which a joint was too fast, and an error beyond its bound.
     """
 
     started: Scalar = 0.0
-    within_since: Scalar = _NOT_WITHIN
+    within_since: Scalar = _NOT_WITHIN_TOLERANCE
     fast_states: Scalar = 0
-    astray_states: Scalar = 0
+    large_error_states: Scalar = 0
 
     def begin(self, time: Scalar) -> None:
         """Begin a goal at a time (s), and keep the count of states with too fast joints."""
-        self.started, self.within_since, self.astray_states = time, _NOT_WITHIN, 0
+        self.started, self.within_since, self.large_error_states = time, _NOT_WITHIN_TOLERANCE, 0
 
-    def settle_anew(self) -> None:
+    def restart_settling(self) -> None:
         """Restart the settling time."""
-        self.within_since = _NOT_WITHIN
+        self.within_since = _NOT_WITHIN_TOLERANCE
 
     def shift_time(self, seconds: Scalar) -> None:
         """Shift the start of the goal by a jump of time (s), and restart the settling time."""
         self.started += seconds
-        self.settle_anew()
+        self.restart_settling()
 
     def check_rates(self, largest_share: Scalar) -> Scalar:
         """Count a state by its largest joint rate, as a share of that joint's limit.
@@ -88,8 +88,8 @@ class GoalMonitor:
 
         Returns whether errors were beyond their bounds in :data:`LOST_STATES` states.
         """
-        self.astray_states = (largest_share > 1.0) * (self.astray_states + 1)
-        return self.astray_states >= LOST_STATES
+        self.large_error_states = (largest_share > 1.0) * (self.large_error_states + 1)
+        return self.large_error_states >= LOST_STATES
 
     def decide_by_errors(
         self, time: Scalar, at_rest: Scalar, errors: Errors, config: ControllerConfig
@@ -116,7 +116,7 @@ class GoalMonitor:
         )
         was_within = self.within_since >= 0
         since = was_within * self.within_since + (1 - was_within) * time
-        self.within_since = within * since + (1 - within) * _NOT_WITHIN
+        self.within_since = within * since + (1 - within) * _NOT_WITHIN_TOLERANCE
         settled = within * (time - since >= config.settle_time - _ROUNDING)
         late = time - self.started >= config.time_limit - _ROUNDING
         failed = (1 - settled) * late if config.time_limit else 0

@@ -75,7 +75,9 @@ class MotionLimits:
             if not value > 0:
                 raise ParameterError(f"The limit '{limit.name}' is {value}; it must be positive.")
 
-    def within_thrust(self, actuators: ActuatorLimits, robot: SpaceRobot, q: Array) -> MotionLimits:
+    def within_thruster_limits(
+        self, actuators: ActuatorLimits, robot: SpaceRobot, q: Array
+    ) -> MotionLimits:
         """Return the limits with accelerations lowered to those that the thrusters can produce.
 
         The robot is treated as one rigid body of the shape ``q`` (n,): force over total mass;
@@ -229,11 +231,13 @@ class JointRateLimits:
         if np.all((lowest <= qddot) & (qddot <= highest)):
             return given
         wanted = Js @ np.clip(qddot, lowest, highest) + Fs
-        share = _bearable_push_share(wanted, pushed, effort)
+        share = _affordable_push_share(wanted, pushed, effort)
         tau = np.clip(wanted - share * pushed, -effort, effort)
         return Actuation(share * given.wrench_B, tau)
 
-    def lowering_expression(self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX) -> ca.SX:
+    def exceeds_limits_expression(
+        self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX
+    ) -> ca.SX:
         """Return whether :meth:`apply` changes the command ``[f; n; tau]`` (6 + n,)."""
         if not np.isfinite(self.rates).any():
             return ca.SX(0)
@@ -303,7 +307,7 @@ def decay_rate(control_period: float) -> float:
     return min(_REST_RATE, _REST_RATE_PER_PERIOD / control_period)
 
 
-def _bearable_push_share(wanted: Array, pushed: Array, effort: Array) -> float:
+def _affordable_push_share(wanted: Array, pushed: Array, effort: Array) -> float:
     """Return the largest share in [0, 1] of a push with which ``wanted`` is within efforts.
 
     Zero if there is none: motors that cannot brake joints are not loaded further.

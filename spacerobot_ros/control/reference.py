@@ -86,8 +86,8 @@ class ReferenceProfile(ABC):
         lines = [
             line
             for line in (
-                _PoseLine.between(start.base, goal.base),
-                _PoseLine.between(start.end_effector, goal.end_effector),
+                _PoseInterpolation.between(start.base, goal.base),
+                _PoseInterpolation.between(start.end_effector, goal.end_effector),
             )
             if line is not None
         ]
@@ -120,8 +120,8 @@ class QuinticReference(ReferenceProfile):
 
     def __init__(self, start: Reference, goal: Reference, limits: MotionLimits) -> None:
         super().__init__(start, goal, limits)
-        self._base = _PoseLine.between(start.base, goal.base)
-        self._end_effector = _PoseLine.between(start.end_effector, goal.end_effector)
+        self._base = _PoseInterpolation.between(start.base, goal.base)
+        self._end_effector = _PoseInterpolation.between(start.end_effector, goal.end_effector)
         self._joints = np.zeros(0)
         if goal.joints is not None and start.joints is not None:
             self._joints = goal.joints.q - start.joints.q
@@ -176,7 +176,7 @@ def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n
     parts: list[npt.ArrayLike] = [[profile.duration]]
     for wanted, begin, end in poses:
         if wanted and begin is not None and end is not None:
-            parts += _PoseLine(begin, end).numbers
+            parts += _PoseInterpolation(begin, end).numbers
     if n and start.joints is not None and goal.joints is not None:
         parts += [start.joints.q, goal.joints.q - start.joints.q, goal.joints.q]
     return np.concatenate(parts)
@@ -248,7 +248,7 @@ PROFILES: dict[str, type[ReferenceProfile]] = {
 """The profiles by name."""
 
 
-class _PoseLine:
+class _PoseInterpolation:
     """A straight line and a geodesic; ``d`` (3,) in m and ``rotvec`` (3,) in rad, both in W."""
 
     def __init__(self, start: PoseReference, goal: PoseReference) -> None:
@@ -270,7 +270,9 @@ class _PoseLine:
         return [*line, self._turn_W, [self.angle], self._goal.position, self._goal.quaternion]
 
     @classmethod
-    def between(cls, start: PoseReference | None, goal: PoseReference | None) -> _PoseLine | None:
+    def between(
+        cls, start: PoseReference | None, goal: PoseReference | None
+    ) -> _PoseInterpolation | None:
         return None if start is None or goal is None else cls(start, goal)
 
     def at(self, s: float, rate: float, acceleration: float) -> PoseReference:

@@ -33,7 +33,7 @@ from spacerobot_ros.model.grasp import (
 )
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 
-_PREDICTION_SLACK = 0.02
+_PREDICTION_TOLERANCE = 0.02
 """Distance (m) and angle (rad) of a target from its predicted motion beyond which the approach is
 planned anew."""
 
@@ -160,7 +160,7 @@ class Approach:
         age = time - target.time
         if age > options.timeout:
             return self._ended(f"the target is lost: its odometry is {age:.3g} s old")
-        if self._plan is not None and self._strays(time, target.motion):
+        if self._plan is not None and self._is_off_prediction(time, target.motion):
             self._plan = None
         if self._plan is None:
             try:
@@ -213,13 +213,13 @@ class Approach:
             return Progress(TaskState.REFUSED, f"The approach is refused: {why}.")
         return Progress(TaskState.FAILED, f"The approach is given up: {why}.")
 
-    def _strays(self, time: float, measured: BodyMotion) -> bool:
+    def _is_off_prediction(self, time: float, measured: BodyMotion) -> bool:
         """Whether the target is away from its predicted motion."""
         assert self._predicted is not None
         assert self.target.body is not None
         expected = self._predicted.grapple([self.target.time - self._planned_at]).body_motion()
         off = RelativeMotion.between(expected, measured.at(self.target.body.grapple))
-        return off.distance > _PREDICTION_SLACK or off.angle > _PREDICTION_SLACK
+        return off.distance > _PREDICTION_TOLERANCE or off.angle > _PREDICTION_TOLERANCE
 
     def _clearance(self, controller: CoordinatedController) -> TargetClearance | None:
         """Return the distances of the robot from the body of the target."""

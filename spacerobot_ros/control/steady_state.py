@@ -11,7 +11,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 
-_UNHELD_SHARE = 1e-6
+_MAX_ROUNDING_SHARE = 1e-6
 """Largest share of a disturbance that is rounding, although the outputs do not hold it."""
 
 
@@ -57,7 +57,7 @@ def steady_errors(
     per_error = law.command_per_error(state)
     pull = -np.linalg.lstsq(per_error, balanced, rcond=None)[0]
     unheld = np.linalg.norm(per_error @ pull + balanced)
-    if unheld > _UNHELD_SHARE * np.linalg.norm(balanced):
+    if unheld > _MAX_ROUNDING_SHARE * np.linalg.norm(balanced):
         raise ParameterError(
             f"The wrench on link '{link}' moves what the outputs of the law '{law.name}' do not "
             f"hold: there is no steady state. The outputs are {', '.join(law.outputs.labels)}."

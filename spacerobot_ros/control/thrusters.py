@@ -483,7 +483,7 @@ class ThrusterModulator:
         self.begun[:] = False
 
     @property
-    def under_way(self) -> Array:
+    def begun_pulse_impulse(self) -> Array:
         """Impulse (6,) of the remaining parts of shortest pulses that have begun, N s, N m s."""
         return np.asarray(self._wrenches @ self._remaining)
 

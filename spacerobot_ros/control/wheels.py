@@ -29,7 +29,7 @@ _MIN_PERIODS_TO_LIMIT = 2
 _SATURATED_SHARE = 0.99
 """Share of the largest rate from which on a wheel counts as saturated."""
 
-_RELEASE = 0.05
+_ANNOUNCEMENT_HYSTERESIS = 0.05
 """Share of the largest rate by which a wheel is slower before it is announced again."""
 
 _DUMP_TIME = 5.0
@@ -47,10 +47,10 @@ _MOTION_SHARE = 0.5
 _FAILURE_TIME = 0.5
 """Time at full torque after which the answer of a wheel is judged, s."""
 
-_LEAST_ANSWER = 0.5
+_MIN_RESPONSE_SHARE = 0.5
 """Least share of the commanded impulse that a wheel in order takes up."""
 
-_TINY = 1e-12
+_MIN_BOUND_WIDTH = 1e-12
 """Width that bounds of the solver get, N m, and a share of a torque that counts as zero."""
 
 _SMOOTHING = 1e-6
@@ -94,7 +94,7 @@ class WheelAllocation:
     def __init__(self, axes: Array, torque: Array) -> None:
         self._scaled, self._torque = axes * torque, torque
         self._inverse = np.linalg.pinv(self._scaled)
-        largest = max(float(torque.max(initial=0.0)), _TINY)
+        largest = max(float(torque.max(initial=0.0)), _MIN_BOUND_WIDTH)
         self._extended = np.vstack([self._scaled / largest, _SMOOTHING * np.eye(len(torque))])
         self._size = largest
         self.rank = int(np.linalg.matrix_rank(self._scaled)) if len(torque) else 0
@@ -108,7 +108,10 @@ class WheelAllocation:
         from scipy.optimize import lsq_linear  # Slow to import, and rarely needed.
 
         wanted = np.concatenate([torque / self._size, np.zeros(len(lower))])
-        bounds = (lower - _TINY) / self._torque, (upper + _TINY) / self._torque
+        bounds = (
+            (lower - _MIN_BOUND_WIDTH) / self._torque,
+            (upper + _MIN_BOUND_WIDTH) / self._torque,
+        )
         shares = lsq_linear(self._extended, wanted, bounds, method="bvls", tol=1e-14).x
         return np.clip(self._torque * shares, lower, upper)
 
@@ -184,9 +187,9 @@ class WheelControl:
         self.dumping = False
         """Whether momentum is being dumped."""
         self._events: list[Event] = []
-        self.forget_answers()
+        self.reset_response_check()
 
-    def forget_answers(self) -> None:
+    def reset_response_check(self) -> None:
         """Judge the answers of the wheels from now on: commands until now were not obeyed."""
         self._asked, self._answered = np.zeros(len(self.wheels)), np.zeros(len(self.wheels))
         self._known = False
@@ -202,7 +205,7 @@ class WheelControl:
         return self._allocate.rank
 
     @property
-    def torque_in_every_direction(self) -> float:
+    def torque_about_every_axis(self) -> float:
         """Largest torque that the wheels in use give about every axis, N m; 0: not about all."""
         if self.rank < 3:
             return 0.0
@@ -221,7 +224,7 @@ class WheelControl:
             self._known = False
             return None, q, qdot
         self._omega = measured.omega_WB_B.copy()
-        self._judge_answers()
+        self._check_wheel_response()
         self._watch_rates()
         return replace(measured, q=q, qdot=qdot), q, qdot
 
@@ -268,7 +271,9 @@ class WheelControl:
             wanted = -(torque + gyroscopic)
             self.torque[used] = self._allocate.allocate(wanted, lower[used], upper[used])
         given = -(A @ self.torque) - gyroscopic
-        if np.abs(given - torque).max() <= 1e3 * _TINY * np.abs(torque).max(initial=1e-6):
+        if np.abs(given - torque).max() <= 1e3 * _MIN_BOUND_WIDTH * np.abs(torque).max(
+            initial=1e-6
+        ):
             return torque.copy()
         return np.asarray(given)
 
@@ -356,7 +361,7 @@ class WheelControl:
         for i in np.flatnonzero(self._used):
             share, name = float(shares[i]), wheels.names[i]
             turns = f"Wheel '{name}' turns at {self.rates[i]:.4g} of {wheels.rate[i]:.4g} rad/s"
-            if share < options.warning_rate - _RELEASE:
+            if share < options.warning_rate - _ANNOUNCEMENT_HYSTERESIS:
                 self._announced[i] = 0.0
             elif share >= _SATURATED_SHARE > self._announced[i]:
                 self._announced[i] = share
@@ -364,13 +369,18 @@ class WheelControl:
                 self._add(EventKind.WHEEL_SATURATED, message, 1, name)
             elif share >= options.warning_rate and not self._announced[i]:
                 self._announced[i] = share
-                self._add(EventKind.WHEEL_NEAR_LIMIT, f"{turns}{self._outlook(int(i))}.", 1, name)
+                self._add(
+                    EventKind.WHEEL_NEAR_LIMIT,
+                    f"{turns}{self._saturation_clause(int(i))}.",
+                    1,
+                    name,
+                )
         if options.dump_rate and not self.dumping:
             fastest = int(np.argmax(np.where(self._used, shares, 0.0)))
             if shares[fastest] >= options.dump_rate:
                 self._begin_dump(f"because wheel '{wheels.names[fastest]}' is fast")
 
-    def _outlook(self, i: int) -> str:
+    def _saturation_clause(self, i: int) -> str:
         """Return a clause on the time in which a wheel saturates at its present torque."""
         seconds = self.time_to_saturation(i)
         return f", and is saturated in {seconds:.3g} s" if math.isfinite(seconds) else ""
@@ -383,7 +393,7 @@ class WheelControl:
         left = wheels.rate[i] - math.copysign(1.0, tau) * self.rates[i]
         return max(0.0, float(wheels.inertia[i] * left / abs(tau)))
 
-    def _judge_answers(self) -> None:
+    def _check_wheel_response(self) -> None:
         """Take wheels out of use whose momentum does not change as their torque demands."""
         wheels = self.wheels
         spins = wheels.spins(self._omega, self.rates)
@@ -392,7 +402,7 @@ class WheelControl:
             self._answered += np.sign(self.torque) * (spins - self._spins)
         self._spins, self._known = spins, True
         judged = self._asked >= wheels.torque * _FAILURE_TIME
-        weak = self._answered < _LEAST_ANSWER * self._asked
+        weak = self._answered < _MIN_RESPONSE_SHARE * self._asked
         for i in np.flatnonzero(judged & self._used & weak):
             self._fail(int(i))
         self._asked[judged] = self._answered[judged] = 0.0

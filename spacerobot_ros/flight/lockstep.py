@@ -224,7 +224,7 @@ class _Host:
     def log(self, level: str, message: str) -> None:
         pass
 
-    log_of_goals = log
+    log_about_goals = log
 
     def has_publisher(self, topic: str) -> bool:
         return topic == "odom" or (topic == JOINT_REFERENCE and self.flight.has_planner)

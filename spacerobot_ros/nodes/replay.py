@@ -21,7 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.bag import Playback, QosProfile, ReplayMessage, read_bag
 from spacerobot_ros.bag.config import ReplayConfig
-from spacerobot_ros.bag.playback import ReaderWait, ReplayStatus, renamed_topics
+from spacerobot_ros.bag.playback import ReplayStatus, SubscriberWait, renamed_topics
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE
 from spacerobot_ros.model.visuals import MeshFolder, has_meshes
@@ -117,7 +117,7 @@ class ReplayNode(FlightNode):
     def activate(self) -> None:
         """Wait for readers, then continue the replay."""
         self._begun = False
-        self._wait = ReaderWait(_READER_CHECK_PERIOD, self.config.wait)
+        self._wait = SubscriberWait(_READER_CHECK_PERIOD, self.config.wait)
         # One timer for the next message, always set anew: half the load of looking every
         # millisecond. Its first period is never waited for.
         self._timer = self.create_timer(1.0, self._send_due_messages, clock=self._steady)

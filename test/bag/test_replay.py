@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from spacerobot_ros.bag import LATCHED, BagWriter, RecordingError, Timeline, read_bag
-from spacerobot_ros.bag.playback import Playback, ReaderWait, ReplayMessage, renamed_topics
+from spacerobot_ros.bag.playback import Playback, ReplayMessage, SubscriberWait, renamed_topics
 from spacerobot_ros.errors import ParameterError
 
 STRING = "std_msgs/msg/String"
@@ -266,7 +266,7 @@ def test_time_goes_on_by_the_rate_and_stands_in_pauses(
 
 
 def test_a_replay_waits_for_readers_to_be_matched_and_to_be_all() -> None:
-    wait = ReaderWait(period=0.1, longest=60.0, settled=0.25)
+    wait = SubscriberWait(period=0.1, longest=60.0, settled=0.25)
     assert not wait.check([0, 0], [0, 0]), "nobody is there"
     assert not wait.check([1, 0], [1, 1]), "one is known and not matched"
     assert not any(wait.check([1, 0], [1, 1]) for _ in range(9))
@@ -275,7 +275,7 @@ def test_a_replay_waits_for_readers_to_be_matched_and_to_be_all() -> None:
 
 
 def test_a_replay_without_readers_begins_after_the_longest_wait() -> None:
-    wait = ReaderWait(period=0.25, longest=1.0)
+    wait = SubscriberWait(period=0.25, longest=1.0)
     assert [wait.check([0], [0]) for _ in range(4)] == [False, False, False, True]
 
 

@@ -123,7 +123,7 @@ def test_a_damaged_chunk_is_left_out_and_counted(bag: Path, tmp_path: Path) -> N
     saved = salvage_bag(damaged, tmp_path / "out.mcap")
     assert saved.lost_chunks == 1
     place = f"the chunk at byte {index.chunk_start_offset} cannot be unpacked"
-    assert saved.lost_because.startswith(place)
+    assert saved.loss_reason.startswith(place)
     assert saved.lost_bytes == 0
     messages = Content(saved.path).messages
     lost = [m for m in Content(bag).messages if m not in messages]

@@ -153,7 +153,7 @@ def test_lanes_start_in_the_states_of_the_plants(sliders: SpaceRobot, actuation:
         size = np.linalg.norm(flights.starts.quaternion[row])
         quaternion = flights.starts.quaternion[row] / size
         center = flights.starts.position[row]
-        if not flights.starts.of_center[row]:
+        if not flights.starts.is_center_of_mass[row]:
             R_WB = Rotation.from_quat(quaternion).as_matrix()
             center = center + R_WB @ flights.robot_of(row).center_of_mass(plant.q)
         shape = flights.starts.q[row], quaternion
@@ -482,9 +482,9 @@ def test_noise_of_chunks_is_that_of_each_seed_in_one_go(all_of_it: bool) -> None
     noise = noise_of(program, sensors, rows, (0, 2, 4, 6))
     assert noise.affects_commands
     alive = np.ones((2, 2))
-    first = noise.draw_ticks(0, 4, alive)
+    first = noise.draw_noise(0, 4, alive)
     alive[1, 1] = 0.0  # The fourth fails.
-    second = noise.draw_ticks(4, 7, alive)
+    second = noise.draw_noise(4, 7, alive)
     assert first is not None
     assert second is not None
     width = 12 + 2 * N
@@ -517,12 +517,12 @@ def test_noise_of_chunks_is_that_of_each_seed_in_one_go(all_of_it: bool) -> None
 def test_noise_that_no_command_needs_is_not_kept() -> None:
     program, sensors = held(), sensors_of()
     none = noise_of(program, None, [0, 1], (0,))
-    assert (none.affects_commands, none.draw_ticks(0, 3, np.ones((1, 2)))) == (False, None)
+    assert (none.affects_commands, none.draw_noise(0, 3, np.ones((1, 2)))) == (False, None)
     pose, q = np.ones((2, 1, 7)), np.ones((2, 1, N))
     assert none.measure(pose, q) == (pose, q)
     sensors.noise[:, 4], sensors.joint_bias[:] = 0.0, 0.0
     quiet = noise_of(program, sensors, [0, 3], (0,))
-    assert (quiet.affects_commands, quiet.draw_ticks(0, 3, np.ones((1, 2)))) == (False, None)
+    assert (quiet.affects_commands, quiet.draw_noise(0, 3, np.ones((1, 2)))) == (False, None)
     # It is drawn all the same, for what is reported.
     assert quiet.measure(pose, q)[0][1, 0, 0] == pytest.approx(
         1
@@ -564,7 +564,7 @@ def test_starts_that_the_plant_would_refuse_are_left_to_it() -> None:
         starts[name][row] = value
     robot = SimpleNamespace(lower=lower, upper=upper)
     flights: Any = SimpleNamespace(starts=SimpleNamespace(**starts), robot=robot)
-    assert lanes.regular_starts(flights).tolist() == [fit for _, _, fit in cases]
+    assert lanes.starts_accepted_by_plant(flights).tolist() == [fit for _, _, fit in cases]
 
 
 @pytest.mark.parametrize(

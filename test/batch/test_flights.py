@@ -144,14 +144,14 @@ def test_starts_are_rows_of_initial_states(sliders: SpaceRobot) -> None:
     assert starts.q[0].tolist() == [0.1, 0.2, 0.3]
     assert starts.qdot.tolist() == [[0.01, 0.02, 0.03], [0, 0, 0]]
     assert starts.momenta.tolist() == [[4, 5, 6, 7, 8, 9], [0] * 6]
-    assert starts.of_center.tolist() == [False, True]
+    assert starts.is_center_of_mass.tolist() == [False, True]
     for index, wanted in enumerate((first, second)):
         again = Starts.of(sliders, [starts.initial_state(index)])
         once = Starts.of(sliders, [wanted])
         for each in dataclasses.fields(Starts):
             assert getattr(again, each.name).tolist() == getattr(once, each.name).tolist()
     three = Starts.repeated(sliders, first, 3)
-    assert (len(three), three.momenta.shape, three.of_center.shape) == (3, (3, 6), (3,))
+    assert (len(three), three.momenta.shape, three.is_center_of_mass.shape) == (3, (3, 6), (3,))
     three.q[1] = 0.0
     assert three.q[2].tolist() == [0.1, 0.2, 0.3]
 

@@ -37,7 +37,7 @@ def test_a_compiler_reads_the_declarations_as_python_means_them(tmp_path: Path) 
     compiler = cxx_compiler()
     if compiler is None:
         pytest.skip("there is no C++ compiler")
-    declared = native._declare_shared(
+    declared = native._shared_declarations(
         ROWS,
         {"WIDTH": 26, "JOINTS": 3},
         {"ARGUMENTS": [4, 2, 9]},
@@ -88,7 +88,7 @@ def test_sizes_are_those_of_the_largest_function() -> None:
 
 
 def test_a_trial_has_the_sizes_of_all_arguments_and_results() -> None:
-    source = native._trial_source(small_function())
+    source = native._trial_function_source(small_function())
     assert source.startswith('extern "C" int small(')
     assert "in[] = {2, 3}, out[] = {2, 1};" in source
     assert "trial(vector_small, in, 2, out, 2, arguments, results);" in source

@@ -271,7 +271,7 @@ def test_the_script_writes_the_result_of_a_measurement(
 )
 def test_a_gait_lasts_as_long_as_the_flight(duration: float, cycles: int) -> None:
     """It takes 100 s before its cycles of 3 s, of which there are at least 170."""
-    assert measurements.gait_cycles(duration) == cycles
+    assert measurements.gait_cycles_for(duration) == cycles
 
 
 def test_ticks_are_the_difference_of_two_flights(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -556,7 +556,7 @@ def test_how_control_ends() -> None:
     [(0.0, 1), (0.01, 1), (0.02, 2), (0.025, 3), (1.0, 100), (1.0001, 101), (0.3, 30), (0.07, 7)],
 )
 def test_the_tick_at_which_a_flight_is_interrupted(longest: float, tick: int) -> None:
-    assert lanes._ticks_until(longest, 10_000_000) == tick
+    assert lanes._tick_of_interruption(longest, 10_000_000) == tick
 
 
 def test_goals_are_rows_and_none_are_nothing() -> None:

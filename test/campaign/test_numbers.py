@@ -94,7 +94,12 @@ def test_what_is_said_of_an_influence() -> None:
     assert str(whole) == "mass of error_m: total Sobol index 0.38"
     assert whole.strength == 0.375
     bare = Influence("a", "b", 0.25, 0.5)
-    assert (bare.departure, bare.p_departure, bare.first, bare.total) == (0.0, 1.0, None, None)
+    assert (bare.departure, bare.p_distance_from_median, bare.first, bare.total) == (
+        0.0,
+        1.0,
+        None,
+        None,
+    )
 
 
 @pytest.mark.parametrize(
@@ -119,8 +124,8 @@ def test_chances_are_corrected_for_the_number_of_tests() -> None:
         Influence("b", "m", 0.25, 0.03, 0.1, 0.5),
     ]
     first, second = corrected(given)
-    assert (first.p, first.p_departure) == pytest.approx((0.04, 0.16 / 3))
-    assert (second.p, second.p_departure) == pytest.approx((0.16 / 3, 0.5))
+    assert (first.p, first.p_distance_from_median) == pytest.approx((0.04, 0.16 / 3))
+    assert (second.p, second.p_distance_from_median) == pytest.approx((0.16 / 3, 0.5))
     assert (first.cause, first.correlation, second.departure) == ("a", 0.5, 0.1)
     assert corrected([]) == []
     (constant,) = corrected([Influence("a", "m", 0.0, math.nan)])
@@ -142,13 +147,13 @@ def test_influences_are_rank_correlations_of_finite_values() -> None:
         away = np.abs(values[there] - np.median(values[there]))
         departure = stats.spearmanr(away, metric[there])
         assert (each.correlation, each.p) == pytest.approx(tuple(expected))
-        assert (each.departure, each.p_departure) == pytest.approx(tuple(departure))
+        assert (each.departure, each.p_distance_from_median) == pytest.approx(tuple(departure))
     three = {"m": np.array([1.0, 3.0, 2.0])}
     (only,) = influences({"x": np.array([1.0, 2.0, 3.0])}, three)
     assert only.correlation == pytest.approx(0.5)
     # Two values are as far from their median: that distance says nothing.
     (sides,) = influences({"x": np.array([1.0, 2.0, 1.0, 2.0])}, {"m": np.arange(4.0)})
-    assert (sides.departure, sides.p_departure) == (0.0, 1.0)
+    assert (sides.departure, sides.p_distance_from_median) == (0.0, 1.0)
 
 
 def test_indices_need_whole_samples() -> None:
@@ -726,7 +731,7 @@ def test_shown_metrics_are_those_with_criteria_and_the_main_ones() -> None:
     found = replace(found, campaign=replace(MADE, criteria=criteria))
     assert found.shown_metrics == ["duration_s", "attitude_error_rad", "position_error_m"]
     assert list(found.metrics()) == found.shown_metrics
-    met = found.requirement_share(criteria[1])
+    met = found.share_meeting(criteria[1])
     assert (met.count, met.total) == (1, 2)
     assert found.success.count == 2
 

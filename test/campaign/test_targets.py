@@ -155,7 +155,7 @@ TUMBLER = """<robot name="tumbler">
 def test_the_target_weighs_otherwise(scenario: Scenario) -> None:
     scenario = scenario.with_overrides("plant", {"target.robot_description": TUMBLER})
     flight = DrawnFlight.of(scenario)
-    assert not flight.weighs_target
+    assert not flight.has_target_masses
     drawn = {"target.mass": 1.25, "target.inertia": 0.8, "target.com.y": 0.02}
     units = {}
     for name, value in drawn.items():
@@ -163,7 +163,7 @@ def test_the_target_weighs_otherwise(scenario: Scenario) -> None:
         flight, units[name] = target.apply(flight, value), target.unit
         assert target.sets == {name}
     assert units == {"target.mass": "1", "target.inertia": "1", "target.com.y": "m"}
-    assert flight.weighs_target
+    assert flight.has_target_masses
     found = load_target(flight.scenario.plant.target)
     assert found is not None
     inertia = found.bodies[0].inertia

@@ -19,8 +19,8 @@ from spacerobot_ros.cli.options import (
     EndEffectorOptions,
     GoalOptions,
     Registered,
-    note_large_angles,
-    viewing_if,
+    viewer_if_requested,
+    warn_of_large_angles,
 )
 from spacerobot_ros.errors import GoalError
 from spacerobot_ros.termination import Terminated
@@ -119,7 +119,7 @@ def test_end_effectors_with_more_or_fewer_names_are_refused(
 def test_a_rotation_of_more_than_a_turn_is_noted(
     rotvec: tuple[float, float, float], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    note_large_angles(rotvec, "--here")
+    warn_of_large_angles(rotvec, "--here")
     assert capsys.readouterr() == ("", said)
     asked: Any = Asked()
     GoalOptions(None, rotvec, None).apply_to(asked)
@@ -149,12 +149,12 @@ def test_a_viewer_runs_beside_a_command_that_wants_one(
             pass
 
     monkeypatch.setattr(module, "viewing", Viewing)
-    with viewing_if(False, {"port": 1}):
+    with viewer_if_requested(False, {"port": 1}):
         pass
     assert capsys.readouterr() == ("", "")
-    with viewing_if(True, {"port": 1}):
+    with viewer_if_requested(True, {"port": 1}):
         pass
-    with viewing_if(True, {}, "left"):
+    with viewer_if_requested(True, {}, "left"):
         pass
     assert capsys.readouterr() == ("", "{'port': 1} ''\n{} 'left'\n")
 
@@ -174,11 +174,11 @@ def test_a_signal_ends_a_command_with_its_code_whatever_a_library_makes_of_it(
         raise Terminated(signal.SIGINT)
     assert ended.value.code == 130
     with pytest.raises(SystemExit) as ended:
-        errors.end_if_requested()
+        errors.exit_if_terminated()
     assert ended.value.code == 143
     assert capsys.readouterr() == ("", "Terminated.\nInterrupted.\nTerminated.\n")
     monkeypatch.setattr(errors, "termination", lambda: None)
-    errors.end_if_requested()
+    errors.exit_if_terminated()
     with pytest.raises(RuntimeError, match="itself"), sentences():
         raise RuntimeError("itself")
 

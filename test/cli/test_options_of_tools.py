@@ -30,7 +30,7 @@ from spacerobot_ros.bag.tables import ExportFormat
 from spacerobot_ros.cli import campaign
 from spacerobot_ros.cli.errors import sentences
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.cli.options import beside, numbers, viewing_if
+from spacerobot_ros.cli.options import beside, numbers, viewer_if_requested
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
 from spacerobot_ros.report.figures import PictureFormat
 
@@ -340,7 +340,7 @@ def test_a_viewer_runs_beside_a_command_that_asks_for_one(
 
     monkeypatch.setattr(viewing, "viewing", view)
     for wanted in (False, True):
-        with viewing_if(wanted, {"port": 0}, "left"):
+        with viewer_if_requested(wanted, {"port": 0}, "left"):
             assert len(asked) == wanted
     assert asked == [({"port": 0}, "left")]
     assert capsys.readouterr().err == "at this address\n"

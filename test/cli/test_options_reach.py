@@ -209,11 +209,13 @@ def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, str]]:
     found: list[tuple[bool, str]] = []
 
     @contextmanager
-    def viewing_if(view: bool, parameters: Mapping[str, Any], namespace: str = "") -> Iterator[Any]:
+    def viewer_if_requested(
+        view: bool, parameters: Mapping[str, Any], namespace: str = ""
+    ) -> Iterator[Any]:
         found.append((view, namespace))
         yield _Viewer() if view else None
 
-    monkeypatch.setattr(flights, "viewing_if", viewing_if)
+    monkeypatch.setattr(flights, "viewer_if_requested", viewer_if_requested)
     return found
 
 
@@ -257,7 +259,7 @@ def replayed(monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, Any]]:
     views: list[bool] = []
 
     @contextmanager
-    def viewing_if(view: bool, parameters: Mapping[str, Any]) -> Iterator[None]:
+    def viewer_if_requested(view: bool, parameters: Mapping[str, Any]) -> Iterator[None]:
         views.append(view)
         yield
 
@@ -268,7 +270,7 @@ def replayed(monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, Any]]:
         make()
         return 3
 
-    monkeypatch.setattr(bags, "viewing_if", viewing_if)
+    monkeypatch.setattr(bags, "viewer_if_requested", viewer_if_requested)
     monkeypatch.setattr(spacerobot_ros.nodes, "ReplayNode", node)
     monkeypatch.setattr(process, "run_node", run_node)
     return found

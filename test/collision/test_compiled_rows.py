@@ -23,7 +23,7 @@ def compare(geometry: CollisionGeometry, pairs: list[int], shapes: int) -> None:
     high = np.minimum(robot.limits("upper"), 3.0)
     for pair in pairs:
         ours, theirs = compiled.rows(pair), DistanceRows.of(geometry, [pair])
-        assert not ours.of_obstacles
+        assert not ours.is_of_obstacle
         for q in rng.uniform(low, high, (shapes, len(low))):
             assert float(ours.values(q)) == pytest.approx(float(theirs.values(q)), abs=1e-13)
             for mine, other in (

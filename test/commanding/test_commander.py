@@ -11,7 +11,12 @@ import numpy as np
 import pytest
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.commanding.commander import Activity, ArrayDecoder, Commander, StateArrays
+from spacerobot_ros.commanding.commander import (
+    ArrayDecoder,
+    Commander,
+    CommanderActivity,
+    StateArrays,
+)
 from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerCommander
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.planner import PlannerCommander
@@ -62,7 +67,7 @@ class Host:
     def log(self, level: str, message: str) -> None:
         self.lines.append((level, message))
 
-    log_of_goals = log
+    log_about_goals = log
 
     def has_publisher(self, topic: str) -> bool:
         return topic in self.publishers
@@ -360,7 +365,7 @@ def test_a_commander_that_is_to_stop_with_the_decision_answers_no_later_state(
     for tick in range(2, 6):
         rig.state(tick)
     assert rig.host.states[-1] == "reached"
-    assert rig.commander.activity is Activity.DECIDED
+    assert rig.commander.activity is CommanderActivity.DECIDED
     assert rig.host.commands[-1] < 5
     rig.commander.deactivate()
     rig.commander.activate()
@@ -418,7 +423,7 @@ def test_a_controller_that_is_to_stop_with_the_decision_does(arm: SpaceRobot) ->
     for tick in range(2, 12):
         rig.state(tick)
     assert rig.host.states[-1] == "reached"
-    assert rig.commander.activity is Activity.DECIDED
+    assert rig.commander.activity is CommanderActivity.DECIDED
     assert rig.host.commands[-1] < 11
 
 
@@ -446,7 +451,7 @@ def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
     rig = Rig(PlannerCommander, config(PlannerConfig, resume_file=str(path), **METHOD), robot.n)
     rig.commander.activate()
     assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("planning", "9.000000000")
-    rig.commander.plant_silent("Node '/plant' is silent.")
+    rig.commander.on_plant_silent("Node '/plant' is silent.")
     assert_one_sentence(rig.host.statuses[-1].message, "Aborted", "silent")
     assert not path.exists()
 
@@ -457,7 +462,7 @@ def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
 def test_a_robot_that_is_replaced_takes_its_goals_along(planner: Rig, robot: SpaceRobot) -> None:
     planner.goal(sec=6)
     planner.state(1)
-    planner.commander.leave_robot("robot_description describes another robot now.")
+    planner.commander.drop_robot("robot_description describes another robot now.")
     assert (planner.host.states[-1], planner.host.statuses[-1].goal_id) == (
         "aborted",
         "6.000000000",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spacerobot_ros.commanding import controller
-from spacerobot_ros.commanding.commander import Activity
+from spacerobot_ros.commanding.commander import CommanderActivity
 from spacerobot_ros.commanding.controller import ControllerCommander
 from spacerobot_ros.commanding.plant_state import (
     Pairing,
@@ -39,7 +39,7 @@ class Filter:
 
     def odom(self, wall: float, stamp: float) -> bool:
         self.wall = wall
-        return self.made.admits_odom(round(stamp * UNIT), f"odom {stamp:g}")
+        return self.made.accepts_odom(round(stamp * UNIT), f"odom {stamp:g}")
 
     def jump(self, wall: float) -> tuple[Stamped | None, Stamped] | None:
         self.wall = wall
@@ -61,7 +61,7 @@ def test_lost_states_are_explained_by_twice_their_time(
     some = Filter()
     assert [some.joints(t, t) for t in (0, 4, 8)] == [True] * 3
     some.wall = wall
-    assert some.made.would_admit(round(stamp * UNIT)) is admitted
+    assert some.made.would_accept(round(stamp * UNIT)) is admitted
     assert some.joints(wall, stamp) is admitted
 
 
@@ -227,7 +227,7 @@ def commander(**changes: Any) -> Any:
         done=done,
         executive=Kept(done),
         active=True,
-        activity=Activity.ACTIVE,
+        activity=CommanderActivity.ACTIVE,
         host=SimpleNamespace(
             has_publisher=lambda topic: topic == "odom",
             send_command=lambda stamp: done.append(("send", stamp)),
@@ -257,7 +257,7 @@ def test_a_controller_without_a_robot_or_rest_dumps_no_momentum() -> None:
 
 @pytest.mark.parametrize(
     ("change", "called"),
-    [(change, "plant_reset" if change is PlantChange.RESET else "plant_obeys_again")
+    [(change, "plant_reset" if change is PlantChange.RESET else "on_plant_obeying")
      for change in PlantChange],
 )  # fmt: skip
 def test_changes_of_the_plant_are_told_to_the_executive(change: PlantChange, called: str) -> None:
@@ -269,10 +269,10 @@ def test_changes_of_the_plant_are_told_to_the_executive(change: PlantChange, cal
 @pytest.mark.parametrize("blocked", ["", "aborted"])
 def test_a_blocked_plant_blocks_the_executive(blocked: str) -> None:
     made = commander(plant=SimpleNamespace(blocked=blocked))
-    ControllerCommander._tell_plant_state(made)
+    ControllerCommander._forward_plant_state(made)
     assert made.executive.plant_blocked is bool(blocked)
     made.executive = None
-    ControllerCommander._tell_plant_state(made)
+    ControllerCommander._forward_plant_state(made)
 
 
 def test_the_first_pose_is_waited_for_once_odom_is_connected() -> None:
@@ -370,17 +370,17 @@ def test_a_state_that_is_refused_is_not_answered(error: Exception) -> None:
 
 
 @pytest.mark.parametrize("executive", [False, True])
-@pytest.mark.parametrize("activity", list(Activity))
+@pytest.mark.parametrize("activity", list(CommanderActivity))
 @pytest.mark.parametrize("pairing", [None, Pairing.WHOLE])
 def test_only_an_active_controller_with_a_robot_answers(
-    executive: bool, activity: Activity, pairing: Pairing | None
+    executive: bool, activity: CommanderActivity, pairing: Pairing | None
 ) -> None:
     made = commander(activity=activity, states=SimpleNamespace(ready=lambda: pairing))
     made._answer_state = made.done.append
     if not executive:
         made.executive = None
     ControllerCommander.answer(made)
-    answered = executive and activity is Activity.ACTIVE and pairing is not None
+    answered = executive and activity is CommanderActivity.ACTIVE and pairing is not None
     assert made.done == [pairing] * answered
 
 

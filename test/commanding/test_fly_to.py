@@ -259,12 +259,12 @@ def test_a_goal_that_was_refused_has_replaced_none() -> None:
 def test_the_latest_goal_is_aborted_once() -> None:
     rig = Rig()
     rig.send("a")
-    assert rig.goals.to_abort({"a"}) == ""
+    assert rig.goals.abort_reason({"a"}) == ""
     rig.goals.request_abort("unknown")
     rig.goals.request_abort("a", "after lunch")
     rig.goals.request_abort("a", "again")
-    assert rig.goals.to_abort({"a", "an earlier one"}) == "after lunch"
-    assert rig.goals.to_abort({"a"}) == ""
+    assert rig.goals.abort_reason({"a", "an earlier one"}) == "after lunch"
+    assert rig.goals.abort_reason({"a"}) == ""
 
 
 def test_a_goal_that_is_about_to_be_replaced_is_not_aborted() -> None:
@@ -272,9 +272,9 @@ def test_a_goal_that_is_about_to_be_replaced_is_not_aborted() -> None:
     rig.send("a")
     rig.goals.accepted("later")
     rig.goals.request_abort("a")
-    assert rig.goals.to_abort({"a", "later"}) == ""
+    assert rig.goals.abort_reason({"a", "later"}) == ""
     # The later one is refused.
-    assert rig.goals.to_abort({"a"}) == "on request"
+    assert rig.goals.abort_reason({"a"}) == "on request"
 
 
 def test_feedback_comes_by_simulated_time() -> None:
@@ -286,9 +286,9 @@ def test_feedback_comes_by_simulated_time() -> None:
         rig.advance(begin + step)
     assert [each.stamp_ns - begin for each in client.told] == [0, 200_000_000, 400_000_000]
     assert [each.elapsed_time for each in client.told] == [0.0, 0.2, 0.4]
-    assert rig.goals.to_abort({"a"}) == ""
+    assert rig.goals.abort_reason({"a"}) == ""
     rig.advance(begin + 500_000_000)
-    assert rig.goals.to_abort({"a"}) == "after its time limit of 0.5 s"
+    assert rig.goals.abort_reason({"a"}) == "after its time limit of 0.5 s"
 
 
 def test_time_that_goes_back_begins_the_goal_anew() -> None:
@@ -298,6 +298,6 @@ def test_time_that_goes_back_begins_the_goal_anew() -> None:
     rig.advance(1_000_000_000)
     rig.advance(2_999_999_999)
     assert [each.elapsed_time for each in client.told] == pytest.approx([0.0, 0.0, 2.0])
-    assert rig.goals.to_abort({"a"}) == ""
+    assert rig.goals.abort_reason({"a"}) == ""
     rig.advance(3_000_000_000)
-    assert rig.goals.to_abort({"a"})
+    assert rig.goals.abort_reason({"a"})

@@ -32,7 +32,7 @@ class Listener:
             assert self.joints(self.time)
 
     def odom(self, seconds: float) -> bool:
-        return self.times.admits_odom(*message("odom", seconds))
+        return self.times.accepts_odom(*message("odom", seconds))
 
     def joints(self, seconds: float) -> bool:
         admitted = self.times.admits(*message("joint_states", seconds))
@@ -210,8 +210,8 @@ def test_stamps_are_plausible_up_to_the_bounds_of_a_step_and_of_losses(
         (odom_from, False, True),
         (odom_from - 1, False, False),
     ):
-        assert exact.times.would_admit(exact.now + ahead) is plausible
-        assert exact.times.admits_odom(exact.now + ahead, "odom") is of_odom
+        assert exact.times.would_accept(exact.now + ahead) is plausible
+        assert exact.times.accepts_odom(exact.now + ahead, "odom") is of_odom
 
 
 @pytest.mark.parametrize(("pace", "doubt"), [(1.0, 0.25), (0.5, 0.5), (4.0, 0.2), (100.0, 0.2)])
@@ -221,7 +221,7 @@ def test_a_jump_is_believed_after_four_states_and_a_fifth_of_a_second(
     exact = Exact(pace)
     stamp = exact.now + 8 * SECOND
     assert exact.times.accepted_jump() is None
-    assert not exact.times.admits_odom(stamp, "odom")
+    assert not exact.times.accepts_odom(stamp, "odom")
     assert not exact.times.admits(stamp, "joints")
     begin = exact.wall
     for share in (0.25, 0.5, 0.75, 0.9375):
@@ -249,7 +249,7 @@ def test_ignored_messages_are_named_with_their_distance_in_time() -> None:
         ("odom", 1234.5678, "1235 s ahead of"),
     ):
         stamp = exact.now + round(ahead * SECOND)
-        put = exact.times.admits if part == "joint_states" else exact.times.admits_odom
+        put = exact.times.admits if part == "joint_states" else exact.times.accepts_odom
         assert not put(stamp, "message")
         before = exact.times.ignored
         assert exact.times.admits(exact.now, "joints")

@@ -59,7 +59,7 @@ class Rig:
     def log(self, level: str, message: str) -> None:
         pass
 
-    log_of_goals = log
+    log_about_goals = log
 
     def has_publisher(self, topic: str) -> bool:
         return topic in self.publishers

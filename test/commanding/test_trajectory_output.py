@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from spacerobot_ros.commanding.trajectory_output import (
-    MotionEnd,
     Outcome,
+    TrajectoryEnd,
     TrajectoryOutput,
 )
 from spacerobot_ros.planning.execution.executive import Phase
@@ -40,7 +40,7 @@ class Sent:
     """An output with its server and the ends that it has told."""
 
     def __init__(self) -> None:
-        self.server, self.ends = Server(), list[MotionEnd]()
+        self.server, self.ends = Server(), list[TrajectoryEnd]()
         self.output = TrajectoryOutput(self.server, "/arm/follow", self.ends.append)
 
     def start(self, schedule: Any = "schedule", *, accepted: bool = True) -> int:
@@ -58,7 +58,7 @@ def test_a_schedule_is_sent_and_ends_with_its_result() -> None:
     assert sent.output.waits
     sent.output.phase_changed(Phase.EXECUTING)
     sent.output.ended(number, Outcome.SUCCEEDED, 0, "")
-    assert sent.ends == [MotionEnd()]
+    assert sent.ends == [TrajectoryEnd()]
     assert not sent.output.waits
     # Each schedule ends once, and nothing that has ended is cancelled.
     sent.output.ended(number, Outcome.ABORTED, -4, "")
@@ -92,7 +92,7 @@ def test_results_are_corrected_or_final(
 ) -> None:
     sent = Sent()
     sent.output.ended(sent.start(), outcome, code, text)
-    assert sent.ends == [MotionEnd(message, final)]
+    assert sent.ends == [TrajectoryEnd(message, final)]
 
 
 def test_what_is_left_is_cancelled_and_its_result_does_not_count() -> None:
@@ -124,7 +124,9 @@ def test_a_schedule_replaces_another() -> None:
     sent.output.rejected(third)
     # The robot must not follow the second one on.
     assert sent.server.cancelled == [second]
-    assert sent.ends == [MotionEnd("the action '/arm/follow' has rejected the trajectory", True)]
+    assert sent.ends == [
+        TrajectoryEnd("the action '/arm/follow' has rejected the trajectory", True)
+    ]
 
 
 def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
@@ -133,7 +135,7 @@ def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
     lost: Any = "lost"
     sent.output.start(lost)
     assert sent.server.sent == []
-    assert sent.ends.pop() == MotionEnd("no server of the action '/arm/follow' is there", True)
+    assert sent.ends.pop() == TrajectoryEnd("no server of the action '/arm/follow' is there", True)
     assert not sent.output.waits
     sent.server.present = True
     number = sent.start(accepted=False)
@@ -141,7 +143,7 @@ def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
         assert not sent.ends
         sent.output.watch(FIRST + second * SECOND)
     sent.output.watch(FIRST + 5 * SECOND + 1)
-    assert sent.ends == [MotionEnd("the action '/arm/follow' has not answered", True)]
+    assert sent.ends == [TrajectoryEnd("the action '/arm/follow' has not answered", True)]
     assert sent.server.cancelled == [number]
     # One that was accepted may take any time; a schedule that is left ends nothing.
     later = sent.start()
@@ -177,7 +179,7 @@ def test_a_server_that_goes_ends_the_goal_within_a_second() -> None:
     sent.output.watch(FIRST + SECOND - 1)
     assert sent.ends == []
     sent.output.watch(FIRST + SECOND)
-    wanted = MotionEnd("the server of the action '/arm/follow' is gone", True)
+    wanted = TrajectoryEnd("the server of the action '/arm/follow' is gone", True)
     assert sent.ends == [wanted]
     # It may still drive the joints, and only this planner not see it.
     assert sent.server.cancelled == [number]

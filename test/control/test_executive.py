@@ -524,7 +524,7 @@ def test_a_held_pose_is_not_flown_back_to_after_a_latch() -> None:
     assert loop.state == "reached"
     assert not loop.executive.plant_stopped("The plant is latched.")
     loop.place = np.array([0.4, 0.0, 0.0])
-    loop.executive.plant_obeys_again()
+    loop.executive.on_plant_obeying()
     wrench, _ = loop.answer()
     np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
     assert (loop.state, loop.status.goal_id) == ("holding", "")

@@ -22,7 +22,7 @@ from spacerobot_ros.control import Actuation, ControlState, PoseReference, Refer
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
-from spacerobot_ros.control.limits import JointRateLimits, _bearable_push_share
+from spacerobot_ros.control.limits import JointRateLimits, _affordable_push_share
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
@@ -257,7 +257,7 @@ def test_a_robot_that_holds_after_a_rearm_takes_no_energy(law: str) -> None:
     # Latched, moved meanwhile, and rearmed; where it was held before is another place.
     flight.plant.state, flight.past = start, [start]
     flight.executive.plant_stopped("latched")
-    flight.executive.plant_obeys_again()
+    flight.executive.on_plant_obeying()
     momentum, first, most = flight.plant.momentum(), energy(flight.plant), 0.0
     for _ in range(100):
         flight.fly(PERIOD)
@@ -439,7 +439,7 @@ def test_a_robot_with_smooth_references_is_held_where_it_is(stopped: str) -> Non
         loop.executive.abort()
     else:
         loop.executive.plant_stopped("latched")
-        loop.executive.plant_obeys_again()
+        loop.executive.on_plant_obeying()
     np.testing.assert_allclose(np.concatenate(loop.answer(20)), 0.0, atol=1e-9)
     loop.place = 2 * AIM
     np.testing.assert_allclose(loop.answer()[0][:3], -2 * KP * AIM, atol=1e-9)
@@ -470,5 +470,5 @@ def test_the_largest_share_of_a_push_that_motors_bear(
     wanted: list[float], pushed: list[float], share: float
 ) -> None:
     """``abs(wanted - share * pushed) <= effort`` for all, of 200 and 50 N m."""
-    found = _bearable_push_share(np.array(wanted), np.array(pushed), np.array([200.0, 50.0]))
+    found = _affordable_push_share(np.array(wanted), np.array(pushed), np.array([200.0, 50.0]))
     assert found == pytest.approx(share)

@@ -30,7 +30,7 @@ def test_a_rigid_robot_is_accelerated_by_half_the_thrust(
     rng = np.random.default_rng(seed)
     q = rng.uniform(-1.5, 1.5, robot.n)
     limits = ActuatorLimits(force, torque, robot.effort_limit)
-    motion = FAST.within_thrust(limits, robot, q)
+    motion = FAST.within_thruster_limits(limits, robot, q)
     oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
     oracle.place(q, REST, np.zeros(3))
     M = oracle.own_mass_matrix()[:6, :6]
@@ -55,4 +55,4 @@ def test_strong_thrusters_and_none_at_all_leave_the_limits_as_they_are(robot: Sp
     q = np.zeros(robot.n)
     for force, torque in ((np.inf, np.inf), (1e9, 1e9), (0.0, 0.0)):
         limits = ActuatorLimits(force, torque, robot.effort_limit)
-        assert motion.within_thrust(limits, robot, q) == motion
+        assert motion.within_thruster_limits(limits, robot, q) == motion

@@ -190,7 +190,7 @@ def test_a_body_that_is_always_in_the_way_is_named() -> None:
 
 
 def test_the_number_of_ways_past_a_body_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(approach, "_MOST_BLOCKED", 5)
+    monkeypatch.setattr(approach, "_MAX_BLOCKED_PATHS", 5)
     answers: Any = Answers(0.01)
     assert "come within 0.01 m" in refusal(NEAR, clearance=answers)
     assert answers.asked == 5

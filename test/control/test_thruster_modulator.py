@@ -78,7 +78,9 @@ def test_impulse_is_met_within_a_shortest_pulse_of_each_thruster(
         assert all(length >= shortest * (1 - 1e-6) for length in lengths)
     # What is missing is what thrusters owe, none more than a shortest pulse, and what is under way.
     missing = wanted - given_
-    np.testing.assert_allclose(missing, pulses.pending_impulse + pulses.under_way, atol=1e-9)
+    np.testing.assert_allclose(
+        missing, pulses.pending_impulse + pulses.begun_pulse_impulse, atol=1e-9
+    )
     assert np.all(np.abs(missing) <= shortest * np.abs(table.wrenches).sum(axis=1) + 1e-9)
     if not shortest:
         assert np.abs(missing).max() <= 1e-9
@@ -137,7 +139,7 @@ def test_pulses_under_way_count_towards_what_may_be_owed(shortest: float) -> Non
     pulses, force = ThrusterModulator(pair(shortest), TICK), 2.0
     for tick in range(60):
         pulses.fire(along_x(float(rng.uniform(20.0, 500.0)) if tick % 9 < 6 else 0.0))
-        outstanding = pulses.pending_impulse + pulses.under_way
+        outstanding = pulses.pending_impulse + pulses.begun_pulse_impulse
         assert abs(outstanding[0]) <= force * (shortest + TICK) + 1e-9, tick
 
 

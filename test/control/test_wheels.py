@@ -337,7 +337,7 @@ def test_answers_to_commands_that_were_not_obeyed_do_not_count() -> None:
     wheels = control()
     observe(wheels, [5.0, 0.0, 0.0])
     for _ in range(100):
-        wheels.forget_answers()
+        wheels.reset_response_check()
         fly(wheels, [-0.3, 0.0, 0.0], 0.0, 0.04)
     assert wheels.events() == []
 

@@ -189,7 +189,7 @@ def test_a_description_is_used_once_and_may_be_none(monkeypatch: pytest.MonkeyPa
     node: Any = SimpleNamespace(
         _description="", config=None, use=done.append, long_work=nullcontext,
         commander=SimpleNamespace(
-            leave_robot=lambda why: done.append(why), answer=lambda: done.append("answer")
+            drop_robot=lambda why: done.append(why), answer=lambda: done.append("answer")
         ),
         get_logger=lambda: log,
     )  # fmt: skip

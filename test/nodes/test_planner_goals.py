@@ -14,7 +14,7 @@ from support.plant_rig import SLIDERS, TICK_NS
 from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.commanding.line_limit import BURST
+from spacerobot_ros.commanding.log_rate_limiter import BURST
 from spacerobot_ros.nodes.common import commander
 
 pytestmark = pytest.mark.usefixtures("one_plant")

@@ -12,7 +12,7 @@ from action_msgs.msg import GoalStatus
 from support.planner_loop import NEAR, TICK, StubMethod, goal_at
 from support.ros_harness import Harness
 
-from spacerobot_ros.commanding.trajectory_output import MotionEnd, TrajectoryOutput
+from spacerobot_ros.commanding.trajectory_output import TrajectoryEnd, TrajectoryOutput
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlannerNode
 from spacerobot_ros.nodes.common import trajectory_client
@@ -87,7 +87,7 @@ def start() -> ScheduleStart:
 
 
 @pytest.fixture
-def ends() -> list[MotionEnd]:
+def ends() -> list[TrajectoryEnd]:
     return []
 
 
@@ -97,7 +97,7 @@ def clients(stand_in: None) -> TrajectoryClients:
 
 
 @pytest.fixture
-def output(clients: TrajectoryClients, ends: list[MotionEnd]) -> TrajectoryOutput:
+def output(clients: TrajectoryClients, ends: list[TrajectoryEnd]) -> TrajectoryOutput:
     return clients.connect("arm/follow", ends.append)
 
 
@@ -108,7 +108,7 @@ def client(clients: TrajectoryClients, output: TrajectoryOutput) -> Any:
 
 
 def test_a_schedule_is_a_trajectory_of_positions_that_begins_at_once(
-    output: TrajectoryOutput, client: Any, ends: list[MotionEnd]
+    output: TrajectoryOutput, client: Any, ends: list[TrajectoryEnd]
 ) -> None:
     given = start()
     output.start(given)
@@ -123,12 +123,12 @@ def test_a_schedule_is_a_trajectory_of_positions_that_begins_at_once(
     handle = Handle()
     answer.give(handle)
     handle.end(GoalStatus.STATUS_SUCCEEDED)
-    assert ends == [MotionEnd()]
+    assert ends == [TrajectoryEnd()]
     assert client.name == "arm/follow"
 
 
 def test_answers_of_the_server_end_the_schedule(
-    output: TrajectoryOutput, client: Any, ends: list[MotionEnd]
+    output: TrajectoryOutput, client: Any, ends: list[TrajectoryEnd]
 ) -> None:
     for status, words, final in (
         (GoalStatus.STATUS_ABORTED, "PATH_TOLERANCE_VIOLATED: off", False),
@@ -143,7 +143,9 @@ def test_answers_of_the_server_end_the_schedule(
         assert ends[-1].final is final
     output.start(start())
     client.sent[-1][1].give(Handle(accepted=False))
-    assert ends[-1] == MotionEnd("the action '/ns/arm/follow' has rejected the trajectory", True)
+    assert ends[-1] == TrajectoryEnd(
+        "the action '/ns/arm/follow' has rejected the trajectory", True
+    )
     client.ready = False
     output.start(start())
     assert ends[-1].message == "no server of the action '/ns/arm/follow' is there"
@@ -167,10 +169,10 @@ def test_a_schedule_is_cancelled_now_or_when_it_is_accepted(
 
 
 def test_the_clients_of_a_node_are_there_until_it_is_destroyed(
-    clients: TrajectoryClients, output: TrajectoryOutput, client: Any, ends: list[MotionEnd]
+    clients: TrajectoryClients, output: TrajectoryOutput, client: Any, ends: list[TrajectoryEnd]
 ) -> None:
     output.start(start())
-    later: list[MotionEnd] = []
+    later: list[TrajectoryEnd] = []
     again = clients.connect("arm/follow", later.append)
     assert list(clients._clients) == ["arm/follow"]
     handles = [Handle(), Handle()]
@@ -181,7 +183,7 @@ def test_the_clients_of_a_node_are_there_until_it_is_destroyed(
     assert later == []
     assert len(ends) == 1
     handles[1].end(GoalStatus.STATUS_SUCCEEDED)
-    assert later == [MotionEnd()]
+    assert later == [TrajectoryEnd()]
     clients.connect("leg/follow", later.append)
     both = list(clients._clients.values())
     assert [each.name for each in both] == ["arm/follow", "leg/follow"]

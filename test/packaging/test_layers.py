@@ -192,7 +192,7 @@ def test_modules_do_not_import_each_other_in_a_circle() -> None:
 # -- values -----------------------------------------------------------------------------------
 
 MUTABLE = {
-    "spacerobot_ros.commanding.fly_to._Served",
+    "spacerobot_ros.commanding.fly_to._ActionGoal",
     "spacerobot_ros.commanding.plant_state._PendingJump",
     "spacerobot_ros.control.goal_monitor.GoalMonitor",
     "spacerobot_ros.planning.execution.executive.ActiveGoal",
@@ -230,7 +230,7 @@ def test_parameters_can_be_given_by_name() -> None:
 
 
 HOOKS = {
-    "commanding.commander": ["_report_waiting_goal", "_pass_on_outputs"],
+    "commanding.commander": ["_report_waiting_goal", "_forward_outputs"],
     "planning.core.method": ["_setup", "require_suitable"],
     "session.stack": ["interrupt", "_supervise"],
 }

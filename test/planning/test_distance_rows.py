@@ -29,7 +29,7 @@ def rows_of_obstacles() -> DistanceRows:
         ca.Function("d", [y, w], [d]),
         ca.Function("J", [y, w], [ca.jacobian(d, y)]),
         ca.Function("H", [y, w, multiplier], [ca.hessian(multiplier * d, y)[0]]),
-        of_obstacles=True,
+        is_of_obstacle=True,
     )
 
 

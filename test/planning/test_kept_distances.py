@@ -32,8 +32,8 @@ CENTER = np.array([0.1, 0.02, -0.05])
 class Rows:
     """Distances that are the sum of the shape times a factor; of obstacles, and of the turn."""
 
-    def __init__(self, factor: float, *, of_obstacles: bool = False) -> None:
-        self.factor, self.of_obstacles = factor, of_obstacles
+    def __init__(self, factor: float, *, is_of_obstacle: bool = False) -> None:
+        self.factor, self.is_of_obstacle = factor, is_of_obstacle
         self.asked: list[tuple[Any, ...]] = []
 
     def values(self, *at: Array) -> ca.DM:
@@ -43,7 +43,7 @@ class Rows:
 
 def library(*rows: Rows) -> Any:
     """Return a library of rows, by the numbers of their pairs."""
-    clearance: Any = SimpleNamespace(has_obstacles=any(x.of_obstacles for x in rows))
+    clearance: Any = SimpleNamespace(has_obstacles=any(x.is_of_obstacle for x in rows))
     robot: Any = SimpleNamespace(center_of_mass=lambda q: CENTER)
     made: Any = DistanceLibrary(clearance, robot, SimpleNamespace())  # type: ignore[arg-type]
     made._rows = dict(enumerate(rows))
@@ -81,7 +81,7 @@ def test_pairs_get_room_and_more_by_what_they_lacked() -> None:
 
 def test_pairs_that_rows_underestimate_spend_room() -> None:
     """Where rows say less than the distance is, they need less room by as much."""
-    among = library(Rows(0.01), Rows(0.1), Rows(0.02), Rows(1.0, of_obstacles=True), Rows(1.0))
+    among = library(Rows(0.01), Rows(0.1), Rows(0.02), Rows(1.0, is_of_obstacle=True), Rows(1.0))
     required = np.array([0.01, 0.02, 0.03, 0.04, 0.05])
     boundary = BoundaryConditions(START, TURN.as_quat(), START, FINAL, state=STATE)
     pairs: Any = KeptDistances(among, boundary, required, turn_is_known=True)
@@ -134,7 +134,7 @@ def test_limits_are_the_required_distances_and_their_room_but_at_the_ends() -> N
 def test_rows_of_obstacles_are_asked_where_the_turn_is_known(
     final: Array | None, known: bool, ends: int
 ) -> None:
-    rows = Rows(1.0, of_obstacles=True)
+    rows = Rows(1.0, is_of_obstacle=True)
     of_links = Rows(1.0)
     pairs = kept(library(of_links, rows), final=final, turn_is_known=known)
     pairs.add([near(0, 0.0), near(1, 0.0)])
@@ -158,7 +158,7 @@ def test_rows_of_obstacles_are_asked_where_the_turn_is_known(
 
 def test_poses_of_the_base_count_among_obstacles_alone() -> None:
     asked: list[tuple[Any, ...]] = []
-    among = library(Rows(1.0, of_obstacles=True))
+    among = library(Rows(1.0, is_of_obstacle=True))
 
     def poses(*at: Any) -> str:
         asked.append(at)
@@ -187,7 +187,7 @@ def test_a_search_begins_with_both_ends_looked_at(
     final: Array | None, known: bool, looked_at: bool | None
 ) -> None:
     asked: list[tuple[str, Any, Any]] = []
-    among = library(Rows(1.0, of_obstacles=True))
+    among = library(Rows(1.0, is_of_obstacle=True))
 
     def required(q: Array, base: Any) -> Array:
         asked.append(("start", q, base))

@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 
 from spacerobot_ros.commanding.commander import Commander, LogLevel
 from spacerobot_ros.commanding.goal_follower import Status
-from spacerobot_ros.commanding.line_limit import Line, LineLimit
+from spacerobot_ros.commanding.log_rate_limiter import Line, LogRateLimiter
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
@@ -86,7 +86,7 @@ class CommanderNode(FlightNode):
     def prepare(self) -> None:
         """Create an inactive commander, and the servers of actions."""
         self.commander = self.make_commander()
-        self._goal_lines = LineLimit()
+        self._goal_lines = LogRateLimiter()
         self._goal_actions = GoalActions(self)
 
     @abstractmethod
@@ -174,7 +174,7 @@ class CommanderNode(FlightNode):
         """Drop all goals if the plant is silent and the parameters request it."""
         super().on_silence(silence)
         if self.config.watchdog_action == "abort" and not silence.over:
-            self.commander.plant_silent(silence.message)
+            self.commander.on_plant_silent(silence.message)
 
     # -- the host of the commander ------------------------------------------------------------
 
@@ -198,7 +198,7 @@ class CommanderNode(FlightNode):
             case "error":
                 logger.error(message)
 
-    def log_of_goals(self, level: LogLevel, message: str) -> None:
+    def log_about_goals(self, level: LogLevel, message: str) -> None:
         """Write a line about a goal into the log; of goals that pour in, one line a second."""
         self._write(self._goal_lines.offer(time.monotonic(), Line(level, message)))
 
@@ -225,7 +225,7 @@ class CommanderNode(FlightNode):
         if message.data == self._description:
             return
         self._description = message.data
-        self.commander.leave_robot("robot_description describes another robot now.")
+        self.commander.drop_robot("robot_description describes another robot now.")
         try:
             with self.long_work():
                 self.use(robot_from_text(message.data, self.config))
@@ -243,7 +243,7 @@ class CommanderNode(FlightNode):
         accepted = self.commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
         if accepted is not None:
             line = goal_description(part, accepted.goal_id, message, accepted.goal)
-            self.log_of_goals("info", line)
+            self.log_about_goals("info", line)
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or another part of the robot.

@@ -10,7 +10,7 @@ from rclpy.action import ActionClient
 from rclpy.serialization import deserialize_message
 from trajectory_msgs.msg import JointTrajectory
 
-from spacerobot_ros.commanding.trajectory_output import MotionEnd, Outcome, TrajectoryOutput
+from spacerobot_ros.commanding.trajectory_output import Outcome, TrajectoryEnd, TrajectoryOutput
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.messages.builders import trajectory_message
 from spacerobot_ros.nodes.common.fly_to import action_class
@@ -51,7 +51,7 @@ class TrajectoryClients:
         self._clients: dict[str, ActionClient] = {}
         """Clients by the name of their action."""
 
-    def connect(self, name: str, on_end: Callable[[MotionEnd], None]) -> TrajectoryOutput:
+    def connect(self, name: str, on_end: Callable[[TrajectoryEnd], None]) -> TrajectoryOutput:
         """Return an output to the server of an action, which tells ends as `on_end`."""
         if name not in self._clients:
             self._clients[name] = ActionClient(self._node, self._kind, name)

@@ -99,7 +99,7 @@ _WEIGHTS: dict[Kind, float] = {
     Kind.WAIT: 3.0,
 }
 
-_TICKS = (0, 0, 1, 2, 5, 20, 60, 200)
+_TICK_VARIABLES = (0, 0, 1, 2, 5, 20, 60, 200)
 
 _BAD_FAULTS = (
     "joint_stuck nobody",
@@ -145,7 +145,7 @@ class Draw:
     def action(self) -> Action:
         """Return the next action."""
         kind = self._kinds[self._rng.choice(len(self._kinds), p=self._chances)]
-        ticks = int(self._rng.choice(_TICKS))
+        ticks = int(self._rng.choice(_TICK_VARIABLES))
         nodes = (PLANT, *self._setup.commanders)
         match kind:
             case Kind.GOAL | Kind.TIP_GOAL:

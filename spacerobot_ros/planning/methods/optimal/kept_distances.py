@@ -191,7 +191,7 @@ class KeptDistances:
             if each.pair not in self._room:
                 continue
             (rows,) = library.of([each.pair])
-            if rows.of_obstacles:
+            if rows.is_of_obstacle:
                 continue
             value = float(rows.values(each.shape[:, np.newaxis]).full().min())
             room = value - each.distance + _ROOM
@@ -209,7 +209,7 @@ class KeptDistances:
         shapes, turned = np.array(ends).T, np.hstack([ends, turns])[:known].T
         least, world = [], np.zeros(0)
         for pair, rows in zip(self.pairs, self._library.of(self.pairs), strict=True):
-            if rows.of_obstacles:
+            if rows.is_of_obstacle:
                 world = self._library.world(self._boundary)
                 values = rows.values(turned, np.tile(world[:, np.newaxis], turned.shape[1]))
             else:

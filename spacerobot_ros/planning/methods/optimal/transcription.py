@@ -321,7 +321,7 @@ def _distances(n: int, pairs: Sequence[DistanceRows], instants: int) -> Block:
     h, s, v, v_next = ca.MX.sym("h"), *(ca.MX.sym(name, n) for name in ("s", "v", "v+"))
     X, X_next = ca.MX.sym("X", 4), ca.MX.sym("X+", 4)
     z, least = ca.vertcat(h, X, s, v, X_next, v_next), ca.MX.sym("least", len(pairs))
-    turning = any(rows.of_obstacles for rows in pairs)
+    turning = any(rows.is_of_obstacle for rows in pairs)
     world = ca.MX.sym("world", 12 if turning else 0)
     multipliers = ca.MX.sym("lambda", least.numel() * instants)
     values, jacobian, hessian = [], [], ca.MX(z.numel(), z.numel())
@@ -336,9 +336,9 @@ def _distances(n: int, pairs: Sequence[DistanceRows], instants: int) -> Block:
         turned = ca.vertcat(point, (1 - tau) * X + tau * X_next)
         slopes, curvature = [], ca.MX(size, size)
         for row, (rows, multiplier) in enumerate(zip(pairs, ca.vertsplit(by_row), strict=True)):
-            at = (turned, world) if rows.of_obstacles else (point,)
+            at = (turned, world) if rows.is_of_obstacle else (point,)
             J, H = rows.jacobian(*at), rows.hessian(*at, multiplier)
-            if turning and not rows.of_obstacles:
+            if turning and not rows.is_of_obstacle:
                 J, H = ca.horzcat(J, ca.MX(1, 4)), ca.diagcat(H, ca.MX(4, 4))
             values.append(rows.values(*at) - least[row])
             slopes.append(J)

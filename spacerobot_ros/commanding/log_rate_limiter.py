@@ -20,7 +20,7 @@ class Line:
     message: str
 
 
-class LineLimit:
+class LogRateLimiter:
     """Lets lines pass as they come up to a burst, and then one in each period.
 
     A line that has to wait is replaced by the next one; the line that passes at last tells how

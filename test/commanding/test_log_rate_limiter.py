@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from spacerobot_ros.commanding.line_limit import Line, LineLimit
+from spacerobot_ros.commanding.log_rate_limiter import Line, LogRateLimiter
 
 
 def test_goals_at_100_hz_write_a_line_a_second() -> None:
-    limit, written = LineLimit(), []
+    limit, written = LogRateLimiter(), []
     for i in range(700):
         now = 50.0 + 0.01 * i
         for words in ("received", "measuring"):
@@ -31,7 +31,7 @@ def _count(written: list[tuple[float, str]]) -> int:
 
 
 def test_a_line_passes_at_once_after_a_quiet_time() -> None:
-    limit = LineLimit()
+    limit = LogRateLimiter()
     assert limit.due(3.0) is None
     lines = [Line("warning", f"{i}") for i in range(23)]
     assert [limit.offer(3.0, line) for line in lines[:20]] == lines[:20]
