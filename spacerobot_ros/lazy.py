@@ -1,10 +1,12 @@
-"""Names of a package that are imported when they are used first, so that importing it is fast."""
+"""Names and packages that are imported when they are used first: importing this one is fast."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
+
+from spacerobot_ros.errors import SpaceRobotError
 
 
 def lazy_names(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
@@ -24,3 +26,33 @@ def lazy_names(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]
         return getattr(import_module(modules[name]), name)
 
     return get
+
+
+def optional_module(
+    name: str, extra: str, needed_by: str, error: type[SpaceRobotError] = SpaceRobotError
+) -> Any:
+    """Return a module of a package that an extra of this one installs.
+
+    Parameters
+    ----------
+    name, extra
+        The module, and the extra in ``setup.cfg``.
+    needed_by
+        Beginning of the message for users, such as "Campaigns need".
+    error
+        Class of the error.
+
+    Raises
+    ------
+    SpaceRobotError
+        The package is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as missing:
+        package = name.partition(".")[0]
+        if (missing.name or package).partition(".")[0] != package:
+            raise  # It is there, and lacks another package.
+        raise error(
+            f"{needed_by} {package}, which is not installed: pip install '.[{extra}]' in the clone."
+        ) from missing

@@ -6,7 +6,6 @@ joints that the entries of an array stand for.
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import re
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.messages.statuses import key_values
 from spacerobot_ros.topics import TOPICS
 
@@ -576,13 +576,4 @@ def _cell_array(texts: list[str]) -> Any:
 
 
 def _import_library(name: str) -> Any:
-    """Import a library of the extra ``data``."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        if error.name is None or error.name.split(".")[0] != name.split(".")[0]:
-            raise
-        raise RecordingError(
-            f"Tables need {name.split('.')[0]}, which is not installed: "
-            "pip install '.[data]' in the clone."
-        ) from error
+    return optional_module(name, "data", "Tables need", RecordingError)

@@ -7,7 +7,6 @@ flights.
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,8 @@ import numpy as np
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.targets import DrawnFlight
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.description import Array
 
 _MIN_PROBABILITY = 1e-12
@@ -160,21 +160,8 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
 
 
 def require_module(module: str) -> Any:
-    """Return a module of the extra ``campaign``.
-
-    Raises
-    ------
-    SpaceRobotError
-        It is not installed.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        name = module.partition(".")[0]
-        raise SpaceRobotError(
-            f"Campaigns need {name}, which is not installed: "
-            "pip install '.[campaign]' in the clone."
-        ) from None
+    """Return a module of the extra ``campaign``; see :func:`.optional_module`."""
+    return optional_module(module, "campaign", "Campaigns need")
 
 
 def import_salib(module: str) -> Any:

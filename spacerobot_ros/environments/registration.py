@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.lazy import optional_module
 
 NAMESPACE = "spacerobot"
 
@@ -13,20 +13,8 @@ ENVIRONMENTS = {"ReorientArm-v0": "reorient", "Reach-v0": "reach"}
 
 
 def import_gymnasium() -> Any:
-    """Return the module of Gymnasium.
-
-    Raises
-    ------
-    SpaceRobotError
-        It is not installed.
-    """
-    try:
-        import gymnasium
-    except ImportError:
-        raise SpaceRobotError(
-            "Environments need gymnasium, which is not installed: pip install '.[rl]' in the clone."
-        ) from None
-    return gymnasium
+    """Return the module of Gymnasium; see :func:`.optional_module`."""
+    return optional_module("gymnasium", "rl", "Environments need")
 
 
 def register() -> None:

@@ -16,7 +16,8 @@ from xml.etree import ElementTree
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import RobotDescriptionError, SpaceRobotError
+from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.external_loads import LoadLayout
 from spacerobot_ros.model.rotations import cross, matrix_from_quaternion, quaternion_multiply
@@ -33,20 +34,8 @@ _MIN_INERTIA = 1e-12
 
 
 def import_mujoco() -> Any:
-    """Return the module of MuJoCo.
-
-    Raises
-    ------
-    SpaceRobotError
-        It is not installed.
-    """
-    try:
-        import mujoco
-    except ImportError as error:
-        raise SpaceRobotError(
-            "MuJoCo is not installed: pip install '.[mujoco]' in the clone."
-        ) from error
-    return mujoco
+    """Return the module of MuJoCo; see :func:`.optional_module`."""
+    return optional_module("mujoco", "mujoco", "Flights in MuJoCo need")
 
 
 def mujoco_spec(mujoco: Any, description: RobotDescription) -> Any:

@@ -327,7 +327,7 @@ def test_bad_commands_and_robots_have_their_sentence(monkeypatch: pytest.MonkeyP
         plant(SpaceRobot(parse_robot(text)))
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(
-        SpaceRobotError, match=r"MuJoCo is not installed: pip install '\.\[mujoco\]'"
+        SpaceRobotError, match=r"need mujoco, which is not installed: pip install '\.\[mujoco\]'"
     ):
         plant(**ARM)
 
