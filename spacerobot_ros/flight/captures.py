@@ -26,6 +26,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_inverse,
     quaternion_multiply,
     quaternions_from_rotvecs,
+    relative_pose,
     rotvecs_from_quaternions,
 )
 from spacerobot_ros.model.space_robot import SpaceRobot
@@ -149,12 +150,9 @@ def _held_between(
     if not len(own):
         return []
     link, kinematics = capturing_link(robot, flight.scenario.plant), ForwardKinematics(robot)
-    R_BL, r_BL = kinematics.link_poses(states.q[own[:1]])
-    number = list(kinematics.links).index(link)
-    base, body = states.pose[own[0]], poses.values[other[0]]
-    R_WB = matrix_from_quaternion(base[3:])
-    R_WL, r_WL = R_WB @ R_BL[0, number], base[:3] + R_WB @ r_BL[0, number]
-    grasp = Pose(R_WL.T @ matrix_from_quaternion(body[3:]), R_WL.T @ (body[:3] - r_WL))
+    hand = kinematics.link_in_world(link, states.pose[own[0]], states.q[own[0]])
+    held = relative_pose(hand, poses.values[other[0]])
+    grasp = Pose(matrix_from_quaternion(held[3:]), held[:3])
     return [HeldBody(start, end, Payload(link, target.bodies[0].inertia.moved(grasp)))]
 
 

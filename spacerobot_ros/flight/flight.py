@@ -32,11 +32,9 @@ from spacerobot_ros.measures import (
     peak_wrench,
 )
 from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import (
-    attitude_error,
     matrices_from_quaternions,
-    matrix_from_quaternion,
-    quaternion_from_matrix,
     quaternion_inverse,
     quaternion_multiply,
     rotvec_from_quaternion,
@@ -467,21 +465,16 @@ class Flight:
     @property
     def end_effector_errors(self) -> dict[str, PoseError]:
         """Errors of the last true poses of the end-effectors that the planner's goal names."""
-        goal = None if self.goal is None or self.robot is None else self.goal
+        goal, robot = self.goal, self.robot
         if goal is None or not goal.end_effectors or not len(self.q) or not len(self.pose):
             return {}
-        assert self.robot is not None
-        shape = dict(zip(self.joint_names, self.q[-1].tolist(), strict=True))
-        frames = self.robot.with_locked(shape).frames
-        R_WB = matrix_from_quaternion(self.pose[-1, 3:])
-        errors = {}
-        for each in goal.for_robot(self.robot).end_effectors:
-            _, pose = frames[each.link]
-            r_WE = self.pose[-1, :3] + R_WB @ pose.r
-            turn = np.zeros(3)
-            if each.quaternion is not None:
-                turn = attitude_error(quaternion_from_matrix(R_WB @ pose.R), each.quaternion)
-            errors[each.link] = PoseError(each.position - r_WE, turn)
+        if robot is None or set(robot.joint_names) - set(self.joint_names):
+            return {}
+        q = self.q[-1, [self.joint_names.index(name) for name in robot.joint_names]]
+        kinematics, errors = ForwardKinematics(robot), {}
+        for each in goal.for_robot(robot).end_effectors:
+            pose = kinematics.link_in_world(each.link, self.pose[-1], q)
+            errors[each.link] = PoseError.of_link(pose, each)
         return errors
 
     @property

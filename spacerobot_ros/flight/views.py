@@ -17,7 +17,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
-from spacerobot_ros.model.rotations import matrices_from_quaternions, rotvec_from_quaternion
+from spacerobot_ros.model.rotations import rotvec_from_quaternion
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.flight import Flight
@@ -205,7 +205,6 @@ class _Skeleton:
         poses, q
             Poses (K, 7) of the base in the world, and joint positions (K, n).
         """
-        R_BL, r_BL = self._kinematics.link_poses(q)
-        points_B = np.concatenate([r_BL, r_BL + np.einsum("klij,lj->kli", R_BL, self._com)], axis=1)
-        R_WB = matrices_from_quaternions(poses[:, 3:])
-        return np.asarray(poses[:, None, :3] + np.einsum("kij,klj->kli", R_WB, points_B))
+        R_WL, r_WL = self._kinematics.poses_in_world(poses, q)
+        centers = r_WL + np.einsum("klij,lj->kli", R_WL, self._com)
+        return np.concatenate([r_WL, centers], axis=1)

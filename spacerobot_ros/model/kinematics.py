@@ -305,6 +305,24 @@ class ForwardKinematics:
             r[..., link, :] = r[..., parent, :] + step[..., 0]
         return R, r
 
+    def poses_in_world(self, base: Array, q: Array) -> tuple[Array, Array]:
+        """Return ``R_WL`` (..., L, 3, 3) and ``r_WL`` (..., L, 3), m, of all :attr:`links`.
+
+        Parameters
+        ----------
+        base, q
+            Poses (..., 7) of the base in the world, and positions (..., n) of the joints.
+        """
+        R_BL, r_BL_B = self.link_poses(q)
+        R_WB = matrices_from_quaternions(base[..., 3:])[..., None, :, :]
+        return R_WB @ R_BL, base[..., None, :3] + (R_WB @ r_BL_B[..., None])[..., 0]
+
+    def link_in_world(self, link: str, base: Array, q: Array) -> Array:
+        """Return the pose (7,) of a link in the world, at a base pose (7,) and ``q`` (n,)."""
+        R_WL, r_WL = self.poses_in_world(base, q)
+        number = self.links.index(link)
+        return np.concatenate([r_WL[number], quaternion_from_matrix(R_WL[number])])
+
 
 def _transform_at_zero(joint: Joint) -> Array:
     return np.concatenate([joint.origin.r, quaternion_from_matrix(joint.origin.R)])

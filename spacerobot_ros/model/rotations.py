@@ -143,6 +143,19 @@ def attitude_error(quaternion: npt.ArrayLike, target: npt.ArrayLike) -> Array:
     return rotvec_from_quaternion(quaternion_multiply(quaternion_inverse(quaternion), target))
 
 
+def compose_poses(outer: Array, inner: Array) -> Array:
+    """Return the composition (7,) of two poses; ``inner`` is relative to ``outer``."""
+    position = outer[:3] + matrix_from_quaternion(outer[3:]) @ inner[:3]
+    return np.concatenate([position, quaternion_multiply(outer[3:], inner[3:])])
+
+
+def relative_pose(outer: Array, pose: Array) -> Array:
+    """Return a pose (7,) relative to another one, ``outer``, in the frame of both."""
+    back = quaternion_inverse(outer[3:])
+    position = matrix_from_quaternion(back) @ (pose[:3] - outer[:3])
+    return np.concatenate([position, quaternion_multiply(back, pose[3:])])
+
+
 def swing_angle(quaternion: npt.ArrayLike, axes: Array) -> float:
     """Return the angle, rad, between a rotation and the nearest rotation about axes (k, 3).
 

@@ -35,7 +35,6 @@ from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.rotations import (
-    matrices_from_quaternions,
     matrix_from_quaternion,
     rotation_angles,
     rotvec_from_quaternion,
@@ -479,14 +478,10 @@ class FlightReport:
         if self.robot is None or self.not_drawn or not links:
             return {}
         rows, kinematics = self.samples(_LINK_STATES), ForwardKinematics(self.robot)
-        R_BL, r_BL_B = kinematics.link_poses(self.joints[rows])
-        R_WB = matrices_from_quaternions(self.quaternion[rows])
-        found = {}
-        for number, link in enumerate(kinematics.links):
-            if link in links:
-                r_WL = self.position.values[rows] + np.einsum("kij,kj->ki", R_WB, r_BL_B[:, number])
-                found[link] = R_WB @ R_BL[:, number], r_WL
-        return found
+        base = np.hstack([self.position.values[rows], self.quaternion[rows]])
+        R_WL, r_WL = kinematics.poses_in_world(base, self.joints[rows])
+        numbers = {link: k for k, link in enumerate(kinematics.links) if link in links}
+        return {link: (R_WL[:, k], r_WL[:, k]) for link, k in numbers.items()}
 
     def _errors_of_link(self, link: str, targets: Sequence[Target]) -> LinkErrors:
         time = self.position.time[self.samples(_LINK_STATES)]

@@ -22,7 +22,6 @@ from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import FAULT_KINDS, Targets, parse_fault
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.viewer.reachability import Check, Verdict
-from spacerobot_ros.viewer.scene import link_pose
 from spacerobot_ros.viewer.state import Measured, Momenta, Notice, Part, StackState
 
 Color = tuple[int, int, int]
@@ -349,10 +348,9 @@ def goal_errors(state: StackState, kinematics: ForwardKinematics) -> dict[Part, 
         else:
             pose = state.tool
         if pose is not None:
-            any_attitude = aim.quaternion is None
-            wanted = Goal(aim.position, pose[3:] if aim.quaternion is None else aim.quaternion)
-            error = PoseError.between(pose[:3], pose[3:], wanted)
-            errors[part] = GoalDistance(error.distance, None if any_attitude else error.angle)
+            error = PoseError.of_link(pose, aim)
+            angle = None if aim.quaternion is None else error.angle
+            errors[part] = GoalDistance(error.distance, angle)
     return errors
 
 
@@ -362,7 +360,7 @@ def _measured_pose(
     """Return the pose (7,) of a link; None: it is not known, or the robot has no such link."""
     if measured is None or link not in kinematics.links:
         return None
-    return link_pose(kinematics, link, measured.pose, measured.q)
+    return kinematics.link_in_world(link, measured.pose, measured.q)
 
 
 def end_effector_positions(state: StackState, kinematics: ForwardKinematics) -> dict[Part, Array]:
@@ -393,11 +391,9 @@ def planned_positions(
     links = {aim.link: aim.link for goal in state.goals.values() for aim in goal.end_effectors}
     if state.tool is not None:
         links[DEFAULT_END_EFFECTOR] = robot.end_effector()
-    return {
-        part: np.array([link_pose(kinematics, link, row[:7], row[7:])[:3] for row in motion])
-        for part, link in links.items()
-        if link in kinematics.links
-    }
+    _, places = kinematics.poses_in_world(motion[:, :7], motion[:, 7:])
+    names = kinematics.links
+    return {part: places[:, names.index(x)] for part, x in links.items() if x in names}
 
 
 def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:

@@ -18,11 +18,7 @@ from spacerobot_ros.model.description import (
     RobotDescription,
 )
 from spacerobot_ros.model.kinematics import ForwardKinematics
-from spacerobot_ros.model.rotations import (
-    matrix_from_quaternion,
-    quaternion_inverse,
-    quaternion_multiply,
-)
+from spacerobot_ros.model.rotations import compose_poses, relative_pose
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
@@ -33,7 +29,7 @@ from spacerobot_ros.viewer.content import (
     shortened,
 )
 from spacerobot_ros.viewer.reachability import Check, Verdict
-from spacerobot_ros.viewer.scene import RobotDrawing, link_pose, wxyz, xyzw
+from spacerobot_ros.viewer.scene import RobotDrawing, wxyz, xyzw
 from spacerobot_ros.viewer.state import Part
 
 if TYPE_CHECKING:
@@ -391,7 +387,7 @@ class GoalEditor:
         if name not in self._gizmos:
             self._add_gizmo(name, 0.25 * self._reach)
             self._gizmos[name].visible = False
-        self._move_gizmo(name, link_pose(self._kinematics, link, *self._present))
+        self._move_gizmo(name, self._kinematics.link_in_world(link, *self._present))
 
     def _show_parts(self) -> None:
         """Show the gizmos of the parts that the goal asks for, and their handles."""
@@ -629,18 +625,9 @@ def _gizmo_of(part: Part) -> str:
     return _BASE_GIZMO if part == BASE_GOAL_KEY else _link_gizmo(part)
 
 
-def relative_pose(outer: Array, pose: Array) -> Array:
-    """Return a pose (7,) of the world relative to another one, ``outer``."""
-    back = quaternion_inverse(outer[3:])
-    position = matrix_from_quaternion(back) @ (pose[:3] - outer[:3])
-    return np.concatenate([position, quaternion_multiply(back, pose[3:])])
-
-
 def move_along(pose: Array, before: Array, after: Array) -> Array:
     """Return a pose (7,) rigidly moved along with another one, from ``before`` to ``after``."""
-    turn = quaternion_multiply(after[3:], quaternion_inverse(before[3:]))
-    position = after[:3] + matrix_from_quaternion(turn) @ (pose[:3] - before[:3])
-    return np.concatenate([position, quaternion_multiply(turn, pose[3:])])
+    return compose_poses(after, relative_pose(before, pose))
 
 
 def rpy_from_quaternion(quaternion: Array) -> Array:

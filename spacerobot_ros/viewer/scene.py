@@ -17,7 +17,6 @@ from spacerobot_ros.collision.drawn import collision_visuals, obstacle_visuals
 from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
-from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.model.visuals import Visual, meshes_from_files, visuals_of
 
 if TYPE_CHECKING:
@@ -198,14 +197,6 @@ class RobotDrawing:
         for frame, pose in zip(self._moving, self._kinematics.transforms, strict=True):
             frame.position = pose[:3]
             frame.wxyz = wxyz(pose[3:])
-
-
-def link_pose(kinematics: ForwardKinematics, link: str, pose: Array, q: Array) -> Array:
-    """Return the pose (7,) of a link in the world, of the base's pose (7,) and the shape (n,)."""
-    R_BL, r_BL_B = kinematics.link_poses(q)
-    number, R_WB = kinematics.links.index(link), matrix_from_quaternion(pose[3:])
-    quaternion = quaternion_from_matrix(R_WB @ R_BL[number])
-    return np.concatenate([pose[:3] + R_WB @ r_BL_B[number], quaternion])
 
 
 def draw_obstacles(

@@ -17,6 +17,7 @@ from spacerobot_ros.bag import RecordingState
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import PlanningError, RecordingError
 from spacerobot_ros.events import EventKind
+from spacerobot_ros.model.rotations import compose_poses
 from spacerobot_ros.nodes import recorder, replay
 from spacerobot_ros.nodes.common import messages, ros_parameters, watchdog
 from spacerobot_ros.nodes.common.messages import KnownFrames
@@ -658,7 +659,7 @@ QUARTER = math.sqrt(0.5)
 def test_composed_poses_turn_the_inner_one() -> None:
     outer = np.array([1.0, 2.0, 3.0, 0.0, 0.0, QUARTER, QUARTER])  # a quarter about z
     inner = np.array([0.5, 0.25, -1.0, QUARTER, 0.0, 0.0, QUARTER])  # a quarter about x
-    composed = messages.compose_poses(outer, inner)
+    composed = compose_poses(outer, inner)
     np.testing.assert_allclose(composed, [0.75, 2.5, 2.0, 0.5, 0.5, 0.5, 0.5], atol=1e-15)
 
 

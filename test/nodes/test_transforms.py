@@ -25,10 +25,10 @@ from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TRANSFORMS, Transfo
 from spacerobot_ros.messages.definitions import _OWN_DEFINITIONS
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.kinematics import ForwardKinematics
-from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
-from spacerobot_ros.nodes.common.messages import KnownFrames, compose_poses
+from spacerobot_ros.nodes.common.messages import KnownFrames
 from spacerobot_ros.nodes.plant import publisher
 from spacerobot_ros.nodes.plant.publisher import TransformPublisher
 from spacerobot_ros.resources import resource_names, robot_file

@@ -384,6 +384,6 @@ def test_end_effectors_with_paths_are_that_of_the_plant_and_those_with_goals() -
     np.testing.assert_allclose(found["end_effector"], [3.0, 2.0, 1.0])
     now = state.measured
     assert now is not None
-    expected = scene.link_pose(kinematics, link, now.pose, now.q)[:3]
+    expected = kinematics.link_in_world(link, now.pose, now.q)[:3]
     np.testing.assert_allclose(found[link], expected)
     assert content.end_effector_positions(StackState(goals=goals), kinematics) == {}

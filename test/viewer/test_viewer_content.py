@@ -37,7 +37,6 @@ from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.content import History, Trail
 from spacerobot_ros.viewer.goal_editor import move_along, rpy_from_quaternion
 from spacerobot_ros.viewer.reachability import Check, Verdict
-from spacerobot_ros.viewer.scene import link_pose
 from spacerobot_ros.viewer.state import Measured, Momenta, Notice, StackState
 
 HERE = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
@@ -198,7 +197,7 @@ def test_errors_are_to_the_goal() -> None:
 def test_errors_of_links_are_those_of_their_measured_poses() -> None:
     robot = load_robot(robot_file("three_joint_arm"))
     kinematics, link = ForwardKinematics(robot), robot.links[-1].name
-    at = link_pose(kinematics, link, HERE, np.zeros(3))
+    at = kinematics.link_in_world(link, HERE, np.zeros(3))
     off, aside = np.array([0.0, 0.3, 0.4]), quaternion_of((0.25, 0.0, 0.0))
     pose = EndEffectorGoal(link, at[:3] + off, quaternion_multiply(at[3:], aside))
     goals = {link: Goal.of_end_effectors([pose])}

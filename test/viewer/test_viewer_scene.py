@@ -252,7 +252,7 @@ def test_a_link_is_where_its_joints_have_it() -> None:
         full[model.joints[model.getJointId(name)].idx_q] = position
     pin.framesForwardKinematics(model, data, full)
     wanted = data.oMf[model.getFrameId(link)]
-    pose = scene.link_pose(ForwardKinematics(robot), link, base, q)
+    pose = ForwardKinematics(robot).link_in_world(link, base, q)
     np.testing.assert_allclose(pose[:3], wanted.translation, atol=1e-12)
     np.testing.assert_allclose(matrix_from_quaternion(pose[3:]), wanted.rotation, atol=1e-12)
 

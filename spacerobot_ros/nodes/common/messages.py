@@ -22,6 +22,7 @@ from spacerobot_ros.messages.builders import STATIC_TRANSFORMS, TRANSFORM_TYPE, 
 from spacerobot_ros.messages.definitions import message_definition
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
 from spacerobot_ros.model.rotations import (
+    compose_poses,
     matrix_from_quaternion,
     quaternion_from_matrix,
     quaternion_multiply,
@@ -325,12 +326,6 @@ def goal_description(part: str, goal_id: str, message: PoseStamped | Path, goal:
     waypoints = getattr(aim, "waypoints", None)
     through = "" if waypoints is None else f" through {len(waypoints)} waypoint(s)"
     return f"Goal {goal_id} of the {part}: ({position}) m, {attitude}{through}{given}."
-
-
-def compose_poses(outer: Array, inner: Array) -> Array:
-    """Return the composition (7,) of two poses; ``inner`` is relative to ``outer``."""
-    position = outer[:3] + matrix_from_quaternion(outer[3:]) @ inner[:3]
-    return np.concatenate([position, quaternion_multiply(outer[3:], inner[3:])])
 
 
 def shape_of(message: JointState, joint_names: Sequence[str]) -> Array:

@@ -462,11 +462,16 @@ class PoseError:
         cls, robot: SpaceRobot, position: Array, quaternion: Array, q: Array, goal: EndEffectorGoal
     ) -> PoseError:
         """Return the error from the pose of a link to its goal, for a pose and a shape."""
-        r_WE, quaternion_WE = end_effector_pose(robot, goal.link, position, quaternion, q)
+        pose = end_effector_pose(robot, goal.link, position, quaternion, q)
+        return cls.of_link(np.concatenate(pose), goal)
+
+    @classmethod
+    def of_link(cls, pose: Array, goal: Goal | EndEffectorGoal) -> PoseError:
+        """Return the error from the pose (7,) of a link in the world to its goal."""
         turn = np.zeros(3)
         if goal.quaternion is not None:
-            turn = attitude_error(quaternion_WE, goal.quaternion)
-        return cls(goal.position - r_WE, turn)
+            turn = attitude_error(pose[3:], goal.quaternion)
+        return cls(goal.position - pose[:3], turn)
 
     @property
     def distance(self) -> float:
