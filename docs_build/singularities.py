@@ -19,9 +19,9 @@ from spacerobot_ros.planning.core.workspaces import workspaces
 from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.planning.methods.resolved_rate import JointPath, ResolvedRateGait
 from spacerobot_ros.report.figures import (
-    INK,
-    MUTED,
     PALETTE,
+    SECONDARY_COLOUR,
+    TEXT_COLOUR,
     PictureFormat,
     drawing,
     new_figure,
@@ -153,7 +153,7 @@ def draw() -> bytes:
         _draw_free(right, example)
         for axes in (left, right):
             axes.set(xlim=(-1.2, 2.6), ylim=(-1.4, 2.4), aspect="equal", xlabel="x (m)")
-            axes.plot(*GOAL[:2], marker="x", color=INK, ms=7, mew=1.5, linestyle="none")
+            axes.plot(*GOAL[:2], marker="x", color=TEXT_COLOUR, ms=7, mew=1.5, linestyle="none")
             for name, place in (("B", GOAL), ("A", example.hand(example.start))):
                 at = float(place[0]), float(place[1])
                 axes.annotate(name, at, (5, 5), textcoords="offset points")
@@ -164,9 +164,9 @@ def draw() -> bytes:
 
 def _draw_fixed(axes: Axes, example: Example) -> None:
     q, det = example.fixed_at_goal()
-    _draw_robot(axes, example, example.start, MUTED)
+    _draw_robot(axes, example, example.start, SECONDARY_COLOUR)
     at_goal = RobotState(example.start.position, example.start.quaternion, q)
-    _draw_robot(axes, example, at_goal, INK)
+    _draw_robot(axes, example, at_goal, TEXT_COLOUR)
     ends = np.array([example.hand(example.start), GOAL])
     axes.plot(ends[:, 0], ends[:, 1], color=PALETTE[2], lw=1.4)
     axes.set_title(f"spacecraft fixed: |det J| = {abs(det):.4f} m² at B")
@@ -176,8 +176,8 @@ def _draw_free(axes: Axes, example: Example) -> None:
     draw_rings(axes, workspaces(example.robot, LINK)[0])
     path = example.path()
     there = example.free(path.shapes[-1], path.turns[-1])
-    _draw_robot(axes, example, example.start, MUTED)
-    _draw_robot(axes, example, there, INK)
+    _draw_robot(axes, example, example.start, SECONDARY_COLOUR)
+    _draw_robot(axes, example, there, TEXT_COLOUR)
     start, stop = example.hand(example.start), example.hand(there)
     followed, rest = np.array([start, stop]), np.array([stop, GOAL])
     axes.plot(followed[:, 0], followed[:, 1], color=PALETTE[2], lw=1.4, label="straight line")

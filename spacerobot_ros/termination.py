@@ -39,7 +39,7 @@ _LONGEST_UNWINDING_TIME = 1.2
 _LONGEST_NOTICE_TIME = 5.0
 """Wall time in which work must notice a request, s: a plan may have to end first."""
 
-_TIME_WITHOUT_PARENT = 1.7
+_TIME_AFTER_PARENT_END = 1.7
 """Wall time within which a process must end after its parent has ended, s."""
 
 _SAME_SIGNAL_TIME = 0.5
@@ -201,7 +201,7 @@ class _Guard:
     def _on_parent_end(self) -> None:
         """End this process soon, as by SIGTERM."""
         if self._end_by is None:
-            self._end_by = time.monotonic() + _TIME_WITHOUT_PARENT
+            self._end_by = time.monotonic() + _TIME_AFTER_PARENT_END
             signal.raise_signal(signal.SIGTERM)
 
     def _kill_tools(self) -> None:

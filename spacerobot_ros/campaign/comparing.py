@@ -20,7 +20,7 @@ from spacerobot_ros.campaign.report import (
 from spacerobot_ros.campaign.statistics import PairedDifference, paired_difference, paired_success
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
-from spacerobot_ros.report.figures import INK, PALETTE, drawing
+from spacerobot_ros.report.figures import PALETTE, TEXT_COLOUR, drawing
 from spacerobot_ros.report.page_parts import facts, html_page, table
 from spacerobot_ros.scenario import different_parameters
 
@@ -173,7 +173,7 @@ def _difference_figure(
         both = np.concatenate([x[np.isfinite(x)], y[np.isfinite(y)]])
         if both.size:
             ends = [both.min(), both.max()]
-            panel.plot(ends, ends, color=INK, linewidth=0.8, linestyle=":")
+            panel.plot(ends, ends, color=TEXT_COLOUR, linewidth=0.8, linestyle=":")
         panel.locator_params(nbins=5)
         panel.set_xlabel(f"{first.campaign.name}: {name}")
         panel.set_ylabel(second.campaign.name)

@@ -20,7 +20,7 @@ from spacerobot_ros.flight.lockstep import Robots, fly_scenario, require_flyable
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.shared_parameters import BelievedRobotConfig, RobotConfig, robot_of
+from spacerobot_ros.model.shared_parameters import AssumedRobotConfig, RobotConfig, robot_of
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -111,7 +111,7 @@ def nominal_robots(scenario: Scenario) -> Robots:
         if not (config.robot or text):
             text = plant  # Commanders without a robot parameter use the plant's robot.
         error, seed = 0.0, 0
-        if isinstance(config, BelievedRobotConfig):
+        if isinstance(config, AssumedRobotConfig):
             error, seed = config.model_error, config.model_error_seed
         return _build_robot(node, text, config.robot, config.world, error, seed)
 
@@ -152,7 +152,7 @@ def _build_robot(
 ) -> SpaceRobot | None:
     # Each node has its own robot, because a robot's functions have buffers.
     if error:
-        return robot_of(BelievedRobotConfig(text, name, world, error, seed))
+        return robot_of(AssumedRobotConfig(text, name, world, error, seed))
     return robot_of(RobotConfig(text, name, world))
 
 

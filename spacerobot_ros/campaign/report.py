@@ -36,7 +36,14 @@ from spacerobot_ros.campaign.statistics import (
 from spacerobot_ros.files import write_output
 from spacerobot_ros.measures import METRICS, Metric, Outcome
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.report.figures import FAINT, INK, PALETTE, PictureFormat, drawing, picture_of
+from spacerobot_ros.report.figures import (
+    LINE_COLOUR,
+    PALETTE,
+    TEXT_COLOUR,
+    PictureFormat,
+    drawing,
+    picture_of,
+)
 from spacerobot_ros.report.page_parts import facts, figure, html_page, table, tiles
 from spacerobot_ros.version import __version__
 
@@ -521,7 +528,9 @@ def _histograms_section(results: Results) -> str:
         bins = min(60, max(8, int(np.sqrt(len(there)))))
         panel.hist(there, bins=bins, color=PALETTE[0], alpha=0.75)
         for level in (5, 50, 95):
-            panel.axvline(np.percentile(there, level), color=INK, linewidth=0.8, linestyle=":")
+            panel.axvline(
+                np.percentile(there, level), color=TEXT_COLOUR, linewidth=0.8, linestyle=":"
+            )
         if name in bounds:
             for bound in (bounds[name].minimum, bounds[name].maximum):
                 if np.isfinite(bound) and abs(bound) < 10 * (np.abs(there).max() + 1e-12):
@@ -532,7 +541,7 @@ def _histograms_section(results: Results) -> str:
         shares = panel.twinx()
         # A curve through more points looks the same.
         few = np.unique(np.linspace(0, len(there) - 1, _MAX_CURVE_STEPS).astype(int))
-        shares.step(np.sort(there)[few], (few + 1) / len(there), color=INK, where="post")
+        shares.step(np.sort(there)[few], (few + 1) / len(there), color=TEXT_COLOUR, where="post")
         shares.set_ylim(0.0, 1.02)
         shares.set_ylabel("cumulative share")
     caption = (
@@ -618,7 +627,7 @@ def _convergence_section(results: Results) -> list[str]:
         at,
         [s.interval_low for s in shares],
         [s.interval_high for s in shares],
-        color=FAINT,
+        color=LINE_COLOUR,
         alpha=0.6,
     )
     axes[0].plot(at, [s.value for s in shares], color=PALETTE[0])

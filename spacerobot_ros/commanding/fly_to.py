@@ -109,8 +109,8 @@ class GoalErrors:
         return cls(
             error.distance if "position" in goal.base else math.nan,
             error.angle if "attitude" in goal.base else math.nan,
-            error.farthest_end_effector if goal.end_effectors else math.nan,
-            error.most_turned_end_effector if turned else math.nan,
+            error.largest_end_effector_distance if goal.end_effectors else math.nan,
+            error.largest_end_effector_angle if turned else math.nan,
             error.max_joint_error if goal.joint_positions is not None else math.nan,
         )
 

@@ -25,7 +25,11 @@ from spacerobot_ros.errors import (
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.world import among_obstacles, obstacles_from_topic, shaped_links
+from spacerobot_ros.model.world import (
+    links_with_shapes,
+    obstacles_from_topic,
+    with_obstacles_around,
+)
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive, Transition
@@ -151,7 +155,7 @@ class PlannerCommander(Commander):
         """Return a worker that plans around the present obstacles."""
         described = robot.description
         if self._obstacles is not None:
-            described = among_obstacles(described, self._world)
+            described = with_obstacles_around(described, self._world)
         return PlanningWorker(robot, self.config, method, self._long_work, described)
 
     def end_schedule(self, end: TrajectoryEnd) -> None:
@@ -173,7 +177,7 @@ class PlannerCommander(Commander):
             self._log_fault("obstacles", printable(f"obstacles: {refusal} {kept}"))
             return
         self._obstacles = text
-        links = [] if self._world is None else shaped_links(self._world)
+        links = [] if self._world is None else links_with_shapes(self._world)
         listed = f": {', '.join(links)}" if links else ""
         self.host.log("info", printable(f"Plans go round {len(links)} obstacle(s){listed}."))
         executive, robot = self.executive, self.robot

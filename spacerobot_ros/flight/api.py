@@ -102,7 +102,7 @@ def fly(
     if law is None:
         if law_options is not None:
             raise ParameterError("law_options are those of a law: give it as law=MyLaw.")
-        return _unless_refused(fly_scenario(scenario))
+        return _raise_if_refused(fly_scenario(scenario))
     if "coordinated_control" not in scenario.commanders:
         raise ParameterError(
             f"'{scenario.name}' has no controller that could use the law '{law.name}': it flies "
@@ -112,7 +112,7 @@ def fly(
     require_known(law.name, law.Options, values)
     own_law = law, configured(law.Options, values)
     robots = replace(Robots.of(scenario), own_law=own_law)
-    return _unless_refused(fly_scenario(scenario, robots=robots))
+    return _raise_if_refused(fly_scenario(scenario, robots=robots))
 
 
 def _require_goal(scenario: Scenario) -> None:
@@ -123,7 +123,7 @@ def _require_goal(scenario: Scenario) -> None:
         )
 
 
-def _unless_refused(flight: Flight) -> Flight:
+def _raise_if_refused(flight: Flight) -> Flight:
     """Return a flight whose goal was accepted.
 
     Raises

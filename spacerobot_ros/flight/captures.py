@@ -114,7 +114,7 @@ class States:
         inside = (self.time >= start - _SAME_TIME) & (self.time <= end + _SAME_TIME)
         return self.at(np.flatnonzero(inside))
 
-    def thinned_rows(self, most: int) -> npt.NDArray[np.int64]:
+    def sample_rows(self, most: int) -> npt.NDArray[np.int64]:
         """Return the rows of at most so many states, at about equal intervals."""
         return np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64))
 
@@ -180,7 +180,7 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
     states = States.of(flight, flight.robot)
     if not len(states):
         return Signal.empty(len(BUDGET_PARTS))
-    states = states.at(states.thinned_rows(most))
+    states = states.at(states.sample_rows(most))
     wheels = ReactionWheels.of(flight.robot)
     alone = SpaceRobot(wheels.gyrostat)
     held = [(each, each.payload.attached_to(alone)) for each in held_bodies(flight)]
@@ -273,7 +273,7 @@ def _impulses(flight: Flight, states: States, about: Array) -> Array:
     """Return the impulses (N, 6) of the thrust since the first of N states, N s and N m s about a
     point, in W. Wrenches are constant over a tick in the frame of the base.
     """
-    wrench = _thrust_before(flight, states.time[1:])
+    wrench = _thrust_during_ticks_before(flight, states.time[1:])
     step = np.diff(states.time)[:, np.newaxis]
     r, q = states.pose[:, :3], states.pose[:, 3:]
     R = matrices_from_quaternions(q)
@@ -296,7 +296,7 @@ def _impulses(flight: Flight, states: States, about: Array) -> Array:
     return np.cumsum(total, axis=0)
 
 
-def _thrust_before(flight: Flight, times: Array) -> Array:
+def _thrust_during_ticks_before(flight: Flight, times: Array) -> Array:
     """Return the wrench (N, 6) of the thrusters on the base in the ticks that end at times (N,)."""
     fired, commands = flight.signal("thruster_wrench"), flight.commands.get("base_wrench")
     found = np.zeros((len(times), 6))

@@ -95,10 +95,10 @@ class FlightClearance:
             )
         ]
 
-    def contacts(self, every: int, *, pushing: bool = False) -> list[Event]:
+    def contacts(self, every: int, *, has_contact_forces: bool = False) -> list[Event]:
         """Return the events of contacts in one state in ``every``, as the plant reports them.
 
-        ``pushing``: bodies that touch push each other.
+        ``has_contact_forces``: bodies that touch push each other.
         """
         if not self.geometry.exact:
             return []
@@ -106,7 +106,9 @@ class FlightClearance:
         distances, _ = self._nearest_at(chosen)
         touching = distances <= 0
         touching[1:] |= touching[:-1]  # Contacts end in the state after.
-        monitor = ClearanceMonitor(self.geometry, self.geometry.links, pushing=pushing)
+        monitor = ClearanceMonitor(
+            self.geometry, self.geometry.links, has_contact_forces=has_contact_forces
+        )
         events: list[Event] = []
         links = len(self.geometry.links)
         for row in chosen[touching].tolist():

@@ -99,7 +99,7 @@ class Signal:
         first, last = np.searchsorted(self.time, [start - 1e-9, end + 1e-9])
         return Signal(self.time[first:last], self.values[first:last])
 
-    def since_first(self) -> Signal:
+    def relative_to_first(self) -> Signal:
         """Return the changes since the first sample."""
         return Signal(self.time, self.values - self.values[:1])
 
@@ -405,9 +405,11 @@ class Flight:
             return ()
         match self.status:
             case ControllerStatus(command=CommandReport(errors=errors)) if errors:
-                controlled: set[Controlled] = {"shape"} if _any_begins(errors, "joint.") else set()
-                controlled |= {"attitude"} if _any_begins(errors, "base.r") else set()
-                positions = _any_begins(errors, *(f"base.{axis}" for axis in "xyz"))
+                controlled: set[Controlled] = (
+                    {"shape"} if _any_starts_with(errors, "joint.") else set()
+                )
+                controlled |= {"attitude"} if _any_starts_with(errors, "base.r") else set()
+                positions = _any_starts_with(errors, *(f"base.{axis}" for axis in "xyz"))
                 controlled |= {"position"} if positions else set()
                 return uncontrolled_parts(self.goal, frozenset(controlled))
             case PlannerStatus(not_controlled=parts) if parts:
@@ -426,7 +428,7 @@ class Flight:
     def turns_end_effector(self) -> bool:
         """Whether a controller turns the end-effector to an attitude."""
         command = self.status.command if isinstance(self.status, ControllerStatus) else None
-        return command is not None and _any_begins(command.errors, "end_effector.r")
+        return command is not None and _any_starts_with(command.errors, "end_effector.r")
 
     @property
     def has_thrust(self) -> bool:
@@ -731,7 +733,7 @@ def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:
     return PoseError.between(poses.values[-1, :3], poses.values[-1, 3:], goal)
 
 
-def _any_begins(labels: Iterable[str], *beginnings: str) -> bool:
+def _any_starts_with(labels: Iterable[str], *beginnings: str) -> bool:
     return any(label.startswith(beginnings) for label in labels)
 
 

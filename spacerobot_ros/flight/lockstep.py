@@ -54,7 +54,7 @@ from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState
 from spacerobot_ros.times import SECOND
 
-_GOAL_STAMP = 0, 1
+_FIRST_GOAL_STAMP = 0, 1
 """Stamp of the first goal that a mission client sends at time zero: seconds and nanoseconds."""
 
 Progress = Callable[[float, float], bool]
@@ -184,8 +184,10 @@ def _with_contacts(flight: Flight) -> Flight:
         return flight
     events = list(flight.events)
     plant = flight.scenario.plant
-    pushing = plant.engine == "mujoco"
-    for contact in flight.clearance.contacts(plant.clearance_ticks, pushing=pushing):
+    has_contact_forces = plant.engine == "mujoco"
+    for contact in flight.clearance.contacts(
+        plant.clearance_ticks, has_contact_forces=has_contact_forces
+    ):
         assert contact.time_s is not None
         # After the beginning of the flight, and before the answers to that state.
         earlier = [
@@ -198,7 +200,7 @@ def _with_contacts(flight: Flight) -> Flight:
     return replace(flight, events=tuple(events))
 
 
-class _DecisionMoment(Enum):
+class _DecisionState(Enum):
     """When a commander has decided about the goal, as the plant sees it."""
 
     BEFORE_COMMAND = "before its command"
@@ -248,9 +250,9 @@ class _LockstepFlight:
         self._monitor = PlantMonitor(self._commands, self._plant, lockstep=True)
         self._injected_seen = self._plant.injected
         self.log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
-        self._follower = GoalFollower(GoalIds().of(*_GOAL_STAMP))
-        self._decided: _DecisionMoment | None = None
-        self._moment = _DecisionMoment.BEFORE_COMMAND
+        self._follower = GoalFollower(GoalIds().of(*_FIRST_GOAL_STAMP))
+        self._decided: _DecisionState | None = None
+        self._moment = _DecisionState.BEFORE_COMMAND
         self._status: Status | None = None
         self._planner: PlannerCommander | None = None
         self._controller: ControllerCommander | None = None
@@ -286,12 +288,12 @@ class _LockstepFlight:
         for commander in self._commanders:
             commander.activate()
         self._report_plant_status(PlantState.RUNNING)
-        self._moment = _DecisionMoment.BEFORE_COMMAND
+        self._moment = _DecisionState.BEFORE_COMMAND
         self._send_goals()
         self._report_state()
         while True:
             self._answer_state()
-            if self._decided is _DecisionMoment.BEFORE_COMMAND:
+            if self._decided is _DecisionState.BEFORE_COMMAND:
                 break
             if not self._commands.complete and not self._reported.sensors.dropout:
                 interrupted = f"No command answers the state of {self._time:g} s."
@@ -352,7 +354,7 @@ class _LockstepFlight:
 
     def _answer_state(self) -> None:
         """Have the commanders answer the present state."""
-        self._moment = _DecisionMoment.BEFORE_COMMAND
+        self._moment = _DecisionState.BEFORE_COMMAND
         quantities, now = self._reported.quantities, self._tick * self._period_ns
         q, qdot = quantities["measured_q"], quantities["measured_qdot"]
         if self._controller is not None:
@@ -376,7 +378,7 @@ class _LockstepFlight:
         velocity = source.quantity == "velocity"
         values = setpoint.velocity if velocity else np.zeros(len(setpoint.velocity))
         self._offer_command(source, values, stamp_ns)
-        self._moment = _DecisionMoment.AFTER_COMMAND
+        self._moment = _DecisionState.AFTER_COMMAND
 
     def _send_reference(self, stamp_ns: int) -> None:
         """Give the setpoint of a planner to the controller."""
@@ -396,11 +398,11 @@ class _LockstepFlight:
             if source.quantity == "velocity":
                 values = np.zeros(len(effort))
             self._offer_command(source, values, now)
-        self._moment = _DecisionMoment.AFTER_COMMAND
+        self._moment = _DecisionState.AFTER_COMMAND
 
     def _offer_command(self, source: CommandSource, values: Array, now: int) -> None:
         self.log.add_command(source.topic, self._tick, values)
-        if self._decided is _DecisionMoment.BEFORE_COMMAND:
+        if self._decided is _DecisionState.BEFORE_COMMAND:
             return
         refusal = self._commands.offer(source, now, values, now)
         if refusal is not None:
@@ -412,7 +414,7 @@ class _LockstepFlight:
 
     def _report_plant_status(self, activity: PlantState) -> None:
         """Pass a change of the plant's status to the commanders."""
-        self._injected_seen, self._moment = self._plant.injected, _DecisionMoment.AFTER_COMMAND
+        self._injected_seen, self._moment = self._plant.injected, _DecisionState.AFTER_COMMAND
         before = self._monitor.status
         self.log.events += self._monitor.update(activity, self._time)
         status = self._monitor.status
@@ -429,14 +431,16 @@ class _LockstepFlight:
         given = Goal.checked(goal.position, goal.quaternion, goal.joint_positions)
         given = replace(given, end_effectors=goal.end_effectors, base=goal.base)
         if self._planner is not None:
-            self._planner.receive_goal(BASE_GOAL_KEY, *_GOAL_STAMP, lambda: given)
+            self._planner.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: given)
         if self._controller is not None:
             unshaped = replace(given, joint_positions=None, end_effectors=(), base=POSE)
-            self._controller.receive_goal(BASE_GOAL_KEY, *_GOAL_STAMP, lambda: unshaped)
+            self._controller.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: unshaped)
             tool = scenario.end_effector_goal
             if tool is not None:
                 self._controller.receive_goal(
-                    END_EFFECTOR, *_GOAL_STAMP, lambda: Goal.checked(tool.position, tool.quaternion)
+                    END_EFFECTOR,
+                    *_FIRST_GOAL_STAMP,
+                    lambda: Goal.checked(tool.position, tool.quaternion),
                 )
 
     def take_status(self, status: Status) -> None:

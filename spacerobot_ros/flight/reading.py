@@ -33,7 +33,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.model.world import among_obstacles, obstacles_from_topic
+from spacerobot_ros.model.world import obstacles_from_topic, with_obstacles_around
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
@@ -136,7 +136,7 @@ class FlightBag:
                 except (RobotDescriptionError, UnicodeDecodeError):
                     continue
                 came = self.obstacles
-                return among_obstacles(found, came[-1][1]) if came else found
+                return with_obstacles_around(found, came[-1][1]) if came else found
         return None
 
     @cached_property

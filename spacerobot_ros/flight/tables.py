@@ -20,7 +20,7 @@ from spacerobot_ros.topics import Topic, state_topics
 if TYPE_CHECKING:
     from spacerobot_ros.flight.flight import Flight
 
-_OF_STATE = ("odom", "joint_states")
+_MEASURED_STATE_TOPICS = ("odom", "joint_states")
 """Topics of a measured state; the truth beside it has the ending ``_true``."""
 
 _UNITS = {"propellant": "kg"}
@@ -67,9 +67,9 @@ def _prefix(topic: Topic, *, erred: bool) -> str | None:
     """Return the words before the columns of a topic; None: its numbers are in another one too."""
     if topic.name == "base_pose":
         return None
-    if topic.name in _OF_STATE:
+    if topic.name in _MEASURED_STATE_TOPICS:
         return "measured." if erred else ""
-    if topic.name.removesuffix("_true") in _OF_STATE:
+    if topic.name.removesuffix("_true") in _MEASURED_STATE_TOPICS:
         return "" if erred else None
     return f"{topic.name}."
 

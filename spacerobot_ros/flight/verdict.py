@@ -74,13 +74,13 @@ def verdict_of(flight: Flight) -> Verdict:
             f"The measured pose is within tolerance of the goal; the true one is {errors}.",
             complete=False,
         )
-    missed = _missed_capture(flight)
+    missed = _automatic_capture_is_missing(flight)
     if missed:
         word += ", but the target is not captured"
     return Verdict(word, f"The goal is reached: {errors}.", complete=not (left_out or missed))
 
 
-def _missed_capture(flight: Flight) -> bool:
+def _automatic_capture_is_missing(flight: Flight) -> bool:
     """Whether the plant was to capture the target by itself, and has not."""
     automatic = flight.scenario.plant.capture.mode == "automatic"
     return automatic and flight.capture == {"captured": False}

@@ -147,7 +147,7 @@ def verify_bag(
     if flight.config.actuation == "velocity" and not _has_efforts(published):
         # An earlier version, which did not compute the efforts of servos, published zeros.
         resimulation.states["effort"][:] = 0.0
-    published = [p for p in published if p.follows_from(resimulation.states)]
+    published = [p for p in published if p.is_determined_by(resimulation.states)]
     missing = _missing_states(flight, published, resimulation)
     if first > 0:
         # The first state is an input: the commands before it are not in the bag.
@@ -322,7 +322,7 @@ class _PublishedTopic:
             values[:, :count] -= self.values[~kept][-1, :count]
         return replace(self, ticks=self.ticks[kept], values=values)
 
-    def follows_from(self, states: dict[str, Floats]) -> bool:
+    def is_determined_by(self, states: dict[str, Floats]) -> bool:
         """Whether a re-simulation has all quantities of the topic, of the same sizes."""
         names = [each.quantity for each in self.topic.state]
         if not all(name in states for name in names):

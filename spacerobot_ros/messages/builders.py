@@ -14,7 +14,7 @@ from spacerobot_ros.messages.layout import (
     encode,
     encode_list,
     layout_of,
-    stamp_pairs,
+    seconds_and_nanoseconds,
 )
 from spacerobot_ros.messages.readers import ODOMETRY, JointReader, TemplateReader
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -242,7 +242,9 @@ def trajectory_message(schedule: GaitSchedule, stamp_ns: int, frame: str) -> byt
         {
             "positions": schedule.positions,
             "velocities": np.vstack([schedule.velocities, np.zeros(n)]),
-            "time_from_start.sec": stamp_pairs(np.arange(count, dtype=np.int64) * period_ns),
+            "time_from_start.sec": seconds_and_nanoseconds(
+                np.arange(count, dtype=np.int64) * period_ns
+            ),
         },
     )
 
@@ -256,7 +258,7 @@ def path_message(path: BasePath, start_ns: int, frame: str) -> bytes:
         "poses",
         {"header": {"frame_id": frame}},
         {
-            "header.stamp.sec": stamp_pairs(np.minimum(times, LATEST_NS)),
+            "header.stamp.sec": seconds_and_nanoseconds(np.minimum(times, LATEST_NS)),
             "pose.position.x": np.hstack([path.position, path.quaternion]),
         },
     )

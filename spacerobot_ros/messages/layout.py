@@ -363,7 +363,7 @@ def stamped_copies(
     for path in ("header.stamp.sec", "clock.sec"):
         if path in leaves:
             begin = leaves[path].offset
-            table[:, begin : begin + 8] = stamp_pairs(stamps_ns).view(np.uint8)
+            table[:, begin : begin + 8] = seconds_and_nanoseconds(stamps_ns).view(np.uint8)
     for path, values in columns.items():
         data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)
         begin = leaves[path].offset
@@ -371,7 +371,7 @@ def stamped_copies(
     return [row.tobytes() for row in table]
 
 
-def stamp_pairs(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
+def seconds_and_nanoseconds(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
     """Return times (N,) in ns as seconds and nanoseconds (N, 2) of stamps."""
     return np.stack([times_ns // SECOND, times_ns % SECOND], axis=1).astype("<u4")
 

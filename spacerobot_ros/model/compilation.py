@@ -70,7 +70,7 @@ _MAX_FUNCTIONS_IN_MEMORY = 12
 _functions_in_memory: dict[tuple[str, ...], ca.Function] = {}
 """The latest used functions of the cache, by name, key and settings of the compilation."""
 
-ANNOUNCEMENT = "announcement"
+ANNOUNCEMENT_ATTRIBUTE = "announcement"
 """Attribute of log records that announce a long computation."""
 
 _LOG = logging.getLogger(__name__)
@@ -510,7 +510,7 @@ def _make_object(
                 entered.enter_context(context())
             built = _compile_object(build, Path(folder), limit)
             for each in tried:
-                _try_object(each, built)
+                _test_object(each, built)
             stored = Cache(cache_directory()).store(
                 _object_file_name(name, key), key, built.read_bytes()
             )
@@ -529,7 +529,8 @@ def _make_object(
 def _announce_compilation() -> None:
     """Log once per process that the first flight of a robot waits for the compiler."""
     _LOG.info(
-        "Compiling the equations of this robot: once, some seconds.", extra={ANNOUNCEMENT: True}
+        "Compiling the equations of this robot: once, some seconds.",
+        extra={ANNOUNCEMENT_ATTRIBUTE: True},
     )
 
 
@@ -602,7 +603,7 @@ print(json.dumps([code, [list(o) for o in outputs]]))
 """
 
 
-def _try_object(function: ca.Function, path: Path) -> None:
+def _test_object(function: ca.Function, path: Path) -> None:
     """Have another process call a new object, and compare with the virtual machine.
 
     Raises

@@ -80,7 +80,7 @@ class Payload:
                 "link": self.link,
                 "mass": self.inertia.mass,
                 "com": self.inertia.com.tolist(),
-                "inertia": [float(about[i, j]) for i, j in _ENTRIES],
+                "inertia": [float(about[i, j]) for i, j in _INERTIA_ENTRIES],
             }
         )
 
@@ -96,7 +96,7 @@ class Payload:
         try:
             values = json.loads(text)
             about = np.zeros((3, 3))
-            for (i, j), value in zip(_ENTRIES, values["inertia"], strict=True):
+            for (i, j), value in zip(_INERTIA_ENTRIES, values["inertia"], strict=True):
                 about[i, j] = about[j, i] = float(value)
             com = np.array([float(x) for x in values["com"]])
             if com.shape != (3,):
@@ -106,7 +106,7 @@ class Payload:
             raise RobotDescriptionError(f"The text describes no held body: {error}.") from error
 
 
-_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True)
@@ -313,7 +313,7 @@ def grasp_impact(
     )
 
 
-def joined_momenta(
+def combined_momenta(
     masses: tuple[float, float], centers: tuple[Array, Array], momenta: tuple[Array, Array]
 ) -> Array:
     """Return the momenta (6,) of two systems together.
@@ -336,12 +336,12 @@ def joined_momenta(
     return np.concatenate([first[:3] + second[:3], first[3:] + second[3:] + cross(arm, relative)])
 
 
-def parted_momenta(
+def separated_momenta(
     masses: tuple[float, float], centers: tuple[Array, Array], together: Array, second: Array
 ) -> Array:
     """Return the momenta (6,) of the first of two systems, from those of both and of the second.
 
-    The arguments are those of :func:`joined_momenta`, which this inverts.
+    The arguments are those of :func:`combined_momenta`, which this inverts.
     """
     share = masses[0] / (masses[0] + masses[1])
     linear = together[:3] - second[:3]

@@ -286,7 +286,7 @@ class SymbolicMassProperties(MassProperties):
         return ca.sparsify(J)
 
 
-def free_entries(nominal: InertialParameters) -> npt.NDArray[np.bool_]:
+def possibly_nonzero_entries(nominal: InertialParameters) -> npt.NDArray[np.bool_]:
     """Return the entries (10 B,) of the vector that can be nonzero for robots of this structure.
 
     All masses may. Entries of centres and products of inertia that are zero stay zero; principal

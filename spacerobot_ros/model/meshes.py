@@ -89,7 +89,7 @@ class TriangleMesh:
             mean = np.stack(
                 [np.bincount(inverse, self.vertices[:, axis]) / count for axis in range(3)], axis=1
             )
-            faces = _without_slivers(inverse[self.faces].astype(np.int32))
+            faces = _without_degenerate_faces(inverse[self.faces].astype(np.int32))
             faces = faces[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]]
             if len(faces) > most:
                 break
@@ -259,13 +259,13 @@ def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
         raise _DamagedError(f"a coordinate is not finite, or beyond {_MAX_COORDINATE:g}")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise _DamagedError("a face has the index of a missing vertex")
-    faces = _without_slivers(faces)
+    faces = _without_degenerate_faces(faces)
     if not len(faces):
         raise _DamagedError("it has no triangle")
     return TriangleMesh(vertices, faces)
 
 
-def _without_slivers(faces: Faces) -> Faces:
+def _without_degenerate_faces(faces: Faces) -> Faces:
     """Return the faces with three different corners."""
     a, b, c = faces.T
     return faces[(a != b) & (b != c) & (c != a)]

@@ -49,7 +49,7 @@ from spacerobot_ros.model.external_loads import LoadLayout, external_loads
 from spacerobot_ros.model.inertial_parameters import (
     InertialParameters,
     SymbolicMassProperties,
-    free_entries,
+    possibly_nonzero_entries,
 )
 from spacerobot_ros.model.integration import attitude_step, repeat_step, runge_kutta_step
 from spacerobot_ros.model.kinematics import tree_kinematics
@@ -404,7 +404,7 @@ class SymbolicModels:
     @classmethod
     def of(cls, robot: RobotDescription) -> SymbolicModels:
         """Return the models for all robots that differ from this robot in mass properties alone."""
-        free = free_entries(InertialParameters.of(robot))
+        free = possibly_nonzero_entries(InertialParameters.of(robot))
         key = _structure_key(robot, free)
         found = _symbolic_models.pop(key, None) or cls(robot, free)
         _symbolic_models[key] = found

@@ -33,13 +33,13 @@ PAYLOAD_PARAMETERS = ("m", "m cx", "m cy", "m cz", "Ixx", "Iyy", "Izz", "Ixy", "
 _SMALLEST_SINGULAR_VALUE = 1e-7
 """Smallest singular value of a direction that motion determines, relative to the largest."""
 
-_LEAST_SIGNAL = 10.0
+_MIN_SIGNAL_TO_NOISE = 10.0
 """Least power of the motion that determines a direction, relative to that of its errors."""
 
-_JERK = 3.0
+_MIN_JERK_RATIO = 3.0
 """Second difference beyond which it counts as a jerk of the motion, relative to the median."""
 
-_UNDETERMINED_SHARE = 0.2
+_MIN_UNDETERMINED_SHARE = 0.2
 """Share of undetermined directions in a parameter from which it is undetermined itself."""
 
 _ROUNDING = 1e-13
@@ -48,7 +48,7 @@ _ROUNDING = 1e-13
 _PRIOR_WEIGHT = 1e-6
 """Weight of the prior of undetermined directions, relative to the largest singular value."""
 
-_CONSISTENT = 1.0
+_MAX_NOISE_DISTANCE = 1.0
 """Largest distance from some body that counts as noise, in standard deviations."""
 
 
@@ -158,14 +158,14 @@ def estimate_payload(
         scatter = [np.sqrt(np.mean(left[..., part] ** 2)) for part in (slice(3), slice(3, 6))]
         weights = 1.0 / np.maximum(np.repeat(scatter, 3), least)
     fit = _fit(rows * weights[:, np.newaxis])
-    x, corrected = _of_a_body(fit)
+    x, corrected = _nearest_physical_parameters(fit)
     shares = np.sqrt(np.sum(fit.undetermined**2, axis=0))
     spread = np.sqrt(
         np.sum((fit.determined * fit.deviations[:, np.newaxis]) ** 2, axis=0)
         # The part in undetermined directions is left out; it is about as large as the others.
         + (shares * np.linalg.norm(x)) ** 2
     )
-    unknown = shares > _UNDETERMINED_SHARE
+    unknown = shares > _MIN_UNDETERMINED_SHARE
     return PayloadEstimate(
         link,
         np.where(unknown, np.nan, unit * x),
@@ -192,14 +192,14 @@ def _fit(rows: Array) -> _Fit:
     differences = (rows[:, 0] - 2.0 * rows[:, 1] + rows[:, 2]) / np.sqrt(6.0)
     size = np.linalg.norm(differences, axis=(1, 2))
     # Errors are in all states; a jerk of the motion itself is in few.
-    usual = differences[size <= _JERK * np.median(size)]
+    usual = differences[size <= _MIN_JERK_RATIO * np.median(size)]
     flat, between = rows.reshape(-1, 11), usual.reshape(-1, 11)
     errors = len(flat) / len(between) * between.T @ between
     signal = flat.T @ flat - errors
     power, V = np.linalg.eigh(signal[:10, :10])
     noise = np.einsum("ik,ij,jk->k", V, errors[:10, :10], V)
     found = (power > _SMALLEST_SINGULAR_VALUE**2 * max(power[-1], 0.0)) & (
-        power > _LEAST_SIGNAL * noise
+        power > _MIN_SIGNAL_TO_NOISE * noise
     )
     determined = V.T[found]
     inverse = determined.T / power[found]
@@ -212,7 +212,7 @@ def _fit(rows: Array) -> _Fit:
     return _Fit(x, determined, np.maximum(deviations, rounding), V.T[~found])
 
 
-def _of_a_body(fit: _Fit) -> tuple[Array, bool]:
+def _nearest_physical_parameters(fit: _Fit) -> tuple[Array, bool]:
     """Return parameters (10,) of a body near the fit, and whether the fit has been corrected."""
     if not len(fit.undetermined) and np.linalg.eigvalsh(_pseudo_inertia(fit.x)).min() > 0.0:
         return fit.x, False
@@ -226,7 +226,7 @@ def _of_a_body(fit: _Fit) -> tuple[Array, bool]:
         return np.concatenate([of_data, _PRIOR_WEIGHT * weights.min() * (theta - start)])
 
     def slopes(theta: Array) -> Array:
-        of_data = weights[:, np.newaxis] * (fit.determined @ _log_cholesky_slopes(theta))
+        of_data = weights[:, np.newaxis] * (fit.determined @ _log_cholesky_jacobian(theta))
         return np.vstack([of_data, _PRIOR_WEIGHT * weights.min() * np.eye(10)])
 
     result = least_squares(
@@ -235,7 +235,7 @@ def _of_a_body(fit: _Fit) -> tuple[Array, bool]:
     found = _from_log_cholesky(result.x)
     distance = float(np.linalg.norm((fit.determined @ found - aim) / fit.deviations))
     near = np.linalg.norm(fit.determined @ found - aim) <= 1e-6 * np.linalg.norm(aim)
-    corrected = not (near or distance <= _CONSISTENT)
+    corrected = not (near or distance <= _MAX_NOISE_DISTANCE)
     return (found, True) if corrected else (fit.x, False)
 
 
@@ -262,37 +262,37 @@ def _start(x: Array) -> Array:
     values, vectors = np.linalg.eigh(_pseudo_inertia(x))
     size = max(float(np.abs(values).max()), 1e-12)
     L = np.linalg.cholesky((vectors * np.maximum(values, 1e-3 * size)) @ vectors.T)
-    return np.concatenate([np.log(np.diag(L)), L[_BELOW]])
+    return np.concatenate([np.log(np.diag(L)), L[_LOWER_TRIANGLE]])
 
 
 def _from_log_cholesky(theta: Array) -> Array:
     """Return the parameters (10,) of a body from its logarithmic Cholesky factor (10,)."""
     L = _factor(theta)
-    return _of_pseudo_inertia(L @ L.T)
+    return _parameters_of_pseudo_inertia(L @ L.T)
 
 
-def _log_cholesky_slopes(theta: Array) -> Array:
+def _log_cholesky_jacobian(theta: Array) -> Array:
     """Return the derivatives (10, 10) of :func:`_from_log_cholesky`."""
     L, slopes = _factor(theta), np.empty((10, 10))
-    rows, columns = (np.concatenate([range(4), each]).tolist() for each in _BELOW)
+    rows, columns = (np.concatenate([range(4), each]).tolist() for each in _LOWER_TRIANGLE)
     for k, (i, j) in enumerate(zip(rows, columns, strict=True)):
         dL = np.zeros((4, 4))
         dL[i, j] = L[i, j] if i == j else 1.0
-        slopes[:, k] = _of_pseudo_inertia(dL @ L.T + L @ dL.T)
+        slopes[:, k] = _parameters_of_pseudo_inertia(dL @ L.T + L @ dL.T)
     return slopes
 
 
 def _factor(theta: Array) -> Array:
     L = np.diag(np.exp(theta[:4]))
-    L[_BELOW] = theta[4:]
+    L[_LOWER_TRIANGLE] = theta[4:]
     return L
 
 
-def _of_pseudo_inertia(J: Array) -> Array:
+def _parameters_of_pseudo_inertia(J: Array) -> Array:
     """Return the parameters (10,) of a pseudo-inertia matrix (4, 4)."""
     about = np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3]
     return np.array([J[3, 3], *J[:3, 3], *(about[i, j] for i, j in INERTIA_ENTRIES)])
 
 
-_BELOW = np.tril_indices(4, -1)
+_LOWER_TRIANGLE = np.tril_indices(4, -1)
 """Entries of a Cholesky factor below its diagonal."""

@@ -48,7 +48,7 @@ class RobotConfig:
 
 
 @dataclass(frozen=True)
-class BelievedRobotConfig(RobotConfig):
+class AssumedRobotConfig(RobotConfig):
     """The robot of flight software, whose model may differ from the plant's."""
 
     model_error: float = parameter(
@@ -116,7 +116,7 @@ class WatchdogConfig:
 
 
 @dataclass(frozen=True)
-class CommanderConfig(WatchdogConfig, BelievedRobotConfig):
+class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     """Parameters of the nodes that command a plant: rate, goals, tolerances."""
 
     tick_rate: float = parameter(

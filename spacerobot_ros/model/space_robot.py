@@ -293,14 +293,14 @@ class SpaceRobot:
         """Compile a function of :meth:`expressions`, and return it with its own buffers.
 
         The argument ``p``, if it has one, is set to this robot's mass properties. With a ``key``,
-        which no other function has, it is compiled as :meth:`made_once` says.
+        which no other function has, it is compiled as :meth:`cached_object` says.
         """
         if key is None:
             return BufferedFunction(compiled(function), self._p)
-        code = self.made_once((key, *compilation_settings()), lambda: compiled(function))
+        code = self.cached_object((key, *compilation_settings()), lambda: compiled(function))
         return BufferedFunction(code, self._p)
 
-    def made_once(self, key: Hashable, make: Callable[[], _Made]) -> _Made:
+    def cached_object(self, key: Hashable, make: Callable[[], _Made]) -> _Made:
         """Return an object that is made of :meth:`expressions`, once per key for all robots that
         share them: those with the same mass properties, or with these as an argument.
         """

@@ -17,8 +17,8 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.resources import suggestion
 
-_CARRIED = re.compile(r"[ \t]*<disable_collisions\b[^<>]*/>\n?")
-_END = re.compile(r"</robot\s*>")
+_DISABLED_PAIR_ELEMENTS = re.compile(r"[ \t]*<disable_collisions\b[^<>]*/>\n?")
+_ROBOT_END_TAG = re.compile(r"</robot\s*>")
 
 
 def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
@@ -66,27 +66,28 @@ def disabled_pairs(root: Element, links: list[str], source: str) -> frozenset[fr
         An element names such a link.
     """
     quiet = {
-        _link(each, "link", links, source) for each in root.findall("disable_default_collisions")
+        _read_link_name(each, "link", links, source)
+        for each in root.findall("disable_default_collisions")
     }
     disabled = {
         frozenset(pair) for pair in itertools.combinations(links, 2) if not quiet.isdisjoint(pair)
     }
-    disabled |= {_pair(each, links, source) for each in root.findall("disable_collisions")}
-    disabled -= {_pair(each, links, source) for each in root.findall("enable_collisions")}
+    disabled |= {_read_pair(each, links, source) for each in root.findall("disable_collisions")}
+    disabled -= {_read_pair(each, links, source) for each in root.findall("enable_collisions")}
     return frozenset(disabled)
 
 
 def _with_pairs(urdf: str, pairs: frozenset[frozenset[str]]) -> str:
     """Return a URDF text that carries these pairs alone."""
-    urdf = _CARRIED.sub("", urdf)
-    ends = list(_END.finditer(urdf))
+    urdf = _DISABLED_PAIR_ELEMENTS.sub("", urdf)
+    ends = list(_ROBOT_END_TAG.finditer(urdf))
     if not pairs or not ends:
         return urdf
     place = ends[-1].start()
-    return urdf[:place] + "".join(_elements(pairs)) + urdf[place:]
+    return urdf[:place] + "".join(_pair_elements(pairs)) + urdf[place:]
 
 
-def _elements(pairs: frozenset[frozenset[str]]) -> list[str]:
+def _pair_elements(pairs: frozenset[frozenset[str]]) -> list[str]:
     named = sorted((min(pair), max(pair)) for pair in pairs)
     return [
         f'  <disable_collisions link1="{escape(first)}" link2="{escape(second)}"/>\n'
@@ -94,11 +95,11 @@ def _elements(pairs: frozenset[frozenset[str]]) -> list[str]:
     ]
 
 
-def _pair(element: Element, links: list[str], source: str) -> frozenset[str]:
-    return frozenset(_link(element, name, links, source) for name in ("link1", "link2"))
+def _read_pair(element: Element, links: list[str], source: str) -> frozenset[str]:
+    return frozenset(_read_link_name(element, name, links, source) for name in ("link1", "link2"))
 
 
-def _link(element: Element, attribute: str, links: list[str], source: str) -> str:
+def _read_link_name(element: Element, attribute: str, links: list[str], source: str) -> str:
     name = element.get(attribute)
     if name not in links:
         raise RobotDescriptionError(

@@ -524,7 +524,7 @@ _ELEMENTS_READ = {
 """Tags of the elements to read, by the tag of their parent; other elements are ignored."""
 
 _GEOMETRIES = ("box", "cylinder", "sphere", "mesh")
-_KNOWN_FORMS = [[name] for name in _GEOMETRIES]
+_ACCEPTED_GEOMETRIES = [[name] for name in _GEOMETRIES]
 _GEOMETRY_REMEDY = f"a <geometry> with one of {', '.join(_GEOMETRIES)}"
 
 
@@ -607,7 +607,9 @@ def _checked_root(text: str) -> Element:
     for link in root.findall("link"):
         for collision in link.findall("collision"):
             # Other programs write forms of their own, such as capsules.
-            if [each.tag for each in collision.iterfind("geometry/*")][0:1] not in _KNOWN_FORMS:
+            if [each.tag for each in collision.iterfind("geometry/*")][
+                0:1
+            ] not in _ACCEPTED_GEOMETRIES:
                 link.remove(collision)
     if not root.get("name"):
         raise _MalformedError("the <robot> has no name", '<robot name="...">')

@@ -133,10 +133,10 @@ def visuals_of(
                 mesh = meshes[shape.resource].coarsened(most).moved(shape.pose, shape.size)
             if mesh is not None and len(mesh.faces):
                 found.append(Visual(link.name, body, shape, mesh))
-    return tuple(found) or _balls_and_bars(robot)
+    return tuple(found) or _stand_in_visuals(robot)
 
 
-def _balls_and_bars(robot: RobotDescription) -> tuple[Visual, ...]:
+def _stand_in_visuals(robot: RobotDescription) -> tuple[Visual, ...]:
     shapes = [(link.name, Shape("sphere", (_BALL_RADIUS,), Pose())) for link in robot.links]
     for joint in robot.joints:
         length = float(np.linalg.norm(joint.origin.r))

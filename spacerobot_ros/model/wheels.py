@@ -137,12 +137,12 @@ def require_reaction_wheels(robot: RobotDescription) -> None:
                 '<limit velocity="..." effort="..."/> in rad/s and N m'
             )
         else:
-            flaw = _imbalance(body)
+            flaw = _imbalance_clause(body)
         if flaw:
             raise RobotDescriptionError(f"The wheel '{joint.name}' {flaw}.")
 
 
-def _imbalance(body: Body) -> str:
+def _imbalance_clause(body: Body) -> str:
     """Return a clause on a wheel that is no body of revolution; empty: it is one."""
     assert body.joint is not None
     axis, inertia = body.joint.axis, body.inertia

@@ -35,7 +35,9 @@ def with_world(robot: RobotDescription, world: RobotDescription) -> RobotDescrip
     return replace(robot, world=world, urdf=urdf)
 
 
-def among_obstacles(robot: RobotDescription, world: RobotDescription | None) -> RobotDescription:
+def with_obstacles_around(
+    robot: RobotDescription, world: RobotDescription | None
+) -> RobotDescription:
     """Return a robot among other obstacles than so far; None: there are none around it."""
     if world is None:
         return replace(robot, world=None, urdf=_CARRIED.sub("", robot.urdf))
@@ -66,6 +68,6 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
     return parse_world(text)
 
 
-def shaped_links(world: RobotDescription) -> list[str]:
+def links_with_shapes(world: RobotDescription) -> list[str]:
     """Return the names of the links that are obstacles: those with a shape."""
     return [each.name for each in world.links if each.collisions or each.shapes]

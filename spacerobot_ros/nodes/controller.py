@@ -74,8 +74,8 @@ class CoordinatedControlNode(CommanderNode):
             String, "target/robot_description", self._on_target_description, LATCHED
         )
         self.take_raw(Odometry, TARGET_ODOMETRY, self._on_target)
-        self.take_goals("goal_pose")
-        self.take_goals("end_effector/goal_pose", END_EFFECTOR)
+        self.subscribe_to_goals("goal_pose")
+        self.subscribe_to_goals("end_effector/goal_pose", END_EFFECTOR)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
             self._inputs[topic] = self.take_raw(kind, topic, partial(self._on_reference, topic))
 

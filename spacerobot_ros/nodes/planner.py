@@ -94,9 +94,9 @@ class PlannerNode(CommanderNode):
         self.listen("planner/status")
         if self.config.output == "trajectory":
             self._follow_trajectories()
-        self.take_goals("goal_pose")
+        self.subscribe_to_goals("goal_pose")
         for name in self.config.goal_links:
-            self.take_goals(goal_topic(name), name)
+            self.subscribe_to_goals(goal_topic(name), name)
             self._take_twists(name)
             self._take_paths(name)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)

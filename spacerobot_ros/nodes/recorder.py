@@ -52,7 +52,7 @@ from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_sta
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
-from spacerobot_ros.nodes.common.streams import StreamTaps, Take
+from spacerobot_ros.nodes.common.streams import StreamListeners, Take
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp
 from spacerobot_ros.topics import TOPICS_NOT_RECORDED
@@ -108,7 +108,7 @@ class RecorderNode(FlightNode):
     """The present recording, or the last one."""
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
-        self._taps = StreamTaps()
+        self._taps = StreamListeners()
         self._stamps = _StampReader()
         self._parameter_requests: dict[str, RemoteParameters | None] = {}
         """Names of the parameter records that are in the bag or requested from nodes."""
@@ -298,7 +298,7 @@ class RecorderNode(FlightNode):
         ours = topic.startswith(f"{namespace}/") and not topic.endswith(TOPICS_NOT_RECORDED)
         return ours and type_name != _CLOCK_TYPE
 
-    def _ask_for_parameters(self, topic: str, publishers: Sequence[Any]) -> None:
+    def _request_parameters(self, topic: str, publishers: Sequence[Any]) -> None:
         """Request the parameters of a topic's publisher for the bag, unless the bag has them."""
         for name, title in _PARAMETER_RECORD_BY_TOPIC.items():
             if not topic.endswith(f"/{name}"):
@@ -338,7 +338,7 @@ class RecorderNode(FlightNode):
             self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
             return
         self._recorded.add(topic)
-        self._ask_for_parameters(topic, publishers)
+        self._request_parameters(topic, publishers)
         listener = None
         if self._transforms is not None:
             listener = self._transforms.listener(topic, channel)
@@ -512,11 +512,11 @@ class _RecordedTransforms:
 
     def _on_odom(self, raw: bytes) -> None:
         self._odom = raw
-        self._write_whole_state()
+        self._write_complete_state()
 
     def _on_joint_states(self, raw: bytes) -> None:
         self._joint_states = raw
-        self._write_whole_state()
+        self._write_complete_state()
 
     def _on_description(self, raw: bytes) -> None:
         try:
@@ -526,7 +526,7 @@ class _RecordedTransforms:
         self._description, self._frames = description, None
         self._state = StateFrames(description)
 
-    def _write_whole_state(self) -> None:
+    def _write_complete_state(self) -> None:
         """Write the transforms if the period is over, or time has gone back."""
         if self._odom[HEADER_STAMP] != self._joint_states[HEADER_STAMP]:
             return

@@ -25,7 +25,11 @@ from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.core.workspaces import Workspaces, workspaces
 from spacerobot_ros.planning.methods.auto import AutoGait
 from spacerobot_ros.planning.methods.geometric_phase import check_planar_chain
-from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nominal, given_nominal
+from spacerobot_ros.planning.methods.nominal_shape import (
+    NominalShape,
+    best_nominal,
+    nominal_at_shape,
+)
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
@@ -119,7 +123,7 @@ def analyze(
             middle = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
             nominal = best_nominal(robot, middle, triples, _LOOP_EDGE_LENGTH)
         else:
-            nominal = given_nominal(robot, given, triples, _LOOP_EDGE_LENGTH)
+            nominal = nominal_at_shape(robot, given, triples, _LOOP_EDGE_LENGTH)
     planar = check_planar_chain(robot)
     if given is None:
         best = planar if planar.controllable else anywhere
@@ -134,7 +138,7 @@ def analyze(
         planar,
         check_sliding_masses(robot),
         {
-            name: _find_objection(method, robot)
+            name: _reason_against_method(method, robot)
             for name, method in METHODS.items()
             if method is not AutoGait
         },
@@ -143,7 +147,7 @@ def analyze(
     )
 
 
-def _find_objection(method: type[GaitMethod], robot: SpaceRobot) -> str | None:
+def _reason_against_method(method: type[GaitMethod], robot: SpaceRobot) -> str | None:
     """Return the reason why a method plans no goal of a robot; None if it plans some."""
     try:
         method.require_suitable(robot)

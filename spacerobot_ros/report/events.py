@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.report.figures import INK, MUTED, PALETTE, inches, panel
+from spacerobot_ros.report.figures import PALETTE, SECONDARY_COLOUR, TEXT_COLOUR, inches, panel
 from spacerobot_ros.times import SECOND
 
 EVENT_STRIP_HEIGHT = 0.62
@@ -101,13 +101,13 @@ _MARKS = {
     EventKind.REARMED: _Mark("rearmed", "s", _GOOD, 1, hollow=True),
     EventKind.STUCK_JOINT: _Mark("stuck joint", "D", _BAD, 1),
     EventKind.FAILED: _Mark("node failed", "X", _BAD, 1),
-    EventKind.RESTING: _Mark("at rest", "|", MUTED, 1),
+    EventKind.RESTING: _Mark("at rest", "|", SECONDARY_COLOUR, 1),
     EventKind.RUNNING: _Mark("running", "|", _GOOD, 1),
-    EventKind.PAUSED: _Mark("paused", "|", INK, 1),
+    EventKind.PAUSED: _Mark("paused", "|", TEXT_COLOUR, 1),
     EventKind.RESUMED: _Mark("resumed", "|", _PLAIN, 1),
-    EventKind.RESET: _Mark("reset", "P", INK, 1),
+    EventKind.RESET: _Mark("reset", "P", TEXT_COLOUR, 1),
     EventKind.RECORDING_FAILED: _Mark("recording failed", "d", _BAD, 1),
-    EventKind.FILE_SPLIT: _Mark("next file", "d", MUTED, 1, hollow=True),
+    EventKind.FILE_SPLIT: _Mark("next file", "d", SECONDARY_COLOUR, 1, hollow=True),
     EventKind.NODE_SILENT: _Mark("node silent", "h", _BAD, 1),
     EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 1, hollow=True),
     EventKind.NODE_RESTARTED: _Mark("node restarted", "h", _WARN, 1),
@@ -165,7 +165,7 @@ def event_style(kind: EventKind) -> dict[str, Any]:
     }
 
 
-def drawn_events(
+def timed_events(
     events: Iterable[tuple[int, str, Event]], began: float, *, stamped: bool
 ) -> list[FlightEvent]:
     """Return the events that are drawn.

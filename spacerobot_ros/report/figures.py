@@ -30,13 +30,13 @@ from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.report.signals import envelope, simplified
 
-INK, MUTED, FAINT = "#1f2328", "#667085", "#c3c8d0"
+TEXT_COLOUR, SECONDARY_COLOUR, LINE_COLOUR = "#1f2328", "#667085", "#c3c8d0"
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _TOL = ("#332288", "#882255", "#999933", "#44AA99")
 PALETTE = (*_OKABE_ITO, *_TOL)
 """Colours that people with any colour vision tell apart."""
 
-GHOST = PALETTE[3]
+GHOST_COLOUR = PALETTE[3]
 """Colour of goals in space."""
 
 WIDTH = 9.6
@@ -641,7 +641,7 @@ class ReportFigure:
         The picture.
     groups
         The traces of its panels over the whole flight; none if the figure is not over time.
-    of_picture
+    picture_section
         The part of the caption that applies to the picture and not to its charts.
     """
 
@@ -650,7 +650,7 @@ class ReportFigure:
     caption: str
     figure: Figure
     groups: Sequence[TraceGroup] = ()
-    of_picture: str = ""
+    picture_section: str = ""
 
     @cached_property
     def svg(self) -> bytes:

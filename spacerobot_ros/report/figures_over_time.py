@@ -26,12 +26,12 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.report.events import EVENT_STRIP_HEIGHT, draw_events
 from spacerobot_ros.report.figures import (
     COLUMNS,
-    FAINT,
-    INK,
     LARGEST_VALUE_SLICES,
     LIMIT,
-    MUTED,
+    LINE_COLOUR,
     PALETTE,
+    SECONDARY_COLOUR,
+    TEXT_COLOUR,
     ReportFigure,
     TraceGroup,
     colour,
@@ -57,23 +57,25 @@ SHOWN_CYCLES = 3
 
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
-_MOST_SCHEDULES = 10
+_MAX_MARKED_SCHEDULES = 10
 """Schedules that are marked by lines; more of them would be a hatching."""
 
 _DUTY_ROW_HEIGHT = 0.8
 """Height of a duty cycle of one, in its row."""
 
-BAND = (
+BAND_CAPTION = (
     "Where a trace has more samples than the picture has columns, the band spans the smallest and "
     "the largest value in each slice of time."
 )
 
-EVENTS = (
+EVENTS_CAPTION = (
     "Below the time axis, events: goals and plans in the upper row, robot and faults in the lower."
 )
 
 
-def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float = 1.0) -> bool:
+def draw_whole_flight(
+    axes: Axes, flight: FlightReport, group: TraceGroup, share: float = 1.0
+) -> bool:
     """Draw traces over the whole flight; return whether any is drawn as a band."""
     if group.rows:
         return _draw_rows(axes, flight, group, share)
@@ -84,7 +86,7 @@ def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
     values = np.concatenate([group.signal.values.ravel(), [g[3] for g in group.goals]])
     if group.window is not None:
         text = f"peaks of {np.abs(values).max():.3g} {group.unit} are beyond the axis"
-        axes.set_title(text, loc="right" if group.limits else "left", color=MUTED)
+        axes.set_title(text, loc="right" if group.limits else "left", color=SECONDARY_COLOUR)
         values = np.array(group.window)
     set_range(axes, values, [bound for _, bound in group.limits])
     low, high = axes.get_ylim()
@@ -92,22 +94,22 @@ def draw_whole(axes: Axes, flight: FlightReport, group: TraceGroup, share: float
     shown = [(k, bound) for k, bound in group.limits if low < bound < high]
     for bound in {bound for _, bound in shown}:
         owners = [k for k, other in shown if other == bound]
-        tint = MUTED if len(owners) == len(group.names) else colours[owners[0]]
+        tint = SECONDARY_COLOUR if len(owners) == len(group.names) else colours[owners[0]]
         axes.axhline(bound, color=tint, lw=1.0, ls=(0, DOTS), zorder=1.8)
     if shown:
-        keys.append(legend_entry(MUTED, group.limit_name, DOTS))
+        keys.append(legend_entry(SECONDARY_COLOUR, group.limit_name, DOTS))
     dense = draw_traces(axes, group.signal, colours, share)
     for start, end, index, value in group.goals:
         axes.hlines(value, start, end, color=colours[index], ls=(0, DASHES), lw=1.2, zorder=3)
     if group.goals:
-        keys.append(legend_entry(MUTED, "goal", DASHES))
+        keys.append(legend_entry(SECONDARY_COLOUR, "goal", DASHES))
     later = [status.time for status in flight.executing[1:]]
-    if len(later) > _MOST_SCHEDULES:
+    if len(later) > _MAX_MARKED_SCHEDULES:
         later = []
     for time in later:
-        axes.axvline(time, color=FAINT, lw=1.0, zorder=1.5)
+        axes.axvline(time, color=LINE_COLOUR, lw=1.0, zorder=1.5)
     if later:
-        keys.append(legend_entry(FAINT, "new schedule"))
+        keys.append(legend_entry(LINE_COLOUR, "new schedule"))
     legend_above(axes, keys)
     set_time(axes, 0.0, flight.end)
     axes.set_ylabel(f"{group.label} ({group.unit})")
@@ -134,7 +136,7 @@ def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
         if floor < bound < top:
             axes.axhline(bound, color=group.colours[index], lw=1.0, ls=(0, DOTS), zorder=1.8)
     if group.limits:
-        legend_above(axes, [legend_entry(MUTED, group.limit_name, DOTS)])
+        legend_above(axes, [legend_entry(SECONDARY_COLOUR, group.limit_name, DOTS)])
     axes.minorticks_off()
     axes.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
     set_time(axes, 0.0, flight.end)
@@ -171,7 +173,7 @@ def time_figure(
     dense = []
     for number, group in enumerate(groups):
         whole, *below = panels[number * len(rows) : (number + 1) * len(rows)]
-        dense.append(draw_whole(whole[0], flight, group, share))
+        dense.append(draw_whole_flight(whole[0], flight, group, share))
         if cycles is not None:
             whole[0].set_title("whole flight")
             first, last = (axes for row in below for axes in row)
@@ -191,8 +193,8 @@ def time_figure(
             f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below, "
             f"the part before them, and {_close_up_text(cycles)}."
         )
-    aside += f" {BAND}" if any(dense) else ""
-    aside += f" {EVENTS}" if flight.events else ""
+    aside += f" {BAND_CAPTION}" if any(dense) else ""
+    aside += f" {EVENTS_CAPTION}" if flight.events else ""
     caption += aside
     return ReportFigure(name, heading, caption, figure, groups, aside)
 
@@ -249,7 +251,7 @@ def _label_trace_ends(axes: Axes, part: Signal, group: TraceGroup) -> None:
 
 def _draw_last_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> None:
     start, end = cycles.last(SHOWN_CYCLES)
-    part = group.signal.between(start, end).since_first()
+    part = group.signal.between(start, end).relative_to_first()
     factor, unit = scaled(group.unit, float(np.abs(part.values).max(initial=0.0)))
     set_range(axes, factor * part.values)
     draw_traces(axes, part, group.colours, factor=factor)
@@ -258,11 +260,11 @@ def _draw_last_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> None:
     axes.set_ylabel(unit)
 
 
-JOINTS_A_PANEL = 6
+JOINTS_PER_PANEL = 6
 
-NO_STATES = "The bag holds no base poses (odom); figures of the base are missing."
+NO_POSES_TEXT = "The bag holds no base poses (odom); figures of the base are missing."
 
-NO_JOINTS = "The bag holds no joint positions (joint_states)."
+NO_JOINTS_TEXT = "The bag holds no joint positions (joint_states)."
 
 
 def position_group(flight: FlightReport) -> TraceGroup:
@@ -299,7 +301,7 @@ def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     def rate_bounds(joint: Joint) -> list[float]:
         return [-joint.limits.velocity, joint.limits.velocity]
 
-    units, most = {"m": "m", "rad": "rad"}, JOINTS_A_PANEL
+    units, most = {"m": "m", "rad": "rad"}, JOINTS_PER_PANEL
     positions, rates = flight.shape, flight.rates
     groups = joint_groups(
         flight, positions, "joint position", units, bounds, most, flight.shape_columns
@@ -364,7 +366,7 @@ def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceG
 def position_figure(flight: FlightReport) -> ReportFigure | str:
     """Base position against the goal."""
     if not len(flight.position):
-        return NO_STATES
+        return NO_POSES_TEXT
     caption = "Position of the base link in the world frame"
     return time_figure(flight, "position", "Base position", caption, [position_group(flight)])
 
@@ -372,7 +374,7 @@ def position_figure(flight: FlightReport) -> ReportFigure | str:
 def pose_figure(flight: FlightReport) -> ReportFigure | str:
     """Base position over base attitude, against the goal."""
     if not len(flight.position):
-        return NO_STATES
+        return NO_POSES_TEXT
     caption = "Position of the base link in the world frame, and its attitude as a rotation vector"
     groups = [position_group(flight), attitude_group(flight)]
     return time_figure(flight, "pose", "Base pose", caption, groups)
@@ -381,7 +383,7 @@ def pose_figure(flight: FlightReport) -> ReportFigure | str:
 def attitude_figure(flight: FlightReport) -> ReportFigure | str:
     """Base attitude against the goal."""
     if not len(flight.attitude):
-        return NO_STATES
+        return NO_POSES_TEXT
     caption = (
         "Attitude of the base link as exponential coordinates: the rotation vector, of the length "
         "of the angle turned, about the axis of rotation"
@@ -402,7 +404,7 @@ def shape_figure(flight: FlightReport) -> ReportFigure | str:
 def _why_no_joints(flight: FlightReport) -> str:
     """Return the reason why there is no figure of the joints."""
     jointless = flight.robot is not None and not flight.robot.joint_names
-    return "The robot has no joints." if jointless else NO_JOINTS
+    return "The robot has no joints." if jointless else NO_JOINTS_TEXT
 
 
 def rates_figure(flight: FlightReport) -> ReportFigure | str:
@@ -436,7 +438,7 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
             low, high = axes.get_ylim()
             for bound in (limit, -limit):
                 if low < bound < high:
-                    axes.axhline(bound, color=MUTED, lw=1.0, ls=(0, DOTS), zorder=1.8)
+                    axes.axhline(bound, color=SECONDARY_COLOUR, lw=1.0, ls=(0, DOTS), zorder=1.8)
             part = signal.between(start, end)
             dense.append(draw_traces(axes, part, [colour(i)], min(1.0, 6 / len(names))))
             last = i == len(names) - 1
@@ -449,7 +451,7 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
             text += f", {100 * peak / limit:.3g} % of the limit {limit:.4g} {unit}"
         row[0].set_title(name, color=colour(i))
         if not narrow():
-            row[0].set_title(text, loc="right", color=INK)
+            row[0].set_title(text, loc="right", color=TEXT_COLOUR)
         row[0].set_ylabel(unit)
     figure.align_ylabels([row[0] for row in panels])
     if cycles is not None:
@@ -461,8 +463,8 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
     aside = ""
     if cycles is not None:
         aside += f" Right: the last {SHOWN_CYCLES} of {cycles.count} cycles, to the same scale."
-    aside += f" {BAND}" if any(dense) else ""
-    aside += f" {EVENTS}" if flight.events else ""
+    aside += f" {BAND_CAPTION}" if any(dense) else ""
+    aside += f" {EVENTS_CAPTION}" if flight.events else ""
     caption += aside
     return ReportFigure("velocities", "Joint velocities", caption, figure, groups, aside)
 
@@ -610,8 +612,8 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
         f"thrusters{largest_of}, on a logarithmic axis; smaller changes and zero lie on its lower "
         "edge. Bottom: kinetic energy."
     )
-    aside = f" {BAND}" if dense else ""
-    aside += f" {EVENTS}" if flight.events else ""
+    aside = f" {BAND_CAPTION}" if dense else ""
+    aside += f" {EVENTS_CAPTION}" if flight.events else ""
     caption += aside
     groups = [
         TraceGroup(
@@ -726,14 +728,14 @@ def errors_figure(flight: FlightReport) -> ReportFigure | None:
     return time_figure(flight, "errors", "Output errors", caption, groups)
 
 
-_MOST_DECADES = 8
+_MAX_DECADES = 8
 """Largest number of powers of ten of an axis of errors of links."""
 
 
 def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Distance and angle of each link to its goals; None where no link had a goal."""
     if not flight.link_errors:
-        return flight.not_drawn or None if flight.link_goals else None
+        return flight.hidden_links_text or None if flight.link_goals else None
     groups: list[TraceGroup] = []
     parts: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
         ("position", "distance", "m"),
@@ -771,7 +773,7 @@ def _error_decades(values: Array, tolerance: float | None) -> int:
     """Return the powers of ten of an axis that has the largest error and the tolerance on it."""
     _, top = log_range(values, 0)
     down_to = 0.1 * tolerance if tolerance else 1e-4 * top
-    return int(np.clip(np.ceil(np.log10(top / down_to)), 3, _MOST_DECADES))
+    return int(np.clip(np.ceil(np.log10(top / down_to)), 3, _MAX_DECADES))
 
 
 def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
@@ -791,7 +793,7 @@ def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
 def sensors_figure(flight: FlightReport) -> ReportFigure | None:
     """Measured minus true poses and joint positions; None if sensors have no errors."""
     true = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
-    pose, at = _match_times(flight.sensed_pose, true)
+    pose, at = _match_times(flight.measured_pose_signal, true)
     turn = quaternion_multiply(pose.values[:, 3:], quaternion_inverse(true.values[at, 3:]))
     offset = pose.values[:, :3] - true.values[at, :3]
     errors = Signal(pose.time, np.hstack([offset, rotvecs_from_quaternions(turn)]))
@@ -801,7 +803,7 @@ def sensors_figure(flight: FlightReport) -> ReportFigure | None:
         off = Signal(shape.time, shape.values - flight.shape.values[at])
         units = {"m": "m", "rad": "rad"}
         groups += joint_groups(
-            flight, off, "joint position", units, lambda joint: [], JOINTS_A_PANEL
+            flight, off, "joint position", units, lambda joint: [], JOINTS_PER_PANEL
         )
     groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SENSOR_ROUNDING]
     if not groups:

@@ -16,10 +16,10 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.report.figures import (
     COLUMNS,
-    GHOST,
-    INK,
-    MUTED,
+    GHOST_COLOUR,
     PALETTE,
+    SECONDARY_COLOUR,
+    TEXT_COLOUR,
     ReportFigure,
     angle_unit,
     colour,
@@ -33,8 +33,8 @@ from spacerobot_ros.report.figures import (
 )
 from spacerobot_ros.report.figures_over_time import (
     DASHES,
-    NO_JOINTS,
-    NO_STATES,
+    NO_JOINTS_TEXT,
+    NO_POSES_TEXT,
     SHOWN_CYCLES,
     power_of_ten,
 )
@@ -44,13 +44,13 @@ from spacerobot_ros.report.solids import Canvas, Solids, View
 
 PIXELS = 420
 """Width of the picture of a robot, pixels."""
-_SHOWN_INSTANTS = 6
+_MAX_SHOWN_POSES = 6
 
 
 def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     """The robot at several instants from the first state to the last, and the goal."""
     if flight.drawn is None:
-        return flight.not_drawn
+        return flight.hidden_links_text
     indices = _choose_instants(flight)
     scenes = [
         flight.drawn.at(flight.joints[index], flight.base_at(index))
@@ -104,16 +104,16 @@ def _choose_instants(flight: FlightReport) -> list[int]:
         places = [0.0, 0.5 * cycles.start, cycles.start]
         places += [cycles.start + cycles.period * (cycles.count * k // 3) for k in (1, 2, 3)]
         found = np.searchsorted(time, np.array(places) - 1e-9)
-        return _end_at(len(time) - 1, found)
+        return _indices_ending_at(len(time) - 1, found)
     moved = np.column_stack([flight.position.values, flight.attitude.values, flight.joints])
     extent = np.maximum(np.ptp(moved, axis=0), 1e-3)
     steps = np.linalg.norm(np.diff(moved, axis=0) / extent, axis=1)
     progress = np.append(0.0, np.cumsum(steps))
-    wanted = np.linspace(0.0, progress[-1], _SHOWN_INSTANTS) if progress[-1] > 0 else np.zeros(1)
-    return _end_at(len(time) - 1, np.searchsorted(progress, wanted))
+    wanted = np.linspace(0.0, progress[-1], _MAX_SHOWN_POSES) if progress[-1] > 0 else np.zeros(1)
+    return _indices_ending_at(len(time) - 1, np.searchsorted(progress, wanted))
 
 
-def _end_at(last: int, found: Indices) -> list[int]:
+def _indices_ending_at(last: int, found: Indices) -> list[int]:
     """Return indices, each once, the last one replaced by that of the last recorded state."""
     return np.unique([*np.minimum(found[:-1], last), last]).tolist()
 
@@ -136,14 +136,22 @@ def draw_robot(axes: Axes, solids: Solids, points: Array, view: View) -> None:
         if float(np.linalg.norm(view(direction))) < 0.1:
             continue
         tip = corner + 0.1 * across * view(direction)
-        arrow = {"arrowstyle": "-|>", "color": MUTED, "lw": 0.9, "shrinkA": 0, "shrinkB": 0}
+        arrow = {
+            "arrowstyle": "-|>",
+            "color": SECONDARY_COLOUR,
+            "lw": 0.9,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
         axes.annotate("", tip, corner, arrowprops=arrow)
         end = corner + 0.135 * across * view(direction)
-        axes.text(end[0], end[1], name, color=MUTED, ha="center", va="center")
+        axes.text(end[0], end[1], name, color=SECONDARY_COLOUR, ha="center", va="center")
     length = _round_length(0.25 * across)
     x, y = low[0] + 0.99 * across, low[1] + 0.02 * across
-    axes.plot([x - length, x], [y, y], color=MUTED, lw=1.6)
-    axes.text(x - length / 2, y + 0.015 * across, f"{length:g} m", color=MUTED, ha="center")
+    axes.plot([x - length, x], [y, y], color=SECONDARY_COLOUR, lw=1.6)
+    axes.text(
+        x - length / 2, y + 0.015 * across, f"{length:g} m", color=SECONDARY_COLOUR, ha="center"
+    )
 
 
 def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Line2D]:
@@ -154,16 +162,16 @@ def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Lin
     if float(np.ptp(path, axis=0).max()) > 0.0:
         flat = view(path)
         dense = len(path) > 2 * COLUMNS
-        axes.plot(flat[:, 0], flat[:, 1], color=INK, lw=0.8, zorder=5, rasterized=dense)
-        keys.append(legend_entry(INK, "path of the base"))
+        axes.plot(flat[:, 0], flat[:, 1], color=TEXT_COLOUR, lw=0.8, zorder=5, rasterized=dense)
+        keys.append(legend_entry(TEXT_COLOUR, "path of the base"))
     if flight.goal is not None and flight.drawn is not None:
         # Without a goal of the position, the ghost shows the attitude alone.
         r = flight.goal.position if flight.position_counts else path[-1]
         pose = Pose(matrix_from_quaternion(flight.goal.quaternion), r)
         for line in flight.drawn.base_outlines(pose):
             flat = view(line)
-            axes.plot(flat[:, 0], flat[:, 1], color=GHOST, lw=0.9, ls=(0, DASHES), zorder=6)
-        keys.append(legend_entry(GHOST, "goal", DASHES))
+            axes.plot(flat[:, 0], flat[:, 1], color=GHOST_COLOUR, lw=0.9, ls=(0, DASHES), zorder=6)
+        keys.append(legend_entry(GHOST_COLOUR, "goal", DASHES))
     axes.axis(limits)
     return keys
 
@@ -185,7 +193,7 @@ _FLIGHT_COLOURS = (PALETTE[0], PALETTE[2], PALETTE[5], *PALETTE[6:])
 def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> ReportFigure | str:
     """The path of the base in three views, with that of the end-effector and of other flights."""
     if not len(flight.position):
-        return NO_STATES
+        return NO_POSES_TEXT
     goals = []
     if flight.goal is not None and flight.position_counts:
         goals.append(flight.goal.position)
@@ -236,7 +244,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
                 zorder=3,
             )
         for goal in goals:
-            axes.plot(*goal[[i, j]], "x", color=GHOST, ms=8, mew=2, zorder=5)
+            axes.plot(*goal[[i, j]], "x", color=GHOST_COLOUR, ms=8, mew=2, zorder=5)
         _set_square_limits(axes, middle[[i, j]], half)
         axes.set_xlabel(f"{'xyz'[i]} (m)")
         axes.set_ylabel(f"{'xyz'[j]} (m)")
@@ -273,7 +281,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
     if len(names) < 2:
         return "A loop in shape space takes two joints or more."
     if not len(flight.shape):
-        return NO_JOINTS
+        return NO_JOINTS_TEXT
     pairs = list(itertools.combinations(range(len(names)), 2))
     cycles = flight.cycles
     joint_units = [joint_unit(flight, name) for name in names]
@@ -384,7 +392,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     for i, value in enumerate(wanted):
         above.axhline(value, color=PALETTE[i], ls=(0, DASHES), lw=1.2, zorder=1.8)
     if goal is not None:
-        legend_above(above, [legend_entry(MUTED, "goal", DASHES)])
+        legend_above(above, [legend_entry(SECONDARY_COLOUR, "goal", DASHES)])
     above.set_ylabel(f"rotation vector ({unit})")
     end_labels(above, list(zip(attitude[-1].tolist(), "xyz", PALETTE[:3], strict=True)))
     caption = (

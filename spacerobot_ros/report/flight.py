@@ -44,7 +44,7 @@ from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 from spacerobot_ros.planning.methods.registry import METHODS
-from spacerobot_ros.report.events import FlightEvent, drawn_events
+from spacerobot_ros.report.events import FlightEvent, timed_events
 from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, rotvecs
 from spacerobot_ros.report.solids import MAX_MESH_FACES, SolidRobot, Solids, obstacle_color, rgb
 from spacerobot_ros.scenario import COMMANDERS, Published
@@ -183,7 +183,7 @@ class FlightReport:
             flight=flight,
             position=Signal(base.time, base.values[:, :3]),
             quaternion=base.values[:, 3:],
-            events=drawn_events(bag.events(), bag.began, stamped=bag.stamped),
+            events=timed_events(bag.events(), bag.began, stamped=bag.stamped),
             meshes=meshes_from_attachments(flight.robot, bag.parts[0].bag.attachments)
             if flight.robot
             else {},
@@ -273,7 +273,7 @@ class FlightReport:
         return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
 
     @property
-    def sensed_pose(self) -> Signal:
+    def measured_pose_signal(self) -> Signal:
         """Pose of the base link as measured while sensors err (M, 7)."""
         return self.signal("measured_pose")
 
@@ -455,7 +455,7 @@ class FlightReport:
         the bag lacks the robot's description or its states.
         """
         robot, targets = self.robot, [each for each in self._all_targets if each.goal.end_effectors]
-        if robot is None or self.not_drawn or not targets:
+        if robot is None or self.hidden_links_text or not targets:
             return {}
         links = [each.link for target in targets for each in target.goal.end_effectors]
         found = {}
@@ -475,7 +475,7 @@ class FlightReport:
     def _link_poses(self) -> dict[str, tuple[Array, Array]]:
         """R_WL (k, 3, 3) and r_WL (k, 3) of links that had goals."""
         links = {each.link for target in self._all_targets for each in target.goal.end_effectors}
-        if self.robot is None or self.not_drawn or not links:
+        if self.robot is None or self.hidden_links_text or not links:
             return {}
         rows, kinematics = self.samples(_LINK_STATES), ForwardKinematics(self.robot)
         base = np.hstack([self.position.values[rows], self.quaternion[rows]])
@@ -544,9 +544,9 @@ class FlightReport:
         return self.flight.error
 
     @property
-    def sensed_error(self) -> PoseError | None:
+    def measured_error(self) -> PoseError | None:
         """Error of the last measured pose to the goal, where sensors err."""
-        return pose_error(self.sensed_pose, self.goal)
+        return pose_error(self.measured_pose_signal, self.goal)
 
     def goal_rotvec(self, goal: Goal) -> Array:
         """Attitude of a goal (3,), rad, with the number of turns nearest to the last attitude."""
@@ -573,7 +573,7 @@ class FlightReport:
     @cached_property
     def drawn(self) -> SolidRobot | None:
         """The robot as something to draw; None if the bag lacks its description or its states."""
-        if self.robot is None or self.not_drawn:
+        if self.robot is None or self.hidden_links_text:
             return None
         return SolidRobot(self.robot, self.meshes, self.obstacles)
 
@@ -591,7 +591,7 @@ class FlightReport:
         return solids
 
     @property
-    def not_drawn(self) -> str:
+    def hidden_links_text(self) -> str:
         """A message about data missing for a picture of the robot; empty: none is missing."""
         lacking = []
         if self.robot is None:

@@ -173,9 +173,9 @@ def _figures_html(figures: Figures) -> list[str]:
 
 
 def _caption_html(each: ReportFigure) -> str:
-    if not each.of_picture:
+    if not each.picture_section:
         return escape(each.caption)
-    before, aside, after = each.caption.partition(each.of_picture)
+    before, aside, after = each.caption.partition(each.picture_section)
     return f'{escape(before)}<span class="still">{escape(aside)}</span>{escape(after)}'
 
 

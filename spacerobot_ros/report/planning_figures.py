@@ -25,10 +25,10 @@ from spacerobot_ros.planning.core.workspaces import Workspaces
 from spacerobot_ros.planning.methods.geometric_phase import PhasePlane, PlanarPhase, curvature_peaks
 from spacerobot_ros.planning.methods.nominal_shape import JOINT_PLANES
 from spacerobot_ros.report.figures import (
-    FAINT,
-    INK,
-    MUTED,
+    LINE_COLOUR,
     PALETTE,
+    SECONDARY_COLOUR,
+    TEXT_COLOUR,
     WIDTH,
     PictureFormat,
     colour,
@@ -116,7 +116,7 @@ def draw_rings(axes: Axes, workspaces: Workspaces) -> None:
             width = max(high - low, 1e-3 * workspaces.reach[1])
             axes.add_patch(Wedge((0.0, 0.0), high, 0.0, 360.0, width=width, **_RING_STYLES[kind]))
     far = 1.05 * workspaces.reach[1]
-    axes.plot(0.0, 0.0, marker="+", color=INK, ms=8, mew=1.3, linestyle="none")
+    axes.plot(0.0, 0.0, marker="+", color=TEXT_COLOUR, ms=8, mew=1.3, linestyle="none")
     axes.set(xlim=(-far, far), ylim=(-far, far), aspect="equal")
 
 
@@ -137,7 +137,7 @@ def _planar_figure(found: Analysis) -> Figure:
     H = -plane.curvature(np.stack(np.meshgrid(x, y), axis=-1))
     norm = _symmetric_norm(np.abs(H).max())
     _draw_map(left, x, y, H, norm)
-    left.plot(*centre, marker="+", color=INK, ms=9, mew=1.4)
+    left.plot(*centre, marker="+", color=TEXT_COLOUR, ms=9, mew=1.4)
     left.set_xlim(lower[0], upper[0])
     left.set_ylim(lower[1], upper[1])
     left.set_xlabel(f"{robot.joint_names[i]} (rad)")
@@ -164,7 +164,9 @@ def _draw_square_turns(axes: Axes, plane: PhasePlane, centre: Array, room: float
     turns = np.abs(plane.square_turns(np.tile(centre, (_SQUARE_COUNT, 1)), sides))
     small = abs(float(plane.curvature(centre))) * sides**2
     axes.plot(sides, turns, color=PALETTE[0], label="round the best centre")
-    axes.plot(sides, small, color=MUTED, dashes=(4, 3), lw=0.9, label="|H| z², small squares")
+    axes.plot(
+        sides, small, color=SECONDARY_COLOUR, dashes=(4, 3), lw=0.9, label="|H| z², small squares"
+    )
     axes.set_xlabel("side z of the square (rad)")
     axes.set_title("turn of the base by one square loop")
     axes.set_ylabel("turn (rad)")
@@ -247,7 +249,7 @@ def _mark_shape(axes: Axes, found: Analysis, pair: tuple[int, int]) -> None:
     """Mark the shape of the analysis, and name the joints of the plane."""
     assert found.nominal is not None
     i, j = (found.nominal.joints[k] for k in pair)
-    axes.plot(found.shape[i], found.shape[j], marker="+", color=INK, ms=8, mew=1.3)
+    axes.plot(found.shape[i], found.shape[j], marker="+", color=TEXT_COLOUR, ms=8, mew=1.3)
     for k, index, label in ((i, 0, axes.set_xlabel), (j, 1, axes.set_ylabel)):
         joint = found.robot.description.movable_joints[k]
         label(f"{_joint_symbol(pair, index)}: {joint.name} ({joint.unit})")
@@ -271,7 +273,10 @@ def _draw_condition_shares(axes: Axes, conditions: Array) -> None:
 def _draw_map(axes: Axes, x: Array, y: Array, values: Array, norm: Normalize) -> None:
     levels = np.linspace(norm.vmin or 0.0, norm.vmax or 1.0, _COLOUR_LEVELS + 1)
     axes.contourf(x, y, values, levels, norm=norm, cmap="RdBu_r")
-    for lines, color, linewidth in ((levels, MUTED, 0.35), (np.zeros(1), INK, 0.8)):
+    for lines, color, linewidth in (
+        (levels, SECONDARY_COLOUR, 0.35),
+        (np.zeros(1), TEXT_COLOUR, 0.8),
+    ):
         # Matplotlib before 3.7 warns where there is nothing to draw.
         inside = lines[(values.min() < lines) & (lines < values.max())]
         if len(inside):
@@ -279,7 +284,7 @@ def _draw_map(axes: Axes, x: Array, y: Array, values: Array, norm: Normalize) ->
     axes.grid(False)
     for spine in axes.spines.values():
         spine.set_visible(True)
-        spine.set_color(FAINT)
+        spine.set_color(LINE_COLOUR)
 
 
 def _symmetric_norm(peak: float) -> Normalize:
@@ -354,5 +359,5 @@ def _draw_panel(
         if wanted is not None:
             axes.axhline(wanted[index], color=colour(index), linewidth=0.8, linestyle=":")
         axes.plot(time, values[:, index], color=colour(index), label=name)
-    axes.axhline(0.0, color=FAINT, linewidth=0.6, zorder=0.5)
+    axes.axhline(0.0, color=LINE_COLOUR, linewidth=0.6, zorder=0.5)
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))

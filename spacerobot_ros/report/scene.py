@@ -22,7 +22,7 @@ from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
 )
 from spacerobot_ros.model.visuals import Visual, solid_mesh, visuals_of
-from spacerobot_ros.report.figures import FAINT, GHOST, PALETTE
+from spacerobot_ros.report.figures import GHOST_COLOUR, LINE_COLOUR, PALETTE
 from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page_parts import PagePart, package_file
 from spacerobot_ros.report.signals import Cycles, Indices, simplified
@@ -312,7 +312,7 @@ def scene_of(flight: FlightReport) -> Scene | str:
     """Return the scene of a flight, or the reason why there is none."""
     drawn = flight.drawn
     if drawn is None:
-        return flight.not_drawn
+        return flight.hidden_links_text
     center, radius = _center_and_radius(flight, drawn)
     frames = key_frames(_scaled_motion(flight, radius), flight.cycles)
     commands = _stage_commands(center, radius, flight.flat)
@@ -377,7 +377,7 @@ def _stage_commands(center: Array, radius: float, flat: bool) -> list[Command]:
         # The camera's own y axis is up.
         set_property(camera, "position", [x, z, -y]),
         set_transform(WORLD, world),
-        segments(f"{WORLD}/grid", _grid_commands(center, radius, spacing, flat), FAINT, 0.6),
+        segments(f"{WORLD}/grid", _grid_commands(center, radius, spacing, flat), LINE_COLOUR, 0.6),
         *[
             segments(f"{WORLD}/world/{name}", np.array([[0.0] * 3, 0.25 * radius * unit]), tint)
             for name, unit, tint in zip("xyz", np.eye(3), _AXIS_COLOURS, strict=True)
@@ -470,13 +470,13 @@ def _motion_command(
         clips.append(clip(paths[joint.child], time, moved))
     target = flight.target_pose
     if len(target):
-        shown, _ = simplified(_in_tolerances(target, radius), _MAX_KEY_FRAMES)
+        shown, _ = simplified(_scaled_by_tolerances(target, radius), _MAX_KEY_FRAMES)
         moved = {"position": target.values[shown, :3], "quaternion": target.values[shown, 3:]}
         clips.append(clip(TARGET, target.time[shown], moved))
     return set_animation(clips)
 
 
-def _in_tolerances(pose: Signal, radius: float) -> Signal:
+def _scaled_by_tolerances(pose: Signal, radius: float) -> Signal:
     """Return a pose (N, 7) over time in tolerances; a quaternion's numbers change by half as much
     as the angle.
     """
@@ -516,7 +516,7 @@ def _goal_commands(flight: FlightReport, robot: RobotDescription, radius: float)
             if visual.body == 0:
                 path = f"{WORLD}/goal/{visual.link.replace('/', '_')} {number}"
                 commands.append(set_transform(path, matrix_of(robot.frames[visual.link][1])))
-                commands += solid(path, visual, GHOST, 0.25)
+                commands += solid(path, visual, GHOST_COLOUR, 0.25)
     marks: list[tuple[str, Array, Array | None]] = []
     for target in flight.tool_targets[-1:]:
         turned = bool(set(flight.controls("end_effector")) & {3, 4, 5})
@@ -529,7 +529,7 @@ def _goal_commands(flight: FlightReport, robot: RobotDescription, radius: float)
         path = f"{WORLD}/{mark}"
         commands.append(set_transform(path, matrix_of(Pose(R, position))))
         ball = Shape("sphere", (0.03 * radius,), Pose())
-        commands += solid(f"{path}/mark", Visual("", 0, ball, solid_mesh(ball)), GHOST, 0.4)
+        commands += solid(f"{path}/mark", Visual("", 0, ball, solid_mesh(ball)), GHOST_COLOUR, 0.4)
         if quaternion is not None:
             for name, unit, tint in zip("xyz", np.eye(3), _AXIS_COLOURS, strict=True):
                 ends = np.array([np.zeros(3), 0.12 * radius * unit])

@@ -34,24 +34,29 @@ class Table:
 def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     """Return label, value and note of each headline number."""
     rows: list[tuple[str, str, str]] = []
-    error, tool, sensed = flight.final_error, flight.tool_error, flight.sensed_error
+    error, tool, sensed = flight.final_error, flight.tool_error, flight.measured_error
     if error is not None:
         measured = "" if sensed is None else f"measured: {sensed.distance:.3g} m"
         near = f"{error.distance:.3g} m", measured
-        rows.append(("Position error", *_judged(flight, "position", *near)))
+        rows.append(("Position error", *_error_with_tolerance(flight, "position", *near)))
         degrees = f"{math.degrees(error.angle):.3g}°"
         measured = degrees + ("" if sensed is None else f"; measured: {sensed.angle:.3g} rad")
         rows.append(
-            ("Attitude error", *_judged(flight, "attitude", f"{error.angle:.3g} rad", measured))
+            (
+                "Attitude error",
+                *_error_with_tolerance(flight, "attitude", f"{error.angle:.3g} rad", measured),
+            )
         )
     if tool is not None:
         turned = set(flight.controls("end_effector")) & {3, 4, 5}
         turn = f"{tool.angle:.3g} rad" if turned else ""
-        note = _hand_note(flight, turn)
+        note = _end_effector_note(flight, turn)
         rows.append(("End-effector error", f"{tool.distance:.3g} m", note))
     for link, left in flight.flight.end_effector_errors.items():
         turn = f"{left.angle:.3g} rad" if flight.link_goals[link].quaternion is not None else ""
-        rows.append((f"Error of {link}", f"{left.distance:.3g} m", _hand_note(flight, turn)))
+        rows.append(
+            (f"Error of {link}", f"{left.distance:.3g} m", _end_effector_note(flight, turn))
+        )
     if flight.manoeuvre_time is not None:
         rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", _time_to_end_text(flight)))
     if flight.method:
@@ -73,7 +78,7 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _hand_note(flight: FlightReport, turn: str) -> str:
+def _end_effector_note(flight: FlightReport, turn: str) -> str:
     """Return the note below the distance of an end-effector: its angle, and the tolerances."""
     units = ("position", "m"), ("attitude", "rad")
     parts = units if turn else units[:1]
@@ -82,7 +87,7 @@ def _hand_note(flight: FlightReport, turn: str) -> str:
     return "; ".join(filter(None, (turn, limits and f"tolerance {limits}")))
 
 
-def _judged(
+def _error_with_tolerance(
     flight: FlightReport, part: Literal["position", "attitude"], error: str, note: str
 ) -> tuple[str, str]:
     """Return value and note of an error with its tolerance, or that it is not controlled."""
@@ -135,7 +140,7 @@ def result_table(flight: FlightReport) -> Table:
             if part in flight.flight.not_controlled:
                 text = f"not controlled; {left} from the goal"
             rows.append((f"{part.capitalize()} error", text))
-    if (sensed := flight.sensed_error) is not None:
+    if (sensed := flight.measured_error) is not None:
         parts = [f"{sensed.distance:.3g} m"] if flight.position_counts else []
         rows.append(("Errors as measured", ", ".join([*parts, f"{sensed.angle:.3g} rad"])))
     if flight.tool_error is not None:

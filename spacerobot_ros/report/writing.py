@@ -23,11 +23,11 @@ from spacerobot_ros.report.figures import (
     widen_panels,
 )
 from spacerobot_ros.report.figures_over_time import (
-    NO_STATES,
+    NO_POSES_TEXT,
     attitude_figure,
     attitude_group,
     clearance_figure,
-    draw_whole,
+    draw_whole_flight,
     efforts_figure,
     errors_figure,
     link_errors_figure,
@@ -228,7 +228,7 @@ def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> 
     format = PictureFormat.of(picture)
     flight = read_report(bag, namespace)
     if not len(flight.position):
-        raise SpaceRobotError(NO_STATES)
+        raise SpaceRobotError(NO_POSES_TEXT)
     with drawing():
         write_output(picture, picture_of(_overview_figure(flight), format, _PICTURE_PIXELS))
 
@@ -248,7 +248,7 @@ def _overview_figure(flight: FlightReport) -> Figure:
     for number, group in enumerate(groups):
         y = up - 0.35 - (number + 1) * (height + gap)
         axes = panel(figure, left, y + 0.05, width, height)
-        draw_whole(axes, flight, group, width / WIDTH)
+        draw_whole_flight(axes, flight, group, width / WIDTH)
         if number < len(groups) - 1:
             axes.set_xlabel("")
             axes.tick_params(labelbottom=False)

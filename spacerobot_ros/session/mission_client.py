@@ -153,7 +153,7 @@ class MissionClient:
             for publisher in self._sends
         )
 
-    def has_decider(self) -> bool:
+    def has_goal_commander(self) -> bool:
         """Whether a commander is connected, with its status and its subscription of goals.
 
         A recorder also subscribes to goals, and may be discovered first.
@@ -188,7 +188,7 @@ class MissionClient:
         of_links = {
             each.link: goal_message(each.as_goal(), self._frame, time_ns)
             if each.waypoints is None
-            else path_message(each.values_on_way, self._frame, time_ns)
+            else path_message(each.path_values, self._frame, time_ns)
             for each in goal.end_effectors
         }
         if end_effector is not None:

@@ -69,10 +69,16 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
             f"The base '{robot.base_link}' is a point mass: give it an <inertia>, for a box of "
             "sides a, b, c ixx = m (b^2 + c^2) / 12 and so on."
         )
-    for remark in (_still_joint, _unlimited_joint, _odd_speed, _many_turns, _no_effort):
+    for remark in (
+        _immovable_joint_remark,
+        _unlimited_joint_remark,
+        _implausible_speed_remark,
+        _large_range_remark,
+        _missing_effort_remark,
+    ):
         found = [text for joint in robot.movable_joints if (text := remark(joint))]
         if found:
-            yield found[0] + _same_for_others(len(found) - 1)
+            yield found[0] + _other_joints_clause(len(found) - 1)
     for link in robot.links:
         # A body with such an inertia is refused; a welded link is not.
         if flaw := describe_inertia_flaw(link.inertia.about_com):
@@ -80,14 +86,14 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
     yield from _visual_remarks(robot)
 
 
-def _same_for_others(count: int) -> str:
+def _other_joints_clause(count: int) -> str:
     """Return a sentence that extends a remark about one joint to others."""
     if not count:
         return ""
     return f" The same holds for {count} other joint{'s' if count > 1 else ''}."
 
 
-def _still_joint(joint: Joint) -> str:
+def _immovable_joint_remark(joint: Joint) -> str:
     if joint.limits.velocity != 0:
         return ""
     return (
@@ -96,7 +102,7 @@ def _still_joint(joint: Joint) -> str:
     )
 
 
-def _unlimited_joint(joint: Joint) -> str:
+def _unlimited_joint_remark(joint: Joint) -> str:
     if not math.isinf(joint.limits.velocity):
         return ""
     return (
@@ -106,7 +112,7 @@ def _unlimited_joint(joint: Joint) -> str:
     )
 
 
-def _odd_speed(joint: Joint) -> str:
+def _implausible_speed_remark(joint: Joint) -> str:
     speed = joint.limits.velocity
     if speed == 0 or math.isinf(speed) or _LEAST_USUAL_SPEED <= speed <= _LARGEST_USUAL_SPEED:
         return ""
@@ -116,7 +122,7 @@ def _odd_speed(joint: Joint) -> str:
     )
 
 
-def _many_turns(joint: Joint) -> str:
+def _large_range_remark(joint: Joint) -> str:
     limits = joint.limits
     reach = max(-limits.lower, limits.upper)
     if joint.unit != "rad" or math.isinf(reach) or reach <= _MAX_USUAL_LIMIT:
@@ -127,7 +133,7 @@ def _many_turns(joint: Joint) -> str:
     )
 
 
-def _no_effort(joint: Joint) -> str:
+def _missing_effort_remark(joint: Joint) -> str:
     if joint.limits.effort != 0:
         return ""
     return (

@@ -37,7 +37,7 @@ from spacerobot_ros.nodes.common.streams import Connections
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import COMMANDERS, Kill, Scenario
-from spacerobot_ros.session.stack import Stack, namespace_words
+from spacerobot_ros.session.stack import Stack, namespace_arguments
 from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.times import SECOND, stamp_to_ns
 
@@ -172,7 +172,7 @@ class MultiProcessStack(Stack):
         overrides |= parameters
         overrides = {k: list(v) if isinstance(v, tuple) else v for k, v in overrides.items()}
         module, folder = NODE_TYPES[name].__module__, Path(self._folder.name)
-        words = node_words(name, module, overrides, folder, self.namespace)
+        words = node_arguments(name, module, overrides, folder, self.namespace)
         with self._log_file_of(name).open("wb") as log:
             self.processes[name] = start_child(words, self._environment(), stdout=log, stderr=log)
 
@@ -328,7 +328,7 @@ class MultiProcessStack(Stack):
         answers = self._call_services(self._change_state, dict.fromkeys(names, request))
         for name, answer in answers.items():
             if not answer.success:
-                error = last_error(self._read_log(name)) or _NO_ERROR
+                error = last_error(self._read_log(name)) or _NO_ERROR_TEXT
                 raise SpaceRobotError(f"The {name} refuses: {error}")
 
     def _ask_statistics(self, patience: float) -> None:
@@ -338,7 +338,7 @@ class MultiProcessStack(Stack):
             answer = self._call_services({"planner": self._get_statistics}, request, patience)[
                 "planner"
             ]
-        except _AnswerLateError:
+        except _ServiceTimeoutError:
             if patience < _LONGEST_START:
                 return
             raise
@@ -378,11 +378,11 @@ class MultiProcessStack(Stack):
         while not condition():
             self.require_alive()
             if time.monotonic() > deadline:
-                raise _AnswerLateError(f"Timed out after {patience:g} s waiting for {what}.")
+                raise _ServiceTimeoutError(f"Timed out after {patience:g} s waiting for {what}.")
             self.executor.spin_once(timeout_sec=0.02)
 
 
-_NO_ERROR = "it wrote no error."
+_NO_ERROR_TEXT = "it wrote no error."
 
 _LOG_PREFIX = re.compile(r"^\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]*\]: ")
 """Level, time and name before a message in the log of a node."""
@@ -413,7 +413,7 @@ def end_message(name: str, code: int, log: str) -> str:
         error = last_error(log)
         how = f"Node '{name}' was ended by {signal.Signals(-code).name}"
         return f"{how}: {error}" if error else f"{how}."
-    return f"Node '{name}' has ended with exit code {code}: {last_error(log) or _NO_ERROR}"
+    return f"Node '{name}' has ended with exit code {code}: {last_error(log) or _NO_ERROR_TEXT}"
 
 
 class RestartLimit:
@@ -445,18 +445,18 @@ class RestartLimit:
         return f" It was started again {times} within a minute, which is the limit (--restarts)."
 
 
-def node_words(
+def node_arguments(
     name: str, module: str, parameters: Mapping[str, Any], folder: Path, namespace: str
 ) -> list[str]:
     """Return the arguments of Python that run a node; its parameter file is written to a folder."""
     file = folder / f"{name}.yaml"
     own = f"{namespace}/{name}" if namespace else name
     file.write_text(yaml.safe_dump({own: {"ros__parameters": dict(parameters)}}), "utf-8")
-    ros = ["--ros-args", "-r", f"__node:={name}", *namespace_words(namespace)]
+    ros = ["--ros-args", "-r", f"__node:={name}", *namespace_arguments(namespace)]
     return ["-m", _CHILD_MODULE, module, *ros, "--params-file", str(file)]
 
 
-class _AnswerLateError(SpaceRobotError):
+class _ServiceTimeoutError(SpaceRobotError):
     """A node has not answered in time."""
 
 

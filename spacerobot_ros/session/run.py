@@ -319,7 +319,7 @@ def send_goal(
         try:
             for each in clients:
                 executor.add_node(each.node)
-            client = _find_decider(
+            client = _find_goal_commander(
                 clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY), goal
             )
             with ended_on_request() as stopped:
@@ -340,7 +340,7 @@ def send_goal(
             executor.shutdown()
 
 
-def _find_decider(
+def _find_goal_commander(
     clients: list[MissionClient], executor: EventsExecutor, patience: float, goal: Goal
 ) -> MissionClient:
     """Return the client that listens to the planner, or to the controller if there is none."""
@@ -348,7 +348,7 @@ def _find_decider(
     while time.monotonic() < deadline:
         executor.spin_once(timeout_sec=0.05)
         for client in clients:
-            if client.is_connected() and client.has_decider():
+            if client.is_connected() and client.has_goal_commander():
                 latest = time.monotonic() + _LONGEST_STATUS_WAIT
                 while client.status is None and time.monotonic() < latest:
                     executor.spin_once(timeout_sec=0.05)

@@ -29,7 +29,7 @@ from spacerobot_ros.nodes import (
     RecorderNode,
 )
 from spacerobot_ros.nodes.common.direct_delivery import DirectDelivery
-from spacerobot_ros.nodes.common.streams import Connections, unconnected_topics
+from spacerobot_ros.nodes.common.streams import Connections, topics_without_all_matches
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.execution.status import PlannerStatistics
@@ -40,7 +40,7 @@ from spacerobot_ros.topics import GLOBAL_TOPICS, TOPICS_NOT_RECORDED
 _DISCOVERY_TIMEOUT = 10.0
 
 
-def namespace_words(namespace: str) -> list[str]:
+def namespace_arguments(namespace: str) -> list[str]:
     """Return the ROS arguments that put a node, its clock and its frames into a namespace."""
     if not namespace:
         return []
@@ -187,7 +187,7 @@ class Stack(ABC):
     def _all_connected(self, nodes: Mapping[str, Connections], recorded: Iterable[str]) -> bool:
         """Whether nodes and client are connected, and all topics to record are in ``recorded``."""
         client = Connections.of(self.client.node)
-        if unconnected_topics([*nodes.values(), client]):
+        if topics_without_all_matches([*nodes.values(), client]):
             return False
         if self.bag is None:
             return True
@@ -359,7 +359,7 @@ class InProcessStack(Stack):
                 autostart=False,
                 context=context,
                 use_global_arguments=False,
-                cli_args=["--ros-args", *namespace_words(self.namespace)],
+                cli_args=["--ros-args", *namespace_arguments(self.namespace)],
                 parameter_overrides=[
                     Parameter(key, value=list(value) if isinstance(value, tuple) else value)
                     for key, value in overrides.items()

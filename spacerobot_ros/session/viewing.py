@@ -17,7 +17,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.process import use_loopback_discovery
 from spacerobot_ros.nodes.viewer import node
 from spacerobot_ros.parameters import Value
-from spacerobot_ros.session.processes import RestartLimit, end_message, node_words
+from spacerobot_ros.session.processes import RestartLimit, end_message, node_arguments
 from spacerobot_ros.session.stack import checked_namespace
 from spacerobot_ros.termination import end_child, start_child
 from spacerobot_ros.viewer.server import require_viser
@@ -58,13 +58,13 @@ class Viewer:
 
     def _start(self) -> subprocess.Popen[bytes]:
         with self.log.open("wb") as errors:
-            words = node_words(
+            words = node_arguments(
                 "viewer", node.__name__, self._parameters, self._folder, self._namespace
             )
             process = start_child(
                 [*words, "--log-level", "WARN"], stdout=subprocess.PIPE, stderr=errors
             )
-        yield_to_flight(process.pid)
+        lower_priority(process.pid)
         return process
 
     def announce(self) -> None:
@@ -145,7 +145,7 @@ def viewing(
             viewer.end()
 
 
-def yield_to_flight(pid: int) -> None:
+def lower_priority(pid: int) -> None:
     """Lower the priority of a process below the priority of all flight nodes."""
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, _NICENESS)

@@ -342,7 +342,7 @@ class FaultyPlant(WrappedPlant):
             self._thrusters.wrench_fault = (
                 (self._wrench_factor, self._wrench_held) if wrench_faulty else None
             )
-            self._disturb_nozzles(self._thrusters, active)
+            self._apply_nozzle_faults(self._thrusters, active)
         self._actuators_sound = all(FAULT_KINDS[f.kind].sensor for f in active)
 
     def _begin_loads(self) -> None:
@@ -376,7 +376,7 @@ class FaultyPlant(WrappedPlant):
             wrenches[self.robot.link_names.index(each.link)] += (*each.force, *each.torque)
 
     @staticmethod
-    def _disturb_nozzles(thrusters: ThrusterPlant, active: tuple[Fault, ...]) -> None:
+    def _apply_nozzle_faults(thrusters: ThrusterPlant, active: tuple[Fault, ...]) -> None:
         thrusters.thruster_health[:], thrusters.stuck_on[:] = 1.0, False
         for fault in active:
             if fault.kind.startswith("nozzle_"):
@@ -492,7 +492,7 @@ def build_plant(
         step = step or mujoco_plant.DEFAULT_INTEGRATION_STEP
         plant = mujoco_plant.build_mujoco_plant(robot, config, start, step, description)
     else:
-        plant = _exact_plant(robot, config, start, step or kind.integration_step, description)
+        plant = _own_engine_plant(robot, config, start, step or kind.integration_step, description)
     plant = with_thrusters(plant, control_period, config.thrusters, config.thrusters_excluded)
     return FaultyPlant(
         plant,
@@ -505,7 +505,7 @@ def build_plant(
     )
 
 
-def _exact_plant(
+def _own_engine_plant(
     robot: SpaceRobot,
     config: PlantConfig,
     start: InitialState,

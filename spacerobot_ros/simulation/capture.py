@@ -27,10 +27,10 @@ from spacerobot_ros.model.grasp import (
     RelativeMotion,
     RobotMotion,
     TargetBody,
+    combined_momenta,
     frame_motion,
     grasp_impact,
-    joined_momenta,
-    parted_momenta,
+    separated_momenta,
 )
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
@@ -44,7 +44,7 @@ from spacerobot_ros.simulation.loads import PlantLoads
 from spacerobot_ros.simulation.plant import Counts, Flags, InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
-_ANY_POSE = Pose(matrix_from_quaternion(unit_quaternion([0.1, 0.2, 0.3, 0.9])), np.ones(3))
+_GENERIC_POSE = Pose(matrix_from_quaternion(unit_quaternion([0.1, 0.2, 0.3, 0.9])), np.ones(3))
 """A pose in which no entry of the inertia of a held body is zero."""
 
 
@@ -334,7 +334,7 @@ class CapturePlant(WrappedPlant):
         """Call all functions of a capture once: compiling them would delay the flight then."""
         robot, motion, inertia = self.robot, self._motion(), self.target.inertia
         grasp_impact(robot, self.link, motion, self._body(), inertia)
-        joined = Payload(self.link, inertia.moved(_ANY_POSE)).attached_to(robot)
+        joined = Payload(self.link, inertia.moved(_GENERIC_POSE)).attached_to(robot)
         _summed_momenta(joined, motion)
         self._build(joined, InitialState(joint_positions=initial.shape(robot)))
 
@@ -440,7 +440,7 @@ class CapturePlant(WrappedPlant):
         motion, body, robot = self._motion(), self._body(), self._alone.robot
         # The target takes its share of the momenta along, the robot keeps the rest.
         self.target.release(body)
-        momenta = parted_momenta(
+        momenta = separated_momenta(
             (robot.total_mass, self.target.inertia.mass),
             self._centers(motion, body),
             self.plant.expected_momenta,
@@ -457,7 +457,7 @@ class CapturePlant(WrappedPlant):
         robot, motion, body = self._alone.robot, self._motion(), self._body()
         inertia = self.target.inertia
         impact = grasp_impact(robot, self.link, motion, body, inertia)
-        momenta = joined_momenta(
+        momenta = combined_momenta(
             (robot.total_mass, inertia.mass),
             self._centers(motion, body),
             (self.plant.expected_momenta, self.target.momenta),

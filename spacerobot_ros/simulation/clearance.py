@@ -98,9 +98,13 @@ class ClearanceMonitor:
     """
 
     def __init__(
-        self, geometry: CollisionGeometry, links: tuple[str, ...], *, pushing: bool = False
+        self,
+        geometry: CollisionGeometry,
+        links: tuple[str, ...],
+        *,
+        has_contact_forces: bool = False,
     ) -> None:
-        self._nearest, self._pushing = NearestPair(geometry, links), pushing
+        self._nearest, self._pushing = NearestPair(geometry, links), has_contact_forces
         self._touching: frozenset[LinkPair] = frozenset()
 
     @classmethod
@@ -110,7 +114,7 @@ class ClearanceMonitor:
         links: tuple[str, ...],
         before: ClearanceMonitor | None = None,
         *,
-        pushing: bool = False,
+        has_contact_forces: bool = False,
     ) -> ClearanceMonitor | None:
         """Return the monitor of a robot; None: none of its links could touch.
 
@@ -128,7 +132,7 @@ class ClearanceMonitor:
                 "The plant measures no clearance without the package coal.",
             )
             return None
-        monitor = cls(geometry, links, pushing=pushing)
+        monitor = cls(geometry, links, has_contact_forces=has_contact_forces)
         if before is not None:
             monitor._touching = before._touching
         return monitor

@@ -40,7 +40,7 @@ _START_TIME = 1.0
 _STAMP_ROUNDING = 1_000
 """Allowed rounding error of stamps, from commanders with floating-point time, ns."""
 
-_SUPERSEDED_CLAUSE = (
+_OUTDATED_STATE_CLAUSE = (
     "it answers a state that is older than the last start, reset or stop of the plant"
 )
 
@@ -308,7 +308,7 @@ class CommandValidator:
         if refusal is None and self.fault:
             refusal = Refusal(Reason.LATCHED, self.fault)
         if stamp_ns < self._earliest and refusal is None and not unset:
-            refusal = Refusal(Reason.STALE, _SUPERSEDED_CLAUSE)
+            refusal = Refusal(Reason.STALE, _OUTDATED_STATE_CLAUSE)
         if refusal is None:
             assert not isinstance(values, CommandError)
             source.accept(values, stamp_ns)

@@ -15,15 +15,15 @@ from dataclasses import dataclass
 from spacerobot_ros.simulation.timeline import (
     Timeline,
     format_times,
+    line_refusal,
     parse_number,
     parse_times,
-    refusal_of_line,
 )
 
 _MAX_COMPONENT = 1e6
 """Largest component of a force or torque, N or N m."""
 
-_FORM = (
+_LINE_FORMAT = (
     "it must be LINK [force X Y Z] [torque X Y Z] [in world|link] [at SECONDS] [until SECONDS], "
     "with a force or a torque"
 )
@@ -70,20 +70,20 @@ def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Dist
     ParameterError
         The line is not a disturbance of this robot; the message quotes it.
     """
-    refusal = refusal_of_line(line, "disturbance")
+    refusal = line_refusal(line, "disturbance")
     link, *rest = line.split() or [""]
     vectors = {"force": (0.0, 0.0, 0.0), "torque": (0.0, 0.0, 0.0)}
     given: list[str] = []
     while rest and rest[0] in vectors and rest[0] not in given:
         name, components = rest[0], rest[1:4]
         if len(components) < 3:
-            raise refusal(_FORM)
+            raise refusal(_LINE_FORMAT)
         x, y, z = (parse_number(text, refusal) for text in components)
         if max(abs(x), abs(y), abs(z)) > _MAX_COMPONENT:
             raise refusal(f"components of its {name} must be at most {_MAX_COMPONENT:g}")
         vectors[name], given, rest = (x, y, z), [*given, name], rest[4:]
     if not given:
-        raise refusal(_FORM)
+        raise refusal(_LINE_FORMAT)
     if link not in links:
         raise refusal(f"the robot has no link '{link[:40]}'; it has {', '.join(links)}")
     in_link = False

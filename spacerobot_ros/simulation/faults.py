@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from spacerobot_ros.simulation.timeline import (
     Timeline,
     format_times,
+    line_refusal,
     parse_number,
     parse_times,
-    refusal_of_line,
 )
 
 _MAX_FAULT_VALUE = 1e6
@@ -140,7 +140,7 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
     ParameterError
         The line is not a fault of this plant; the message quotes it.
     """
-    refusal = refusal_of_line(line, "fault")
+    refusal = line_refusal(line, "fault")
     words = line.split()
     if len(words) < 2:
         raise refusal("it must be KIND TARGET [VALUE] [at SECONDS] [until SECONDS]")

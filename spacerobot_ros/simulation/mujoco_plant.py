@@ -22,7 +22,7 @@ from spacerobot_ros.collision.geometry import solids_of
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Inertia, RobotDescription
-from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, joined_momenta
+from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, combined_momenta
 from spacerobot_ros.model.integration import count_steps
 from spacerobot_ros.model.rotations import (
     cross,
@@ -49,13 +49,13 @@ from spacerobot_ros.simulation.plant import Counts, Flags, InitialState
 DEFAULT_INTEGRATION_STEP = 0.001
 """Longest Runge-Kutta step, s."""
 
-_STIFFNESS = 2.0
+_CONTACT_TIME_CONSTANT = 2.0
 """Time constant of contacts, stops and welds, in steps: the least that MuJoCo recommends."""
 
-_AT_STOP = 1e-4
+_STOP_DISTANCE = 1e-4
 """Distance from its limit, m or rad, at which a joint counts as stopped: stops are soft."""
 
-_STEPS_OF_IMPULSE = 5
+_STEPS_PER_IMPULSE_SUM = 5
 """Integration steps over which the impulse of a wrench is added up at once."""
 
 _TARGET = "target/"
@@ -234,7 +234,7 @@ class MujocoPlant:
         self._update()
         clipped = realised != wanted
         q = self.q
-        stopped = (q <= robot.lower + _AT_STOP) | (q >= robot.upper - _AT_STOP)
+        stopped = (q <= robot.lower + _STOP_DISTANCE) | (q >= robot.upper - _STOP_DISTANCE)
         for kind, limited in zip(self.limit_counts, (clipped, stopped), strict=True):
             self.limit_counts[kind] += limited
         return bool(clipped.any() or stopped.any())
@@ -305,7 +305,7 @@ class MujocoPlant:
         if not loaded and not self.wrench.any():
             self._mujoco.mj_step(self._model, self._data, self._steps)
             return
-        at_once = 1 if loaded else _STEPS_OF_IMPULSE
+        at_once = 1 if loaded else _STEPS_PER_IMPULSE_SUM
         for step in range(0, self._steps, at_once):
             count = min(at_once, self._steps - step)
             if loaded:
@@ -406,7 +406,7 @@ class MujocoPlant:
             target = self._target_body
             masses = tuple(float(model.body_subtreemass[each]) for each in (self._root, target))
             centers = tuple(data.subtree_com[each] for each in (self._root, target))
-            momenta = joined_momenta(
+            momenta = combined_momenta(
                 (masses[0], masses[1]),
                 (centers[0], centers[1]),
                 (momenta, self._momenta_of(target)),
@@ -627,7 +627,7 @@ def _set_options(mujoco: Any, model: Any, step: float) -> None:
     model.opt.timestep = step
     # The plant clips efforts itself; servos exceed the limits where commanded rates jump.
     model.jnt_actfrclimited[:] = 0
-    stiff = [_STIFFNESS * step, 1.0]
+    stiff = [_CONTACT_TIME_CONSTANT * step, 1.0]
     for soft in (model.eq_solref, model.jnt_solref, model.pair_solref):
         soft[:] = stiff
 

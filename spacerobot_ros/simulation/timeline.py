@@ -30,7 +30,7 @@ class Timed(Protocol):
         """End, s; infinite: never."""
 
 
-def refusal_of_line(line: str, noun: str) -> Refusal:
+def line_refusal(line: str, noun: str) -> Refusal:
     """Return the refusal of a line, which the message quotes."""
     return lambda reason: ParameterError(f"The {noun} '{line.strip()[:80]}' is refused: {reason}.")
 

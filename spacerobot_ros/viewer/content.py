@@ -32,7 +32,7 @@ SILENT_AFTER = 1.0
 _NEAR_LIMIT_SHARE = 0.05
 """Distance from a limit below which a joint is marked, as a share of its range."""
 
-_FAST_WHEEL, _FULL_WHEEL = 0.8, 0.98
+_WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE = 0.8, 0.98
 """Shares of the largest rate of a wheel from which it is marked amber, and red."""
 
 _MAX_NAME_LENGTH = 21
@@ -114,7 +114,7 @@ def status_html(
         lines.append(
             _line_html("No robot is shown: no valid robot_description has been received.", 2)
         )
-    if stack_ended(state):
+    if has_stack_ended(state):
         lines.append(_line_html(_ENDED, 2))
     for name, seconds in sorted(state.silent.items()):
         lines.append(_line_html(f"Node '{name}' has been silent for {math.floor(seconds)} s.", 2))
@@ -170,7 +170,7 @@ def look_back_html(shown: StackState, live: StackState) -> str:
     ago = live.measured.time_s - shown.measured.time_s
     text = f"Looking back {ago:.1f} s. The robot is at t = {live.measured.time_s:.2f} s now."
     lines = [_line_html(text, 1)]
-    if stack_ended(live):
+    if has_stack_ended(live):
         lines.append(_line_html(_ENDED, 2))
     return padded("".join(lines))
 
@@ -180,7 +180,7 @@ def announcement_html(notice: Notice) -> str:
     return padded(_line_html(notice.message, notice.level))
 
 
-def stack_ended(state: StackState) -> bool:
+def has_stack_ended(state: StackState) -> bool:
     """Whether every node that has reported a status is offline, and one of them fell silent."""
     statuses = {"plant": state.plant, "planner": state.planner, "controller": state.controller}
     known = {key for key, status in statuses.items() if status is not None}
@@ -433,7 +433,13 @@ def momentum_html(state: StackState) -> str:
         (escape(part), f"{_format_decimals(value, 3)} N m s", "") for part, value in budget.items()
     ]
     for name, share in command.wheels.items():
-        level = 2 if abs(share) >= _FULL_WHEEL else 1 if abs(share) >= _FAST_WHEEL else 0
+        level = (
+            2
+            if abs(share) >= _SATURATED_WHEEL_SHARE
+            else 1
+            if abs(share) >= _WARNING_WHEEL_SHARE
+            else 0
+        )
         title = f'<span title="{escape(name)}">{escape(shortened(name))}</span>'
         bar = _bar_html((1.0 + share) / 2, level)
         rows.append((title, f"{_format_decimals(100 * share, 0)} %", bar))

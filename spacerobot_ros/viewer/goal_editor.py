@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 Defer = Callable[[Callable[[], None]], None]
 """Queues a function for the thread that draws the page."""
 
-AT_REST_S = 0.3
+GOAL_SETTLING_TIME_S = 0.3
 """Wall time without a change after which a goal is checked, s."""
 
 _HIDDEN_GHOST_DISTANCE = 0.01
@@ -50,7 +50,7 @@ _MARK_SIZE = 0.12
 """Radius of the mark at the goal of an end-effector, as a share of the size of its gizmo."""
 
 
-class Asked(Enum):
+class RequestedPart(Enum):
     """Parts of the pose of a link that a goal is for."""
 
     NOTHING = "free"
@@ -90,7 +90,7 @@ class GoalEditor:
         gui = server.gui
         self._none_taken = gui.add_html(hint_html("A recording takes no goals."), visible=False)
         self._verdict = gui.add_html(check_html(self._check))
-        self._parts = _AskedParts(gui, defer, on_note, self._on_parts_chosen)
+        self._parts = _PartMenu(gui, defer, on_note, self._on_parts_chosen)
         # Any: for mypy viser's values are read-only.
         self._position: Any = gui.add_vector3("Goal (m)", (0.0, 0.0, 0.0), step=0.01)
         self._angles: Any = gui.add_vector3("Roll, pitch, yaw (deg)", (0.0, 0.0, 0.0), step=1.0)
@@ -127,7 +127,7 @@ class GoalEditor:
             self._move_gizmo(_TOOL_GIZMO, pose)
             self.touch(time.monotonic())
 
-    def on_goal_to_robot(self, act: Callable[[], None]) -> None:
+    def on_reset_goal(self, act: Callable[[], None]) -> None:
         """Call a function when the button that moves the goal to the robot is pressed."""
 
         @self._to_robot.on_click
@@ -199,7 +199,7 @@ class GoalEditor:
 
     def _ghost_pose(self, pose: Array) -> Array:
         """Return the pose (7,) of the ghost's base: of the goal, or, if free, as predicted."""
-        if self._parts.asked(BASE_GOAL_KEY) is not Asked.NOTHING:
+        if self._parts.asked(BASE_GOAL_KEY) is not RequestedPart.NOTHING:
             return self._poses[_BASE_GIZMO]
         return pose if self._check.base is None else self._check.base
 
@@ -259,13 +259,13 @@ class GoalEditor:
             return {}
         shape = self._final.positions
         goals: dict[Part, Goal] = {}
-        if self._parts.asked(BASE_GOAL_KEY) is not Asked.NOTHING:
+        if self._parts.asked(BASE_GOAL_KEY) is not RequestedPart.NOTHING:
             goals[BASE_GOAL_KEY] = self._goal_at(_BASE_GIZMO, shape)
         if self._tool_too.visible and self._tool_too.value and self.has_tool:
             goals[DEFAULT_END_EFFECTOR] = self._goal_at(_TOOL_GIZMO)
         for link, asked in self._parts.asked_links().items():
             pose = self._poses[_link_gizmo(link)]
-            aim = EndEffectorGoal.checked(link, pose if asked is Asked.POSE else pose[:3])
+            aim = EndEffectorGoal.checked(link, pose if asked is RequestedPart.POSE else pose[:3])
             goals[link] = Goal.of_end_effectors([aim], joint_positions=shape)
         return goals
 
@@ -273,9 +273,13 @@ class GoalEditor:
         pose = self._poses[gizmo]
         return Goal.checked(pose[:3].tolist(), pose[3:].tolist(), shape)
 
-    def goals_at_rest(self, now: float) -> dict[Part, Goal] | None:
+    def settled_goals(self, now: float) -> dict[Part, Goal] | None:
         """Return the goals once after every change, when they have come to rest; else None."""
-        if self._changed_at is None or now - self._changed_at < AT_REST_S or not self.placed:
+        if (
+            self._changed_at is None
+            or now - self._changed_at < GOAL_SETTLING_TIME_S
+            or not self.placed
+        ):
             return None
         self._changed_at = None
         try:
@@ -371,7 +375,7 @@ class GoalEditor:
 
     def _on_parts_chosen(self, part: Part) -> None:
         """Take over the choice of users for a part, or another part whose numbers are shown."""
-        if part != BASE_GOAL_KEY and self._parts.asked(part) is not Asked.NOTHING:
+        if part != BASE_GOAL_KEY and self._parts.asked(part) is not RequestedPart.NOTHING:
             gizmo = self._gizmos.get(_link_gizmo(part))
             if gizmo is None or not gizmo.visible:
                 self._place_link_gizmo(part)
@@ -395,14 +399,14 @@ class GoalEditor:
             gizmo = self._gizmos.get(_link_gizmo(link))
             if gizmo is not None:
                 asked = self._parts.asked(link)
-                gizmo.visible = asked is not Asked.NOTHING
-                gizmo.disable_rotations = asked is Asked.POSITION
+                gizmo.visible = asked is not RequestedPart.NOTHING
+                gizmo.disable_rotations = asked is RequestedPart.POSITION
         base = self._gizmos.get(_BASE_GIZMO)
         if base is not None:
             # Its node stays visible, because the ghost hangs on it.
-            free = self._parts.asked(BASE_GOAL_KEY) is Asked.NOTHING
+            free = self._parts.asked(BASE_GOAL_KEY) is RequestedPart.NOTHING
             base.disable_axes = base.disable_sliders = base.disable_rotations = free
-        self._angles.visible = self._parts.asked(self._parts.shown) is not Asked.POSITION
+        self._angles.visible = self._parts.asked(self._parts.shown) is not RequestedPart.POSITION
 
     def _show_fields(self) -> None:
         pose = self._poses.get(_gizmo_of(self._parts.shown))
@@ -414,7 +418,7 @@ class GoalEditor:
             self._angles.value = (roll, pitch, yaw)
 
 
-class _AskedParts:
+class _PartMenu:
     """Controls of the parts of the robot that a goal for a planner asks for.
 
     Without end-effectors, or without a planner, that is the pose of the base.
@@ -460,16 +464,16 @@ class _AskedParts:
         """The part whose numbers are shown."""
         return str(self._numbers.value)
 
-    def asked(self, part: Part) -> Asked:
+    def asked(self, part: Part) -> RequestedPart:
         """Return whether the goal is for the position or the pose of a part, or leaves it free."""
         if self._there and part in self._menus:
-            return Asked(self._menus[part].value)
-        return Asked.POSE if part == BASE_GOAL_KEY else Asked.NOTHING
+            return RequestedPart(self._menus[part].value)
+        return RequestedPart.POSE if part == BASE_GOAL_KEY else RequestedPart.NOTHING
 
-    def asked_links(self) -> dict[str, Asked]:
+    def asked_links(self) -> dict[str, RequestedPart]:
         """Return for each link of the goal whether it is for its position or its pose."""
         asked = {link: self.asked(link) for link in self.links}
-        return {link: each for link, each in asked.items() if each is not Asked.NOTHING}
+        return {link: each for link, each in asked.items() if each is not RequestedPart.NOTHING}
 
     def offer(self, links: Iterable[str]) -> None:
         """Offer goals of other links; the goal is for the base again."""
@@ -490,7 +494,11 @@ class _AskedParts:
             self._on_change(self.shown)
 
     def _add_menu(self, part: Part) -> Any:
-        choices = (Asked.POSE, Asked.NOTHING) if part == BASE_GOAL_KEY else tuple(Asked)
+        choices = (
+            (RequestedPart.POSE, RequestedPart.NOTHING)
+            if part == BASE_GOAL_KEY
+            else tuple(RequestedPart)
+        )
         menu = self._gui.add_dropdown(shortened(part), [each.value for each in choices], hint=part)
 
         @menu.on_update
@@ -506,19 +514,19 @@ class _AskedParts:
         base, for_links = self._menus[BASE_GOAL_KEY], self.asked_links()
         chosen = self.asked(part)
         if not for_links:
-            if part == BASE_GOAL_KEY and chosen is Asked.NOTHING:
+            if part == BASE_GOAL_KEY and chosen is RequestedPart.NOTHING:
                 self._on_note("A goal is for the base or for an end-effector: choose one of them.")
-            base.value = Asked.POSE.value
+            base.value = RequestedPart.POSE.value
         elif list(for_links) == [part] and self._numbers.options == (BASE_GOAL_KEY,):
             # The first end-effector of a goal for the base: the base is free until users fix it.
-            base.value = Asked.NOTHING.value
+            base.value = RequestedPart.NOTHING.value
         self._update(part)
         self._on_change(part)
 
     def _update(self, part: Part | None = None) -> None:
         """Show the numbers of a part, if the goal asks for it, else of those of before."""
         self._folder.visible = self._there
-        parts = [BASE_GOAL_KEY] if self.asked(BASE_GOAL_KEY) is not Asked.NOTHING else []
+        parts = [BASE_GOAL_KEY] if self.asked(BASE_GOAL_KEY) is not RequestedPart.NOTHING else []
         parts += self.asked_links()
         wanted = [each for each in (part, self.shown) if each in parts]
         self._numbers.options = tuple(parts)

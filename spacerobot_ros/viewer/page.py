@@ -63,10 +63,10 @@ _PLOT_PIXELS = 170
 _LOOK_BACK_STEP_S = 0.1
 """Step of the slider over the past, simulated s."""
 
-_LEAST_PAST_S = 1.0
+_MIN_LOOK_BACK_S = 1.0
 """Shortest past that has a slider, simulated s."""
 
-_SLIDER_FREE_S = 1.5
+_SLIDER_HOLD_S = 1.5
 """Wall time for which the page does not move the time slider after a user has, s."""
 
 
@@ -149,7 +149,7 @@ class TimeLine:
                 self._defer(lambda: self._seek(seconds))
 
     def _seek(self, seconds: float) -> None:
-        self._left_alone_until = time.monotonic() + _SLIDER_FREE_S
+        self._left_alone_until = time.monotonic() + _SLIDER_HOLD_S
         self._act(Seek(seconds))
 
 
@@ -190,7 +190,7 @@ class LookBack:
 
     def show(self, span: tuple[float, float] | None) -> None:
         """Show the slider over a span of simulated time, s; None: there is no past."""
-        if span is None or span[1] - span[0] < _LEAST_PAST_S:
+        if span is None or span[1] - span[0] < _MIN_LOOK_BACK_S:
             self.time_s = None
             self._slider.visible = self._live.visible = False
             return
@@ -477,7 +477,7 @@ _OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
 """Period of drawing of the slower parts, wall s."""
 
-_ANNOUNCED_S = 60.0
+_ANNOUNCEMENT_TIME_S = 60.0
 """Wall time for which an announcement is shown, s."""
 
 CAMERA = np.array([1.1, 1.4, 0.8])
@@ -579,7 +579,7 @@ class Page:
             self.faults = Faults(gui, defer, self._request, self._refuse)
         with tabs.add_tab("Log"):
             self._log = Log(gui)
-        self.editor.on_goal_to_robot(self._goal_to_robot)
+        self.editor.on_reset_goal(self._goal_to_robot)
         look = gui.add_button(
             "Look at the robot", color="gray", hint="Turn the camera of this browser to the robot."
         )
@@ -618,7 +618,7 @@ class Page:
 
         @self._server.on_client_connect
         async def _(client: Any) -> None:
-            defer(lambda: self._greet(client.camera))
+            defer(lambda: self._place_first_camera(client.camera))
 
         self._style = gui.add_button("Dark or light", color="gray")
         themes: dict[int, bool] = {}
@@ -702,7 +702,7 @@ class Page:
         if self._around is not None:
             self._around.show_paths(visible=shown["Paths"])
             self._around.show_world(visible=shown["Frames"])
-            self._around.plumes.show(visible=shown["Plumes"])
+            self._around.plume_lines.show(visible=shown["Plumes"])
             self._around.show_setting(scene.Setting(self._setting.value))
 
     def end(self) -> None:
@@ -721,7 +721,7 @@ class Page:
 
     def announce(self, notice: Notice) -> None:
         """Show a line in the head for a minute."""
-        self._announced = (notice, self._now + _ANNOUNCED_S)
+        self._announced = (notice, self._now + _ANNOUNCEMENT_TIME_S)
 
     # -- drawing --------------------------------------------------------------------------------
 
@@ -801,7 +801,9 @@ class Page:
             self._draw_paths(state, around, measured.time_s)
         if state.firing is not None and self._table is not None:
             names, duty = state.firing.names, state.firing.duty
-            around.plumes.draw_segments(scene.plumes(self._table, names, duty, 0.25 * self._reach))
+            around.plume_lines.draw_segments(
+                scene.plume_lines(self._table, names, duty, 0.25 * self._reach)
+            )
 
     def _draw_paths(self, state: StackState, around: scene.Surroundings, until: float) -> None:
         """Draw the planned paths, and those flown until a time."""
@@ -865,7 +867,7 @@ class Page:
             at = at - _PORTRAIT_SHIFT * float(np.linalg.norm(away)) * screen_up(away)
         camera.position, camera.look_at = at + away, at
 
-    def _greet(self, camera: Any) -> None:
+    def _place_first_camera(self, camera: Any) -> None:
         """Turn the camera of a phone that has opened the page to the robot."""
         if getattr(camera, "aspect", 1.0) < _PORTRAIT and self._last is not None:
             self._aim_camera(camera)

@@ -178,7 +178,7 @@ class Question:
     link: str = ""
 
 
-def question_of(
+def make_question(
     state: StackState,
     goals: Mapping[Part, Goal],
     robot: RobotDescription | None,

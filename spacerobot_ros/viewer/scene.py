@@ -291,7 +291,7 @@ class Lines:
         self._handle.visible = self._shown
 
 
-def plumes(table: ThrusterTable, names: tuple[str, ...], duty: Array, length: float) -> Array:
+def plume_lines(table: ThrusterTable, names: tuple[str, ...], duty: Array, length: float) -> Array:
     """Return the plumes of active thrusters as segments (k, 2, 3) in the base frame, m.
 
     Parameters
@@ -355,7 +355,7 @@ class Surroundings:
         self._world = scene.add_frame("/world", axes_length=0.25 * reach, axes_radius=0.006 * reach)
         self.planned = Lines(scene, "/planned_path", _PLANNED)
         self.flown = Lines(scene, "/flown_path", _FLOWN)
-        self.plumes = Lines(scene, f"{robot_path}/plumes", _PLUME)
+        self.plume_lines = Lines(scene, f"{robot_path}/plumes", _PLUME)
         self._end_effectors: dict[tuple[str, str], Lines] = {}
         self._paths_shown = True
 

@@ -235,10 +235,10 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     beside = campaign(set={"plant.target.robot": "block.urdf"})
     with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has a target"):
         select_engine(beside, "lanes")
-    pushing = campaign(set={"plant.engine": "mujoco"})
-    assert select_engine(pushing, "auto").name == "flights"
+    has_contact_forces = campaign(set={"plant.engine": "mujoco"})
+    assert select_engine(has_contact_forces, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="its plant has the engine 'mujoco'"):
-        select_engine(pushing, "lanes")
+        select_engine(has_contact_forces, "lanes")
     near = campaign(criteria={"clearance_m": {"min": 0.0}})
     assert select_engine(near, "auto").name == "flights"
     with pytest.raises(SpaceRobotError, match="lanes measure no distances between links"):

@@ -29,17 +29,17 @@ POSE = (1.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8)
 HAND = (4.0, 5.0, 6.0)
 
 
-class Asked:
+class RequestedPart:
     """A scenario that keeps the goals that it is asked for."""
 
     def __init__(self) -> None:
         self.goals: list[Any] = []
 
-    def with_goal(self, *goal: Any) -> Asked:
+    def with_goal(self, *goal: Any) -> RequestedPart:
         self.goals.append(goal)
         return self
 
-    def with_end_effectors(self, hands: Any, base: Any) -> Asked:
+    def with_end_effectors(self, hands: Any, base: Any) -> RequestedPart:
         self.goals.append(([hand.link for hand in hands], sorted(base)))
         return self
 
@@ -57,11 +57,11 @@ class Asked:
 def test_beside_goals_of_end_effectors_the_base_has_what_is_asked(
     pose: Any, rotvec: Any, rpy_deg: Any, base: list[str]
 ) -> None:
-    asked: Any = Asked()
+    asked: Any = RequestedPart()
     hands = EndEffectorOptions((), (HAND,), ("left",))
     GoalOptions(pose, rotvec, rpy_deg, hands).apply_to(asked)
     assert asked.goals == [(pose, rotvec, rpy_deg), (["left"], base)]
-    alone: Any = Asked()
+    alone: Any = RequestedPart()
     GoalOptions(pose, rotvec, rpy_deg).apply_to(alone)
     assert alone.goals == [(pose, rotvec, rpy_deg)]
 
@@ -121,7 +121,7 @@ def test_a_rotation_of_more_than_a_turn_is_noted(
 ) -> None:
     warn_of_large_angles(rotvec, "--here")
     assert capsys.readouterr() == ("", said)
-    asked: Any = Asked()
+    asked: Any = RequestedPart()
     GoalOptions(None, rotvec, None).apply_to(asked)
     assert capsys.readouterr().err == said.replace("--here", "--goal-rpy-deg")
 
@@ -248,7 +248,7 @@ def test_paths_of_end_effectors_are_read_from_files(tmp_path: Path) -> None:
     options = EndEffectorOptions((), (HAND,), ("tip", "left", "right"), (places, poses))
     found = {each.link: each for each in options.goals()}
     assert found["tip"].waypoints is None
-    assert found["left"].values_on_way.tolist() == [[1.5, 0.7, 1.3], [1.3, -0.9, 0.8]]
+    assert found["left"].path_values.tolist() == [[1.5, 0.7, 1.3], [1.3, -0.9, 0.8]]
     assert found["right"].values == (0.4, 0.5, 0.6, 0.0, 0.6, 0.0, 0.8)
     assert found["right"].waypoints is not None
     assert found["right"].waypoints.tolist() == [[0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]]

@@ -152,7 +152,7 @@ def test_paths_of_end_effectors_reach_the_scenario(
     monkeypatch.setattr(type(load_scenario("arm_attitude")), "with_end_effectors", noted)
     call(command, "arm_attitude", "--end-effector-path", way_in(tmp_path))
     (hand,) = found
-    assert hand.values_on_way.tolist() == [[0.5, -0.1, 0.7], [0.4, 0.1, 0.8]]
+    assert hand.path_values.tolist() == [[0.5, -0.1, 0.7], [0.4, 0.1, 0.8]]
 
 
 def test_a_path_of_an_end_effector_is_sent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

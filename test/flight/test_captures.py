@@ -144,8 +144,8 @@ def test_states_are_those_at_which_base_and_joints_are_known(capture: Flight) ->
     assert np.array_equal(states.q, fewer.values[:, ::-1])
     middle = states.between(float(q.time[4]), float(q.time[6]))
     assert np.array_equal(middle.time, q.time[4:7])
-    assert np.array_equal(states.time[states.thinned_rows(2)], q.time[[3, 8]])
-    assert len(states.thinned_rows(100)) == 6
+    assert np.array_equal(states.time[states.sample_rows(2)], q.time[[3, 8]])
+    assert len(states.sample_rows(100)) == 6
 
 
 def test_a_planar_flight_determines_seven_parameters_of_the_block(capture: Flight) -> None:

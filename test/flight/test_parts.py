@@ -24,7 +24,7 @@ from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.topics import state_topics
 
-BEFORE, AFTER = lockstep._DecisionMoment
+BEFORE, AFTER = lockstep._DecisionState
 
 
 # -- the loop ------------------------------------------------------------------------------------
@@ -181,8 +181,8 @@ def test_contacts_are_among_the_events_of_their_time(engine: str) -> None:
     ]
     asked: list[tuple[int, bool]] = []
 
-    def contacts(every: int, *, pushing: bool) -> list[Event]:
-        asked.append((every, pushing))
+    def contacts(every: int, *, has_contact_forces: bool) -> list[Event]:
+        asked.append((every, has_contact_forces))
         return [event(contact, 0.5), event(contact, 0.75), event(contact, 2.0)]
 
     flight: Any = SimpleNamespace(clearance=None)

@@ -23,7 +23,7 @@ from spacerobot_ros.messages.layout import (
     column_dtype,
     encode_list,
     read_columns,
-    stamp_pairs,
+    seconds_and_nanoseconds,
     stamped_copies,
 )
 from spacerobot_ros.messages.readers import (
@@ -236,7 +236,7 @@ def test_lists_of_messages_have_a_row_each(count: int) -> None:
     raw = encode_list(
         "nav_msgs/msg/Path", {"header": {"frame_id": "world"}}, "poses",
         {"header": {"frame_id": "hand"}},
-        {"header.stamp.sec": stamp_pairs(times), "pose.position.x": positions},
+        {"header.stamp.sec": seconds_and_nanoseconds(times), "pose.position.x": positions},
     )  # fmt: skip
     message = deserialize_message(raw, Path)
     assert message.header.frame_id == "world"

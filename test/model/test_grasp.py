@@ -20,10 +20,10 @@ from spacerobot_ros.model.grasp import (
     Impact,
     Payload,
     RobotMotion,
+    combined_momenta,
     frame_motion,
     grasp_impact,
-    joined_momenta,
-    parted_momenta,
+    separated_momenta,
 )
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.resources import robot_file
@@ -139,7 +139,7 @@ def test_momentum_is_conserved_energy_is_not_gained_and_both_move_as_one(seed: i
     of_body = np.concatenate(body.momenta(TUMBLER))
     masses = robot.total_mass, TUMBLER.mass
     centers = center_of(robot, motion), body.at(Pose(r=TUMBLER.com)).r_WT
-    total = joined_momenta(masses, centers, (before[0], of_body))
+    total = combined_momenta(masses, centers, (before[0], of_body))
 
     impact = grasp_impact(robot, link, motion, body, TUMBLER)
     moved = after(motion, impact)
@@ -153,7 +153,7 @@ def test_momentum_is_conserved_energy_is_not_gained_and_both_move_as_one(seed: i
     # The body moves with the link: what it lost, the robot has.
     grasp = held_pose(robot, link, motion, body)
     carried = np.concatenate(frame_motion(robot, link, moved).at(grasp).momenta(TUMBLER))
-    alone = parted_momenta(masses, centers, both[0], carried)
+    alone = separated_momenta(masses, centers, both[0], carried)
     np.testing.assert_allclose(alone, momenta(robot, moved)[0], rtol=0, atol=1e-11)
     np.testing.assert_allclose(impact.impulse[:3], of_body[:3] - carried[:3], rtol=0, atol=1e-11)
 
@@ -237,10 +237,10 @@ def test_momenta_of_two_systems_are_about_the_common_centre() -> None:
     """A mass of 1 kg at the origin at rest, one of 3 kg at x = 4 m that moves along y by 2 m/s."""
     still, moving = np.zeros(6), np.array([0.0, 6.0, 0.0, 0.1, 0.2, 0.5])
     masses, centers = (1.0, 3.0), (np.zeros(3), np.array([4.0, 0.0, 0.0]))
-    together = joined_momenta(masses, centers, (still, moving))
+    together = combined_momenta(masses, centers, (still, moving))
     # The reduced mass, 0.75 kg, times 4 m and 2 m/s is 6 kg m^2/s.
     np.testing.assert_allclose(together, [0.0, 6.0, 0.0, 0.1, 0.2, 6.5], rtol=1e-15)
-    parted = parted_momenta(masses, centers, together, moving)
+    parted = separated_momenta(masses, centers, together, moving)
     np.testing.assert_allclose(parted, still, rtol=0, atol=1e-15)
 
 

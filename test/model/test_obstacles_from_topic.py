@@ -8,9 +8,9 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.urdf import load_robot, parse_robot, parse_world
 from spacerobot_ros.model.world import (
     MAX_OBSTACLES_TEXT,
-    among_obstacles,
+    links_with_shapes,
     obstacles_from_topic,
-    shaped_links,
+    with_obstacles_around,
     with_world,
 )
 from spacerobot_ros.resources import robot_file
@@ -27,7 +27,7 @@ BALL = (
 def test_a_text_is_obstacles_and_an_empty_one_is_none() -> None:
     world = obstacles_from_topic(BALL)
     assert world is not None
-    assert shaped_links(world) == ["ball", "post"]
+    assert links_with_shapes(world) == ["ball", "post"]
     for empty in ("", " \n"):
         assert obstacles_from_topic(empty) is None
     padded = BALL + " " * (MAX_OBSTACLES_TEXT - len(BALL))
@@ -63,12 +63,12 @@ def test_other_texts_are_refused(text: str, message: str) -> None:
 def test_a_robot_is_among_the_obstacles_that_came_last() -> None:
     robot = load_robot(robot_file("planar_chain"))
     before = with_world(robot, parse_world(BALL.replace("ball", "stone")))
-    other = among_obstacles(before, parse_world(BALL))
+    other = with_obstacles_around(before, parse_world(BALL))
     assert other.world is not None
     carried = parse_robot(other.urdf).world
     assert carried is not None
-    assert shaped_links(carried) == ["ball", "post"]
-    free = among_obstacles(other, None)
+    assert links_with_shapes(carried) == ["ball", "post"]
+    free = with_obstacles_around(other, None)
     assert free.world is None
     assert parse_robot(free.urdf).world is None
     assert "<world" not in free.urdf

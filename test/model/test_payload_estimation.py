@@ -15,7 +15,7 @@ from spacerobot_ros.model.payload_estimation import (
     PAYLOAD_PARAMETERS,
     PayloadEstimate,
     _from_log_cholesky,
-    _log_cholesky_slopes,
+    _log_cholesky_jacobian,
     _pseudo_inertia,
     estimate_payload,
     momentum_regressor,
@@ -200,4 +200,4 @@ def test_the_order_of_the_factor_is_that_of_the_parameters() -> None:
         (_from_log_cholesky(theta + step * e) - _from_log_cholesky(theta - step * e)) / (2 * step)
         for e in np.eye(10)
     ]
-    np.testing.assert_allclose(_log_cholesky_slopes(theta), np.transpose(slopes), atol=1e-8)
+    np.testing.assert_allclose(_log_cholesky_jacobian(theta), np.transpose(slopes), atol=1e-8)

@@ -64,7 +64,7 @@ def test_foreign_plants_publish_a_status_and_no_pose(
         resolve_topic_name=lambda topic: f"/{topic}",
         get_publishers_info_by_topic=lambda topic: [endpoint(name) for name in known[topic]],
     )
-    assert CommanderNode._foreign_plants(node) == foreign
+    assert CommanderNode._other_status_publishers(node) == foreign
 
 
 class Plant:
@@ -75,7 +75,7 @@ class Plant:
         self.taken: list[Any] = []
         self.node: Any = SimpleNamespace(
             _status_number=None, _doubted=False, _last_complaint=-1e9,
-            _foreign_plants=lambda: self.foreign,
+            _other_status_publishers=lambda: self.foreign,
             _subscribe_plant_status=lambda: self.taken.append("anew"),
             log=lambda *words: self.said.append(words),
             commander=SimpleNamespace(

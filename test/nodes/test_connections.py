@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import PlantNode
-from spacerobot_ros.nodes.common.streams import Connections, unconnected_topics
+from spacerobot_ros.nodes.common.streams import Connections, topics_without_all_matches
 
 PLANT = Connections((("/odom", 2), ("/clock", 1)), (("/joint_commands", 1),))
 PLANNER = Connections((("/joint_commands", 2),), (("/odom", 1),))
@@ -19,21 +19,23 @@ RECORDER = Connections((), (("/odom", 1), ("/clock", 1), ("/joint_commands", 1))
 
 
 def test_all_have_met_or_the_topics_say_who_has_not() -> None:
-    assert unconnected_topics([PLANT, PLANNER, RECORDER]) == set()
+    assert topics_without_all_matches([PLANT, PLANNER, RECORDER]) == set()
     early = Connections((("/odom", 1), ("/clock", 1)), PLANT.subscriptions)
-    assert unconnected_topics([early, PLANNER, RECORDER]) == {"/odom"}, (
+    assert topics_without_all_matches([early, PLANNER, RECORDER]) == {"/odom"}, (
         "a publisher knows one reader"
     )
     deaf = Connections((), (("/odom", 1), ("/clock", 0), ("/joint_commands", 1)))
-    assert unconnected_topics([PLANT, PLANNER, deaf]) == {"/clock"}, "a reader knows no publisher"
+    assert topics_without_all_matches([PLANT, PLANNER, deaf]) == {"/clock"}, (
+        "a reader knows no publisher"
+    )
     # Readers from elsewhere are no matter.
     more = Connections((("/odom", 7), ("/clock", 7)), PLANT.subscriptions)
-    assert unconnected_topics([more, PLANNER, RECORDER]) == set()
+    assert topics_without_all_matches([more, PLANNER, RECORDER]) == set()
 
 
 def test_two_readers_of_one_node_are_two() -> None:
     twice = Connections((), (("/clock", 1), ("/clock", 1)))
-    assert unconnected_topics([PLANT, PLANNER, RECORDER, twice]) == {"/clock"}
+    assert topics_without_all_matches([PLANT, PLANNER, RECORDER, twice]) == {"/clock"}
 
 
 @pytest.fixture
@@ -53,7 +55,7 @@ def test_a_node_answers_with_its_endpoints(harness: Harness, plant: PlantNode) -
     assert not {"/rosout", "/parameter_events"} & {topic for topic, _ in found.publishers}
     probe.create_publisher(String, "fault_injection", 10)
     harness.connect()
-    assert unconnected_topics([Connections.of(plant), Connections.of(probe)]) == set()
+    assert topics_without_all_matches([Connections.of(plant), Connections.of(probe)]) == set()
 
 
 def _odometry() -> Any:

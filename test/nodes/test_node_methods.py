@@ -22,7 +22,7 @@ from spacerobot_ros.nodes import recorder, replay
 from spacerobot_ros.nodes.common import messages, ros_parameters, watchdog
 from spacerobot_ros.nodes.common.messages import KnownFrames
 from spacerobot_ros.nodes.common.node import FlightNode
-from spacerobot_ros.nodes.common.watchdog import Liveness, Pulse, Role, Silence, Watchdog
+from spacerobot_ros.nodes.common.watchdog import HeartbeatState, Liveness, Role, Silence, Watchdog
 from spacerobot_ros.nodes.recorder import RecorderNode
 from spacerobot_ros.nodes.replay import ReplayNode
 from spacerobot_ros.planning import Goal
@@ -529,7 +529,7 @@ def test_a_node_beats_while_it_is_active_and_says_when_it_is_busy(
     assert (node.liveness._watchdog is not None) is watches
     node.liveness.end()
     node.liveness.end()
-    assert node.pulses() == [Pulse.INACTIVE.value]
+    assert node.pulses() == [HeartbeatState.INACTIVE.value]
     assert len(node.destroyed) == len(node.timers)
     assert node.contexts == []
     assert node.liveness._watchdog is None

@@ -375,7 +375,7 @@ class Draining:
     def _rest(self) -> None:
         self.rested += 1
 
-    def _look_at_status(self) -> None:
+    def _publish_changed_status(self) -> None:
         assert self.rested == 1
 
     def _step(self) -> None:

@@ -79,10 +79,10 @@ def plant(own: str, **changes: Any) -> Any:
         _reported_ns=0,
     )  # fmt: skip
     vars(node).update(changes)
-    node._steps_or_pauses = node._active in (RUNNING, PAUSED)
+    node._is_running_or_paused = node._active in (RUNNING, PAUSED)
     names = [
-        "_look_at_status", "_step", "_publish", "_publish_report", "_report_by_wall",
-        "_look_for_commanders", "_step_if_complete", "_count_commanders", "get_logger",
+        "_publish_changed_status", "_step", "_publish", "_publish_report", "_report_on_wall_clock",
+        "_check_for_commanders", "_step_if_complete", "_count_commanders", "get_logger",
     ]  # fmt: skip
     log = Kept(done, "log")
     for name in names:
@@ -112,7 +112,7 @@ def test_real_time_shortens_the_periods_of_viewers(
 ) -> None:
     node = plant("", _real_time=real_time)
     node._ticks = lambda seconds: ticks(node, seconds)
-    assert PlantNode._viewed_ticks(node, seconds, 0.6) == count, "0.6 wall s are 1.2 s here"
+    assert PlantNode._ticks_for_viewers(node, seconds, 0.6) == count, "0.6 wall s are 1.2 s here"
 
 
 ALL = ("markers", "clearance", "transforms")
@@ -150,8 +150,8 @@ def test_what_has_no_period_is_not_published_and_new_quantities_get_messages() -
     ("tick", "changes", "after"),
     [
         (40, {}, ["_publish"]),
-        (40, {"_injected_seen": "a fault"}, ["_publish", "_look_at_status"]),
-        (40, {"_capturing": SimpleNamespace(reports=[1])}, ["_look_at_status", "_publish"]),
+        (40, {"_injected_seen": "a fault"}, ["_publish", "_publish_changed_status"]),
+        (40, {"_capturing": SimpleNamespace(reports=[1])}, ["_publish_changed_status", "_publish"]),
         (40, {"_capturing": SimpleNamespace(reports=[])}, ["_publish"]),
         (plant_node._MAX_UNCONFIRMED_TICKS - 1, {}, ["_publish", ("publisher.await_readers",)]),
         (plant_node._MAX_UNCONFIRMED_TICKS, {}, ["_publish"]),
@@ -186,8 +186,8 @@ def test_a_publisher_keeps_half_of_its_states_for_slow_readers() -> None:
 
 @pytest.mark.parametrize(("since", "due"), [(949_999_999, False), (950_000_000, True)])
 def test_diagnostics_come_every_second_of_wall_time(since: int, due: bool) -> None:
-    node = plant("_report_by_wall", _reported_ns=7 * S - since)
-    PlantNode._report_by_wall(node)
+    node = plant("_report_on_wall_clock", _reported_ns=7 * S - since)
+    PlantNode._report_on_wall_clock(node)
     assert node.done == ["_publish_report"] * due
     PlantNode._publish_report(node)
     assert node._reported_ns == 7 * S
@@ -201,7 +201,7 @@ def test_diagnostics_come_every_second_of_wall_time(since: int, due: bool) -> No
         (RUNNING, 0, [], []),
         (RUNNING, 2, [], ["_step"] * 2),
         (RUNNING, 1, ["a", "b"], [("report.timed_out", "a", 0.5), ("report.timed_out", "b", 0.5),
-                                  "_look_at_status", "_step"]),
+                                  "_publish_changed_status", "_step"]),
     ],
 )  # fmt: skip
 def test_wall_time_steps_as_often_as_is_due(
@@ -220,18 +220,18 @@ def test_wall_time_steps_as_often_as_is_due(
 @pytest.mark.parametrize(
     ("changes", "must", "waits", "new", "done"),
     [
-        ({"_active": PAUSED}, True, True, True, ["_report_by_wall"]),
+        ({"_active": PAUSED}, True, True, True, ["_report_on_wall_clock"]),
         ({"_active": PAUSED, "_report_ticks": 0}, True, True, True, []),
-        ({}, True, True, True, ["_look_for_commanders", "_step"]),
-        ({}, False, True, True, ["_look_for_commanders", ("publisher.publish", 2 * S, True)]),
-        ({}, False, True, False, ["_look_for_commanders"]),
-        ({}, False, False, True, ["_look_for_commanders"]),
+        ({}, True, True, True, ["_check_for_commanders", "_step"]),
+        ({}, False, True, True, ["_check_for_commanders", ("publisher.publish", 2 * S, True)]),
+        ({}, False, True, False, ["_check_for_commanders"]),
+        ({}, False, False, True, ["_check_for_commanders"]),
     ],
 )
 def test_new_readers_get_the_state_that_the_plant_waits_with(
     changes: dict[str, Any], must: bool, waits: bool, new: bool, done: list[Any]
 ) -> None:
-    node = plant("_on_look_round", **changes)
+    node = plant("_on_subscriber_check", **changes)
     node._reported = SimpleNamespace(sensors=SimpleNamespace(dropout="lost"))
     asked: list[Any] = []
 
@@ -241,7 +241,7 @@ def test_new_readers_get_the_state_that_the_plant_waits_with(
 
     node._lockstep = SimpleNamespace(must_step_at_check=must_step, waits=waits)
     node._publisher.has_new_readers = lambda: new
-    PlantNode._on_look_round(node)
+    PlantNode._on_subscriber_check(node)
     assert node.done == done
     assert asked == [(40, "lost")] * (node._active is RUNNING)
 
@@ -253,9 +253,9 @@ def test_new_readers_get_the_state_that_the_plant_waits_with(
         (PlantState.FAILED, None, RUNNING, []),
         (RUNNING, None, RUNNING, ["_step_if_complete"]),
         (PAUSED, None, RUNNING, ["_step_if_complete"]),
-        (RUNNING, None, PlantState.RESTING, ["_look_at_status", "_step_if_complete"]),
+        (RUNNING, None, PlantState.RESTING, ["_publish_changed_status", "_step_if_complete"]),
         (RUNNING, False, PlantState.RESTING, ["refused", "_step_if_complete"]),
-        (RUNNING, True, RUNNING, ["refused", "_look_at_status", "_step_if_complete"]),
+        (RUNNING, True, RUNNING, ["refused", "_publish_changed_status", "_step_if_complete"]),
     ],
 )
 def test_commands_are_offered_reported_and_completed(
@@ -300,7 +300,7 @@ def test_only_a_running_plant_with_all_commands_steps(active: PlantState, comple
 def test_injections_that_are_refused_change_nothing() -> None:
     node = plant("_on_injection")
     PlantNode._on_injection(node, node.done.append, String(data="clear"))
-    assert node.done == ["clear", "_look_at_status"]
+    assert node.done == ["clear", "_publish_changed_status"]
 
     def refuse(text: str) -> None:
         raise ParameterError(f"There is no fault '{text}'.")
@@ -323,7 +323,7 @@ def test_a_reset_is_known_before_the_next_state(active: PlantState) -> None:
     node = plant("_on_reset", _active=active)
     said = (True, "The robot is back in its initial state; time goes on.")
     assert answer(PlantNode._on_reset, node) == said
-    first = [("plant.reset",), ("commands.begin", 2 * S), "_look_at_status"]
+    first = [("plant.reset",), ("commands.begin", 2 * S), "_publish_changed_status"]
     assert node.done == first + ["_publish"] * (active is not INACTIVE)
     assert (node._monitor.resets, node._monitor.rearms) == (6, 2)
 
@@ -337,11 +337,11 @@ def test_a_plant_is_stopped_and_armed_again(fault: str, message: str, rearms: in
     stopped = (True, "The joints come to rest; nothing moves until '~/rearm' is called.")
     assert answer(PlantNode._on_abort, node) == stopped
     latched = ("commands.latch", "abort", "aborted on request", 2 * S)
-    assert node.done == [latched, ("report.latched",), "_look_at_status"]
+    assert node.done == [latched, ("report.latched",), "_publish_changed_status"]
     node.done.clear()
     node._commands = SimpleNamespace(rearm=lambda: fault)
     assert answer(PlantNode._on_rearm, node) == (True, message)
-    assert node.done == ["_look_at_status"] * bool(fault)
+    assert node.done == ["_publish_changed_status"] * bool(fault)
     assert (node._monitor.resets, node._monitor.rearms) == (5, rearms)
 
 
@@ -381,7 +381,7 @@ def test_a_capture_is_told_with_its_time(active: PlantState) -> None:
     node._grasp = lambda response, act: PlantNode._grasp(node, response, act)
     assert answer(PlantNode._on_capture, node) == (True, "caught at 2 s")
     assert answer(PlantNode._on_release, node) == (True, "freed at 2 s")
-    assert node.done == ["_look_at_status"] * 2
+    assert node.done == ["_publish_changed_status"] * 2
 
 
 @pytest.mark.parametrize("real", [False, True])
@@ -402,7 +402,7 @@ def test_a_pause_ends_as_it_began(
     assert answer(PlantNode._on_pause, node, SetBool.Request(data=pause)) == (True, wanted)
     assert node._active is after
     more: list[Any] = [("time.start", 7 * S, 40) if real else "_step_if_complete"]
-    assert node.done == ["_look_at_status", *(more if goes_on else [])]
+    assert node.done == ["_publish_changed_status", *(more if goes_on else [])]
 
 
 def test_timers_are_destroyed_and_forgotten() -> None:
@@ -419,7 +419,7 @@ def test_a_plant_that_is_deactivated_drops_its_commands(active: PlantState) -> N
     PlantNode.deactivate(node)
     ended = active in (INACTIVE, PlantState.FAILED)
     assert node._active is (active if ended else INACTIVE)
-    assert node.done == ([] if ended else [("commands.rest",), "_look_at_status"])
+    assert node.done == ([] if ended else [("commands.rest",), "_publish_changed_status"])
 
 
 @pytest.mark.parametrize(
@@ -430,7 +430,7 @@ def test_a_failure_has_a_reason(error: Exception, reason: str) -> None:
     PlantNode.on_failure(node, "It failed.", error)
     assert node._monitor.failure == (reason, "It failed.")
     assert node._active is PlantState.FAILED
-    assert node.done == [("commands.rest",), "_look_at_status"]
+    assert node.done == [("commands.rest",), "_publish_changed_status"]
     early = plant("on_failure", _stop_timers=lambda: None, _monitor=None)
     shown: list[Any] = []
     early._publish_status = shown.append

@@ -21,7 +21,7 @@ from support.made_bags import joint_states
 from spacerobot_ros.bag import BagWriter, QosProfile, Recording
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.nodes import recorder
-from spacerobot_ros.nodes.common.streams import RawInput, RawStream, StreamTaps
+from spacerobot_ros.nodes.common.streams import RawInput, RawStream, StreamListeners
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 LATCHED, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
@@ -68,7 +68,7 @@ class Heard:
 
 
 def taps_of(*streams: RawStream) -> Any:
-    taps = StreamTaps()
+    taps = StreamListeners()
     taps.nodes = [SimpleNamespace(raw_streams=[stream]) for stream in streams]
     return taps
 

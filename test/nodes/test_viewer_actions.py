@@ -102,7 +102,7 @@ class Stand:
             offer_end_effectors=self.offered.append,
             moving=False,
             touch=self.touched.append,
-            goals_at_rest=lambda now: self.at_rest,
+            settled_goals=lambda now: self.at_rest,
             show_check=lambda check: self.checks.append((check.verdict, check.message)),
         )
         page = SimpleNamespace(

@@ -16,7 +16,7 @@ from support.ros_harness import Harness
 
 from spacerobot_ros.model.compilation import c_compiler, compiled
 from spacerobot_ros.nodes import RecorderNode
-from spacerobot_ros.nodes.common.watchdog import Liveness, Pulse, Role, Silence, Watchdog
+from spacerobot_ros.nodes.common.watchdog import HeartbeatState, Liveness, Role, Silence, Watchdog
 from spacerobot_ros.simulation.status import PlantState
 
 REAL_TIME = {"time_mode": "realtime", "real_time_factor": 1.0, "command_timeout": 5.0}
@@ -64,8 +64,8 @@ def test_a_node_that_is_silent_is_named_once_within_a_second() -> None:
     assert not watch.watchdog.silent
 
 
-@pytest.mark.parametrize("pulse", [Pulse.INACTIVE, Pulse.BUSY])
-def test_nothing_is_expected_of_nodes_that_say_so(pulse: Pulse) -> None:
+@pytest.mark.parametrize("pulse", [HeartbeatState.INACTIVE, HeartbeatState.BUSY])
+def test_nothing_is_expected_of_nodes_that_say_so(pulse: HeartbeatState) -> None:
     watch = Watch()
     watch.spend(1.0, "/planner")
     watch.hear("/planner", pulse.value)
@@ -245,7 +245,7 @@ def test_a_planner_that_plans_is_busy_and_not_silent(
     heard = ["active"]
     beat = flight.planner._liveness._publish
 
-    def publish(pulse: Pulse) -> None:
+    def publish(pulse: HeartbeatState) -> None:
         heard.append(pulse.value)
         beat(pulse)
 
@@ -270,7 +270,7 @@ def test_an_active_node_that_compiles_is_busy_and_not_silent(
     flight = Watched(harness)
     heard: list[str] = []
 
-    def publish(pulse: Pulse) -> None:
+    def publish(pulse: HeartbeatState) -> None:
         heard.append(pulse.value)
 
     monkeypatch.setattr(flight.planner._liveness, "_publish", publish)

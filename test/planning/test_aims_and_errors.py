@@ -150,8 +150,8 @@ def test_the_worst_parts_of_an_error_are_named() -> None:
     )
     error = PoseError(np.array([2.0, 3.0, 6.0]), np.zeros(3), np.array([0.1, -0.7]), hands)
     assert (error.distance, error.angle, error.max_joint_error) == (7.0, 0.0, 0.7)
-    assert error.farthest_end_effector == 5.0
-    assert error.most_turned_end_effector == 0.5
+    assert error.largest_end_effector_distance == 5.0
+    assert error.largest_end_effector_angle == 0.5
     alone = PoseError(np.zeros(3), np.zeros(3))
-    assert (alone.max_joint_error, alone.farthest_end_effector) == (0.0, 0.0)
-    assert alone.most_turned_end_effector == 0.0
+    assert (alone.max_joint_error, alone.largest_end_effector_distance) == (0.0, 0.0)
+    assert alone.largest_end_effector_angle == 0.0

@@ -20,7 +20,11 @@ from support.slow import some_fast
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
 from spacerobot_ros.planning.methods.area_loop import edge_path
-from spacerobot_ros.planning.methods.nominal_shape import NominalShape, best_nominal, given_nominal
+from spacerobot_ros.planning.methods.nominal_shape import (
+    NominalShape,
+    best_nominal,
+    nominal_at_shape,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -93,7 +97,7 @@ def test_small_loops_turn_the_base_by_the_curvature_matrix(
     oracle = PinocchioOracle(urdf, robot.joint_names)
     shape = NOMINAL if seed is None else np.clip([0.3, -0.4, 0.5, 0.2], robot.lower, robot.upper)
     joints = (0, 1, 2) if seed is None else (3, 0, 2)
-    nominal = given_nominal(robot, shape, [joints], 1.0)
+    nominal = nominal_at_shape(robot, shape, [joints], 1.0)
     errors = []
     for size in (4e-3, 1e-3):
         S = size * np.array(areas)
@@ -106,7 +110,7 @@ def test_small_loops_turn_the_base_by_the_curvature_matrix(
 
 
 def test_the_condition_number_of_the_papers_nominal_shape(arm: SpaceRobot) -> None:
-    nominal = given_nominal(arm, NOMINAL, [(0, 1, 2)], 1.0)
+    nominal = nominal_at_shape(arm, NOMINAL, [(0, 1, 2)], 1.0)
     assert nominal.condition == pytest.approx(3.60, abs=5e-3)
 
 
@@ -121,7 +125,7 @@ def test_the_best_nominal_shape_is_better_than_any_of_many(arm: SpaceRobot) -> N
 
     rng = np.random.default_rng(5)
     for shape in rng.uniform(arm.lower, arm.upper, (500, 3)):
-        assert worst_turn(given_nominal(arm, shape, [(0, 1, 2)], 1.0)) <= worst_turn(best) + 1e-6
+        assert worst_turn(nominal_at_shape(arm, shape, [(0, 1, 2)], 1.0)) <= worst_turn(best) + 1e-6
     # Loops of a radian fit round it.
     assert np.all(best.shape - 0.5 >= arm.lower)
     assert np.all(best.shape + 0.5 <= arm.upper)

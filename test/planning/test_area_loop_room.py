@@ -16,7 +16,10 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
-from spacerobot_ros.planning.methods.nominal_shape import NominalShapeChooser, roomy_nominal
+from spacerobot_ros.planning.methods.nominal_shape import (
+    NominalShapeChooser,
+    nominal_with_clearance,
+)
 from spacerobot_ros.resources import robot_file
 
 GOAL = Goal.checked([0, 0, 0], Rotation.from_rotvec([0.1, -0.2, 0.3]).as_quat())
@@ -59,31 +62,33 @@ def walled(arm: SpaceRobot, **options: Any) -> AreaLoopGait:
 
 
 def test_boxes_of_loops_keep_clear_and_are_the_best_that_do(arm: SpaceRobot) -> None:
-    free = roomy_nominal(arm, START.q, [(0, 1, 2)], 1.0, 0.5, lambda shapes: True)
-    kept = roomy_nominal(arm, START.q, [(0, 1, 2)], 1.0, 0.5, beyond_the_wall)
+    free = nominal_with_clearance(arm, START.q, [(0, 1, 2)], 1.0, 0.5, lambda shapes: True)
+    kept = nominal_with_clearance(arm, START.q, [(0, 1, 2)], 1.0, 0.5, beyond_the_wall)
     assert free is not None
     assert kept is not None
     assert free.shape[1] > WALL, "the best one is beyond the wall only if it must be"
     assert kept.shape[1] + kept.longest[1] / 2 <= WALL + 1e-12
     assert kept.longest.max() <= 0.5
-    assert roomy_nominal(arm, START.q, [(0, 1, 2)], 1.0, 0.5, lambda shapes: False) is None
+    assert nominal_with_clearance(arm, START.q, [(0, 1, 2)], 1.0, 0.5, lambda shapes: False) is None
     seen: list[Array] = []
 
     def refuse(shapes: Array) -> bool:
         seen.append(shapes)
         return False
 
-    roomy_nominal(arm, START.q, [(0, 1, 2)], 1.0, 0.5, refuse)
+    nominal_with_clearance(arm, START.q, [(0, 1, 2)], 1.0, 0.5, refuse)
     assert {each.shape for each in seen} == {(27, 3)}
     np.testing.assert_allclose(np.ptp(seen[0], axis=0), free.longest)
     np.testing.assert_allclose(seen[0].mean(axis=0), free.shape)
 
 
 def test_smaller_boxes_are_looked_for_and_none_where_users_chose(arm: SpaceRobot) -> None:
-    found = list(NominalShapeChooser(arm, 0.8, "", ()).roomier(START.q, beyond_the_wall))
+    found = list(
+        NominalShapeChooser(arm, 0.8, "", ()).shapes_with_more_room(START.q, beyond_the_wall)
+    )
     assert [each.longest.max() for each in found] == pytest.approx([0.8, 0.4, 0.2, 0.1])
     given = NominalShapeChooser(arm, 0.8, "", (0.1, -1.7, 1.0))
-    assert list(given.roomier(START.q, beyond_the_wall)) == []
+    assert list(given.shapes_with_more_room(START.q, beyond_the_wall)) == []
 
 
 def test_a_loop_without_room_goes_elsewhere_and_one_with_room_stays(arm: SpaceRobot) -> None:

@@ -289,8 +289,8 @@ def test_notes_of_goals_of_hands_have_the_errors_that_count(
     errors = {
         "angle": 0.1,
         "distance": 0.2,
-        "farthest_end_effector": 0.3,
-        "most_turned_end_effector": 0.4,
+        "largest_end_effector_distance": 0.3,
+        "largest_end_effector_angle": 0.4,
     }
     between = SimpleNamespace(between=lambda *_: SimpleNamespace(**errors))
     monkeypatch.setattr(module, "PoseError", between)

@@ -21,7 +21,7 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.held_commands import DriftVariation
-from spacerobot_ros.planning.methods.optimal.method import OptimalGait, _Found
+from spacerobot_ros.planning.methods.optimal.method import OptimalGait, _PlanResult
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
 
 ATTITUDE = Rotation.from_rotvec([0.4, -0.3, 0.7]).as_quat()
@@ -186,7 +186,7 @@ def test_joints_rest_until_the_drift_leads_past_the_goal(
     asked: list[Any] = []
     moves = ARM_START + np.outer(np.linspace(0.0, 1.0, 31) ** 2, [0.2, -0.3, 0.1])
 
-    def search(self: OptimalGait, request: Any, boundary: Any, *others: Any) -> _Found:
+    def search(self: OptimalGait, request: Any, boundary: Any, *others: Any) -> _PlanResult:
         asked.append((request.state, boundary, others[1].longest, *others[3:]))
         # The start; then by turns at zero momentum, and with that of the robot.
         if len(asked) == 1:
@@ -194,7 +194,7 @@ def test_joints_rest_until_the_drift_leads_past_the_goal(
         if len(asked) == 3:
             raise PlanningError("Links are in contact.")
         manoeuvre: Any = None
-        return _Found(manoeuvre, moves, {"starts": 2.0})
+        return _PlanResult(manoeuvre, moves, {"starts": 2.0})
 
     monkeypatch.setattr(OptimalGait, "_begin_now", search)
     goal = (Rotation.from_quat(ATTITUDE) * TURN).as_rotvec()

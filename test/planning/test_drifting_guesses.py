@@ -96,7 +96,7 @@ def test_joints_that_coast_first_begin_later_and_go_the_same_way(guesses: Initia
     instants = np.linspace(0.0, 1.0, 61)
     paths = np.array([START + np.outer(instants**p, FINAL - START) for p in (1.0, 2.0)])
     shares = Shares(np.array([0.25, 0.6]))
-    found = guesses._after_coasting(paths, shares)  # type: ignore[arg-type]
+    found = guesses._loops_after_coasting(paths, shares)  # type: ignore[arg-type]
     assert shares.asked == (0.0, 0.6, 2)
     for path, share, power in zip(found, shares.shares, (1.0, 2.0), strict=True):
         assert np.all(path[instants <= share] == START)

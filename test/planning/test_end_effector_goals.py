@@ -316,8 +316,8 @@ def test_errors_are_those_of_the_links() -> None:
     aim = EndEffectorGoal("end_effector", r + shift, (R * turn).as_quat())
     goal = Goal.of_end_effectors([aim])
     error = PoseError.between(PLACE, ATTITUDE.as_quat(), goal, ARM, robot)
-    assert error.farthest_end_effector == pytest.approx(0.05)
-    assert error.most_turned_end_effector == pytest.approx(0.02)
+    assert error.largest_end_effector_distance == pytest.approx(0.05)
+    assert error.largest_end_effector_angle == pytest.approx(0.02)
     parts = frozenset({"end_effectors"})
     assert Tolerance(0.051, 0.021).admits(error, parts)  # type: ignore[arg-type]
     assert not Tolerance(0.049, 0.021).admits(error, parts)  # type: ignore[arg-type]

@@ -125,7 +125,7 @@ def test_turns_on_direct_ways_are_those_of_many_small_steps(
     arm: SpaceRobot, rows: EndEffectorRows
 ) -> None:
     ends = np.array([OTHER, [1.3, -0.6, 0.9]])
-    for X, end in zip(rows.turns_on_direct_way(ARM, ends), ends, strict=True):
+    for X, end in zip(rows.turns_along_direct_path(ARM, ends), ends, strict=True):
         turned, step = Rotation.identity(), (end - ARM) / 600
         for k in range(600):
             A = arm.connection(ARM + (k + 0.5) * step)[3:]
@@ -358,7 +358,7 @@ def test_possible_ends_are_at_the_goal_and_different_and_the_nearest_come_first(
         if fixed:
             assert (Rotation.from_quat(end.turn).inv() * X).magnitude() < 1e-9
         else:
-            direct = kind.rows.turns_on_direct_way(ARM, end.shape[np.newaxis])[0]
+            direct = kind.rows.turns_along_direct_path(ARM, end.shape[np.newaxis])[0]
             np.testing.assert_allclose(end.turn, direct, atol=1e-12)
         times.append(np.abs((end.shape - ARM) / limits.velocity).max())
         for other in boundary.ends[:k]:

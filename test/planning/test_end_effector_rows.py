@@ -105,7 +105,7 @@ def test_straight_ways_turn_the_base_as_momentum_says(
     arm: SpaceRobot, pose_rows: EndEffectorRows
 ) -> None:
     ends = np.array([[1.2, -0.2, 0.3], [-0.5, -1.4, 2.0]])
-    found = pose_rows.turns_on_direct_way(ARM, ends)
+    found = pose_rows.turns_along_direct_path(ARM, ends)
     for end, X in zip(ends, found, strict=True):
 
         def rate(t: float, x: Array, end: Array = end) -> Array:
@@ -127,7 +127,7 @@ def specification(arm: SpaceRobot, goal: Goal) -> EndEffectorSpecification:
 def position_goal(arm: SpaceRobot, way: Array) -> tuple[EndEffectorSpecification, Array]:
     """Return the specification of a position that the arm reaches, and its parameters."""
     rows = EndEffectorRows(arm, [(HAND, False)], np.eye(3))
-    X = rows.turns_on_direct_way(ARM, way[np.newaxis])[0]
+    X = rows.turns_along_direct_path(ARM, way[np.newaxis])[0]
     r_CE, _ = hand_from_center(Rotation.from_quat(X), way)
     r_WC = PLACE + ATTITUDE.apply(arm.center_of_mass(ARM))
     goal = Goal.of_end_effectors([EndEffectorGoal(HAND, r_WC + ATTITUDE.apply(r_CE))])
@@ -148,7 +148,7 @@ def test_ends_of_guesses_are_at_the_goal_and_the_soonest_is_first(arm: SpaceRobo
         r_CE, _ = hand_from_center(Rotation.from_quat(each.turn), each.shape)
         assert np.abs(r_CE - parameters[:3]).max() <= 2e-3
         assert np.all((LOWER - 1e-12 <= each.shape) & (each.shape <= UPPER + 1e-12))
-        exact = found.rows.turns_on_direct_way(ARM, each.shape[np.newaxis])[0]
+        exact = found.rows.turns_along_direct_path(ARM, each.shape[np.newaxis])[0]
         np.testing.assert_allclose(each.turn, exact, atol=1e-12)
         for other in ends[:k]:
             assert np.max(np.abs(each.shape - other.shape) / half) > 0.05
@@ -177,9 +177,9 @@ def test_inverse_kinematics_with_a_base_that_follows_is_given_or_turns_by_loops(
             if attitude is not None:
                 np.testing.assert_array_equal(X[k], given)
             elif follows:
-                exact = found.rows.turns_on_direct_way(ARM, q[k : k + 1])[0]
+                exact = found.rows.turns_along_direct_path(ARM, q[k : k + 1])[0]
                 np.testing.assert_allclose(X[k], exact, atol=1e-12)
-    free = found.rows.turns_on_direct_way(ARM, shapes)
+    free = found.rows.turns_along_direct_path(ARM, shapes)
     assert free.shape == (3, 4)
 
 

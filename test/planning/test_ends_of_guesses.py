@@ -125,7 +125,7 @@ class Plane:
     def connection(self, _: Array) -> Any:
         return SimpleNamespace(full=lambda: np.zeros((6, self.columns)))
 
-    def turns_on_direct_way(self, start: Array, shapes: Array) -> Array:
+    def turns_along_direct_path(self, start: Array, shapes: Array) -> Array:
         self.columns = 2 * len(shapes)
         return np.tile(IDENTITY, (len(shapes), 1))
 

@@ -240,10 +240,10 @@ def test_a_path_is_a_goal_with_waypoints() -> None:
     assert aim.quaternion is not None
     np.testing.assert_array_equal(aim.quaternion, [0, 0, 0, -1])
     np.testing.assert_array_equal(aim.waypoints, [[1, 2, 3, 0, 0, 1, 0]])
-    np.testing.assert_array_equal(aim.values_on_way[1], aim.values)
+    np.testing.assert_array_equal(aim.path_values[1], aim.values)
     one = EndEffectorGoal.along("hand", [[1, 2, 3]])
     assert (one.waypoints, one.quaternion) == (None, None)
-    np.testing.assert_array_equal(one.values_on_way, [[1, 2, 3]])
+    np.testing.assert_array_equal(one.path_values, [[1, 2, 3]])
     goal, other = (
         Goal.of_end_effectors([aim]),
         Goal.of_end_effectors([replace(aim, waypoints=None)]),
@@ -251,7 +251,7 @@ def test_a_path_is_a_goal_with_waypoints() -> None:
     assert goal.has_path
     assert not other.has_path
     assert not goal.equals(other)
-    assert goal.equals(Goal.of_end_effectors([EndEffectorGoal.along("hand", aim.values_on_way)]))
+    assert goal.equals(Goal.of_end_effectors([EndEffectorGoal.along("hand", aim.path_values)]))
     assert waypoint_counts(goal) == {"hand": 1}
     assert waypoint_counts(other) == {}
 
@@ -324,5 +324,5 @@ def test_a_goal_with_a_path_is_displaced_with_its_waypoints() -> None:
     way = [[0.1, 0.2, 0.3, 0.0, 0.6, 0.0, 0.8], [1.0, -2.0, 3.0, 0.0, 0.0, 0.0, 1.0]]
     goal = Goal.of_end_effectors([EndEffectorGoal.along("tip", way)])
     (moved,) = goal.displaced(np.array([1.0, 10.0, -100.0])).end_effectors
-    assert moved.values_on_way[:, :3].tolist() == [[1.1, 10.2, -99.7], [2.0, 8.0, -97.0]]
-    assert moved.values_on_way[:, 3:].tolist() == [row[3:] for row in way]
+    assert moved.path_values[:, :3].tolist() == [[1.1, 10.2, -99.7], [2.0, 8.0, -97.0]]
+    assert moved.path_values[:, 3:].tolist() == [row[3:] for row in way]

@@ -75,14 +75,14 @@ def test_waves_fade_where_joints_are_near_their_ends(holder: Any) -> None:
     """Within 0.02 of half a range of 1.2 or 2: by a cubic from nothing at the end."""
     near, at = [1.4 - 0.006, -2.0 + 0.04, 50.0], [-1.0, 2.0 + 1e-3, -50.0]
     q = np.array([near, at, [1.4 - 0.024, 0.0, 0.0]])
-    found = holder._fading(q, LIMITS)
+    found = holder._smooth_weights(q, LIMITS)
     x = 0.006 / 0.024
     np.testing.assert_allclose(
         found, [[x**2 * (3 - 2 * x), 1.0, 1.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]], atol=1e-9
     )
-    np.testing.assert_allclose(holder._fading(q[0], LIMITS), found[0])
+    np.testing.assert_allclose(holder._smooth_weights(q[0], LIMITS), found[0])
     still = MotionLimits(np.zeros(3), np.zeros(3), np.ones(3), np.ones(3))
-    np.testing.assert_array_equal(holder._fading(np.zeros(3), still), 0.0)
+    np.testing.assert_array_equal(holder._smooth_weights(np.zeros(3), still), 0.0)
 
 
 def test_ramps_move_the_last_shape_alone(holder: Any) -> None:

@@ -99,7 +99,7 @@ def test_pairs_that_rows_underestimate_spend_room() -> None:
     among.base_poses = lambda *_: "base"
     pairs.add([near(pair, 0.0) for pair in range(4)])
     positions = np.array([START, FINAL])
-    assert pairs.spend_room(positions, np.array([IDENTITY, TURN.as_quat()])) is True
+    assert pairs.reduce_margins(positions, np.array([IDENTITY, TURN.as_quat()])) is True
     # The second one is nearer than its rows say, and the third farther by 1 mm, less than the room.
     expected = {0: 0.009 - 0.03 + 0.002, 1: 0.002, 2: 0.002, 3: 0.002}
     assert pairs._room == pytest.approx(expected)
@@ -108,7 +108,7 @@ def test_pairs_that_rows_underestimate_spend_room() -> None:
     np.testing.assert_allclose(wanted, required + 0.05)
     assert base == "base"
     # The same again spends nothing more.
-    assert pairs.spend_room(positions, np.array([IDENTITY, TURN.as_quat()])) is False
+    assert pairs.reduce_margins(positions, np.array([IDENTITY, TURN.as_quat()])) is False
     assert pairs._room == pytest.approx(expected)
 
 

@@ -18,7 +18,7 @@ from spacerobot_ros.planning.methods.nominal_shape import (
     NominalShape,
     NominalShapeChooser,
     best_nominal,
-    given_nominal,
+    nominal_at_shape,
 )
 
 Array = npt.NDArray[np.float64]
@@ -140,7 +140,7 @@ def test_shapes_without_room_are_passed_over_if_there_are_others() -> None:
 def test_a_given_shape_has_the_triple_that_turns_the_base_most_and_edges_of_the_ranges() -> None:
     robot = robot_with([-1.0, -2.0, -0.1, -1.0], [1.4, 2.0, 0.2, 1.0], [0.0] * 4)
     shape = np.array([0.1, 0.0, 0.15, -0.2])
-    found = given_nominal(robot, shape, [(1, 2, 3), (0, 1, 2)], 1.5)
+    found = nominal_at_shape(robot, shape, [(1, 2, 3), (0, 1, 2)], 1.5)
     assert found.joints == (0, 1, 2)
     # Not those round the shape: boxes are moved into the limits.
     np.testing.assert_allclose(found.longest, [1.5, 1.5, 0.3])

@@ -15,7 +15,7 @@ from support.planner_phases import executing, planning, resting, stub_of, twisti
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.urdf import load_robot, parse_world
-from spacerobot_ros.model.world import among_obstacles
+from spacerobot_ros.model.world import with_obstacles_around
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -110,7 +110,7 @@ def test_without_obstacles_nothing_is_looked_at() -> None:
     use(loop, lambda positions, base: ["here"], has_obstacles=False)
     assert loop.executive.phase is Phase.EXECUTING
     loop.executive._worker.clearance = None
-    assert loop.executive._nears_obstacles(loop.executive._active_goal) == ""  # type: ignore[arg-type]
+    assert loop.executive._obstacle_clause(loop.executive._active_goal) == ""  # type: ignore[arg-type]
 
 
 def test_a_plan_that_is_made_is_made_again_for_a_goal_that_rests_or_waits() -> None:
@@ -157,7 +157,7 @@ def test_a_path_of_the_base_is_read_between_its_poses() -> None:
 
 def test_the_clearance_of_another_robot_is_among_the_same_obstacles() -> None:
     robot = load_robot(robot_file("planar_chain"))
-    described = among_obstacles(robot, parse_world(BALL))
+    described = with_obstacles_around(robot, parse_world(BALL))
     other = Clearance(described, 0.03).of(robot)
     assert (other._robot.world, other.distance) == (described.world, 0.03)
 
@@ -166,7 +166,7 @@ def test_the_clearance_of_another_robot_is_among_the_same_obstacles() -> None:
 def test_a_worker_plans_among_the_obstacles_that_it_is_given(*, obstacles: bool) -> None:
     loop = resting()
     robot, config = loop.plant.robot, PlannerConfig(clearance=0.0)
-    described = among_obstacles(robot.description, parse_world(BALL)) if obstacles else None
+    described = with_obstacles_around(robot.description, parse_world(BALL)) if obstacles else None
     worker = PlanningWorker(robot, config, loop.method, described=described)
     if described is None:
         assert worker.clearance is None

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedWay
+from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 
 Array = npt.NDArray[np.float64]
 
@@ -136,7 +136,7 @@ def test_the_motion_stops_at_sharp_corners_and_without_a_tolerance_at_all() -> N
 
 def test_a_blend_is_a_parabola_between_both_lines() -> None:
     path, tolerance = at_rest(CORNER[:3]), 0.03
-    way = RoundedWay(path, tolerance, before=0.2, whole=7.0)
+    way = RoundedPath(path, tolerance, before=0.2, whole=7.0)
     d, total = 4 * tolerance, 0.8
     to, on = np.array([0.0, 0.8, 0.6]), np.array([1.0, 0.0, 0.0])
     for s in (0.1, 0.5 - d, 0.45, 0.5, 0.57, 0.5 + d, 0.8):
@@ -151,17 +151,17 @@ def test_a_blend_is_a_parabola_between_both_lines() -> None:
     assert way.length == pytest.approx(0.8)
     assert (way.whole, way.is_straight) == (7.0, False)
     assert way.travelled(0.5) == pytest.approx(0.6)
-    assert RoundedWay(at_rest(CORNER[:2]), 0.1).is_straight
-    assert RoundedWay(at_rest(CORNER[:2]), 0.1).whole == pytest.approx(0.5)
+    assert RoundedPath(at_rest(CORNER[:2]), 0.1).is_straight
+    assert RoundedPath(at_rest(CORNER[:2]), 0.1).whole == pytest.approx(0.5)
     # Blends meet halfway on a short line.
-    narrow = RoundedWay(path, 0.05)
+    narrow = RoundedPath(path, 0.05)
     np.testing.assert_allclose(narrow.marks[[0, -1]] * total, [0.35, 0.65], atol=1e-12)
 
 
 @pytest.mark.parametrize("tolerance", [0.01, 0.2])
 def test_rates_are_derivatives_and_corners_are_rounded(tolerance: float) -> None:
     path = turning()
-    way, h = RoundedWay(path, tolerance), 1e-6
+    way, h = RoundedPath(path, tolerance), 1e-6
     shares = np.concatenate([np.linspace(0.003, 0.997, 40), way.marks])
     for share in shares:
         slope = (way.place(share + h) - way.place(share - h)) / (2 * h)

@@ -10,7 +10,7 @@ import pytest
 from spacerobot_ros import plan
 from spacerobot_ros.cli.progress import Display, display
 from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.model.compilation import ANNOUNCEMENT
+from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE
 from spacerobot_ros.planning.core.progress import SearchProgress, log_progress, report_progress
 
 _LOG = logging.getLogger("spacerobot_ros.planning.somewhere")
@@ -50,7 +50,7 @@ def test_listening_changes_nothing_for_others() -> None:
     sentences: list[str] = []
     with report_progress(lambda progress: None, sentences.append):
         _LOG.info("something")
-        _LOG.info("It takes long.", extra={ANNOUNCEMENT: True})
+        _LOG.info("It takes long.", extra={ANNOUNCEMENT_ATTRIBUTE: True})
         log_progress(_LOG, SearchProgress(1, 2), "start 1")
     assert sentences == ["It takes long."]
     assert (package.level, package.handlers) == (before, handlers)

@@ -426,8 +426,8 @@ def test_a_singularity_is_not_stepped_over(
     robot, state = manipulator
     module = "spacerobot_ros.planning.methods.resolved_rate."
     monkeypatch.setattr(module + "_STEP", first_step)
-    monkeypatch.setattr(module + "_FEWEST_STEPS", 2)
-    monkeypatch.setattr(module + "_APPROACH", 1.0)
+    monkeypatch.setattr(module + "_MIN_STEPS", 2)
+    monkeypatch.setattr(module + "_SINGULARITY_STEP_SHARE", 1.0)
     method = build_method("resolved_rate", robot, 0.01, 0.01, {})
     assert isinstance(method, ResolvedRateGait)
     path = method.path(request_b(state))

@@ -274,7 +274,7 @@ def test_solutions_nearly_as_good_as_the_best_are_refined(
     found = search.search(BOUNDARY, LIMITS, IDENTITY, 80, options)
     assert len(search.scripted[80].calls) == refined == len(found.solutions)
     assert found.duration == pytest.approx(min(fine))
-    assert (found.starts, found.cut_short, found.kept_apart) == (4, False, 0)
+    assert (found.starts, found.cut_short, found.separated_pairs) == (4, False, 0)
 
 
 @pytest.mark.parametrize(

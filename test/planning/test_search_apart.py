@@ -104,7 +104,7 @@ class Kept:
         for each in near:
             self.rooms[each.pair] = self.rooms.get(each.pair, 0) + 1
 
-    def spend_room(self, positions: Array, _: Array) -> bool:
+    def reduce_margins(self, positions: Array, _: Array) -> bool:
         duration = round((len(positions) - 1) * PERIOD, 6)
         self.spent.append(duration)
         less = self.too_far.get(duration, [])
@@ -122,7 +122,7 @@ class Apart(Search):
     def __init__(self, model: ManoeuvreModel, kept: Kept, **scripts: Any) -> None:
         super().__init__(model, **scripts)
         self._begin = lambda _: kept  # type: ignore[assignment, return-value]
-        self.kept_apart: list[tuple[int, float, tuple[int, ...]]] = []
+        self.separated_pairs: list[tuple[int, float, tuple[int, ...]]] = []
 
     def solver(  # type: ignore[override]
         self,
@@ -134,7 +134,7 @@ class Apart(Search):
         drifting: bool = False,
     ) -> Solver:
         if pairs:
-            self.kept_apart.append((intervals, tolerance, pairs))
+            self.separated_pairs.append((intervals, tolerance, pairs))
         return super().solver(intervals, position, tolerance, drifting=False)
 
 
@@ -156,7 +156,7 @@ def test_what_keeps_clear_is_left_as_it_is(model: ManoeuvreModel) -> None:
     search = Apart(model, kept, n40=[1.0])
     found = [made(9.0), made(8.0)]
     assert search._keep_clear(progress(kept), found, 40) is found
-    assert not search.kept_apart
+    assert not search.separated_pairs
 
 
 def test_a_shallow_contact_is_solved_for_on_the_full_grid_with_a_pair_more_each_time(
@@ -165,14 +165,14 @@ def test_a_shallow_contact_is_solved_for_on_the_full_grid_with_a_pair_more_each_
     kept = Kept({8.0: [-0.019], 8.2: [0.004, -0.01], 8.4: [-0.01]}, {})
     search = Apart(model, kept, n40=[8.2, 8.4, 8.6])
     found = search._keep_clear(progress(kept), [made(8.0), made(8.65), made(8.5)], 40)
-    assert search.kept_apart == [(40, 1e-5, (0,)), (40, 1e-5, (0, 1)), (40, 1e-5, (0, 1))]
+    assert search.separated_pairs == [(40, 1e-5, (0,)), (40, 1e-5, (0, 1)), (40, 1e-5, (0, 1))]
     # Each solution is the guess of the next one, and distances have room for what was missing.
     calls = search.scripted[40].calls
     assert [call.guess.duration for call in calls] == pytest.approx([8.0, 8.2, 8.4])
     assert [list(call.limits.distances) for call in calls] == [[1], [2, 1], [3, 1]]
     # One that was found, keeps clear and is faster than the first freed one counts, too.
     assert [each.duration for each in found] == pytest.approx([8.6, 8.5])
-    assert [each.kept_apart for each in found] == [2, 0]
+    assert [each.separated_pairs for each in found] == [2, 0]
     # Pairs of one manoeuvre are not those of the next.
     assert kept.rooms == {}
 
@@ -195,7 +195,7 @@ def test_a_manoeuvre_that_keeps_more_distance_than_it_needs_to_is_made_faster(
     kept = Kept({8.5: [0.009, 0.008]}, {0: 2, 1: 2}, {8.8: [1], 8.6: [1]})
     search = Apart(model, kept, n40=solutions)
     asked = progress(kept, iterations=90)
-    found = search._make_closer(asked, made(8.8), 40)
+    found = search._shorten_with_less_clearance(asked, made(8.8), 40)
     assert found.duration == pytest.approx(expected)
     calls = search.scripted[40].calls
     assert [list(call.limits.distances) for call in calls] == rooms
@@ -219,8 +219,8 @@ def test_the_way_round_a_deep_contact_is_found_on_a_coarse_grid(
     kept = Kept({8.0: [-0.02], 8.5: [-0.001]}, {})
     search = Apart(model, kept, n40=fine, n8=[8.7])
     (found,) = search._keep_clear(progress(kept, iterations=90), [made(8.0)], 40)
-    assert search.kept_apart[0] == (8, 1e-4, (0,))
-    assert all(each == (40, 1e-5, (0,)) for each in search.kept_apart[1:])
+    assert search.separated_pairs[0] == (8, 1e-4, (0,))
+    assert all(each == (40, 1e-5, (0,)) for each in search.separated_pairs[1:])
     assert found.duration == pytest.approx(expected)
     # What is solved for on the full grid begins near it: it takes few steps.
     (coarse,), (first, *_) = search.scripted[8].calls, search.scripted[40].calls
@@ -241,7 +241,7 @@ def test_small_problems_and_drifting_robots_have_no_coarse_grid(
     assert boundary.drifts is drifts
     search._hold_in_whole_ticks = lambda _, trajectory: Holder().hold(trajectory)
     (found,) = search._keep_clear(progress(kept, boundary), [made(8.0)], intervals)
-    assert {each[0] for each in search.kept_apart} == {intervals}
+    assert {each[0] for each in search.separated_pairs} == {intervals}
     assert found.duration == pytest.approx(8.7)
 
 
@@ -254,7 +254,7 @@ def test_after_six_solutions_that_are_too_near_new_guesses_keep_their_pairs_apar
     asked = progress(kept)
     (found,) = search._keep_clear(asked, [made(8.0)], 40)
     assert asked.rejection == "pair 0 is 0.002 m apart, 0.05 s"
-    assert search.kept_apart[:6] == [(40, 1e-5, (0, 1))] * 6
+    assert search.separated_pairs[:6] == [(40, 1e-5, (0, 1))] * 6
     assert kept.rooms == {0: 6, 1: 1}
     assert list(asked.limits.distances) == [6, 1]
     assert asked.starts == 3
@@ -279,7 +279,7 @@ def test_a_refined_solution_keeps_clear_with_pairs_of_its_own(model: ManoeuvreMo
     assert solution is not None
     (found,) = search._refine_solutions(asked, [solution], coarse, fine)  # type: ignore[arg-type]
     assert found.duration == pytest.approx(9.2)
-    assert found.kept_apart == 2
+    assert found.separated_pairs == 2
     assert kept.rooms == {3: 1}
 
 
@@ -317,7 +317,7 @@ class Ticks(Search):
         assert limits is LIMITS
         return f"held for {trajectory.duration:.2f} s" if next(self.held) else None
 
-    def corrected_aim(self, trajectory: Trajectory, boundary: Any, ticks: int) -> str:
+    def corrected_end(self, trajectory: Trajectory, boundary: Any, ticks: int) -> str:
         assert boundary == "goal"
         self.aims.append((round(trajectory.duration, 6), ticks))
         return f"aim {len(self.aims)}"
@@ -450,7 +450,7 @@ def test_the_aim_is_turned_by_the_difference_of_solution_and_commands() -> None:
     L_0 = np.array([0.1, -0.3, 0.2])
     boundary = BoundaryConditions(shapes[0], goal.as_quat(), shapes[0], angular_momentum=L_0)
     trajectory = Trajectory(0.5, shapes, shapes, ends)
-    found = CommandHolder.corrected_aim(holder, trajectory, boundary, 17)
+    found = CommandHolder.corrected_end(holder, trajectory, boundary, 17)
     expected = goal * (reached.inv() * solved)
     assert (Rotation.from_quat(found.turn).inv() * expected).magnitude() < 1e-12
     assert asked[0] == 18

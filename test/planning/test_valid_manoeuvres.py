@@ -230,7 +230,7 @@ def test_limits_count_as_active_from_nineteen_twentieths_on() -> None:
 
 
 def test_limits_of_efforts_are_searched_for_where_they_are_exceeded() -> None:
-    kind: Any = SimpleNamespace(of_any_effort="free", within_efforts="limited")
+    kind: Any = SimpleNamespace(without_effort_limits="free", within_efforts="limited")
     asked: list[str] = []
     is_hard = [False]
 
@@ -249,7 +249,7 @@ def test_limits_of_efforts_are_searched_for_where_they_are_exceeded() -> None:
     ):
         is_hard[0] = hard
         made: Any = SimpleNamespace(options=replace(OptimalOptions(), **chosen))
-        made._keeps_efforts = lambda found, velocity, boundary, excess=excess: excess <= 1.0
+        made._is_within_efforts = lambda found, velocity, boundary, excess=excess: excess <= 1.0
         if found is None:
             with pytest.raises(NotFoundError):
                 OptimalGait._within_efforts(made, kind, search)

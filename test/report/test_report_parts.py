@@ -86,7 +86,7 @@ def test_whole_cycles_are_counted_and_the_last_are_at_the_end() -> None:
 
 def test_change_is_since_the_first_sample_of_a_window() -> None:
     values = np.array([[1.0, -2.0], [4.0, 3.0], [7.0, 5.0]])
-    part = Signal(np.array([0.0, 1.0, 2.0]), values).between(1.0, 2.0).since_first()
+    part = Signal(np.array([0.0, 1.0, 2.0]), values).between(1.0, 2.0).relative_to_first()
     np.testing.assert_array_equal(part.values, [[0.0, 0.0], [3.0, 2.0]])
     np.testing.assert_array_equal(part.time, [1.0, 2.0])
 

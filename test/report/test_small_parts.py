@@ -21,7 +21,7 @@ from spacerobot_ros.flight.flight import Signal
 from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.report import figures, figures_space, page, scene, solids
-from spacerobot_ros.report.events import _MARKS, FlightEvent, draw_events, drawn_events
+from spacerobot_ros.report.events import _MARKS, FlightEvent, draw_events, timed_events
 from spacerobot_ros.report.figures import (
     TraceGroup,
     draw_traces,
@@ -40,7 +40,7 @@ from spacerobot_ros.report.figures import (
 )
 from spacerobot_ros.report.figures_over_time import (
     _match_times,
-    draw_whole,
+    draw_whole_flight,
     power_of_ten,
     range_without_peaks,
     time_figure,
@@ -281,9 +281,9 @@ def test_goals_limits_and_peaks_of_a_group() -> None:
     group = TraceGroup(signal, ["a", "b"], "label", "m", ["#0000ff", "#ff0000"])
     axes = axes_of()
     limits = [(0, 1.125), (1, 1.125), (1, -0.125), (0, 9.0)]
-    assert not draw_whole(axes, flight, replace(group, limits=limits))
+    assert not draw_whole_flight(axes, flight, replace(group, limits=limits))
     levels = {line.get_ydata()[0]: line.get_color() for line in axes.lines[:2]}  # type: ignore[index]
-    assert levels == {1.125: figures.MUTED, -0.125: "#ff0000"}
+    assert levels == {1.125: figures.SECONDARY_COLOUR, -0.125: "#ff0000"}
     assert len(axes.lines) == 4
     assert axes.get_ylabel() == "label (m)"
     assert axes.get_xlim() == (0.0, 3.0)
@@ -291,11 +291,11 @@ def test_goals_limits_and_peaks_of_a_group() -> None:
     assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == ["limit (URDF)"]
     axes = axes_of()
-    draw_whole(axes, flight, replace(group, window=(0.0, 0.5)))
+    draw_whole_flight(axes, flight, replace(group, window=(0.0, 0.5)))
     assert axes.get_title("left") == "peaks of 1 m are beyond the axis"
     assert axes.get_ylim() == pytest.approx((0.25 - 0.28, 0.25 + 0.28))
     axes = axes_of()
-    draw_whole(axes, flight, replace(group, window=(0.0, 0.5), limits=[(0, 0.5)]))
+    draw_whole_flight(axes, flight, replace(group, window=(0.0, 0.5), limits=[(0, 0.5)]))
     assert axes.get_title("right") == "peaks of 1 m are beyond the axis"
 
 
@@ -623,9 +623,9 @@ def test_times_of_events_are_stamps_or_log_times() -> None:
         (5_000_000_000, "/d", made(1e13)),
         (6_000_000_000, "/e", made(8.0, EventKind.CONFIGURED)),
     ]
-    found = drawn_events(events, 1.5, stamped=True)
+    found = timed_events(events, 1.5, stamped=True)
     assert [(each.node, each.time) for each in found] == [("/a", 5.5), ("/b", 1.5)]
-    found = drawn_events(events, 1.5, stamped=False)
+    found = timed_events(events, 1.5, stamped=False)
     assert [each.time for each in found] == [0.5, 1.5, 2.5, 3.5]
 
 

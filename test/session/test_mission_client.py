@@ -55,7 +55,7 @@ class Mission:
         shapes = {"goal_joint_states": JointState} if decider == "planner" else {}
         self.commander: Probe = harness.probe({**TOPICS, **shapes})
         self.status = self.commander.create_publisher(DiagnosticStatus, STATUS[decider], LATCHED)
-        harness.spin_until(lambda: self.client.is_connected() and self.client.has_decider())
+        harness.spin_until(lambda: self.client.is_connected() and self.client.has_goal_commander())
         harness.spin_until(lambda: self.status.get_subscription_count() == 1)
 
     def on_end(self) -> None:
@@ -199,9 +199,9 @@ def test_a_recorder_that_reads_goals_is_no_commander(harness: Harness) -> None:
     status = commander.create_publisher(DiagnosticStatus, "planner/status", LATCHED)
     harness.spin_until(lambda: status.get_subscription_count() and client.is_connected())
     harness.settle(recorder)
-    assert not client.has_decider()
+    assert not client.has_goal_commander()
     commander.watch("goal_pose", PoseStamped)
-    harness.spin_until(lambda: client.has_decider() and client.is_connected(2))
+    harness.spin_until(lambda: client.has_goal_commander() and client.is_connected(2))
     client.send(GOAL)
     harness.spin_until(lambda: commander.count("goal_pose"), "the goal")
 

@@ -437,7 +437,7 @@ def test_a_planner_that_does_not_answer_is_waited_for_only_after_an_interrupt(
 
     def late(services: Any, requests: Any, patience: float) -> Any:
         asked.append(patience)
-        raise processes._AnswerLateError("It is late.")
+        raise processes._ServiceTimeoutError("It is late.")
 
     monkeypatch.setattr(stack, "_call_services", late)
     stack._ask_statistics(0.5)

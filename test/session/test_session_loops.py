@@ -259,7 +259,7 @@ class FakeClient:
     def is_connected(self) -> bool:
         return self.time.now >= self.connected
 
-    def has_decider(self) -> bool:
+    def has_goal_commander(self) -> bool:
         return self.time.now >= self.decides
 
     def send(self, goal: Goal) -> None:
@@ -366,7 +366,7 @@ def find(
     for name, value in times.items():
         setattr(controller, name, 50.0 + value)
     planner.decides = 1e9
-    found = run._find_decider([planner, controller], FakeExecutor(time), 4.0, goal)  # type: ignore[list-item]
+    found = run._find_goal_commander([planner, controller], FakeExecutor(time), 4.0, goal)  # type: ignore[list-item]
     return found, planner, controller  # type: ignore[return-value]
 
 
@@ -657,7 +657,7 @@ def test_the_plant_begins_last_and_the_goal_is_there_before(goal: Goal | None) -
 )
 def test_namespaces_have_a_slash_before_and_none_behind(given: str, namespace: str) -> None:
     assert stack.checked_namespace(given) == namespace
-    words = stack.namespace_words(namespace)
+    words = stack.namespace_arguments(namespace)
     if not namespace:
         assert words == []
         return

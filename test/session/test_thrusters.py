@@ -96,10 +96,10 @@ def test_thrusters_of_a_robot_that_nothing_pushes_are_refused(tmp_path: Path) ->
 def test_a_short_flight_tells_what_thrusters_do(tmp_path: Path) -> None:
     """Two seconds of it: topics, diagnostics, and the warning of a direction that is missing."""
     path = tmp_path / "run.mcap"
-    pushing = " ".join(f"minus_x_{number}" for number in range(1, 5))
+    has_contact_forces = " ".join(f"minus_x_{number}" for number in range(1, 5))
     scenario = (
         load_scenario("servicer_thrusters")
-        .with_overrides("plant", {"thrusters_excluded": pushing})
+        .with_overrides("plant", {"thrusters_excluded": has_contact_forces})
         .with_overrides("coordinated_control", {"time_limit": 2.0})
     )
     run_scenario(scenario, path)

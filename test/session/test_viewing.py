@@ -93,9 +93,9 @@ def test_a_viewer_runs_while_the_block_lasts(
     monkeypatch.setattr(viewing, "require_viser", lambda: asked.append("viser"))
     monkeypatch.setattr(viewing, "use_loopback_discovery", lambda: asked.append("loopback"))
     monkeypatch.setattr(viewing, "checked_namespace", lambda name: f"/{name}")
-    monkeypatch.setattr(viewing, "node_words", words)
+    monkeypatch.setattr(viewing, "node_arguments", words)
     monkeypatch.setattr(viewing, "start_child", start)
-    monkeypatch.setattr(viewing, "yield_to_flight", lambda pid: asked.append(pid))
+    monkeypatch.setattr(viewing, "lower_priority", lambda pid: asked.append(pid))
     monkeypatch.setattr(viewing, "end_child", lambda *given: asked.append(given))
     said: list[str] = []
     with viewing.viewing({"port": 1}, said.append, "left"):
@@ -126,9 +126,9 @@ def test_a_viewer_that_dies_is_started_again_at_its_address(
         return []
 
     process.texts = [b"viewer      http://127.0.0.1:8091/\n"]
-    monkeypatch.setattr(viewing, "node_words", words)
+    monkeypatch.setattr(viewing, "node_arguments", words)
     monkeypatch.setattr(viewing, "start_child", lambda *_, **options: process)
-    monkeypatch.setattr(viewing, "yield_to_flight", lambda pid: None)
+    monkeypatch.setattr(viewing, "lower_priority", lambda pid: None)
     monkeypatch.setattr(viewing, "end_child", lambda *given: ended.append(given))
     said: list[str] = []
     with viewing.viewing({"port": 8080}, said.append) as viewer:
@@ -154,5 +154,5 @@ def test_a_viewer_yields_to_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
         return SimpleNamespace(write_text=lambda *text: asked.append((name, *text)))
 
     monkeypatch.setattr(viewing, "Path", file)
-    viewing.yield_to_flight(7)
+    viewing.lower_priority(7)
     assert asked == [(os.PRIO_PROCESS, 7, 5), ("/proc/7/autogroup", "5", "ascii")]

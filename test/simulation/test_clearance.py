@@ -58,7 +58,7 @@ def test_a_plant_whose_bodies_push_each_other_says_so() -> None:
     config = PlantConfig(initial_joint_positions=(0.0, 0.0))
     plant = build_plant(SpaceRobot(parse_robot(URDF)), config)
     links = tuple(plant.robot.link_names)
-    monitor = ClearanceMonitor.of(plant.robot.description, links, pushing=True)
+    monitor = ClearanceMonitor.of(plant.robot.description, links, has_contact_forces=True)
     assert monitor is not None
     shapes = np.linspace(-0.6, 0.6, 60)
     messages = []

@@ -29,7 +29,7 @@ USES = "SPACEROBOT_TEST_USES"
 TESTS = Path(__file__).resolve().parents[1]
 FILE = TESTS / "passage" / "lost_values.yaml"
 
-_TRIED = 8
+_EXTREME_STARTS = 8
 """Tests that are tried for a value before it is left without one."""
 
 _OF_OTHER_NODES = (
@@ -250,7 +250,7 @@ def main() -> None:
         if loss not in entries:
             used = uses.get(loss.removeprefix("unit of "), [])
             tests = sorted(dict.fromkeys(used), key=_shows_no_effect)
-            found = next((test for test in tests[:_TRIED] if notices(test, loss)), "")
+            found = next((test for test in tests[:_EXTREME_STARTS] if notices(test, loss)), "")
             if not found:
                 continue
             entries[loss] = found

@@ -154,7 +154,7 @@ def prints(flight: str, parameters: Mapping[str, Any]) -> dict[str, str]:
     words["parameters"] = {**words.get("parameters", {}), **parameters}
     try:
         # The flight of a refused goal has quantities as well.
-        with patch.object(api, "_unless_refused", lambda flight: flight):
+        with patch.object(api, "_raise_if_refused", lambda flight: flight):
             flown = spacerobot_ros.fly(words.pop("what"), words.pop("goal", None), **words)
     except SpaceRobotError as error:
         return {"refused": str(error)}

@@ -57,10 +57,10 @@ def test_on_times_count_from_the_state_at_which_the_flight_begins() -> None:
 
 def test_topics_follow_where_a_resimulation_has_all_their_numbers() -> None:
     states = {name: np.zeros((3, 2)) for name in ("measured_q", "measured_qdot", "effort")}
-    assert joints([1], [[0.0] * 6]).follows_from(states)
-    assert not joints([1], [[0.0] * 5]).follows_from(states)
+    assert joints([1], [[0.0] * 6]).is_determined_by(states)
+    assert not joints([1], [[0.0] * 5]).is_determined_by(states)
     del states["effort"]
-    assert not joints([1], [[0.0] * 6]).follows_from(states)
+    assert not joints([1], [[0.0] * 6]).is_determined_by(states)
 
 
 def test_efforts_are_the_last_third_of_joint_states() -> None:

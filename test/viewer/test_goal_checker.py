@@ -27,8 +27,8 @@ from spacerobot_ros.viewer.reachability import (
     Verdict,
     _uncontrolled_text,
     is_reached,
+    make_question,
     planner_config,
-    question_of,
     reaching_positions,
 )
 from spacerobot_ros.viewer.state import Measured, StackState
@@ -244,7 +244,7 @@ def test_why_a_goal_cannot_be_checked() -> None:
     known = {"planner": {"a": "1"}}
 
     def asked(state: StackState, goals: Any, parameters: Any = known) -> Any:
-        return question_of(state, goals, robot, parameters)
+        return make_question(state, goals, robot, parameters)
 
     goals = {"base": BASE}
     assert asked(StackState(), goals) == "No state received yet."

@@ -30,8 +30,8 @@ from spacerobot_ros.viewer.reachability import (
     _LastQuestion,
     _uncontrolled_text,
     is_reached,
+    make_question,
     planner_config,
-    question_of,
     reaching_positions,
 )
 from spacerobot_ros.viewer.state import Measured, Momenta, StackState
@@ -214,15 +214,15 @@ PLANNING = StackState(MEASURED, planner=PlannerStatus(PlannerState.IDLE))
 )
 def test_why_no_question_is_asked(state: StackState, known: bool, reason: str) -> None:
     parameters = {"planner": {"tick_rate": "20.0"}} if known else {"controller": {}}
-    assert question_of(state, {"base": GOAL}, SERVICER, parameters) == reason
-    assert question_of(state, {"base": GOAL}, None, parameters) == "No state received yet."
+    assert make_question(state, {"base": GOAL}, SERVICER, parameters) == reason
+    assert make_question(state, {"base": GOAL}, None, parameters) == "No state received yet."
 
 
 def test_a_question_has_the_measured_state_and_the_momenta() -> None:
     momenta = Momenta(np.arange(6.0), np.zeros(6), 2.0)
     parameters = {"planner": {"tick_rate": "20.0"}, "controller": {"law": '"step"'}}
     for given, expected in ((momenta, np.arange(6.0)), (None, np.zeros(6))):
-        question = question_of(
+        question = make_question(
             replace(PLANNING, momenta=given), {"base": GOAL}, SERVICER, parameters
         )
         assert isinstance(question, Question)
@@ -239,17 +239,17 @@ def test_a_question_has_the_measured_state_and_the_momenta() -> None:
 def test_the_question_of_a_controller_is_for_its_end_effector() -> None:
     state = StackState(MEASURED, momenta=Momenta(np.ones(6), None, 0.0))
     goals = {"base": GOAL, "end_effector": HAND}
-    question = question_of(state, goals, SERVICER, {})
+    question = make_question(state, goals, SERVICER, {})
     assert isinstance(question, Question)
     assert (question.goal, question.tool, question.link) == (GOAL, HAND, SERVICER.end_effector())
     elbow = {"controller": {"end_effector_frame": '"forearm"'}, "planner": {"a": "1"}}
     known = [name for name in SERVICER.frames if name != SERVICER.end_effector()][-1]
     elbow["controller"]["end_effector_frame"] = f'"{known}"'
-    other = question_of(state, goals, SERVICER, elbow)
+    other = make_question(state, goals, SERVICER, elbow)
     assert isinstance(other, Question)
     assert (other.link, other.parameters) == (known, {})
     absent = {"controller": {"end_effector_frame": '"nobody"'}}
-    answer = question_of(state, goals, SERVICER, absent)
+    answer = make_question(state, goals, SERVICER, absent)
     assert answer == "The end-effector is not a link of the robot."
 
 

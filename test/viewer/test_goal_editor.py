@@ -80,7 +80,7 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     goal = page.editor.goals()["base"]
     np.testing.assert_array_equal(goal.position, POSE[:3])
     assert goal.joint_positions is None, "any"
-    page.editor.goals_at_rest(LATER)
+    page.editor.settled_goals(LATER)
     # The fields begin where the robot is now.
     page.editor.robot_is_at(POSE, q + 0.02)
     page.set(page.final._enabled, True)
@@ -90,13 +90,13 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     np.testing.assert_allclose(shape, q + 0.02)
     assert page.editor.moving, "another goal is to be checked"
     page.editor.show_check(Check(Verdict.REACHABLE, shape=q))
-    page.editor.goals_at_rest(LATER)
+    page.editor.settled_goals(LATER)
     at_rest = page.ghost()
     page.set(page.final._fields[2], -0.2)
     shape = page.editor.goals()["base"].joint_positions
     assert shape is not None
     np.testing.assert_allclose(shape, [0.07, -0.08, -0.2])
-    checked = page.editor.goals_at_rest(LATER)
+    checked = page.editor.settled_goals(LATER)
     assert checked is not None
     assert checked["base"].joint_positions is not None
     # The ghost has that shape before it is planned for, whatever the robot does.
@@ -152,13 +152,13 @@ def test_fields_of_joints_stay_within_their_limits(server: Any) -> None:
 def test_a_goal_of_the_end_effector_that_appears_is_checked(server: Any) -> None:
     page = Editor(server, "servicer")
     page.editor.place(POSE, None, np.zeros(6), 0.0)
-    goals = page.editor.goals_at_rest(LATER)
+    goals = page.editor.settled_goals(LATER)
     assert goals is not None
     assert set(goals) == {"base"}
-    assert page.editor.goals_at_rest(LATER) is None, "it is checked once"
+    assert page.editor.settled_goals(LATER) is None, "it is checked once"
     page.editor.add_tool(np.array([1.0, 0, 0, 0, 0, 0, 1]))
     page.editor.show_tool(there=True)
-    goals = page.editor.goals_at_rest(LATER)
+    goals = page.editor.settled_goals(LATER)
     assert goals is not None
     assert set(goals) == {"base", "end_effector"}
 
@@ -362,7 +362,7 @@ def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
     # The same planner again, and one that takes no goals of hands.
     page.editor.offer_end_effectors(HANDS)
     assert set(page.editor.goals()) == {HANDS[0]}
-    page.editor.goals_at_rest(LATER)
+    page.editor.settled_goals(LATER)
     page.editor.offer_end_effectors(())
     assert page.editor.moving, "the goal is another one"
     page.editor.show_end_effectors(there=True)

@@ -290,10 +290,10 @@ def test_on_a_phone_the_robot_is_above_the_panel(
     aspect: float, phone: bool, server: Server, page: Page
 ) -> None:
     camera: Any = type("Camera", (), {"aspect": aspect})()
-    page._greet(camera)
+    page._place_first_camera(camera)
     assert not hasattr(camera, "position"), "there is no robot yet"
     page.update(FIRST, 1.0)
-    page._greet(camera)
+    page._place_first_camera(camera)
     assert hasattr(camera, "position") is phone
     page._aim_camera(camera)
     at, away = np.array([1.0, 2.0, 0.5]), camera.position - camera.look_at
@@ -335,13 +335,13 @@ def test_nodes_that_have_ended_are_never_green(
 ) -> None:
     state = replace(FLYING, absent=frozenset(absent), silent=dict.fromkeys(silent, 3.0))
     head = content.status_html(state)
-    assert (ENDED in head) is content.stack_ended(state) is ended
+    assert (ENDED in head) is content.has_stack_ended(state) is ended
     assert head.count(GREEN) == greens
     assert ("offline, last executing:" in head) is ("planner" in absent)
 
 
 def test_nothing_has_ended_where_nothing_has_begun() -> None:
-    assert not content.stack_ended(StackState(silent={"/recorder": 3.0}))
+    assert not content.has_stack_ended(StackState(silent={"/recorder": 3.0}))
 
 
 def test_a_viewer_that_ends_says_so_on_its_page(server: Server, page: Page) -> None:

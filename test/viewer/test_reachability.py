@@ -29,9 +29,9 @@ from spacerobot_ros.viewer.reachability import (
     Planner,
     Question,
     Verdict,
+    make_question,
     planned_goal,
     planned_links,
-    question_of,
 )
 from spacerobot_ros.viewer.state import Measured, StackState
 
@@ -169,12 +169,12 @@ def test_a_goal_of_a_link_is_not_for_a_controller() -> None:
     state = StackState(measured)
     hand = Goal.of_end_effectors([EndEffectorGoal("end_effector", np.ones(3))])
     base = Goal.checked(np.ones(3), [0, 0, 0, 1])
-    answer = question_of(state, {"end_effector": hand}, servicer, {})
+    answer = make_question(state, {"end_effector": hand}, servicer, {})
     assert answer == "The goal is for a planner, and none is running."
-    answer = question_of(state, {"base": base, "end_effector": hand}, servicer, {})
+    answer = make_question(state, {"base": base, "end_effector": hand}, servicer, {})
     assert answer == "No planner is running: a controller flies the base to any pose."
     planning = replace(state, planner=PlannerStatus(PlannerState.IDLE))
-    asked = question_of(planning, {"end_effector": hand}, servicer, {"planner": {"a": "1"}})
+    asked = make_question(planning, {"end_effector": hand}, servicer, {"planner": {"a": "1"}})
     assert isinstance(asked, Question)
     assert (asked.goal.end_effectors, asked.goal.base) == (hand.end_effectors, frozenset())
     assert asked.tool is None

@@ -18,7 +18,7 @@ from support.viewer_page import ROOT, Page
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.session import viewing
-from spacerobot_ros.session.viewing import yield_to_flight
+from spacerobot_ros.session.viewing import lower_priority
 
 COMMAND = (sys.executable, "-m", "spacerobot_ros.cli.main")
 
@@ -34,7 +34,7 @@ def test_a_lockstep_flight_is_over_before_it_is_seen() -> None:
 def test_the_viewer_gives_way_to_what_flies_within_its_session_and_among_sessions() -> None:
     with subprocess.Popen(["sleep", "60"], start_new_session=True) as process:
         try:
-            yield_to_flight(process.pid)
+            lower_priority(process.pid)
             assert os.getpriority(os.PRIO_PROCESS, process.pid) > 0
             among = Path(f"/proc/{process.pid}/autogroup")
             if among.exists() and (text := among.read_text("ascii")):

@@ -27,12 +27,12 @@ from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.nodes import ViewerNode
-from spacerobot_ros.nodes.common.watchdog import Pulse, Role
+from spacerobot_ros.nodes.common.watchdog import HeartbeatState, Role
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
-from spacerobot_ros.viewer.reachability import Check, Verdict, question_of
+from spacerobot_ros.viewer.reachability import Check, Verdict, make_question
 from spacerobot_ros.viewer.server import free_port
 from spacerobot_ros.viewer.state import Measured, StackState
 
@@ -410,7 +410,7 @@ def test_nodes_that_are_gone_are_shown_no_longer(harness: Harness) -> None:
     stack.describe()
     stack.until(lambda: stack.viewer._robot is not None, "a robot")
 
-    def beat(name: str, pulse: Pulse, role: Role | None) -> None:
+    def beat(name: str, pulse: HeartbeatState, role: Role | None) -> None:
         hardware = "" if role is None else role.value
         heart.publish(DiagnosticStatus(name=name, message=pulse.value, hardware_id=hardware))
 
@@ -426,30 +426,30 @@ def test_nodes_that_are_gone_are_shown_no_longer(harness: Harness) -> None:
     values = [KeyValue(key=k, value=v) for k, v in idle.to_values().items()]
     planner.publish(DiagnosticStatus(name="/planner", values=values))
     stack.until(lambda: listener.state().planner is not None, "a planner")
-    beat("/planner", Pulse.ACTIVE, Role.COMMANDER)
-    beat("/other_viewer", Pulse.INACTIVE, None)
+    beat("/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
+    beat("/other_viewer", HeartbeatState.INACTIVE, None)
     assert "/planner" not in look().silent
     assert look().inactive == (), "viewers come and go"
     pass_time(10.0)
     assert look().silent["/planner"] >= 10.0
     assert look().absent == {"planner"}
     seen = replace(look(), measured=HERE)
-    answer = question_of(seen, {"base": GOAL}, load_robot(robot_file("sliding_masses")), {})
+    answer = make_question(seen, {"base": GOAL}, load_robot(robot_file("sliding_masses")), {})
     assert answer == "The planner is offline."
     assert look().planner == idle, "it may come back"
     pass_time(60.0)
     assert look().planner is None
     assert "/planner" not in look().silent
-    beat("/planner", Pulse.ACTIVE, Role.COMMANDER)
+    beat("/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
     assert look().planner == idle, "it had only stood still"
     assert look().absent == frozenset()
-    beat("/planner", Pulse.INACTIVE, Role.COMMANDER)
+    beat("/planner", HeartbeatState.INACTIVE, Role.COMMANDER)
     assert look().inactive == ("/planner",)
     assert look().absent == {"planner"}
-    beat("/planner", Pulse.BUSY, Role.COMMANDER)
+    beat("/planner", HeartbeatState.BUSY, Role.COMMANDER)
     pass_time(1000.0)
     assert look().planner == idle, "it plans"
-    beat("/planner", Pulse.ACTIVE, Role.COMMANDER)
+    beat("/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
     look()
     listener._last_call -= 1000.0
     pass_time(1000.0)
@@ -460,15 +460,15 @@ def test_nodes_that_are_gone_are_shown_no_longer(harness: Harness) -> None:
     values = [KeyValue(key=k, value=v) for k, v in status.to_values().items()]
     replay.publish(DiagnosticStatus(name="/replay", values=values))
     stack.until(lambda: listener.state().replay is not None, "a replay")
-    beat("/replay", Pulse.ACTIVE, Role.REPLAY)
-    beat("/live_plant", Pulse.ACTIVE, Role.PLANT)
+    beat("/replay", HeartbeatState.ACTIVE, Role.REPLAY)
+    beat("/live_plant", HeartbeatState.ACTIVE, Role.PLANT)
     assert look().replay == status
     assert look().plant is not None
-    beat("/replay", Pulse.INACTIVE, Role.REPLAY)
+    beat("/replay", HeartbeatState.INACTIVE, Role.REPLAY)
     assert look().replay is None
     assert look().plant is None, "it was recorded"
     assert look().planner == idle
-    beat("/replay", Pulse.ACTIVE, Role.REPLAY)
+    beat("/replay", HeartbeatState.ACTIVE, Role.REPLAY)
     assert look().replay == status
 
 
@@ -507,7 +507,9 @@ def test_a_commander_that_is_busy_is_waited_for(harness: Harness) -> None:
     heart = stack.probe.create_publisher(DiagnosticStatus, "/heartbeat", 20)
     harness.connect()
     for role in (Role.PLANT, Role.COMMANDER):
-        beat = DiagnosticStatus(name="/x", message=Pulse.BUSY.value, hardware_id=role.value)
+        beat = DiagnosticStatus(
+            name="/x", message=HeartbeatState.BUSY.value, hardware_id=role.value
+        )
         heart.publish(beat)
         harness.settle(stack.probe)
         assert viewer._listener.state().busy is (role is Role.COMMANDER)

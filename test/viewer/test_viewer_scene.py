@@ -260,13 +260,13 @@ def test_a_link_is_where_its_joints_have_it() -> None:
 def test_plumes_point_against_the_thrust() -> None:
     table = find_thrusters("urdf", load_robot(robot_file("servicer")))
     duty = np.zeros(len(table.names))
-    assert scene.plumes(table, table.names, duty, 1.0).shape == (0, 2, 3)
+    assert scene.plume_lines(table, table.names, duty, 1.0).shape == (0, 2, 3)
     duty[[2, 5]] = 1.0, 0.5
-    first, second = scene.plumes(table, table.names, duty, 1.0)
+    first, second = scene.plume_lines(table, table.names, duty, 1.0)
     np.testing.assert_allclose(first[0], table.r_B[2])
     np.testing.assert_allclose(first[1] - first[0], -table.direction_B[2])
     assert np.linalg.norm(second[1] - second[0]) < 1.0
-    assert scene.plumes(table, ("unknown",), np.ones(1), 1.0).shape == (0, 2, 3)
+    assert scene.plume_lines(table, ("unknown",), np.ones(1), 1.0).shape == (0, 2, 3)
 
 
 def test_a_target_is_drawn_from_its_first_state_on_and_outlasts_a_new_robot(server: Any) -> None:

@@ -196,7 +196,7 @@ class ControlLaw(ABC):
         self.singular_value_threshold: float = self.options.singular_value_threshold
         inputs = {name: np.asarray(value) for name, value in self._inputs().items()}
         key = (type(self), accepted, thrust, self.options)
-        self.function, self._has_integral = robot.made_once(
+        self.function, self._has_integral = robot.cached_object(
             key, lambda: self._make_function(inputs)
         )
         self._function = robot.view(self.function, ("compiled", *key))

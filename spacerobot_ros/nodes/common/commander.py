@@ -129,7 +129,7 @@ class CommanderNode(FlightNode):
         else:
             self.use(robot)
 
-    def take_goals(self, topic: str, key: str = BASE_GOAL_KEY) -> None:
+    def subscribe_to_goals(self, topic: str, key: str = BASE_GOAL_KEY) -> None:
         """Subscribe to goal poses for the base or another part of the robot."""
         self.create_subscription(
             PoseStamped, topic, lambda message: self._on_goal(key, message), STREAM
@@ -307,7 +307,7 @@ class CommanderNode(FlightNode):
         that are there then. So tests, tools and plants of other stacks stop no goal.
         """
         number = information["publication_sequence_number"] or 0
-        last, foreign = self._status_number, self._foreign_plants()
+        last, foreign = self._status_number, self._other_status_publishers()
         if foreign:
             self._doubted = True
             now = time.monotonic()
@@ -331,7 +331,7 @@ class CommanderNode(FlightNode):
             return
         self.commander.receive_plant_status(status, record.name or "plant")
 
-    def _foreign_plants(self) -> list[str]:
+    def _other_status_publishers(self) -> list[str]:
         """Return nodes that publish plant/status but not odom; empty if no node publishes odom."""
         found = []
         for topic in ("plant/status", "odom"):
@@ -390,7 +390,7 @@ class CommanderNode(FlightNode):
         with handle:
             while (taken := handle.take_message(DiagnosticStatus, False)) is not None:
                 self._on_plant_status(*taken)
-        if self._doubted and not self._foreign_plants():
+        if self._doubted and not self._other_status_publishers():
             self._subscribe_plant_status()
         if self._unheard:
             self._resubscribe_best_effort()

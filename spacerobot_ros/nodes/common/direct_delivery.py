@@ -95,7 +95,7 @@ class DirectDelivery:
             )
             alone = subscribed.count(topic) == len(link.inputs)
             numbered = any(stream.numbered for stream in link.inputs)
-            if link.outputs and alone and not numbered and not self._has_others(link):
+            if link.outputs and alone and not numbered and not self._has_other_publishers(link):
                 self._links.append(link)
         self._announce(outputs, set(subscribed) - self.topics)
         for link in self._links:
@@ -103,7 +103,7 @@ class DirectDelivery:
                 stream.unsubscribe()
             deliver = partial(self._deliver, [stream.receive for stream in link.inputs])
             for output in link.outputs:
-                output.hand_over(deliver)
+                output.call_after_publication(deliver)
         for node in flight_nodes:
             node.before_cleanup = self.end
         if self._links:
@@ -112,7 +112,7 @@ class DirectDelivery:
 
     def check(self) -> None:
         """Leave delivery to the middleware if a topic has another publisher."""
-        if any(map(self._has_others, self._links)):
+        if any(map(self._has_other_publishers, self._links)):
             self.end()
 
     def end(self) -> None:
@@ -129,7 +129,7 @@ class DirectDelivery:
             time.sleep(0.001)
         for link in links:
             for output in link.outputs:
-                output.hand_over(None)
+                output.call_after_publication(None)
         for publisher in self._announcing:
             _set_announcement(publisher, None)
 
@@ -155,9 +155,9 @@ class DirectDelivery:
                 self._queue.append((take, raw))
         else:
             self._published += 1
-            self._executor.create_task(self._take_turn, readers, raw, self._published)
+            self._executor.create_task(self._deliver_one_turn, readers, raw, self._published)
 
-    def _take_turn(self, readers: Sequence[Take], raw: bytes, number: int) -> None:
+    def _deliver_one_turn(self, readers: Sequence[Take], raw: bytes, number: int) -> None:
         """Deliver a message, and those that answer it as long as nothing else is under way.
 
         The executor calls this when everything that was published before ``number`` has arrived.
@@ -178,7 +178,7 @@ class DirectDelivery:
             self._left = _MESSAGES_PER_TURN
             self.check()
 
-    def _has_others(self, link: _Link) -> bool:
+    def _has_other_publishers(self, link: _Link) -> bool:
         """Whether a topic has publishers beside those of this process."""
         return bool(self._host.count_publishers(link.topic) != len(link.outputs))
 

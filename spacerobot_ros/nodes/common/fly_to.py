@@ -38,7 +38,7 @@ Each kept goal makes the next ones slower.
 _NAV2_FAILURE = 9000
 """NavigateToPose's error code of an unknown error, which says no more than that it has failed."""
 
-_OF_BASE = "The goal of the base"
+_BASE_GOAL_NAME = "The goal of the base"
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class FlyToAction(GoalAction):
             shape = shape_of(joints, surroundings.joint_names)
         goal, frame, pose_of = None, surroundings.world_frame, surroundings.pose_of
         if request.base_pose:
-            goal = goal_of(request.base_pose[0], frame, _OF_BASE, shape, pose_of)
+            goal = goal_of(request.base_pose[0], frame, _BASE_GOAL_NAME, shape, pose_of)
         if links:
             goal = Goal.of_end_effectors(
                 [
@@ -179,7 +179,7 @@ class NavigateToPoseAction(GoalAction):
             goal_of(
                 request.pose,
                 surroundings.world_frame,
-                _OF_BASE,
+                _BASE_GOAL_NAME,
                 pose_of=surroundings.pose_of,
             )
         )

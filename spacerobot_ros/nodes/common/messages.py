@@ -135,7 +135,7 @@ def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str
         set_pose(marker.pose, placed.r, quaternion_from_matrix(placed.R))
         markers.append(marker)
     markers.append(_line_marker("planned_path", len(markers), path.position, frame))
-    given = [each.values_on_way for each in goal.end_effectors if each.waypoints is not None]
+    given = [each.path_values for each in goal.end_effectors if each.waypoints is not None]
     if given:
         markers.append(_line_marker("given_path", 0, given[0][:, :3], frame))
     else:  # One of an earlier goal is erased.

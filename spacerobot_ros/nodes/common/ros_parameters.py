@@ -17,14 +17,14 @@ from rclpy.parameter import parameter_value_to_python
 
 from spacerobot_ros.parameters import Parameter, Value
 
-_MAX_LOOKS_FOR_ANSWER = 200
+_MAX_CHECKS_FOR_ANSWER = 200
 """Number of checks after which a node without an answer counts as one without services."""
 
-_LOOKS_UNTIL_CONNECTED = 3
+_CHECKS_UNTIL_CONNECTED = 3
 """Number of checks before a request, in which the node discovers the client. Before that, an answer
 would hold up the node for 0.1 s, and be lost."""
 
-_LOOKS_UNTIL_LOST = 50
+_CHECKS_UNTIL_LOST = 50
 """Number of checks after which an answer counts as lost by the middleware."""
 
 
@@ -70,12 +70,12 @@ class RemoteParameters:
         client: Client = self._node.create_client(kind, f"{self.name}/{service}")
         try:
             future, asked_at, ready = None, 0, 0
-            for look in range(_MAX_LOOKS_FOR_ANSWER):
+            for look in range(_MAX_CHECKS_FOR_ANSWER):
                 if future is not None and future.done():
                     return future.result()
                 ready = ready + 1 if client.service_is_ready() else 0
-                lost = future is None or look - asked_at >= _LOOKS_UNTIL_LOST
-                if lost and ready > _LOOKS_UNTIL_CONNECTED:
+                lost = future is None or look - asked_at >= _CHECKS_UNTIL_LOST
+                if lost and ready > _CHECKS_UNTIL_CONNECTED:
                     future, asked_at = client.call_async(request), look
                 yield False
             return None

@@ -52,7 +52,7 @@ class Connections:
         return cls(_without_middleware(publishers), _without_middleware(subscriptions))
 
 
-def unconnected_topics(nodes: Iterable[Connections]) -> set[str]:
+def topics_without_all_matches(nodes: Iterable[Connections]) -> set[str]:
     """Return the topics on which endpoints of these nodes are not all matched."""
     nodes = list(nodes)
     writers = Counter(topic for node in nodes for topic, _ in node.publishers)
@@ -155,20 +155,20 @@ def _one_after_another(*acts: Take) -> Take:
         return acts[0]
     first, second, *others = acts
 
-    def do_two(raw: bytes) -> None:
+    def call_two(raw: bytes) -> None:
         first(raw)
         second(raw)
 
     if not others:
-        return do_two
+        return call_two
     (third,) = others
 
-    def do_three(raw: bytes) -> None:
+    def call_three(raw: bytes) -> None:
         first(raw)
         second(raw)
         third(raw)
 
-    return do_three
+    return call_three
 
 
 class RawOutput(RawStream):
@@ -211,7 +211,7 @@ class RawOutput(RawStream):
         self._acts = *before, self._publish
         self._compose()
 
-    def hand_over(self, deliver: Take | None) -> None:
+    def call_after_publication(self, deliver: Take | None) -> None:
         """Call a function with each message after its publication; None: no longer."""
         after = () if deliver is None else (deliver,)
         self._acts = self._publish, *after
@@ -308,7 +308,7 @@ class StreamingNode(Protocol):
         """Return the name of the node with its namespace."""
 
 
-class StreamTaps:
+class StreamListeners:
     """Listens to streams of nodes in this process that carry every message of a topic."""
 
     def __init__(self) -> None:

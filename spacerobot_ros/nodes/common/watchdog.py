@@ -44,7 +44,7 @@ class Role(str, Enum):
     REPLAY = "replay"
 
 
-class Pulse(str, Enum):
+class HeartbeatState(str, Enum):
     """The state of a node; the value is the ``message`` of its heartbeats."""
 
     ACTIVE = "active"
@@ -111,9 +111,9 @@ class Watchdog:
         if name in self.silent:
             back = Silence(name, now - self.silent.pop(name), over=True)
         self._busy.discard(name)
-        if pulse == Pulse.BUSY.value:
+        if pulse == HeartbeatState.BUSY.value:
             self._busy.add(name)
-        if pulse in (Pulse.ACTIVE.value, Pulse.BUSY.value):
+        if pulse in (HeartbeatState.ACTIVE.value, HeartbeatState.BUSY.value):
             self._heard[name] = now
         else:
             self._heard.pop(name, None)
@@ -203,12 +203,12 @@ class Liveness:
             self._end_timers()
             self._watchdog = None
             with suppress(Exception):  # The ROS context may be shut down already.
-                self._publish(Pulse.INACTIVE)
+                self._publish(HeartbeatState.INACTIVE)
 
     def beat(self) -> None:
         """Send a heartbeat if the node is active."""
         if self._timers:
-            self._publish(Pulse.BUSY if self._busy else Pulse.ACTIVE)
+            self._publish(HeartbeatState.BUSY if self._busy else HeartbeatState.ACTIVE)
 
     @contextmanager
     def busy(self) -> Iterator[None]:
@@ -221,7 +221,7 @@ class Liveness:
             self._busy -= 1
             self.beat()
 
-    def _publish(self, pulse: Pulse) -> None:
+    def _publish(self, pulse: HeartbeatState) -> None:
         name, role = self._node.get_fully_qualified_name(), self._role
         self._publisher.publish(
             DiagnosticStatus(

@@ -27,7 +27,7 @@ from spacerobot_ros.messages.readers import CommandReader
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.shared_parameters import robot_of
-from spacerobot_ros.model.world import among_obstacles, obstacles_from_topic
+from spacerobot_ros.model.world import obstacles_from_topic, with_obstacles_around
 from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node
@@ -117,7 +117,7 @@ class PlantNode(FlightNode):
         return self.status.state
 
     @property
-    def _steps_or_pauses(self) -> bool:
+    def _is_running_or_paused(self) -> bool:
         return self._active in (PlantState.RUNNING, PlantState.PAUSED)
 
     # -- life ---------------------------------------------------------------------------------
@@ -155,19 +155,21 @@ class PlantNode(FlightNode):
         self._transforms = TransformPublisher(self, robot, self._reported, config)
         self._markers = LinkMarkers(self, self.plant, config.world_frame)
         self._report = PlantReport(self, self.plant, self._commands, self._real_time)
-        self._pose_ticks = self._viewed_ticks(config.base_pose_period, _LONGEST_MARKER_PERIOD) or 1
-        self._marker_ticks = self._viewed_ticks(config.marker_period, _LONGEST_MARKER_PERIOD)
+        self._pose_ticks = (
+            self._ticks_for_viewers(config.base_pose_period, _LONGEST_MARKER_PERIOD) or 1
+        )
+        self._marker_ticks = self._ticks_for_viewers(config.marker_period, _LONGEST_MARKER_PERIOD)
         self._tf_ticks = 0
         if self._transforms.publishes:
-            self._tf_ticks = self._viewed_ticks(config.tf_period, _LONGEST_FRAME_PERIOD)
+            self._tf_ticks = self._ticks_for_viewers(config.tf_period, _LONGEST_FRAME_PERIOD)
         self._report_ticks = self._ticks(config.diagnostics_period)
-        self._clearance_ticks = self._viewed_ticks(
+        self._clearance_ticks = self._ticks_for_viewers(
             config.clearance_period, _LONGEST_CLEARANCE_PERIOD
         )
         self._clearance = None
         if self._clearance_ticks:
             self._clearance = ClearancePublisher.of(
-                self, self.plant, robot.description, pushing=config.engine == "mujoco"
+                self, self.plant, robot.description, has_contact_forces=config.engine == "mujoco"
             )
         self._obstacles: str | None = None
         """The text on the topic obstacles; None: the robot has its own."""
@@ -213,17 +215,17 @@ class PlantNode(FlightNode):
         self._reported_ns = steady.now().nanoseconds
         if self._real_time is None:
             self._publisher.has_new_readers()
-            self._look_for_commanders()
+            self._check_for_commanders()
             self._wall_timers = [
-                self.create_timer(_READER_CHECK_PERIOD, self._on_look_round, clock=steady)
+                self.create_timer(_READER_CHECK_PERIOD, self._on_subscriber_check, clock=steady)
             ]
         else:
             self._real_time.start(steady.now().nanoseconds, self._tick)
             self._wall_timers = [
                 self.create_timer(self._real_time.period, self._on_wall_tick, clock=steady),
-                self.create_timer(_READER_CHECK_PERIOD, self._on_real_time_look, clock=steady),
+                self.create_timer(_READER_CHECK_PERIOD, self._on_commander_check, clock=steady),
             ]
-        self._look_at_status()
+        self._publish_changed_status()
         self._publish()
 
     def deactivate(self) -> None:
@@ -233,7 +235,7 @@ class PlantNode(FlightNode):
             return
         self._active = PlantState.INACTIVE
         self._commands.rest()
-        self._look_at_status()
+        self._publish_changed_status()
 
     def start_message(self) -> str:
         """Return a log message with robot, actuation, rate and time mode."""
@@ -256,7 +258,7 @@ class PlantNode(FlightNode):
             return
         self._monitor.failure = reason, message
         self._commands.rest()
-        self._look_at_status()
+        self._publish_changed_status()
 
     def drain(self, executor: EventsExecutor) -> None:
         """Bring the joints to rest, because the commanders end as well."""
@@ -265,7 +267,7 @@ class PlantNode(FlightNode):
         for stream in self.raw_inputs:
             stream.take = lambda raw: None
         self._commands.rest()
-        self._look_at_status()
+        self._publish_changed_status()
         end, began = time.monotonic() + _LONGEST_REST, self._tick
 
         def at_rest() -> bool:
@@ -286,7 +288,7 @@ class PlantNode(FlightNode):
         self._active, self._monitor = PlantState.INACTIVE, None
         self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
 
-    def _look_at_status(self) -> None:
+    def _publish_changed_status(self) -> None:
         """Publish the status if it has changed, and the events since the last call."""
         assert self._monitor is not None
         self._injected_seen = self.plant.injected
@@ -344,13 +346,13 @@ class PlantNode(FlightNode):
             self._report.limited()
         if self._capturing is not None and self._capturing.reports:
             # Commanders must know of the other robot before they answer a state of it.
-            self._look_at_status()
+            self._publish_changed_status()
         self._tick += 1
         self._publish()
         if self._lockstep is not None and self._tick % _MAX_UNCONFIRMED_TICKS == 0:
             self._publisher.await_readers()
         if self.plant.injected is not self._injected_seen:
-            self._look_at_status()
+            self._publish_changed_status()
 
     def _publish(self) -> None:
         now = self._tick * self._period_ns
@@ -370,7 +372,7 @@ class PlantNode(FlightNode):
         self._reported_ns = self._steady.now().nanoseconds
         self._report.publish(self.time_ns)
 
-    def _report_by_wall(self) -> None:
+    def _report_on_wall_clock(self) -> None:
         """Publish diagnostics if none were published for a second of wall time."""
         if self._steady.now().nanoseconds - self._reported_ns >= _REPORT_PERIOD_NS:
             self._publish_report()
@@ -378,7 +380,7 @@ class PlantNode(FlightNode):
     def _ticks(self, seconds: float) -> int:
         return max(1, round(seconds * SECOND / self._period_ns)) if seconds else 0
 
-    def _viewed_ticks(self, seconds: float, longest_wall: float) -> int:
+    def _ticks_for_viewers(self, seconds: float, longest_wall: float) -> int:
         """Return the ticks of a period, which real time shortens for viewers."""
         if self._real_time is not None and seconds:
             seconds = min(seconds, longest_wall * self.config.real_time_factor)
@@ -395,27 +397,27 @@ class PlantNode(FlightNode):
             for source in silent:
                 self._report.timed_out(source, self.config.command_timeout)
             if silent:
-                self._look_at_status()
+                self._publish_changed_status()
             self._step()
 
-    def _on_look_round(self) -> None:
+    def _on_subscriber_check(self) -> None:
         """Publish the last state again to new subscribers, whose command a lockstep plant needs."""
         if self._active is not PlantState.RUNNING:
             if self._report_ticks:
-                self._report_by_wall()
+                self._report_on_wall_clock()
             return  # A new subscriber receives the state after the pause.
-        self._look_for_commanders()
+        self._check_for_commanders()
         assert self._lockstep is not None
         if self._lockstep.must_step_at_check(self._tick, pose_lost=self._reported.sensors.dropout):
             self._step()
         elif self._lockstep.waits and self._publisher.has_new_readers():
             self._publisher.publish(self.time_ns, all_topics=True)
 
-    def _on_real_time_look(self) -> None:
+    def _on_commander_check(self) -> None:
         self._count_commanders()
-        self._report_by_wall()
+        self._report_on_wall_clock()
 
-    def _look_for_commanders(self) -> None:
+    def _check_for_commanders(self) -> None:
         self._count_commanders()
         self._commands.require_commanded()
 
@@ -436,9 +438,9 @@ class PlantNode(FlightNode):
         if refusal is not None:
             self._report.refused(reader.source, refusal)
             if refusal.latches:
-                self._look_at_status()
+                self._publish_changed_status()
         elif self.status.state is _RESTING:
-            self._look_at_status()
+            self._publish_changed_status()
         if self._real_time is None:
             self._step_if_complete()
         elif reader.source is self._commands.sources[0]:
@@ -456,7 +458,7 @@ class PlantNode(FlightNode):
         except ParameterError as error:
             self.get_logger().warning(str(error))
             return
-        self._look_at_status()
+        self._publish_changed_status()
 
     def _on_obstacles(self, message: String) -> None:
         """Measure distances to the obstacles of a text, and draw them, in place of those so far."""
@@ -471,7 +473,7 @@ class PlantNode(FlightNode):
         self._obstacles = message.data
         self._markers.use_obstacles(world)
         if self._clearance_ticks:
-            described = among_obstacles(self.plant.robot.description, world)
+            described = with_obstacles_around(self.plant.robot.description, world)
             with self.long_work():
                 # The plant in MuJoCo has the obstacles of the beginning alone.
                 self._clearance = ClearancePublisher.of(
@@ -484,7 +486,7 @@ class PlantNode(FlightNode):
         if self.config.watchdog_action == "latch" and not silence.over:
             self._commands.latch("watchdog", f"node '{silence.name}' is silent", self.time_ns)
             self._report.latched()
-            self._look_at_status()
+            self._publish_changed_status()
 
     # -- services -----------------------------------------------------------------------------
 
@@ -496,15 +498,15 @@ class PlantNode(FlightNode):
         response.success = True
         response.message = "The robot is back in its initial state; time goes on."
         # Commanders must know of the reset before they answer a state after it.
-        self._look_at_status()
-        if self._steps_or_pauses:
+        self._publish_changed_status()
+        if self._is_running_or_paused:
             self._publish()
         return response
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._commands.latch("abort", "aborted on request", self.time_ns)
         self._report.latched()
-        self._look_at_status()
+        self._publish_changed_status()
         response.success = True
         response.message = "The joints come to rest; nothing moves until '~/rearm' is called."
         return response
@@ -514,7 +516,7 @@ class PlantNode(FlightNode):
         if fault:
             assert self._monitor is not None
             self._monitor.rearms += 1
-            self._look_at_status()
+            self._publish_changed_status()
         response.success = True
         response.message = (
             f"Commands pass again after: {fault}." if fault else "No fault was latched."
@@ -536,7 +538,7 @@ class PlantNode(FlightNode):
         try:
             if self._capturing is None:
                 raise CommandError("There is no target: set parameter 'target.robot' to its URDF.")
-            if not self._steps_or_pauses:
+            if not self._is_running_or_paused:
                 raise CommandError(f"The plant is {self._active.value}: nothing moves.")
             if self._commands.fault:
                 raise CommandError(
@@ -547,15 +549,15 @@ class PlantNode(FlightNode):
             response.success, response.message = False, str(error)
             return response
         response.success, response.message = True, report.event(self.time_ns / SECOND).message
-        self._look_at_status()
+        self._publish_changed_status()
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._when_active = PlantState.PAUSED if request.data else PlantState.RUNNING
         before = self._active
-        if self._steps_or_pauses:
+        if self._is_running_or_paused:
             self._active = self._when_active
-        self._look_at_status()
+        self._publish_changed_status()
         if (before, self._active) == (PlantState.PAUSED, PlantState.RUNNING):
             if self._real_time is None:
                 self._step_if_complete()

@@ -481,15 +481,17 @@ class ClearancePublisher:
         described: RobotDescription,
         before: ClearancePublisher | None = None,
         *,
-        pushing: bool = False,
+        has_contact_forces: bool = False,
     ) -> ClearancePublisher | None:
         """Return the publisher of a plant among obstacles; None where no links could touch.
 
-        ``before`` is the publisher among those so far, whose topic goes on; ``pushing`` is that of
-        :class:`.ClearanceMonitor`.
+        ``before`` is the publisher among the obstacles so far, whose topic goes on;
+        ``has_contact_forces`` is that of :class:`.ClearanceMonitor`.
         """
         links, so_far = tuple(plant.robot.link_names), None if before is None else before._monitor
-        monitor = ClearanceMonitor.of(described, links, so_far, pushing=pushing)
+        monitor = ClearanceMonitor.of(
+            described, links, so_far, has_contact_forces=has_contact_forces
+        )
         if monitor is None:
             return None
         return cls(node, plant, monitor, None if before is None else before._stream)

@@ -33,7 +33,7 @@ from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.nodes.common.messages import goal_of, pose_array
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
-from spacerobot_ros.nodes.common.watchdog import Pulse, Role
+from spacerobot_ros.nodes.common.watchdog import HeartbeatState, Role
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
@@ -46,7 +46,7 @@ from spacerobot_ros.viewer.state import Firing, Measured, Momenta, Part, StackSt
 LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of streams: only the last message is kept, without acknowledgement."""
 
-_SUSPENSION = 1.5
+_MAX_CALL_INTERVAL = 1.5
 """Wall time between two calls after which this process counts as suspended meanwhile, s."""
 
 _TIME_UNTIL_SILENT_NODE_IS_HIDDEN = 60.0
@@ -196,14 +196,16 @@ class Listener:
         """Take the received messages and return the state of the stack."""
         now = time.monotonic()
         self._take_streams(now)
-        self._hide_lost_nodes(now)
+        self._hide_long_silent_nodes(now)
         beats = self._beats.items()
         silent = {
             name: now - beat.at
             for name, beat in beats
-            if beat.pulse is Pulse.ACTIVE and now - beat.at > self._silent_after
+            if beat.pulse is HeartbeatState.ACTIVE and now - beat.at > self._silent_after
         }
-        inactive = tuple(name for name, beat in beats if beat.pulse is Pulse.INACTIVE and beat.role)
+        inactive = tuple(
+            name for name, beat in beats if beat.pulse is HeartbeatState.INACTIVE and beat.role
+        )
         statuses = {
             key: status
             for key, status in self._statuses.items()
@@ -231,7 +233,8 @@ class Listener:
                 key for key in statuses if self._reporters[key] in (*silent, *inactive)
             ),
             busy=any(
-                beat.pulse is Pulse.BUSY and beat.role == Role.COMMANDER.value for _, beat in beats
+                beat.pulse is HeartbeatState.BUSY and beat.role == Role.COMMANDER.value
+                for _, beat in beats
             ),
         )
 
@@ -404,13 +407,13 @@ class Listener:
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
         with suppress(ValueError):  # The heartbeat is of another package.
-            pulse = Pulse(message.message)
+            pulse = HeartbeatState(message.message)
             self._beats[message.name] = _Heartbeat(time.monotonic(), pulse, message.hardware_id)
             self._hidden = {name: by for name, by in self._hidden.items() if by != message.name}
 
-    def _hide_lost_nodes(self, now: float) -> None:
+    def _hide_long_silent_nodes(self, now: float) -> None:
         """Hide the reports of nodes that have long been silent, and of a replay that is over."""
-        if now - self._last_call > _SUSPENSION:
+        if now - self._last_call > _MAX_CALL_INTERVAL:
             # This process was suspended, so the other nodes were not silent.
             gap = now - self._last_call
             self._beats = {n: replace(b, at=b.at + gap) for n, b in self._beats.items()}
@@ -423,7 +426,8 @@ class Listener:
             is_replay = beat.role == Role.REPLAY.value
             over = is_replay and a_plant_runs and not beat.is_alive(now, self._silent_after)
             if not over and (
-                beat.pulse is Pulse.BUSY or now - beat.at <= _TIME_UNTIL_SILENT_NODE_IS_HIDDEN
+                beat.pulse is HeartbeatState.BUSY
+                or now - beat.at <= _TIME_UNTIL_SILENT_NODE_IS_HIDDEN
             ):
                 continue
             del self._beats[name]
@@ -457,11 +461,11 @@ class _Heartbeat:
     """The last heartbeat of a node: time of arrival, wall s, pulse and role."""
 
     at: float
-    pulse: Pulse
+    pulse: HeartbeatState
     role: str
 
     def is_alive(self, now: float, silent_after: float) -> bool:
         """Whether the node is active and not silent: for less than ``silent_after`` s."""
-        return self.pulse is Pulse.BUSY or (
-            self.pulse is Pulse.ACTIVE and now - self.at <= silent_after
+        return self.pulse is HeartbeatState.BUSY or (
+            self.pulse is HeartbeatState.ACTIVE and now - self.at <= silent_after
         )

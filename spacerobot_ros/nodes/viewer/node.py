@@ -47,8 +47,8 @@ from spacerobot_ros.viewer.reachability import (
     GoalChecker,
     Question,
     Verdict,
+    make_question,
     planned_links,
-    question_of,
 )
 from spacerobot_ros.viewer.server import (
     ViewerConfig,
@@ -80,7 +80,7 @@ _ROSOUT_QOS = QoSProfile(
 _LEAST_SHOWN_LOG_LEVEL = 30
 """Least level of shown log messages (rcl_interfaces/Log)."""
 
-_HEARD_GOALS = (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
+_PARTS_WITH_RECEIVED_GOALS = (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
 """Parts whose goals this node hears as well as it sends them."""
 
 _SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
@@ -171,7 +171,7 @@ class ViewerNode(FlightNode):
             ParameterEvent, "/parameter_events", self._on_parameter_change, STREAM
         )
         self._goal_topics: dict[Part, Publisher] = {}
-        self._add_goal_topics(_HEARD_GOALS)
+        self._add_goal_topics(_PARTS_WITH_RECEIVED_GOALS)
         self._shape_topic = self.create_publisher(JointState, "goal_joint_states", STREAM)
         self._fault_topic = self.create_publisher(String, "fault_injection", STREAM)
         self._seek_topic = self.create_publisher(Float64, "replay/seek", STREAM)
@@ -239,7 +239,7 @@ class ViewerNode(FlightNode):
         editor = self._page.editor
         if editor.moving:
             self._checker.cancel()
-        goals = editor.goals_at_rest(now)
+        goals = editor.settled_goals(now)
         if goals is not None:
             question = self._question(state, goals)
             if isinstance(question, Question):
@@ -255,7 +255,7 @@ class ViewerNode(FlightNode):
         """Return the check of goals, or the reason why they are not checked."""
         if not self.config.check_goals:
             return "Parameter 'check_goals' is false."
-        return question_of(state, goals, self._robot, self._remote_values)
+        return make_question(state, goals, self._robot, self._remote_values)
 
     # -- messages of the stack ------------------------------------------------------------------
 
@@ -450,7 +450,7 @@ class ViewerNode(FlightNode):
             message = goal_message(aim, self.config.world_frame, time_ns)
             self._goal_topics[part].publish(message)
             # Where this node hears the goal too, one of the readers is its own.
-            own = 1 if part in _HEARD_GOALS else 0
+            own = 1 if part in _PARTS_WITH_RECEIVED_GOALS else 0
             readers = max(readers, self._goal_topics[part].get_subscription_count() - own)
         if not readers:
             self._note("No planner or controller takes the goal: none is running.", 2, "page")

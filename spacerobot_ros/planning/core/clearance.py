@@ -34,15 +34,15 @@ DEFAULT_CLEARANCE = 0.01
 _CLEARANCE_OF_OBSTACLES = 0.01
 """Smallest distance among obstacles where none is asked for, m."""
 
-_DISABLED = ", or have an SRDF disable the pair (planner.srdf)"
+_SRDF_REMEDY = ", or have an SRDF disable the pair (planner.srdf)"
 
-_EXACT = 1e-6
+_DISTANCE_ERROR = 1e-6
 """Error of a distance, m."""
 
-_ROOM_FOR_LOOPS = 5.0
+_LOOP_ROOM_FACTOR = 5.0
 """Distance of links in a shape round which loops go, in clearances."""
 
-_NEARER = 0.5
+_MIN_START_SHARE = 0.5
 """Share of the clearance from which on a start is refused: a flight that has ended at the clearance
 may be a little nearer."""
 
@@ -133,16 +133,16 @@ class Clearance:
             if distance <= 0:
                 required[pair] = -np.inf
                 self._warn_of_contact(geometry.links_of(pair))
-            elif distance < _NEARER * self.distance:
+            elif distance < _MIN_START_SHARE * self.distance:
                 links = geometry.links_of(pair)
-                remedy = "" if isinstance(links, ObstaclePair) else _DISABLED
+                remedy = "" if isinstance(links, ObstaclePair) else _SRDF_REMEDY
                 raise PlanningError(
                     f"{sentence_case(links.subject)} are {distance:.3g} m apart at the start, "
                     f"nearer than planner.clearance = {self.distance:g} m: make it smaller{remedy}."
                 )
             else:
                 required[pair] = min(self.distance, distance)
-        return required - _EXACT
+        return required - _DISTANCE_ERROR
 
     def _warn_of_contact(self, links: LinkPair) -> None:
         if links.subject not in self._warned:
@@ -158,7 +158,7 @@ class Clearance:
 
     def is_roomy(self, shapes: Array) -> npt.NDArray[np.bool_]:
         """Return for shapes (N, n) whether all links are far enough for loops (N,)."""
-        geometry, room = self.geometry, _ROOM_FOR_LOOPS * self.distance
+        geometry, room = self.geometry, _LOOP_ROOM_FACTOR * self.distance
         roomy = np.ones(len(shapes), dtype=np.bool_)
         if not len(geometry.pairs):
             return roomy

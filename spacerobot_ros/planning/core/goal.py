@@ -140,10 +140,10 @@ class EndEffectorGoal:
     @property
     def numbers(self) -> list[float] | list[list[float]]:
         """The goal as :meth:`of_numbers` takes it."""
-        return list(self.values) if self.waypoints is None else self.values_on_way.tolist()
+        return list(self.values) if self.waypoints is None else self.path_values.tolist()
 
     @property
-    def values_on_way(self) -> Array:
+    def path_values(self) -> Array:
         """The waypoints and the goal (K + 1, 3) or (K + 1, 7), as :meth:`along` takes them."""
         end = np.array(self.values)[np.newaxis]
         return end if self.waypoints is None else np.vstack([self.waypoints, end])
@@ -368,8 +368,8 @@ class Goal:
         return (
             bool(same_shape)
             and self.base == other.base
-            and {each.link: each.values_on_way.tolist() for each in self.end_effectors}
-            == {each.link: each.values_on_way.tolist() for each in other.end_effectors}
+            and {each.link: each.path_values.tolist() for each in self.end_effectors}
+            == {each.link: each.path_values.tolist() for each in other.end_effectors}
             and np.array_equal(self.position, other.position)
             and np.array_equal(self.quaternion, other.quaternion)
         )
@@ -489,12 +489,12 @@ class PoseError:
         return float(np.abs(self.shape).max(initial=0.0))
 
     @property
-    def farthest_end_effector(self) -> float:
+    def largest_end_effector_distance(self) -> float:
         """Largest distance of an end-effector from its goal, m; zero where the goal has none."""
         return max((each.distance for each in self.end_effectors), default=0.0)
 
     @property
-    def most_turned_end_effector(self) -> float:
+    def largest_end_effector_angle(self) -> float:
         """Largest angle of an end-effector from its goal, rad; zero where the goal has none."""
         return max((each.angle for each in self.end_effectors), default=0.0)
 

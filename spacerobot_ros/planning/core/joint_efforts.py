@@ -12,10 +12,10 @@ import numpy.typing as npt
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 
-_BEYOND = 1e-6
+_MAX_EXCESS = 1e-6
 """Part of a limit by which it may be exceeded: rounding."""
 
-_ALL_TICKS = 4000
+_MAX_CHECKED_TICKS = 4000
 """Number of ticks up to which the efforts of all of them are compared with limits."""
 
 
@@ -74,17 +74,17 @@ class JointEfforts:
         accelerate most, and some in between.
         """
         rates, changes = self._rates(positions, velocity)
-        if len(positions) > _ALL_TICKS:
+        if len(positions) > _MAX_CHECKED_TICKS:
             scale = np.maximum(np.abs(changes).max(axis=0), np.finfo(float).tiny)
-            most = np.argsort(-np.abs(changes / scale).max(axis=1))[: _ALL_TICKS // 2]
-            between = np.linspace(0, len(positions) - 1, _ALL_TICKS // 2).astype(int)
+            most = np.argsort(-np.abs(changes / scale).max(axis=1))[: _MAX_CHECKED_TICKS // 2]
+            between = np.linspace(0, len(positions) - 1, _MAX_CHECKED_TICKS // 2).astype(int)
             chosen = np.union1d(most, between)
             positions, rates, changes = positions[chosen], rates[chosen], changes[chosen]
             L_B = None if L_B is None else L_B[chosen]
         peaks = np.abs(self._effort_shares(positions, rates, changes, L_B)).max(axis=0)
         clauses = []
         for joint, share, limit in zip(self._joints, peaks, self.limit, strict=True):
-            if share > 1 + _BEYOND:
+            if share > 1 + _MAX_EXCESS:
                 unit = "N" if joint.unit == "m" else "N m"
                 taken, allowed = f"{share * limit:.4g} {unit}", f"{limit:.4g} {unit}"
                 clauses.append(

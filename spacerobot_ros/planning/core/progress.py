@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from spacerobot_ros.model.compilation import ANNOUNCEMENT
+from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE
 
 _RECORD_ATTRIBUTE = "search_progress"
 """The attribute of log records that holds a SearchProgress."""
@@ -85,5 +85,5 @@ class _ProgressHandler(logging.Handler):
         progress = getattr(record, _RECORD_ATTRIBUTE, None)
         if isinstance(progress, SearchProgress):
             self._show(progress)
-        elif getattr(record, ANNOUNCEMENT, False):
+        elif getattr(record, ANNOUNCEMENT_ATTRIBUTE, False):
             self._announce(record.getMessage())

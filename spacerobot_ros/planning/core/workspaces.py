@@ -31,7 +31,7 @@ _SEED = 20
 _SHAPES = 48
 """Shapes from which singular ones are sought, and shapes that are examined for the reach."""
 
-_TRIED = 3
+_EXTREME_STARTS = 3
 """Shapes from which an extreme distance is sought."""
 
 _NEWTON_STEPS, _LONGEST_NEWTON_STEP = 40, 0.5
@@ -44,7 +44,7 @@ _ZERO = 1e-9
 _ZERO_RATE = 1e-6
 """Singular value of J* over the reach that counts as zero."""
 
-_TOUCHING = 2e-3
+_MAX_CLOSED_GAP = 2e-3
 """Gaps between path-dependent distances below this share of the reach are closed: curves end on
 either side of a distance at which others begin."""
 
@@ -83,7 +83,7 @@ class Workspaces:
         """The intervals of the reach between the path-dependent ones, in ascending order."""
         ends = [self.reach[0], *np.ravel(self.path_dependent).tolist(), self.reach[1]]
         gaps = zip(ends[::2], ends[1::2], strict=True)
-        smallest = _TOUCHING * self.reach[1]
+        smallest = _MAX_CLOSED_GAP * self.reach[1]
         return tuple((low, high) for low, high in gaps if high - low > smallest)
 
 
@@ -107,7 +107,7 @@ def workspaces(robot: SpaceRobot, link: str) -> tuple[Workspaces, ...]:
     limited = _search(robot, link, equations, within_limits=True)
     # Singular shapes within the limits are some without them, too.
     intervals = np.array([*free.path_dependent, *limited.path_dependent]).reshape(-1, 2)
-    joined = _union(intervals, _TOUCHING * free.reach[1])
+    joined = _union(intervals, _MAX_CLOSED_GAP * free.reach[1])
     return replace(free, path_dependent=tuple(joined)), limited
 
 
@@ -225,7 +225,7 @@ class _Equations:
         z = np.hstack([self.samples, np.zeros((len(self.samples), m))])
         order = np.argsort(self.evaluate(z)[2])
         ends, shapes = [], []
-        for sign, best in ((1.0, order[:_TRIED]), (-1.0, order[-_TRIED:])):
+        for sign, best in ((1.0, order[:_EXTREME_STARTS]), (-1.0, order[-_EXTREME_STARTS:])):
             found = [
                 minimize(
                     squared,
@@ -270,13 +270,13 @@ class _Search:
         """Return the union of the intervals of curves, with its ends at extreme distances."""
         largest = float(radii[1].max())
         found = []
-        for low, high in _union(np.column_stack(radii), _TOUCHING * largest):
+        for low, high in _union(np.column_stack(radii), _MAX_CLOSED_GAP * largest):
             from_below = int(np.argmin(np.abs(radii[0] - low)))
             from_above = int(np.argmin(np.abs(radii[1] - high)))
             down = self._extreme(ends[0][from_below], low, 1.0)
             up = self._extreme(ends[1][from_above], high, -1.0)
             found.append((down if down > 1e-6 * largest else 0.0, up))
-        return _union(np.array(found), _TOUCHING * largest)
+        return _union(np.array(found), _MAX_CLOSED_GAP * largest)
 
     def _extreme(self, z: Array, distance: float, sign: float) -> float:
         """Return the smallest (sign 1) or largest (-1) distance of singular shapes near one."""

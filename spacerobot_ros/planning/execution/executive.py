@@ -216,7 +216,7 @@ class ActiveGoal:
     """Positions of the stuck joints, m or rad, as measured for the last plan."""
     required: frozenset[Controlled] = frozenset()
     """Parts of the goal that plans without the stuck joints must control."""
-    not_flown: str = ""
+    not_flown_reason: str = ""
     """Clause that tells why no schedule is flown any more; empty: schedules are flown."""
 
 
@@ -475,7 +475,7 @@ class Executive:
         bool
             Whether a goal was given up.
         """
-        if commanded_until_ns is not None and not self._plant_has_obeyed(
+        if commanded_until_ns is not None and not self._commands_were_obeyed(
             commanded_until_ns, rests_since_ns
         ):
             return False
@@ -492,7 +492,7 @@ class Executive:
             self.outputs.append(PlannerStatus(PlannerState.ABORTED, message, goal_id=goal_id))
         return has_goal
 
-    def _plant_has_obeyed(self, commanded_until_ns: int, rests_since_ns: int) -> bool:
+    def _commands_were_obeyed(self, commanded_until_ns: int, rests_since_ns: int) -> bool:
         """Whether a plant has obeyed the active goal before it came to rest."""
         active, since = self._active_goal, self._commanded_from_ns
         if active is None or commanded_until_ns < active.begins_ns:
@@ -516,7 +516,7 @@ class Executive:
         if active is None:
             return
         if final:
-            active.not_flown = why
+            active.not_flown_reason = why
         elif why:
             self._add_notice(Severity.WARNING, f"{sentence_case(why)}.")
         self._tracker.end_by_result()
@@ -570,7 +570,7 @@ class Executive:
             case Phase.REPLANNING | Phase.TAKING_OVER:
                 self._change_phase(Event.OBSTACLES, Phase.EXECUTING)
         if self.phase is Phase.EXECUTING and active is not None:
-            clause = self._nears_obstacles(active)
+            clause = self._obstacle_clause(active)
             if clause:
                 message = (
                     f"{sentence_case(clause)}: the joints brake, and the remaining motion is "
@@ -580,7 +580,7 @@ class Executive:
                 self._add_status(PlannerState.EXECUTING, message, active.identified, active)
                 self._brake_for_replan(Event.OBSTACLES)
 
-    def _nears_obstacles(self, active: ActiveGoal) -> str:
+    def _obstacle_clause(self, active: ActiveGoal) -> str:
         """Return the clause that says where the rest of a schedule comes too near; else nothing."""
         clearance, schedule = self._worker.clearance, active.schedule
         if clearance is None or not clearance.has_obstacles:
@@ -626,7 +626,7 @@ class Executive:
     def add_base_measurement(self, measured: MeasuredState) -> None:
         """Use a base measurement that arrives after its state was answered."""
         if self._teleoperation is not None:
-            self._see_base(self._teleoperation, measured)
+            self._keep_base_pose(self._teleoperation, measured)
         elif self.measuring:
             if self._tracker.is_active:
                 # A moving robot has no average: only its last state counts.
@@ -694,7 +694,7 @@ class Executive:
 
     # -- TELEOPERATING ------------------------------------------------------------------------
 
-    def _see_base(self, teleoperation: Teleoperation, measured: MeasuredState) -> None:
+    def _keep_base_pose(self, teleoperation: Teleoperation, measured: MeasuredState) -> None:
         """Keep the measured pose of the base, if it is one."""
         base = measured.base()
         if base is not None and np.all(np.isfinite(base.pose)):
@@ -703,7 +703,7 @@ class Executive:
     def _follow_twist(self, teleoperation: Teleoperation, measured: MeasuredState) -> None:
         """Write the rates for the last twist; brake where it is old, and end at rest."""
         stamp, q, timeout = measured.stamp_ns, measured.q, self.config.twist_timeout * 1e9
-        self._see_base(teleoperation, measured)
+        self._keep_base_pose(teleoperation, measured)
         twist, reason = teleoperation.twist, ""
         if self._new_goal is not None or stamp - teleoperation.received_ns > timeout:
             twist = teleoperation.twist = None
@@ -776,8 +776,8 @@ class Executive:
             self._add_status(PlannerState.REACHED, message, active.identified, active, error)
             self._end_goal(Event.REACHED)
             return
-        if active.not_flown:
-            self._fail_goal(active, error, f", and {active.not_flown}.")
+        if active.not_flown_reason:
+            self._fail_goal(active, error, f", and {active.not_flown_reason}.")
             return
         if active.next_plan is PlanReason.CORRECTION:
             if active.corrections >= self.config.max_corrections:
@@ -1329,8 +1329,8 @@ class Executive:
             if not aim.end_effectors or "attitude" in aim.base:
                 values["attitude_error_rad"] = remaining.angle
             if aim.end_effectors:
-                values["end_effector_position_error_m"] = remaining.farthest_end_effector
-                values["end_effector_attitude_error_rad"] = remaining.most_turned_end_effector
+                values["end_effector_position_error_m"] = remaining.largest_end_effector_distance
+                values["end_effector_attitude_error_rad"] = remaining.largest_end_effector_angle
         values["end_effector_goals"] = end_effector_values(aim)
         values["end_effector_waypoints"] = waypoint_counts(aim)
         if schedule is not None:

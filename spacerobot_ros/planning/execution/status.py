@@ -279,7 +279,7 @@ def describe_remaining_error(
     if len(error.shape):
         parts["shape"] = f"{error.max_joint_error:.3g} at the joints"
     if error.end_effectors:
-        distance, angle = error.farthest_end_effector, error.most_turned_end_effector
+        distance, angle = error.largest_end_effector_distance, error.largest_end_effector_angle
         # Goals of positions alone leave no angle.
         turn = f" and {angle:.3g} rad" if angle > 0 else ""
         parts["end_effectors"] = f"end-effectors {distance:.3g} m{turn}"

@@ -37,7 +37,7 @@ _SLOW_PROGRESS = 2 * LEAST_PROGRESS
 _LOOK_AHEAD = 1e-3
 """Motion of the fastest joint after which the progress is looked at again, rad."""
 
-_SHARES_BEFORE_CONTACT = (1.0, 0.5, 0.25, 0.0)
+_TRIED_SPEED_SHARES = (1.0, 0.5, 0.25, 0.0)
 """Shares of the rates that are tried where links come too near; with the last one joints brake."""
 
 _MIDPOINT_STEPS = 2
@@ -200,7 +200,7 @@ class TwistFollower:
                 turn = quaternion_from_rotvec(-self._robot.connection(q + half / 2)[3:] @ half)
                 middle = np.append(pose[:3], quaternion_multiply(pose[3:], turn))
                 wanted, reason = self._wanted(twist, middle, q + half)
-        for share in _SHARES_BEFORE_CONTACT:
+        for share in _TRIED_SPEED_SHARES:
             rates = self._limited(share * wanted, q, before)
             if self._clearance is None or not np.any(rates):
                 break
@@ -223,7 +223,9 @@ class TwistFollower:
             return np.zeros(len(q)), ""
         rates, progress = self._solution(q, motion)
         factor, reason = 1.0, ""
-        if progress < _SLOW_PROGRESS and not self._leads_away(q, motion, rates, progress):
+        if progress < _SLOW_PROGRESS and not self._moves_away_from_singularity(
+            q, motion, rates, progress
+        ):
             factor = max(0.0, (progress - LEAST_PROGRESS) / (_SLOW_PROGRESS - LEAST_PROGRESS))
             reason = (
                 f"'{self.link}' is near a dynamic singularity: it moves by {progress:.3g} of its "
@@ -240,7 +242,9 @@ class TwistFollower:
             reason = f"Joint '{joint}' comes to its limit at {q[nearest]:.4g}."
         return factor * rates, reason
 
-    def _leads_away(self, q: Array, motion: Array, rates: Array, progress: float) -> bool:
+    def _moves_away_from_singularity(
+        self, q: Array, motion: Array, rates: Array, progress: float
+    ) -> bool:
         """Whether rates (n,) lead away from a singularity."""
         fastest = np.abs(rates / self._weights).max()
         if fastest == 0.0:

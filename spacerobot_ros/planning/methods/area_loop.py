@@ -157,7 +157,7 @@ class AreaLoopGait(GaitMethod):
             return self._build_schedule(gait, request, notes, progress)
         chosen = self._nominal.at(state.q, None if progress is None else progress.nominal)
         if progress is None:
-            chosen = self._with_room(request, final, chosen, cancellation)
+            chosen = self._shape_with_room(request, final, chosen, cancellation)
         nominal = self._nominal.move_to_nearest_turn(chosen, state.q)
         flown = 0 if progress is None else progress.cycles
         gait = self._add_legs(gait, [(nominal.shape, self.options.edge_time)])
@@ -184,7 +184,7 @@ class AreaLoopGait(GaitMethod):
         progress = AreaLoopProgress(chosen, flown)
         return self._build_schedule(gait, request, notes, progress, remaining)
 
-    def _with_room(
+    def _shape_with_room(
         self,
         request: PlanRequest,
         final: Array | None,
@@ -201,7 +201,7 @@ class AreaLoopGait(GaitMethod):
             return chosen
         required = self.clearance.required(request.state.q)
         keeps_clear = partial(self.clearance.is_clear, required=required)
-        for other in self._nominal.roomier(request.state.q, keeps_clear):
+        for other in self._nominal.shapes_with_more_room(request.state.q, keeps_clear):
             cancellation.raise_if_requested()
             time, _ = self._expected_time(request, final, other)
             if time < least:
@@ -226,7 +226,7 @@ class AreaLoopGait(GaitMethod):
             return 0.0, True
         if self._too_near(gait.positions, self._base_poses(state, gait.positions, gait.attitudes)):
             return math.inf, False
-        S, share = self._first_areas(left, nominal)
+        S, share = self._initial_loop_areas(left, nominal)
         try:
             clear, _ = self._shrink_until_clear(state, gait, S, share, nominal)
         except PlanningError:
@@ -235,7 +235,7 @@ class AreaLoopGait(GaitMethod):
         duration = (len(loop.positions) - len(gait.positions)) * self.control_period
         return self._count_cycles_left(missing, clear, enough) * duration, clear == share
 
-    def _first_areas(self, left: Array, nominal: NominalShape) -> tuple[Array, float]:
+    def _initial_loop_areas(self, left: Array, nominal: NominalShape) -> tuple[Array, float]:
         """Return the areas (3,) for the share k of a turn (3,), rad, and the part of them that
         loops with edges of at most the longest have.
         """
@@ -260,12 +260,12 @@ class AreaLoopGait(GaitMethod):
         The gait begins in ``state``. Cycles go on until the attitude is off by ``enough`` (rad);
         ``flown`` are done.
         """
-        S, share = self._first_areas(left, nominal)
+        S, share = self._initial_loop_areas(left, nominal)
         missing = float(np.linalg.norm(left))
-        cycles = self._require_few_cycles(missing, share, enough, flown)
+        cycles = self._count_cycles_within_limits(missing, share, enough, flown)
         share, too_near = self._shrink_until_clear(state, gait, S, share, nominal)
         if too_near:
-            cycles = self._require_few_cycles(missing, share, enough, flown, too_near)
+            cycles = self._count_cycles_within_limits(missing, share, enough, flown, too_near)
         for _ in range(_MAX_CYCLE_TRIALS):
             path = edge_path(share * S, nominal.longest)
             after = self._add_legs(gait, self._edge_ends(path, nominal))
@@ -298,7 +298,7 @@ class AreaLoopGait(GaitMethod):
             cycles,
         )
 
-    def _require_few_cycles(
+    def _count_cycles_within_limits(
         self, missing: float, share: float, enough: float, flown: int, too_near: str = ""
     ) -> float:
         """Return the expected number of cycles for the goal, with those that are ``flown``.

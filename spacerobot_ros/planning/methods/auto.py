@@ -77,7 +77,7 @@ class AutoGait(GaitMethod):
             one of them proves it, and else a `NotFoundError` where one of them searched.
         """
         refusals = dict(self._unsuitable)
-        names = self._list_comparable(refusals)
+        names = self._comparable_methods(refusals)
         if request.goal.end_effectors:
             names = [name for name in self._candidates if name not in self._unsuitable]
         if request.goal.has_path:
@@ -122,7 +122,7 @@ class AutoGait(GaitMethod):
         message = f"No method plans this goal of robot '{self.robot.description.name}'. {reasons}"
         return refusal_of_all(message, of_goal)
 
-    def _list_comparable(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
+    def _comparable_methods(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
         """Return the methods to compare; add the refusals of the other methods.
 
         The others do not control a part of the pose that one of the methods controls. Methods that

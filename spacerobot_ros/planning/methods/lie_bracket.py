@@ -42,7 +42,7 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
 _MIN_CYCLE_TICKS = 12
 _MAX_REFINEMENTS = 20
-_SMALLER = 1.4
+_SHRINK_FACTOR = 1.4
 """Factor by which a cycle on which links come too near is made smaller."""
 
 _PATH_POSES_PER_STEP = 100
@@ -335,7 +335,7 @@ class LieBracketGait(GaitMethod):
                 too_near = self._too_near(shapes)
                 if not too_near:
                     return _TurnStep(shapes, n, alpha, amplitudes)
-                excess = _SMALLER
+                excess = _SHRINK_FACTOR
             # Amplitudes go as 1/sqrt(n).
             n = math.ceil(min(n * min(excess, 1e6) ** 2 * 1.001, 1e12)) + 1
 

@@ -58,10 +58,10 @@ _BOX_GRID_POINTS = 7
 _MAX_BOXES = 300
 """Boxes of one size that are looked at, the best first."""
 
-ClearTest = Callable[[Array], bool]
+ClearanceTest = Callable[[Array], bool]
 """Whether links keep clear at all of some shapes (N, n)."""
 
-RoomTest = Callable[[Array], npt.NDArray[np.bool_]]
+LoopRoomTest = Callable[[Array], npt.NDArray[np.bool_]]
 """Whether links have room to move (N,) at shapes (N, n)."""
 
 
@@ -125,7 +125,7 @@ class NominalShapeChooser:
         largest_edge: float,
         joints: str,
         nominal: Sequence[float],
-        is_roomy: RoomTest | None = None,
+        is_roomy: LoopRoomTest | None = None,
     ) -> None:
         self._robot = robot
         self._is_roomy = is_roomy
@@ -162,7 +162,7 @@ class NominalShapeChooser:
             kept if kept is not None and self._still_applies(kept, q) else self._choose_nominal(q)
         )
 
-    def roomier(self, q: Array, is_clear: ClearTest) -> Iterator[NominalShape]:
+    def shapes_with_more_room(self, q: Array, is_clear: ClearanceTest) -> Iterator[NominalShape]:
         """Yield other nominal shapes from shape ``q`` (n,), round which loops have room.
 
         All shapes in a box round one keep clear, as ``is_clear`` says. The edges of the first box
@@ -172,7 +172,7 @@ class NominalShapeChooser:
         if self._given_shape is not None:
             return
         for share in _BOX_SHARES:
-            found = roomy_nominal(
+            found = nominal_with_clearance(
                 self._robot, q, self._triples, self._largest_edge, share, is_clear
             )
             if found is not None:
@@ -195,7 +195,7 @@ class NominalShapeChooser:
                 f"{int(np.sum(robot.velocity_limit > 0))} with a velocity limit above zero."
             )
         if self._given_shape is not None:
-            chosen = given_nominal(robot, self._given_shape, self._triples, self._largest_edge)
+            chosen = nominal_at_shape(robot, self._given_shape, self._triples, self._largest_edge)
         else:
             chosen = best_nominal(robot, q, self._triples, self._largest_edge, self._is_roomy)
         names = [robot.joint_names[i] for i in chosen.joints]
@@ -216,7 +216,7 @@ class NominalShapeChooser:
         return chosen
 
 
-def given_nominal(
+def nominal_at_shape(
     robot: SpaceRobot, shape: Array, triples: Sequence[tuple[int, int, int]], largest_edge: float
 ) -> NominalShape:
     """Return a given shape (n,) with the best of the triples of joints.
@@ -237,7 +237,7 @@ def best_nominal(
     held: Array,
     triples: Sequence[tuple[int, int, int]],
     largest_edge: float,
-    is_roomy: RoomTest | None = None,
+    is_roomy: LoopRoomTest | None = None,
 ) -> NominalShape:
     """Return the best nominal shape over all triples; other joints stay as in ``held`` (n,).
 
@@ -255,13 +255,13 @@ def best_nominal(
     )
 
 
-def roomy_nominal(
+def nominal_with_clearance(
     robot: SpaceRobot,
     held: Array,
     triples: Sequence[tuple[int, int, int]],
     largest_edge: float,
     share: float,
-    is_clear: ClearTest,
+    is_clear: ClearanceTest,
 ) -> NominalShape | None:
     """Return the best nominal shape of a grid round which links keep clear; None if none is found.
 
@@ -315,7 +315,7 @@ def _best_shape_of_triple(
     triple: tuple[int, int, int],
     largest_edge: float,
     points: int,
-    is_roomy: RoomTest | None,
+    is_roomy: LoopRoomTest | None,
 ) -> NominalShape:
     chosen = list(triple)
     lower, upper = (bound[chosen] for bound in shape_box(robot))

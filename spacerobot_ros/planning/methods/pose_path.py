@@ -26,16 +26,16 @@ from spacerobot_ros.model.rotations import (
     rotvecs_from_quaternions,
 )
 
-MOST_CORNERS = 500
+MAX_CORNERS = 500
 """Largest number of corners that is planned for: it bounds the time of a plan."""
 
 _SAME_POSE = 1e-10
 """Distance of equal poses, m or rad."""
 
-_SHARPEST_BLEND = -0.5
+_MIN_BLEND_COSINE = -0.5
 """Cosine of the largest angle of a corner that is rounded; beyond it the motion stops there."""
 
-_MARKS_OF_BLEND = 4
+_BLEND_PARTS = 4
 """Parts of a blend at whose ends the way is looked at."""
 
 
@@ -117,21 +117,21 @@ class PosePath:
             first, last = open_parts.pop()
             if last - first < 2:
                 continue
-            off = self._off_line(first, last)
+            off = self._distances_from_line(first, last)
             worst = int(np.argmax(off))
             if off[worst] <= max(tolerance, _SAME_POSE):
                 continue
             kept.add(first + 1 + worst)
-            if len(kept) > MOST_CORNERS + 2:
+            if len(kept) > MAX_CORNERS + 2:
                 raise PlanningError(
-                    f"The path has more than {MOST_CORNERS} corners: give fewer poses, or a larger "
+                    f"The path has more than {MAX_CORNERS} corners: give fewer poses, or a larger "
                     "resolved_rate.corner_tolerance."
                 )
             open_parts += [(first, first + 1 + worst), (first + 1 + worst, last)]
         order = sorted(kept)
         return PosePath(self.positions[order], self.quaternions[order])
 
-    def _off_line(self, first: int, last: int) -> Array:
+    def _distances_from_line(self, first: int, last: int) -> Array:
         """Return how far the poses between two of them are off the line of these, m or rad."""
         inner = slice(first + 1, last)
         shares = (self.along[inner] - self.along[first]) / (self.along[last] - self.along[first])
@@ -154,12 +154,12 @@ class PosePath:
         directions = np.hstack([self.chords, self.turns])
         size = np.linalg.norm(directions, axis=1)
         cosines = (directions[1:] * directions[:-1]).sum(axis=1) / (size[1:] * size[:-1])
-        stops = 1 + np.flatnonzero((cosines < _SHARPEST_BLEND) | (tolerance <= 0.0))
+        stops = 1 + np.flatnonzero((cosines < _MIN_BLEND_COSINE) | (tolerance <= 0.0))
         for first, last in zip([0, *stops], [*stops, len(self.positions) - 1], strict=True):
             yield PosePath(self.positions[first : last + 1], self.quaternions[first : last + 1])
 
 
-class RoundedWay:
+class RoundedPath:
     """The way along a path, rounded at the corners: a displacement and a turn from its start.
 
     Parameters
@@ -192,7 +192,7 @@ class RoundedWay:
         near = np.minimum(path.lengths[1:], path.lengths[:-1]) / 2
         self._blends = np.concatenate([[0.0], np.minimum(near, 4 * tolerance), [0.0]])
         """(K,) distances from the corners at which their blends begin and end."""
-        parts = np.linspace(-1.0, 1.0, _MARKS_OF_BLEND + 1)
+        parts = np.linspace(-1.0, 1.0, _BLEND_PARTS + 1)
         inner = slice(1, -1)
         marks = path.along[inner, np.newaxis] + np.outer(self._blends[inner], parts)
         self.marks = np.unique(marks) / self._total

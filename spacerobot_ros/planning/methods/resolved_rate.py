@@ -54,12 +54,12 @@ from spacerobot_ros.planning.methods.optimal.end_effectors import (
 )
 from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
-from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedWay
+from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 
 _STEP = 0.02
 """Longest step along a path of the joints, rad of the fastest one."""
 
-_FEWEST_STEPS = 20
+_MIN_STEPS = 20
 """Steps along a path at least."""
 
 LEAST_PROGRESS = 0.01
@@ -69,10 +69,10 @@ for a motion of the joints by one radian of the fastest one."""
 _ZERO_PROGRESS = 1e-8
 """Progress below which the path has come to the singularity itself."""
 
-_APPROACH = 0.25
+_SINGULARITY_STEP_SHARE = 0.25
 """Share of the way to a singularity that is a step at most."""
 
-_AT_MARK = 1e-6
+_KNOT_TOLERANCE = 1e-6
 """Share of the way within which a jump of its curvature counts as passed."""
 
 _ZERO_DISTANCE = 1e-10
@@ -216,7 +216,7 @@ class _LinkLine:
     rotations: Array
     r_CE: Array
     quaternion: Array
-    way: _Way | RoundedWay
+    way: _Way | RoundedPath
 
     def miss(self, R: Array, r: Array, progress: float) -> Array:
         """Return the errors (k + l,) of a pose to that after a share ``progress`` of the line."""
@@ -379,17 +379,17 @@ def _trace(lines: _Lines, q: Array, cancellation: Cancellation) -> JointPath:
 
     k = rate(y)
     lengths, states, progress = [0.0], [y], [float(k[-1])]
-    longest = min(_STEP, total / _FEWEST_STEPS / max(progress[0], _ZERO_PROGRESS))
+    longest = min(_STEP, total / _MIN_STEPS / max(progress[0], _ZERO_PROGRESS))
     step = longest
     while progress[-1] > _ZERO_PROGRESS:
         cancellation.raise_if_requested()
         left = total - y[-1]
-        ahead = lines.marks[lines.marks * total > y[-1] + _AT_MARK * total] * total - y[-1]
+        ahead = lines.marks[lines.marks * total > y[-1] + _KNOT_TOLERANCE * total] * total - y[-1]
         # Steps end where the curvature of the way jumps.
         step = min(longest, left / progress[-1], *ahead[:1] / progress[-1])
         if len(progress) > 1 and (falls := progress[-2] - progress[-1]) > 0:
             slope = falls / (lengths[-1] - lengths[-2])
-            step = min(step, _APPROACH * progress[-1] / slope)
+            step = min(step, _SINGULARITY_STEP_SHARE * progress[-1] / slope)
         k2 = rate(y + step / 2 * k)
         k3 = rate(y + step / 2 * k2)
         k4 = rate(y + step * k3)
@@ -626,7 +626,7 @@ class ResolvedRateGait(GaitMethod):
         if before is not None and isinstance(before.progress, PathProgress):
             rest = before.progress.rest(before.positions, state.q)
         else:
-            points = aim.values_on_way[-1:] if request.correction else aim.values_on_way
+            points = aim.path_values[-1:] if request.correction else aim.path_values
             # Without an attitude any will do: it does not turn.
             any_ = np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1))
             rest = PosePath(points[:, :3], any_ if aim.quaternion is None else points[:, 3:])
@@ -780,13 +780,13 @@ class ResolvedRateGait(GaitMethod):
                 turn = rotvec_from_quaternion(between)
             is_base, is_led = each.link == robot.base_link, each is goals[0]
             points = np.vstack([waypoints, each.position] if is_led else [each.position])
-            way: _Way | RoundedWay
+            way: _Way | RoundedPath
             if is_led and piece is not None:
                 path, before, whole = piece
                 seen = PosePath(
                     path.positions @ R_BW.T, quaternion_multiply(from_start, path.quaternions)
                 )
-                way = RoundedWay(seen, self.options.corner_tolerance / 2, before, whole)
+                way = RoundedPath(seen, self.options.corner_tolerance / 2, before, whole)
             else:
                 points = np.vstack([np.zeros(3), (points - state.position) @ R_BW.T - r_BE])
                 way = _Way(points) if is_base else _Way(points, turn)
@@ -906,8 +906,8 @@ class ResolvedRateGait(GaitMethod):
             **notes,
             "final_shape": positions[-1].tolist(),
             "final_position": path.position[-1].tolist(),
-            "predicted_end_effector_position_error": left.farthest_end_effector,
-            "predicted_end_effector_attitude_error": left.most_turned_end_effector,
+            "predicted_end_effector_position_error": left.largest_end_effector_distance,
+            "predicted_end_effector_attitude_error": left.largest_end_effector_angle,
         }
         for each in goal.end_effectors:
             r_WE, quaternion = end_effector_pose(self.robot, each.link, *end, positions[-1])

@@ -53,7 +53,7 @@ _MAX_SIDE = math.pi
 """rad. Over a whole turn of both joints the curvature has mean zero: beyond about half a turn a
 larger square adds curvature of the other sign."""
 
-_TRIED_SIDE_COUNT = 8
+_SIDE_SAMPLES = 8
 """Number of tried sides between zero and the largest side that fits."""
 
 _USED_RANGE_SHARE = 1.0 - 1e-9
@@ -308,7 +308,9 @@ class SquareSearch:
             all of them.
         """
         pairs = itertools.combinations(self._movable, 2)
-        found = [candidates for pair in pairs if (candidates := self._growing_squares(psi_e, pair))]
+        found = [
+            candidates for pair in pairs if (candidates := self._squares_within_limits(psi_e, pair))
+        ]
         largest = max(found, key=lambda candidates: candidates.largest, default=None)
         if largest is None or largest.largest * self._most_loops < abs(wanted):
             raise PlanningError(self._describe_refusal(wanted, largest))
@@ -386,7 +388,7 @@ class SquareSearch:
             f"{self._most_loops}: {most}."
         )
 
-    def _growing_squares(self, psi_e: Array, pair: tuple[int, int]) -> _SquareFamily | None:
+    def _squares_within_limits(self, psi_e: Array, pair: tuple[int, int]) -> _SquareFamily | None:
         """Return squares of growing side within the joint limits; None without room for any."""
         at, lower, upper = (x[list(pair)] for x in (psi_e, self._robot.lower, self._robot.upper))
         room = float(np.min(upper - lower))
@@ -395,11 +397,9 @@ class SquareSearch:
         if room <= 0:
             return None
         plane = self._phase.plane(psi_e, *pair)
-        sides = np.linspace(0.0, min(room, _MAX_SIDE) * _USED_RANGE_SHARE, _TRIED_SIDE_COUNT + 1)[
-            1:
-        ]
+        sides = np.linspace(0.0, min(room, _MAX_SIDE) * _USED_RANGE_SHARE, _SIDE_SAMPLES + 1)[1:]
         if self._centre is not None:
-            centres = np.tile(self._centre, (_TRIED_SIDE_COUNT, 1))
+            centres = np.tile(self._centre, (_SIDE_SAMPLES, 1))
         else:
             boxes = [centre_box(at, lower + side / 2, upper - side / 2) for side in sides]
             centres = curvature_peaks(plane, at, np.array(boxes))

@@ -12,7 +12,7 @@ import numpy as np
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 
-_RESERVE = 1e-4
+_LIMIT_RESERVE = 1e-4
 """Share of velocity and acceleration limits that is left for the last, small correction."""
 
 _OPTIONS = {
@@ -93,7 +93,7 @@ def least_change(
     shares = np.concatenate(
         [(rates / limits.velocity).ravel(), (changes / limits.acceleration).ravel()]
     )
-    most = 1.0 - _RESERVE
+    most = 1.0 - _LIMIT_RESERVE
     wanted = weight * error
     program = ca.conic(
         "commands", "osqp", {"h": ca.Sparsity.diag(count * n), "a": A.sparsity()}, _OPTIONS

@@ -71,7 +71,7 @@ _PARAMETERS_PER_LINK = 7
 _HALF_TURN_ROUNDING = 1e-9
 """Keeps the derivatives of the rotation error finite at half a turn."""
 
-_STARTS, _MORE_STARTS = 16, 96
+_STARTS, _ADDITIONAL_STARTS = 16, 96
 """Shapes from which inverse kinematics begins, and those where none of these leads to the goal."""
 
 _ITERATIONS = 40
@@ -83,7 +83,7 @@ _DAMPING = 1e-4
 _END_ERROR = 2e-3
 """Error of a shape that may be the end of a guess, m or rad: the solver brings it to the goal."""
 
-_STEPS_ON_DIRECT_WAY = 12
+_DIRECT_PATH_STEPS = 12
 """Steps in which the turn of the base on the direct way to a shape is integrated."""
 
 _MAX_STEP = 0.5
@@ -92,7 +92,7 @@ _MAX_STEP = 0.5
 _POSSIBLE_ENDS = 6
 """Ends that guesses of the search have, one after the other."""
 
-_SAME_END = 0.05
+_MIN_END_DIFFERENCE = 0.05
 """Ends nearer than this, as shares of the joints' ranges, are the same."""
 
 _GIVEN_SHAPE_ERROR = 1e-9
@@ -197,9 +197,9 @@ class EndEffectorRows:
             by_shape.reshape(m, K, self.robot.n).transpose(1, 0, 2),
         )
 
-    def turns_on_direct_way(self, start: Array, ends: Array) -> Array:
+    def turns_along_direct_path(self, start: Array, ends: Array) -> Array:
         """Return the turns (K, 4) of the base on straight ways from a shape (n,) to ends (K, n)."""
-        N = _STEPS_ON_DIRECT_WAY
+        N = _DIRECT_PATH_STEPS
         step = (ends - start) / N
         shapes = start + step[:, np.newaxis] * np.arange(N)[:, np.newaxis]
         steps = np.repeat(step, N, axis=0).T
@@ -452,7 +452,7 @@ class EndEffectorSpecification:
         tolerance = request.tolerance
         X = turn
         if not self.attitude:
-            X = self.rows.turns_on_direct_way(request.state.q, shape[np.newaxis])[0]
+            X = self.rows.turns_along_direct_path(request.state.q, shape[np.newaxis])[0]
         most = max(tolerance.position, _GIVEN_SHAPE_ERROR)
         if not self.attitude and len(self.rows.axes):
             # Loops of the joints turn the base about the axes; Newton's method finds how far.
@@ -506,7 +506,7 @@ class EndEffectorSpecification:
         middle, half = limits.span(start)
         speed = np.where(np.isfinite(limits.velocity), limits.velocity, half)
         nearest = np.inf
-        for count, follows in ((_STARTS, True), (_STARTS, False), (_MORE_STARTS, False)):
+        for count, follows in ((_STARTS, True), (_STARTS, False), (_ADDITIONAL_STARTS, False)):
             # From here, from nearby, and from anywhere.
             anywhere = middle + half * rng.uniform(-1, 1, (count, len(start)))
             share = np.linspace(0.0, 1.0, count)[:, np.newaxis]
@@ -519,7 +519,7 @@ class EndEffectorSpecification:
             ends: list[PossibleEnd] = []
             for k in np.argsort(times, kind="stable"):
                 scaled = [np.abs((shapes[k] - end.shape) / np.maximum(half, 1e-9)) for end in ends]
-                is_new = all(each.max() > _SAME_END for each in scaled)
+                is_new = all(each.max() > _MIN_END_DIFFERENCE for each in scaled)
                 if miss[k] <= _END_ERROR and is_new:
                     ends.append(PossibleEnd(shapes[k], X[k]))
             if ends:
@@ -529,9 +529,9 @@ class EndEffectorSpecification:
         names = " and ".join(f"'{link}'" for link, _ in self.rows.links)
         raise NotFoundError(
             f"No shape of robot '{self.rows.robot.description.name}' that puts {names} to the goal "
-            f"was found from {2 * _STARTS + _MORE_STARTS} shapes; the nearest is {nearest:.3g} m "
-            "or rad away. A nearer goal may help, a position instead of a pose, or more freedom "
-            "of the base."
+            f"was found from {2 * _STARTS + _ADDITIONAL_STARTS} shapes; the nearest is "
+            f"{nearest:.3g} m or rad away. A nearer goal may help, a position instead of a pose, or "
+            "more freedom of the base."
         )
 
     def _inverse_kinematics(
@@ -554,7 +554,7 @@ class EndEffectorSpecification:
         free = given is None and not follows
         X = np.tile(given, (count, 1)) if given is not None else None
         if X is None:
-            X = rows.turns_on_direct_way(start, shapes)
+            X = rows.turns_along_direct_path(start, shapes)
         for _ in range(_ITERATIONS):
             values, by_rotation, by_shape = rows.evaluate(X, shapes, parameters)
             J = by_shape
@@ -584,7 +584,7 @@ class EndEffectorSpecification:
                 turns = quaternions_from_rotvecs(step[:, n:] @ rows.axes)
                 X = quaternion_multiply(X, turns)
             elif given is None:
-                X = rows.turns_on_direct_way(start, shapes)
+                X = rows.turns_along_direct_path(start, shapes)
         values, _, _ = rows.evaluate(X, shapes, parameters)
         return shapes, X, np.abs(values).max(axis=1)
 

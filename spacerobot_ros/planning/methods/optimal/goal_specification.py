@@ -416,7 +416,7 @@ def shape_for_center(
             best, miss = q, distance
         if miss <= 1e-6:
             break
-    found = nearest_for_center(robot, limits, best, wanted)
+    found = nearest_shape_for_center(robot, limits, best, wanted)
     if found is not None:
         return found
     if _distance_to_center(robot, best, wanted) <= enough:
@@ -424,7 +424,7 @@ def shape_for_center(
     raise _unreachable_center_error(robot, limits, best, wanted)
 
 
-def nearest_for_center(
+def nearest_shape_for_center(
     robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
 ) -> Array | None:
     """Return the shape (n,) next to ``near`` whose centre of mass is at ``wanted`` (3,) exactly."""

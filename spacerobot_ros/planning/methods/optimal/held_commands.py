@@ -38,7 +38,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.command_program import least_change
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
-from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_for_center
+from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_shape_for_center
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
 from spacerobot_ros.planning.methods.optimal.kept_distances import (
     DistanceLibrary,
@@ -70,7 +70,7 @@ _PROGRAM_STRETCH = 1.01
 """Factor between them, rounded up to a tick."""
 
 _MAX_PROGRAMS_IN_TURN = 6
-_FITTED = 1e-5
+_FIT_TOLERANCE = 1e-5
 """Error before the last program, rad, m or m/s: what it leaves is far below."""
 
 _MIN_SMOOTH_TICKS = 20
@@ -168,7 +168,7 @@ class CommandHolder:
         if final is None:
             final = np.clip(trajectory.shapes[-1], limits.lower, limits.upper)
         if boundary.center is not None:
-            final = nearest_for_center(self._robot, limits, final, boundary.center)
+            final = nearest_shape_for_center(self._robot, limits, final, boundary.center)
         if final is None:
             return None
         ticks = max(1, math.ceil(trajectory.duration / self._period - _TICK_ROUNDING))
@@ -254,7 +254,7 @@ class CommandHolder:
             if change is None:
                 return None
             positions = np.clip(positions + change, limits.lower, limits.upper)
-            if float(np.linalg.norm(error)) <= _FITTED:
+            if float(np.linalg.norm(error)) <= _FIT_TOLERANCE:
                 break
         else:
             return None
@@ -281,7 +281,7 @@ class CommandHolder:
         positions[0], positions[-1] = boundary.start, final
         return positions
 
-    def corrected_aim(
+    def corrected_end(
         self, trajectory: Trajectory, boundary: BoundaryConditions, ticks: int
     ) -> BoundaryConditions:
         """Return boundary conditions whose solution ends at the goal as commands of ``ticks``.
@@ -335,7 +335,7 @@ class CommandHolder:
                     ramps = self._build_ramps(s, limits)
                     if self._end_effectors is not None:
                         # The others make up for joints at the end of their range.
-                        ramps = ramps * self._fading(positions[-1], limits)
+                        ramps = ramps * self._smooth_weights(positions[-1], limits)
                     waves = np.hstack([waves, ramps])
         return None
 
@@ -345,14 +345,14 @@ class CommandHolder:
         order = np.arange(1, _WAVES_PER_JOINT + 1)
         shape = np.sin(math.pi * s) * np.sin(math.pi * s * order) / order
         speed, _ = self._speeds_and_half_ranges(positions[0], limits)
-        fading = self._fading(positions, limits)
+        fading = self._smooth_weights(positions, limits)
         joints = np.eye(self._n) * speed
         waves = (
             shape[:, :, np.newaxis, np.newaxis] * (fading[:, np.newaxis] * joints)[:, np.newaxis]
         )
         return np.asarray(waves.reshape(len(positions), -1, self._n))
 
-    def _fading(self, positions: Array, limits: MotionLimits) -> Array:
+    def _smooth_weights(self, positions: Array, limits: MotionLimits) -> Array:
         """Return factors (..., n) that vanish where joints are at the ends of their ranges."""
         _, half = self._speeds_and_half_ranges(positions.reshape(-1, self._n)[0], limits)
         room = np.minimum(positions - limits.lower, limits.upper - positions)

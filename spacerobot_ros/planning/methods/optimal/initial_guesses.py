@@ -47,7 +47,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 _CANDIDATES_PER_GUESS = 24
 """Number of random loops of one kind, of which the nearest to the goal is the guess."""
 
-_LEAST_SIZE = 0.1
+_MIN_LOOP_SIZE = 0.1
 """Least size of loops on the way to a possible end, in half ranges, from the second guess on."""
 
 _MAX_RANGE_SHARE = 0.85
@@ -106,7 +106,7 @@ class InitialGuesses:
             around, place = divmod(number, len(ends))
             final, turn = ends[place].shape, ends[place].turn
             # The direct way to an end may be all that it takes, and is no guess twice.
-            size = max(sizes[place], _LEAST_SIZE if boundary.ends and around else 0.0)
+            size = max(sizes[place], _MIN_LOOP_SIZE if boundary.ends and around else 0.0)
             loop = _LOOPS[around % len(_LOOPS)]
             rounds = [
                 size * rng.uniform(0.3, 1.5) * loop(rng, self._instants, len(half))
@@ -114,13 +114,13 @@ class InitialGuesses:
             ]
             shapes = self._add_loops(np.array(rounds), boundary.start, final, limits)
             if self._angular_momentum is not None and around % 3 == 1:
-                shapes = self._after_coasting(shapes, rng)
+                shapes = self._loops_after_coasting(shapes, rng)
             candidates = self._build_trajectories(shapes, limits)
             # The cosine of half the remaining angle.
             near = np.abs([each.quaternions[-1] @ turn for each in candidates])
             yield candidates[int(near.argmax())]
 
-    def _after_coasting(self, shapes: Array, rng: np.random.Generator) -> Array:
+    def _loops_after_coasting(self, shapes: Array, rng: np.random.Generator) -> Array:
         """Return paths (K, N + 1, n) that begin later: meanwhile the base drifts on."""
         s = self._instants
         shares = rng.uniform(0.0, _MAX_COASTING_SHARE, len(shapes))

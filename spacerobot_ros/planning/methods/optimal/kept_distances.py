@@ -28,15 +28,15 @@ from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, 
 ROUNDS = 6
 """Solutions from one guess, each with more pairs or more room, before it is given up."""
 
-_ROOM = 2e-3
+_INITIAL_MARGIN = 2e-3
 """Room beyond the clearance that a pair is given: held commands change the path, m."""
 
 _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
-_WIDE = 0.05
+_MAX_ACTIVE_DISTANCE = 0.05
 """Distance beyond the clearance at which the rows of a pair are no longer compared with it, m."""
 
-_AT_ENDS = 1e-4
+_END_MARGIN = 1e-4
 """Least room at the ends, where the shape is given, m."""
 
 
@@ -179,23 +179,27 @@ class KeptDistances:
         """Keep pairs apart that have come too near; those that are kept already get more room."""
         for each in near:
             lacking = self._required[each.pair] - each.distance if each.pair in self._room else 0.0
-            self._room[each.pair] = self._room.get(each.pair, 0.0) + max(lacking, 0.0) + _ROOM
+            self._room[each.pair] = (
+                self._room.get(each.pair, 0.0) + max(lacking, 0.0) + _INITIAL_MARGIN
+            )
 
-    def spend_room(self, positions: Array, turns: Array) -> bool:
+    def reduce_margins(self, positions: Array, turns: Array) -> bool:
         """Give pairs as much room as the rows are wrong by where they are nearest along held
         commands, (N + 1, n) and (N + 1, 4); return whether any gets less than it had.
         """
         library, base = self._library, self._library.base_poses(self._boundary, positions, turns)
         spent = False
-        for each in library.clearance.approaches(positions, self._required + _WIDE, base):
+        for each in library.clearance.approaches(
+            positions, self._required + _MAX_ACTIVE_DISTANCE, base
+        ):
             if each.pair not in self._room:
                 continue
             (rows,) = library.of([each.pair])
             if rows.is_of_obstacle:
                 continue
             value = float(rows.values(each.shape[:, np.newaxis]).full().min())
-            room = value - each.distance + _ROOM
-            if room < self._room[each.pair] - _ROOM:
+            room = value - each.distance + _INITIAL_MARGIN
+            if room < self._room[each.pair] - _INITIAL_MARGIN:
                 self._room[each.pair], spent = room, True
         return spent
 
@@ -214,6 +218,6 @@ class KeptDistances:
                 values = rows.values(turned, np.tile(world[:, np.newaxis], turned.shape[1]))
             else:
                 values = rows.values(shapes)
-            at_ends = float(values.full().min()) - _AT_ENDS
+            at_ends = float(values.full().min()) - _END_MARGIN
             least.append(min(self._required[pair] + self._room[pair], at_ends))
         return replace(limits, distances=np.array(least), world=world)

@@ -104,7 +104,7 @@ _STARTS_BEFORE_COASTING = 8
 _STARTS_AFTER_COASTING = 3
 """Guesses without a solution after which the next pass of the goal is tried."""
 
-_BRIEF_ANGLE = math.radians(40.0)
+_MAX_ANGLE_WITHOUT_COASTING = math.radians(40.0)
 """Angle by which the base turns in the longest manoeuvre that begins at once."""
 
 _COASTING_ANGLE = math.radians(5.0)
@@ -113,16 +113,16 @@ _COASTING_ANGLE = math.radians(5.0)
 _COASTING_TURNS = 4.0
 """Turns of the base for which it coasts at most."""
 
-_MOST_PASSES = 3
+_MAX_COASTING_ENDS = 3
 """Passes of the goal that are tried."""
 
-_STARTS_TO_PASS = 8
+_STARTS_PER_COASTING_END = 8
 """Guesses of the turn at zero momentum that is left at a pass."""
 
-_LONGEST_PASS = 2.5
+_MAX_DURATION_RATIO = 2.5
 """Longest time of a manoeuvre that ends at a pass, as multiple of that at zero momentum."""
 
-_LONGEST_FACTOR, _LONGEST_ADDITIONAL_TICKS = 1.25, 20
+_MAX_DURATION_FACTOR, _LONGEST_ADDITIONAL_TICKS = 1.25, 20
 """Longest duration of held commands: a factor of optimal.longest, and additional ticks."""
 
 _LIMIT_ROUNDING = 1e-8
@@ -130,7 +130,7 @@ _LIMIT_ROUNDING = 1e-8
 
 
 @dataclass(frozen=True)
-class _Found:
+class _PlanResult:
     """A manoeuvre, the shapes (N + 1, n) at ticks from the start of the plan to its end, and notes
     on the search.
     """
@@ -174,7 +174,7 @@ class _GoalKind:
     compiling: bool
 
     @cached_property
-    def of_any_effort(self) -> _Searches:
+    def without_effort_limits(self) -> _Searches:
         """The searches without effort limits."""
         return _Searches.of(replace(self.model, efforts=None), compiling=self.compiling)
 
@@ -418,7 +418,7 @@ class OptimalGait(GaitMethod):
             self._cache is not None
             and key is not None
             and not found.manoeuvre.cut_short
-            and self._keeps_efforts(found.manoeuvre, boundary=boundary)
+            and self._is_within_efforts(found.manoeuvre, boundary=boundary)
         ):
             kept_plan = _CachedPlan(schedule.positions, found.notes)
             self._cache.store(archive_name(key), key, kept_plan.to_bytes())
@@ -431,9 +431,9 @@ class OptimalGait(GaitMethod):
         limits: MotionLimits,
         chosen: OptimalOptions,
         cancellation: Cancellation,
-        in_vain: int = sys.maxsize,
+        max_failed_starts: int = sys.maxsize,
         guess: SolutionLibrary | None = None,
-    ) -> _Found:
+    ) -> _PlanResult:
         """Return a manoeuvre that begins at once; see :meth:`.ManoeuvreSearch.search`.
 
         A ``guess`` comes before all others.
@@ -453,7 +453,7 @@ class OptimalGait(GaitMethod):
                 library=guess or library,
                 # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
                 gentle=correction and not boundary.drifts,
-                in_vain=in_vain,
+                max_failed_starts=max_failed_starts,
             ),
             boundary=boundary,
         )
@@ -467,7 +467,7 @@ class OptimalGait(GaitMethod):
                 f"The search used up optimal.time_budget, {self.options.time_budget:g} s, after "
                 f"{found.starts} start(s); a longer one may find a faster manoeuvre."
             )
-        return _Found(found, found.held.positions, notes)
+        return _PlanResult(found, found.held.positions, notes)
 
     def _begin_now_or_coast(
         self,
@@ -476,7 +476,7 @@ class OptimalGait(GaitMethod):
         limits: MotionLimits,
         chosen: OptimalOptions,
         cancellation: Cancellation,
-    ) -> _Found:
+    ) -> _PlanResult:
         """Return a manoeuvre of a robot that drifts: joints may rest until the goal is in reach.
 
         The drift may lead away from the goal faster than the joints turn the base back; later, it
@@ -487,7 +487,7 @@ class OptimalGait(GaitMethod):
         momenta, rest = (state.linear_momentum, state.angular_momentum), np.zeros(self.robot.n)
         _, omega = self.robot.base_twist(state.quaternion, q, rest, *momenta)
         rate = float(np.linalg.norm(omega))
-        brief = replace(chosen, longest=min(chosen.longest, _BRIEF_ANGLE / rate))
+        brief = replace(chosen, longest=min(chosen.longest, _MAX_ANGLE_WITHOUT_COASTING / rate))
         with suppress(NotFoundError):
             return self._begin_now(
                 request, boundary, limits, brief, cancellation, _STARTS_BEFORE_COASTING
@@ -497,7 +497,9 @@ class OptimalGait(GaitMethod):
         step = max(1, round(_COASTING_ANGLE / rate / self.control_period))
         for end in self._passes(request, boundary, coast, step):
             try:
-                return self._meet_pass(request, boundary, limits, chosen, cancellation, coast, end)
+                return self._plan_for_coasting_time(
+                    request, boundary, limits, chosen, cancellation, coast, end
+                )
             except (PlanningError, CandidateError):
                 cancellation.raise_if_requested()
         return self._begin_now(
@@ -541,9 +543,9 @@ class OptimalGait(GaitMethod):
         near = np.abs(turns[:, 3])
         passes = 1 + np.flatnonzero((near[1:-1] > near[:-2]) & (near[1:-1] >= near[2:]))
         closest = passes[np.argsort(-near[passes], kind="stable")]
-        return [int(tick) for tick in grid[closest][:_MOST_PASSES]]
+        return [int(tick) for tick in grid[closest][:_MAX_COASTING_ENDS]]
 
-    def _meet_pass(
+    def _plan_for_coasting_time(
         self,
         request: PlanRequest,
         boundary: BoundaryConditions,
@@ -552,7 +554,7 @@ class OptimalGait(GaitMethod):
         cancellation: Cancellation,
         coast: _Coast,
         end: int,
-    ) -> _Found:
+    ) -> _PlanResult:
         """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
         ``end``. Its first guess turns the base at zero momentum by the angle that is left there.
 
@@ -566,13 +568,13 @@ class OptimalGait(GaitMethod):
         h = self.control_period
         there, aimed = self._later(request, boundary, coast, end)
         at_rest = replace(aimed, angular_momentum=np.zeros(3))
-        few = replace(chosen, starts=min(chosen.starts, _STARTS_TO_PASS))
+        few = replace(chosen, starts=min(chosen.starts, _STARTS_PER_COASTING_END))
         free = self._begin_now(there, at_rest, limits, few, cancellation)
         guess = SolutionLibrary("", at_rest.turn[np.newaxis], free.positions[np.newaxis])
         takes = len(free.positions) - 1
         begin = max(0, end - takes)
         later, aimed = self._later(request, boundary, coast, begin)
-        brief = replace(chosen, longest=min(chosen.longest, _LONGEST_PASS * takes * h))
+        brief = replace(chosen, longest=min(chosen.longest, _MAX_DURATION_RATIO * takes * h))
         found = self._begin_now(
             later, aimed, limits, brief, cancellation, _STARTS_AFTER_COASTING, guess
         )
@@ -639,8 +641,8 @@ class OptimalGait(GaitMethod):
 
         Limits that are the robot's own, and that no manoeuvre is found to keep, are not kept.
         """
-        found = search(kind.of_any_effort)
-        if self._keeps_efforts(found, velocity, boundary):
+        found = search(kind.without_effort_limits)
+        if self._is_within_efforts(found, velocity, boundary):
             return found
         try:
             return search(kind.within_efforts)
@@ -649,7 +651,7 @@ class OptimalGait(GaitMethod):
                 return found
             raise
 
-    def _keeps_efforts(
+    def _is_within_efforts(
         self,
         found: Manoeuvre,
         velocity: Array | float = 0.0,
@@ -696,8 +698,8 @@ class OptimalGait(GaitMethod):
             r_WE, quaternion = end_effector_pose(self.robot, each.link, *end, positions[-1])
             notes[f"final_pose_of_{each.link}"] = [*r_WE.tolist(), *quaternion.tolist()]
         if goal.end_effectors:
-            notes["predicted_end_effector_position_error"] = left.farthest_end_effector
-            notes["predicted_end_effector_attitude_error"] = left.most_turned_end_effector
+            notes["predicted_end_effector_position_error"] = left.largest_end_effector_distance
+            notes["predicted_end_effector_attitude_error"] = left.largest_end_effector_angle
         if L_B is not None:
             momenta, rest = (state.linear_momentum, state.angular_momentum), np.zeros(self.robot.n)
             _, omega = self.robot.base_twist(attitudes[-1], positions[-1], rest, *momenta)
@@ -797,7 +799,10 @@ class OptimalGait(GaitMethod):
         wanted, duration = self.options.duration, (len(positions) - 1) * period
         if wanted > 0 and abs(duration - wanted) > period:
             raise CandidateError(f"it takes {duration:g} s, not {wanted:g} s")
-        if duration > _LONGEST_FACTOR * self.options.longest + _LONGEST_ADDITIONAL_TICKS * period:
+        if (
+            duration
+            > _MAX_DURATION_FACTOR * self.options.longest + _LONGEST_ADDITIONAL_TICKS * period
+        ):
             raise CandidateError(f"it takes {duration:g} s")
         first, last = positions[0], positions[-1]
         if np.abs(first - boundary.start).max() > _MAX_CACHED_END_ERROR:

@@ -91,10 +91,10 @@ _MAX_REFINED_COST_RATIO = 1.1
 """Largest ratio of the cost of a coarse solution to the best one at which it is refined, too: the
 coarse grid underestimates some costs by more than others."""
 
-_MAX_ITERATIONS_APART = 80
+_MAX_SEPARATION_ITERATIONS = 80
 """Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most."""
 
-_ROUNDS_CLOSER = 3
+_MAX_SHORTENING_ROUNDS = 3
 """Solutions by which a manoeuvre is made to keep no more distance than is asked for."""
 
 _DISTANCE_INSTANTS = 80
@@ -171,7 +171,7 @@ class Manoeuvre:
         Durations of all manoeuvres that were found, s.
     cut_short
         Whether the wall time was used up before the search had come to its end.
-    kept_apart
+    separated_pairs
         Number of pairs of links that the solver was told to keep apart.
     """
 
@@ -181,7 +181,7 @@ class Manoeuvre:
     starts: int = 1
     solutions: list[float] = field(default_factory=list)
     cut_short: bool = False
-    kept_apart: int = 0
+    separated_pairs: int = 0
 
     @property
     def solution_time(self) -> float:
@@ -201,7 +201,7 @@ class _Progress:
         Guesses that were tried, and the reason against the last candidate.
     shortest
         Duration of the fastest solution so far, s.
-    in_vain
+    max_failed_starts
         Guesses without any solution after which the search ends.
     kept
         The pairs of links that are kept apart; None: no clearance is asked for.
@@ -214,7 +214,7 @@ class _Progress:
     cancellation: Cancellation
     library: SolutionLibrary | None
     gentle: bool
-    in_vain: int = sys.maxsize
+    max_failed_starts: int = sys.maxsize
     starts: int = 0
     rejection: str = ""
     shortest: float = math.inf
@@ -299,13 +299,13 @@ class ManoeuvreSearch:
         library: SolutionLibrary | None = None,
         *,
         gentle: bool = False,
-        in_vain: int = sys.maxsize,
+        max_failed_starts: int = sys.maxsize,
     ) -> Manoeuvre:
         """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
 
         The nearest manoeuvres of a library are the first guesses. A ``gentle`` manoeuvre takes the
         path of least effort, whose turn of the base depends least on errors of masses. After
-        ``in_vain`` guesses without any solution the search ends.
+        ``max_failed_starts`` guesses without any solution the search ends.
 
         Raises
         ------
@@ -323,7 +323,7 @@ class ManoeuvreSearch:
             )
         kept = self._begin(boundary)
         progress = _Progress(
-            boundary, limits, quaternion, options, cancellation, library, gentle, in_vain
+            boundary, limits, quaternion, options, cancellation, library, gentle, max_failed_starts
         )
         found = self._search_on_grids(progress, intervals)
         if found and kept is not None:
@@ -352,7 +352,7 @@ class ManoeuvreSearch:
         if options.answers > 1 and coarser >= _MIN_COARSE_INTERVALS:
             coarse = self._get_solver(progress, coarser, _COARSE_TOLERANCE)
             found = self._search_from_guesses(progress, coarse, full, options.starts)
-            ends = progress.starts >= progress.in_vain or progress.cut_short(found=False)
+            ends = progress.starts >= progress.max_failed_starts or progress.cut_short(found=False)
             if found or ends:
                 return found
             return self._search_from_guesses(
@@ -405,18 +405,18 @@ class ManoeuvreSearch:
         coarser = intervals // _COARSE_GRID_RATIO
         # On a coarse grid the attitude of a robot that drifts is too far off.
         on_full_grid = progress.boundary.drifts or coarser < _MIN_COARSE_INTERVALS
-        iterations = min(progress.options.iterations, _MAX_ITERATIONS_APART)
+        iterations = min(progress.options.iterations, _MAX_SEPARATION_ITERATIONS)
         brief = replace(progress, options=replace(progress.options, iterations=iterations))
         if near[0].distance > _DEEP_CONTACT or on_full_grid:
             clear = self._clear_on_grid(progress, manoeuvre, intervals, TOLERANCE)
-            return self._make_closer(brief, clear, intervals)
+            return self._shorten_with_less_clearance(brief, clear, intervals)
         # The way round is far: it is found on a coarse grid first.
         clear = self._clear_on_grid(progress, manoeuvre, coarser, _COARSE_TOLERANCE)
         try:
             refined = self._clear_on_grid(brief, clear, intervals, TOLERANCE)
         except CandidateError:
             return clear
-        refined = self._make_closer(brief, refined, intervals)
+        refined = self._shorten_with_less_clearance(brief, refined, intervals)
         return min(refined, clear, key=lambda one: one.duration)
 
     def _clear_on_grid(
@@ -437,29 +437,31 @@ class ManoeuvreSearch:
         )
         for _ in range(ROUNDS):
             kept.add(near)
-            solution = self._solve_apart(progress, solution, intervals, tolerance)
+            solution = self._solve_with_separation(progress, solution, intervals, tolerance)
             made = self._make_held_commands(progress, solution)
             near = kept.approaches(made.held.positions, made.held.quaternions)
             if not near:
-                return replace(made, kept_apart=len(kept.pairs))
+                return replace(made, separated_pairs=len(kept.pairs))
         raise CandidateError(kept.message(near[0], self._period))
 
-    def _make_closer(self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int) -> Manoeuvre:
+    def _shorten_with_less_clearance(
+        self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int
+    ) -> Manoeuvre:
         """Return a faster manoeuvre near to one that keeps clear by more than it needs to, as rows
         are not exact; that one, where none is found.
         """
         assert progress.kept is not None
         kept, best = progress.kept.copy(), manoeuvre
         near: list[Approach] = []
-        for _ in range(_ROUNDS_CLOSER):
+        for _ in range(_MAX_SHORTENING_ROUNDS):
             held = manoeuvre.held
             if near:
                 kept.add(near)
-            elif not kept.spend_room(held.positions, held.quaternions):
+            elif not kept.reduce_margins(held.positions, held.quaternions):
                 break
             closer = replace(progress, kept=kept)
             try:
-                solution = self._solve_apart(closer, manoeuvre.solution, intervals)
+                solution = self._solve_with_separation(closer, manoeuvre.solution, intervals)
                 if solution.duration > best.duration - self._period:
                     break
                 manoeuvre = self._make_held_commands(closer, solution)
@@ -467,10 +469,10 @@ class ManoeuvreSearch:
                 break
             near = kept.approaches(manoeuvre.held.positions, manoeuvre.held.quaternions)
             if not near and manoeuvre.duration < best.duration:
-                best = replace(manoeuvre, kept_apart=len(kept.pairs))
+                best = replace(manoeuvre, separated_pairs=len(kept.pairs))
         return best
 
-    def _solve_apart(
+    def _solve_with_separation(
         self,
         progress: _Progress,
         trajectory: Trajectory,
@@ -539,7 +541,7 @@ class ManoeuvreSearch:
             # A search may also be cut short within its last start.
             cut_short = progress.cut_short(found=bool(solutions))
             going_on = len(solutions) < enough and not progress.agreed(solutions)
-            cut_short = cut_short or not (solutions or progress.starts < progress.in_vain)
+            cut_short = cut_short or not (solutions or progress.starts < progress.max_failed_starts)
             if going_on and number < starts and not cut_short:
                 continue
             found = self._refine_solutions(progress, solutions, grid, full)
@@ -745,7 +747,7 @@ class ManoeuvreSearch:
             if held is not None:
                 return held
             guess = solution
-            aim = self._holder.corrected_aim(solution, boundary, ticks + more)
+            aim = self._holder.corrected_end(solution, boundary, ticks + more)
         return None
 
 
@@ -958,7 +960,7 @@ class MotionSearch:
             if held is not None:
                 return held
             if solution is not None and boundary.drifts:
-                aim = self._holder.corrected_aim(solution, boundary, ticks + more)
+                aim = self._holder.corrected_end(solution, boundary, ticks + more)
         raise CandidateError(_NO_HELD_COMMANDS)
 
     def _guesses(

@@ -54,7 +54,7 @@ from spacerobot_ros.planning.methods.optimal.problem import PathConstraints
 GAUSS = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
 """Gauss points of an interval, from 0 to 1."""
 
-_DIRECTION = 3
+_DIRECTION_SIZE = 3
 """Size of the kept direction, the first parameter of an interval."""
 
 Indices = npt.NDArray[np.int64]
@@ -145,7 +145,7 @@ class Stages:
     @property
     def drifting(self) -> bool:
         """Whether the angular momentum is a parameter of the interval; else it is zero."""
-        return self.interval.values.numel_in(1) > _DIRECTION
+        return self.interval.values.numel_in(1) > _DIRECTION_SIZE
 
     @classmethod
     def of(
@@ -258,7 +258,7 @@ def _interval(
     n = robot.n
     X, s, v, a = (ca.SX.sym(name, size) for name, size in zip("Xsva", (4, n, n, n), strict=True))
     X_next, s_next, v_next = ca.SX.sym("X+", 4), ca.SX.sym("s+", n), ca.SX.sym("v+", n)
-    h, direction = ca.SX.sym("h"), ca.SX.sym("direction", _DIRECTION)
+    h, direction = ca.SX.sym("h"), ca.SX.sym("direction", _DIRECTION_SIZE)
     L_0 = ca.SX.sym("L_0", 3 if drifting else 0)
     z = ca.vertcat(h, X, s, v, a, X_next, s_next, v_next)
     rotation, (rotation_jac, rotation_hess) = (
@@ -348,9 +348,9 @@ def _distances(n: int, pairs: Sequence[DistanceRows], instants: int) -> Block:
         bend = ca.horzcat(ca.MX(1, 5 + n), b * slope, ca.MX(1, 4), c * slope)
         # How [point; turn] moves with z: by a column, and by multiples of units.
         weights = (b * h, c * h)
-        jacobian.append(_moved_columns(J, along, weights, tau, n))
-        half = _moved_columns(curvature, along, weights, tau, n)
-        hessian += ca.triu(_moved_columns(half.T, along, weights, tau, n))
+        jacobian.append(_point_derivative_columns(J, along, weights, tau, n))
+        half = _point_derivative_columns(curvature, along, weights, tau, n)
+        hessian += ca.triu(_point_derivative_columns(half.T, along, weights, tau, n))
         hessian += ca.vertcat(bend, ca.MX(z.numel() - 1, z.numel()))
     z_p, J = [z, ca.vertcat(least, world)], ca.vertcat(*jacobian)
     return Block(
@@ -360,7 +360,7 @@ def _distances(n: int, pairs: Sequence[DistanceRows], instants: int) -> Block:
     )
 
 
-def _moved_columns(
+def _point_derivative_columns(
     A: ca.MX, along: ca.MX, weights: tuple[ca.MX, ca.MX], tau: float, n: int
 ) -> ca.MX:
     """Return ``A P``, where P is the derivative of a point of an interval, and of the turn there if
@@ -566,7 +566,7 @@ def program(stages: Stages, intervals: int) -> Program:
     kept = 0 if stages.distances is None else stages.distances.rows
     goals = int(stages.end.values.size1_in(1)) - 7
     sizes = {"start": n, "turn": 4, "direction": 3, "center": 3, "end_effectors": goals}
-    drift = int(stages.interval.values.numel_in(1)) - _DIRECTION
+    drift = int(stages.interval.values.numel_in(1)) - _DIRECTION_SIZE
     sizes |= {"typical": n, "weights": 2, "angular_momentum": drift}
     if stages.distances is not None:
         sizes["distances"] = int(stages.distances.values.numel_in(1))
