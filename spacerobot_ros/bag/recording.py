@@ -52,13 +52,13 @@ class FirstTime(Enum):
     """Meaning of the time with which the messages of a topic begin."""
 
     NONE = 0
-    """They begin with something else."""
+    """The messages begin with something else than a time."""
 
     STAMP = 1
-    """It is the stamp of their header."""
+    """The time is the stamp of the header."""
 
     CLOCK = 2
-    """It is the time of the clock, which all later messages carry."""
+    """The time is that of the clock; all later messages carry it."""
 
 
 _BATCH_SIZE = 1000
@@ -76,7 +76,7 @@ class Derived(NamedTuple):
 
 
 Derive = Callable[[NDArray[np.intp], Sequence[bytes], NDArray[np.int64]], Sequence[Derived]]
-"""Returns the messages derived from some, in their order.
+"""Computes further messages from recorded ones, in their order.
 
 Arguments are the channel, the bytes and the first time (ns; 0: none) of each."""
 

@@ -175,7 +175,7 @@ class SteppedFlights:
             )
         of_others = self._flights.starts, self._flights.inertial
         assert of_others[1] is not None
-        # Checked as rows of their own: what is refused changes no flight.
+        # Checked as rows of their own: a refusal changes no flight.
         masses = of_others[1][chosen] if inertial is None else inertial
         self._require_regular(replace(self._flights, starts=starts, inertial=masses))
         for each in fields(starts):

@@ -120,7 +120,7 @@ class Columns(Mapping[str, Any]):
             if name not in table.column_names:
                 continue
             column = table[name]
-            # What is converted is freed at once: a million rows of a column are eight megabytes.
+            # Converted data is freed at once: a million rows of a column are eight megabytes.
             table = table.drop_columns([name])
             if name in _TEXT_COLUMNS or column.type == text:
                 self._known[name] = self._texts(column.cast(text))
@@ -262,7 +262,7 @@ class Results:
 
     @property
     def not_controlled(self) -> list[str]:
-        """Parts of the goal that a reached flight left where they came to, by its message."""
+        """Parts of the goal that a successful flight did not control, by its message."""
         notes = [_NOT_CONTROLLED.search(text) for text in self.messages[1]]
         named = {part for note in notes if note for part in note[1].split(" and ")}
         return sorted(named)

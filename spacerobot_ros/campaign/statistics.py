@@ -60,7 +60,7 @@ def share(count: int, total: int) -> Share:
 
 
 _SIGNIFICANCE = 0.05
-"""Largest probability of what is called a driver, after the correction for many tests."""
+"""Largest probability of a significant influence, after the correction for many tests."""
 
 
 @dataclass(frozen=True)

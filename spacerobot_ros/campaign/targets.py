@@ -150,7 +150,7 @@ class DrawnFlight:
             return
         factors = np.concatenate([self.mass, self.inertia])
         small, large = factors.min(), factors.max()
-        # Positive factors leave the ratios of principal moments: the dear check is not needed.
+        # Positive factors leave the ratios of principal moments: the slow check is not needed.
         mild = _LEAST_FACTOR < small <= large < 1.0 / _LEAST_FACTOR
         if self.physical and mild and np.isfinite(self.com).all():
             return

@@ -47,7 +47,7 @@ _MAX_WORKER_DEATHS = 2
 _PACKAGE_NAME = "spacerobot_ros"
 
 _POLL_PERIOD = 0.2
-"""Longest wall time between two looks at tasks, signals and the dataset, s."""
+"""Longest wall time between two checks of tasks, signals and the dataset, s."""
 
 _NO_WORKER_WARNING_DELAY = 5.0
 """Wall time without a worker after which a warning is printed, s."""
@@ -197,7 +197,7 @@ class LocalWorkers:
         return worker
 
     def ended(self, tasks: list[_LocalWorker]) -> list[_LocalWorker]:
-        """Return those of the tasks that have ended, after a while also none."""
+        """Return the tasks that have ended; after a while also an empty list."""
         ready = wait([worker.connection for worker in tasks], timeout=_POLL_PERIOD)
         for worker in tasks:
             if _resident_bytes(worker.process.pid) > self._memory:
@@ -233,7 +233,7 @@ def _run_worker(connection: Connection) -> None:
             arguments = connection.recv()
             try:
                 answer: list[Row | Fallback] | Exception = fly_task(*arguments)
-            except Exception as error:  # Raised again in the parent.
+            except Exception as error:  # The parent process raises it again.
                 answer = error
             connection.send(answer)
 
@@ -300,7 +300,7 @@ class DaskWorkers:
         return self._client.submit(fly_task, *arguments, pure=False, retries=0)
 
     def ended(self, tasks: list[Any]) -> list[Any]:
-        """Return those of the tasks that have ended, after a while also none."""
+        """Return the tasks that have ended; after a while also an empty list."""
         import distributed
 
         try:
@@ -345,7 +345,7 @@ class DaskWorkers:
         self._client.cancel(tasks, force=True)
 
     def _require_package(self, workers: Iterable[str]) -> None:
-        """Refuse workers without this package, which would die of every task."""
+        """Refuse workers without this package, which would fail at every task."""
         joined = [address for address in workers if address not in self._checked]
         if not joined:
             return
@@ -356,7 +356,7 @@ class DaskWorkers:
                 raise SpaceRobotError(
                     f"The worker at {address} has no {_PACKAGE_NAME}: install it there."
                 )
-            if not isinstance(spec, Exception):  # It may be gone again.
+            if not isinstance(spec, Exception):  # The worker may have left again.
                 self._checked.add(address)
 
 
@@ -460,7 +460,7 @@ class TaskDistributor:
         self._fallbacks: deque[int] = deque()
         """Draws that the engine passes on to the engine ``flights``."""
         self._reasons: dict[int, str] = {}
-        """The reason of each of them."""
+        """Reason of each of these outcomes."""
         self._running: dict[Any, _SubmittedTask] = {}
         self._retry_alone: deque[int] = deque()
         """Draws of tasks whose worker died."""

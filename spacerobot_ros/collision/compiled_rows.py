@@ -68,7 +68,7 @@ class CompiledRows:
 
     @classmethod
     def of(cls, geometry: CollisionGeometry) -> CompiledRows | None:
-        """Compile those of all pairs of links, or take them from the cache; None: no compiler."""
+        """Compile the rows of all link pairs, or take them from the cache; None: no compiler."""
         pairs = np.flatnonzero(~geometry.with_obstacles).tolist()
         if not pairs:
             return None
@@ -79,7 +79,7 @@ class CompiledRows:
         return None if functions is None else cls(geometry, functions)
 
     def rows(self, pair: int) -> DistanceRows:
-        """Return those of a pair, by its number."""
+        """Return the rows of a pair, by its number."""
         robot, solids = self._geometry.robot, self._geometry.solids
         q, multiplier = ca.MX.sym("q", len(robot.joint_names)), ca.MX.sym("lambda")
         value, jacobian, hessian = self._functions

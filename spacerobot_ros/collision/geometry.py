@@ -34,10 +34,10 @@ from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
 from spacerobot_ros.model.rotations import matrices_from_quaternions
 
 _SHAPES, _SEED = 1000, 0
-"""Random shapes at which a pair is in contact that always is, and the seed of their draw."""
+"""Number of random shapes that find pairs which are always in contact, and their seed."""
 
 _HALF_RANGE = {JointKind.PRISMATIC: 1.0}
-"""Half the range that is drawn from of a joint without limits, m; pi for joints that turn."""
+"""Half of the sampled range of a joint without limits, m; revolute joints have pi."""
 
 
 _WORLD_BODY = -1
@@ -61,7 +61,7 @@ class LinkPair(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """The two as the subject of a sentence, in lower case."""
+        """The names of both, as the subject of a sentence in lower case."""
         return f"links {self}"
 
 
@@ -72,7 +72,7 @@ class ObstaclePair(LinkPair):
 
     @property
     def subject(self) -> str:
-        """The two as the subject of a sentence, in lower case."""
+        """The names of both, as the subject of a sentence in lower case."""
         return f"link '{self.first}' and obstacle '{self.second}'"
 
 
@@ -130,7 +130,7 @@ class Solid:
 
     @property
     def is_obstacle(self) -> bool:
-        """Whether it is fixed in the world."""
+        """Whether the solid is an obstacle, fixed in the world."""
         return self.body == _WORLD_BODY
 
 
@@ -245,7 +245,7 @@ class CollisionGeometry:
         )
 
     def place(self, pair: int, shape: Array, base: BasePoses) -> Array:
-        """Return the place (3,) in W, m, where a link is about nearest to an obstacle.
+        """Return the approximate point (3,) in W, m, at which a link is nearest to an obstacle.
 
         ``shape`` is (n,), and ``base`` has one pose.
         """
@@ -360,7 +360,7 @@ class CollisionGeometry:
     # -- motion -------------------------------------------------------------------------------
 
     def reaches(self, shapes: Array) -> tuple[Array, Array]:
-        """Return how far solids move against each other: at most ``reaches @ |dtheta|`` (P,), m.
+        """Return a bound of the relative motion of solids, ``reaches @ |dtheta|`` (P,), m.
 
         ``reaches`` (P, m) is the largest distance of a point of the pair from each of the moving
         joints at any of the shapes (N, n), for joints between the two; zero for others, and for a

@@ -17,7 +17,7 @@ from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, Link
 from spacerobot_ros.model.description import Array
 
 _MOTION_RESOLUTION = 5e-4
-"""Motion of a pair within which its distance is not looked at any more, m."""
+"""Largest relative motion of a pair between two evaluations of its distance, m."""
 
 
 @dataclass(frozen=True)

@@ -155,7 +155,7 @@ def nearest_points(
 def _nearest_points(
     c_1: Array, A: Array, c_2: Array, B: Array, a: Array, b: Array
 ) -> tuple[Array, Array]:
-    """Return about the nearest points (N, 3) of two boxes, by alternating projections."""
+    """Return approximately the nearest points (N, 3) of two boxes, by alternating projections."""
     x, y = c_1, c_2
     for _ in range(_MAX_PROJECTIONS):
         x = _projected(y, c_1, A, a)

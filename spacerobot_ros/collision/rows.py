@@ -114,7 +114,7 @@ class Form:
         return cls(box, _moved(box.pose, points), box.radius)
 
     def field(self, x: ca.SX) -> ca.SX:
-        """Return about the distance of a point (3,) in the frame of the link, m."""
+        """Return the approximate distance of a point (3,) in the frame of the link, m."""
         local = ca.sparsify(ca.DM(self.box.pose.R.T)) @ (x - ca.DM(self.box.pose.r))
         half = self.box.half
         if self.is_rod:
@@ -162,7 +162,7 @@ class DistanceRows:
 
     @classmethod
     def of(cls, geometry: CollisionGeometry, pairs: Sequence[int]) -> DistanceRows:
-        """Derive those of pairs, by their numbers."""
+        """Derive the rows of pairs, given by their numbers."""
         robot = geometry.robot
         q = ca.SX.sym("q", len(robot.joint_names))
         multipliers = ca.SX.sym("lambda", len(pairs))
@@ -184,7 +184,7 @@ class DistanceRows:
     def from_obstacles(
         cls, geometry: CollisionGeometry, pair: int, center_of_mass: ca.Function
     ) -> DistanceRows:
-        """Derive that of a link and an obstacle; ``center_of_mass`` is ``q -> r_BC``, of SX."""
+        """Derive the row of a link and an obstacle; ``center_of_mass`` is ``q -> r_BC``, of SX."""
         robot = geometry.robot
         n = len(robot.joint_names)
         y, w, multiplier = ca.SX.sym("y", n + 4), ca.SX.sym("w", 12), ca.SX.sym("lambda")
@@ -219,7 +219,7 @@ def _row(robot: RobotDescription, first: Solid, second: Solid, q: ca.SX) -> ca.S
 
 
 def _smooth_distance(forms: tuple[Form, Form], poses: Sequence[tuple[ca.SX, ca.SX]]) -> ca.SX:
-    """Return about the distance of two forms, whose links are at poses in one frame, m."""
+    """Return the approximate distance of two forms, whose links are at poses in one frame, m."""
     values = []
     for balls, field in ball_and_field_roles(*forms):
         R_a, r_a = poses[balls]

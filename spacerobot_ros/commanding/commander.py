@@ -90,7 +90,7 @@ class CommanderHost(Protocol):
         """Write a line into the log."""
 
     def log_about_goals(self, level: LogLevel, message: str) -> None:
-        """Write a line about a goal into the log, which has few of goals that pour in."""
+        """Log a line about a goal, at a limited rate where many goals arrive."""
 
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of odom, or of a reference, is connected."""
@@ -307,7 +307,7 @@ class Commander(ABC):
     def receive_fly_to(
         self, goal_id: str, read: Callable[[], FlyTo], client: FlyToClient
     ) -> IdentifiedGoal | None:
-        """Accept or refuse the goal of an action; its client is told its course and its result.
+        """Accept or refuse the goal of an action; the client receives feedback and a result.
 
         Parameters
         ----------
@@ -388,7 +388,7 @@ class Commander(ABC):
             self.host.report_event(event)
 
     def _publish_status(self, status: Status) -> None:
-        # What a goal replaces ends before it begins: the last status is that of the present goal.
+        # A replaced goal ends before its successor begins: the last status is of the present goal.
         if self._fly_to:
             self._fly_to.settle(self._active_goal_ids() | {status.goal_id})
         self.host.publish_status(status)
@@ -406,7 +406,7 @@ class Commander(ABC):
         return pursued
 
     def _watch_fly_to(self) -> None:
-        """Tell the clients of actions the course of their goals after a state."""
+        """Send feedback to the clients of actions after a state."""
         self._fly_to.advance(self.stamps.now_ns, self._progress)
         self._abort_fly_to()
         self._fly_to.settle(self._active_goal_ids())

@@ -141,7 +141,7 @@ class GoalErrors:
 
 @dataclass(frozen=True)
 class Progress:
-    """Course of a goal, as feedback tells it.
+    """Feedback about a goal.
 
     Attributes
     ----------
@@ -180,10 +180,10 @@ class FlyToClient(Protocol):
     """The client of one goal."""
 
     def feedback(self, progress: Progress) -> None:
-        """Tell it the course of its goal."""
+        """Send feedback about the goal to the client."""
 
     def end(self, result: FlyToResult) -> None:
-        """Tell it the result; called once, and last."""
+        """Send the result to the client; called once, at the end."""
 
 
 @dataclass
@@ -194,13 +194,13 @@ class _ActionGoal:
     request: FlyTo | None
     """None: it is refused."""
     first_state_ns: int | None = None
-    """Stamp of the first state after it was sent, ns."""
+    """Stamp of the first state after the goal was sent, ns."""
     last_feedback_ns: int | None = None
-    """Stamp of the state at its last feedback, ns."""
+    """Stamp of the state at the last feedback about the goal, ns."""
     give_up: str = ""
-    """Why it is to be given up; empty: it is not."""
+    """Reason to abort the goal; empty: it is not."""
     aborted: bool = False
-    """Whether its abort was requested of the executive."""
+    """Whether the executive was asked to abort the goal."""
 
 
 class FlyToGoals:
@@ -239,13 +239,13 @@ class FlyToGoals:
         self._accepted.append(goal_id)
 
     def request_abort(self, goal_id: str, why: str = "on request") -> None:
-        """Have a goal given up with the next :meth:`abort_reason`."""
+        """Request that a goal is aborted; :meth:`abort_reason` then returns the reason."""
         served = self._served.get(goal_id)
         if served is not None:
             served.give_up = served.give_up or why
 
     def abort_reason(self, pursued: Collection[str]) -> str:
-        """Return why all goals are to be given up now; empty: they are not.
+        """Return the reason to abort all goals now; empty: they are not.
 
         An abort gives up every goal. So one that is about to be replaced waits until it is
         replaced, or until the goal that came later is refused.
@@ -258,7 +258,7 @@ class FlyToGoals:
         return ""
 
     def advance(self, now_ns: int, progress: Callable[[str, Goal, int], Progress]) -> None:
-        """Watch the time limits in a state of a stamp, and tell the clients the course.
+        """Check the time limits at a state, and send feedback to the clients.
 
         ``progress`` returns the course of a goal by its id, its goal, and the stamp of its begin.
         """

@@ -1,4 +1,4 @@
-"""A limit for lines of a log, which keeps the last line and counts the others."""
+"""Limits the rate of log lines; keeps the last line and counts the omitted ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Line:
 
 
 class LogRateLimiter:
-    """Lets lines pass as they come up to a burst, and then one in each period.
+    """Passes a burst of log lines at once, and then one line in each period.
 
     A line that has to wait is replaced by the next one; the line that passes at last tells how
     many were left out. So the log ends with the last line, whatever came before.

@@ -21,7 +21,7 @@ _ANSWER_TIMEOUT_NS = 5 * SECOND
 """Longest time until the server has accepted or rejected a schedule, ns."""
 
 _SERVER_CHECK_PERIOD_NS = SECOND
-"""Time between two looks whether the server is still there, ns."""
+"""Time between two checks for the server, ns."""
 
 _PHASES_OF_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.PLANNING)
 """Phases in which a schedule is followed on; in PLANNING its successor replaces it."""
@@ -72,11 +72,11 @@ class TrajectoryServer(Protocol):
         """Send a schedule."""
 
     def cancel(self, number: int) -> None:
-        """Have a schedule cancelled, accepted or not."""
+        """Cancel a schedule, whether it is accepted yet or not."""
 
 
 class TrajectoryOutput:
-    """Sends each schedule to a server, follows its result, and cancels what is given up.
+    """Sends each schedule to a server, follows its result, and cancels abandoned ones.
 
     Parameters
     ----------
@@ -97,12 +97,12 @@ class TrajectoryOutput:
         self._sent: int | None = None
         """Number of the schedule without a result."""
         self._replaced: int | None = None
-        """Number of the one that it replaces, until it is accepted."""
+        """Number of the schedule that the latest one replaces, until the latest is accepted."""
         self._accepted = False
         self._watched_ns: int | None = None
         """Stamp of the first state after the latest schedule was sent, ns."""
         self._looked_ns = 0
-        """Stamp of the last look whether the server is there, ns."""
+        """Stamp of the last check for the server, ns."""
 
     @property
     def waits(self) -> bool:
@@ -151,7 +151,7 @@ class TrajectoryOutput:
             self._accepted, self._replaced = True, None
 
     def rejected(self, number: int) -> None:
-        """End a schedule that the server does not take, and the one that it was to replace."""
+        """End a schedule that the server rejects, and the schedule that it was to replace."""
         if number != self._sent:
             return
         if self._replaced is not None:

@@ -44,7 +44,7 @@ _SAMPLE_PERIOD = 0.25
 """Time between two samples of a reference whose limits are checked, s."""
 
 _COARSE_STRIDE = 8
-"""Samples from one to the next where most references are refused."""
+"""Stride of the samples in the first, coarse check of a reference."""
 
 _START_PERIOD = 1.0
 """Time between two start times that are tried, s."""
@@ -59,7 +59,7 @@ _REACHED_DISTANCE = 1e-3
 """Distance of an end-effector from its reference (m, rad) below which the arm reaches it."""
 
 _STANDOFF_FACTORS = (1.0, 2.0, 3.0)
-"""Distances of the standoffs that are tried where the target is in the way, over the given one."""
+"""Standoff distances that are tried where the target blocks the way, over the given one."""
 
 _MAX_BLOCKED_PATHS = 100
 """Number of paths past the body of the target that are tried."""

@@ -536,7 +536,7 @@ class ControlExecutive:
     def _begin_goals(self, time: float, state: ControlState, *, carried: bool = False) -> None:
         """Start towards the pending goals.
 
-        After tasks, a goal of the base alone takes the end-effector with what it holds along.
+        After tasks, a goal of the base alone takes the end-effector and its load along.
         """
         self._goal_id = self._latest_id()
         self._after_tasks = dict(self._pending) if carried else {}

@@ -308,7 +308,7 @@ def decay_rate(control_period: float) -> float:
 
 
 def _affordable_push_share(wanted: Array, pushed: Array, effort: Array) -> float:
-    """Return the largest share in [0, 1] of a push with which ``wanted`` is within efforts.
+    """Return the largest share in [0, 1] of an added effort that keeps the sum within limits.
 
     Zero if there is none: motors that cannot brake joints are not loaded further.
     """

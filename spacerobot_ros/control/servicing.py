@@ -39,7 +39,7 @@ planned anew."""
 
 
 class Task(str, Enum):
-    """What a controller does with a target before it pursues a goal."""
+    """Tasks of a controller with a target, done before it pursues a goal."""
 
     APPROACH = "approach"
     """Bring the end-effector to the grapple frame, until the target is captured."""

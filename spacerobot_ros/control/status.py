@@ -101,7 +101,7 @@ class ControllerStatus:
     command
         Report on the last command; None before the first.
     task
-        What is done before the goal is pursued: ``approach`` or ``detumble``; empty: nothing.
+        The work before the goal is pursued: ``approach`` or ``detumble``; empty: nothing.
     ends_at_s
         Simulated time at which the goal is to be reached, when the reference has ended and the
         robot has settled, s; 0: not known.

@@ -12,7 +12,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 
 _MAX_ROUNDING_SHARE = 1e-6
-"""Largest share of a disturbance that is rounding, although the outputs do not hold it."""
+"""Largest share of a disturbance outside of the outputs that counts as rounding."""
 
 
 def steady_errors(

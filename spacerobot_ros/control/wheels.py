@@ -30,7 +30,7 @@ _SATURATED_SHARE = 0.99
 """Share of the largest rate from which on a wheel counts as saturated."""
 
 _ANNOUNCEMENT_HYSTERESIS = 0.05
-"""Share of the largest rate by which a wheel is slower before it is announced again."""
+"""Decrease of a wheel's rate after which it may be reported again, as share of the largest."""
 
 _DUMP_TIME = 5.0
 """Time constant with which rates decay while momentum is dumped, s."""
@@ -45,13 +45,13 @@ _MOTION_SHARE = 0.5
 """Share of the torque and of the momentum of wheels for references."""
 
 _FAILURE_TIME = 0.5
-"""Time at full torque after which the answer of a wheel is judged, s."""
+"""Time at full torque after which the response of a wheel is checked, s."""
 
 _MIN_RESPONSE_SHARE = 0.5
-"""Least share of the commanded impulse that a wheel in order takes up."""
+"""Smallest share of the commanded impulse that an intact wheel takes up."""
 
 _MIN_BOUND_WIDTH = 1e-12
-"""Width that bounds of the solver get, N m, and a share of a torque that counts as zero."""
+"""Smallest width of the solver's bounds, N m, and the share of a torque that counts as zero."""
 
 _SMOOTHING = 1e-6
 """Weight of the torques relative to their sum, which chooses the smallest of equal allocations."""
@@ -183,14 +183,14 @@ class WheelControl:
         self.rates, self._omega = np.zeros(count), np.zeros(3)
         self._q, self._spins = np.zeros(0), np.zeros(count)
         self._announced = np.zeros(count)
-        """Share of its largest rate at which each wheel was announced last; zero: it was not."""
+        """Share of its largest rate at which each wheel was last reported; zero: it was not."""
         self.dumping = False
         """Whether momentum is being dumped."""
         self._events: list[Event] = []
         self.reset_response_check()
 
     def reset_response_check(self) -> None:
-        """Judge the answers of the wheels from now on: commands until now were not obeyed."""
+        """Restart the check of the wheels' response: earlier commands were not obeyed."""
         self._asked, self._answered = np.zeros(len(self.wheels)), np.zeros(len(self.wheels))
         self._known = False
 
@@ -394,7 +394,7 @@ class WheelControl:
         return max(0.0, float(wheels.inertia[i] * left / abs(tau)))
 
     def _check_wheel_response(self) -> None:
-        """Take wheels out of use whose momentum does not change as their torque demands."""
+        """Stop using wheels whose momentum does not follow their commanded torque."""
         wheels = self.wheels
         spins = wheels.spins(self._omega, self.rates)
         if self._known:

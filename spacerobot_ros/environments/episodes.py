@@ -204,7 +204,7 @@ class Episodes:
     Parameters
     ----------
     config
-        What they are about.
+        The goals and errors of the episodes.
     count
         Their number N.
     in_lanes

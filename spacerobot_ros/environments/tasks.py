@@ -1,4 +1,4 @@
-"""Tasks of environments: what is observed, what is rewarded, and the command of an action.
+"""Tasks of environments: observations, rewards, and the command of an action.
 
 All functions take the states of N robots at once, so that one robot in a plant, many in lanes and a
 robot behind ROS topics are observed by the same code.
@@ -96,7 +96,7 @@ class RewardWeights:
 
 
 class Task(ABC):
-    """A kind of goal: its draws, its errors, and what a policy observes of it.
+    """A kind of goal: its draws, its errors, and the observations of it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A second opinion on a recorded flight: its commands flown by another engine.
+"""Comparison of a recorded flight with another engine: its commands flown by another engine.
 
 The engine gets the joint rates, or the efforts and the wrench, that the plant's actuators have
 realised in each tick, after limits and faults, and the external loads of the tick; its states are

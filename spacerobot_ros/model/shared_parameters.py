@@ -28,7 +28,7 @@ class RobotConfig:
     )
 
     def described(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot with what this configuration says of it beside its URDF.
+        """Return the robot with the obstacles and disabled pairs of this configuration.
 
         Raises
         ------

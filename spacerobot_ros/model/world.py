@@ -38,7 +38,7 @@ def with_world(robot: RobotDescription, world: RobotDescription) -> RobotDescrip
 def with_obstacles_around(
     robot: RobotDescription, world: RobotDescription | None
 ) -> RobotDescription:
-    """Return a robot among other obstacles than so far; None: there are none around it."""
+    """Return a robot with other obstacles around it; None: there are none around it."""
     if world is None:
         return replace(robot, world=None, urdf=_CARRIED.sub("", robot.urdf))
     return with_world(robot, world)

@@ -214,7 +214,7 @@ class RecorderNode(FlightNode):
     # -- for the composer of the nodes --------------------------------------------------------
 
     def watch(self, nodes: Iterable[FlightNode]) -> None:
-        """Take the streams of nodes of this process and executor where they pass through them.
+        """Record topics directly from the streams of nodes in this process and executor.
 
         To be called before the recorder is configured. Messages are then recorded in the order of
         their publication, and a plant's commands as the plant received them. Other topics are
@@ -459,7 +459,7 @@ class _RecordedTransforms:
     def derive(
         self, channels: NDArray[np.intp], messages: Sequence[bytes], times: NDArray[np.int64]
     ) -> list[Derived]:
-        """Return the messages that the listeners write, of messages that are written together."""
+        """Return the messages that listeners derive from messages that are written together."""
         of_odom, of_joints, _ = self._channels.values()
         odoms, joints = (_latest(channels == channel) for channel in (of_odom, of_joints))
         latest = self._odom, self._joint_states
@@ -498,7 +498,7 @@ class _RecordedTransforms:
         ]
 
     def _due(self, states: NDArray[np.intp], times: NDArray[np.int64]) -> Iterator[int]:
-        """Yield those of some states whose transforms are due; the caller writes them."""
+        """Yield the states whose transforms are due; the caller writes them."""
         k = 0
         ordered = bool(np.all(np.diff(times[states]) >= 0))
         while k < len(states):
@@ -575,7 +575,7 @@ class _RecordedTransforms:
 
 
 def _latest(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return for each place the last place up to there that is chosen; -1: none."""
+    """Return for each index the last chosen index up to it; -1: none."""
     return np.maximum.accumulate(np.where(chosen, np.arange(len(chosen)), -1))
 
 

@@ -81,8 +81,9 @@ class Analysis:
 
     @cached_property
     def workspaces(self) -> tuple[Workspaces, ...]:
-        """Those of the end-effector, without and within the limits of the joints; () without an
-        end-effector or joints.
+        """Workspaces of the end-effector, without and within the limits of the joints.
+
+        Empty without an end-effector or joints.
         """
         if not self.end_effector or self.robot.n == 0:
             return ()

@@ -54,7 +54,7 @@ def plan(
     """Plan a gait: ``plan("sliding_masses", position=(0.3, 0, 0.1), rotvec=(0.5, 0, 0))``.
 
     With a goal of an end-effector, ``plan("three_joint_arm", end_effector_position=(2, 1, 0.5))``,
-    the base is free but for what is given of its pose.
+    the base is free except for the given parts of its pose.
 
     Parameters
     ----------

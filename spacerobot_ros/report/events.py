@@ -18,7 +18,7 @@ EVENT_STRIP_HEIGHT = 0.62
 """Height of a strip of events with its key below a time axis, inches."""
 
 _MAX_MARKS = 2000
-"""Most marks in a strip: more would merge."""
+"""Largest number of marks in a strip: more would merge."""
 
 _STRIP_DISTANCE = 0.44
 """Distance of the strip's upper edge from the axis, inches: labels are between."""

@@ -77,7 +77,7 @@ _FIXED_SETTINGS: Any = {
 _figure_width = ContextVar("_figure_width", default=WIDTH)
 _degrees = ContextVar("_degrees", default=False)
 _lettered = ContextVar("_lettered", default=False)
-"""Whether panels of several have letters: (a), (b)."""
+"""Whether figures of several panels have letters: (a), (b)."""
 _font_scale = ContextVar("_font_scale", default=1.0)
 """Ratio of the font size to 8.5 points."""
 

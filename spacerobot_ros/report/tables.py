@@ -19,7 +19,7 @@ from spacerobot_ros.scenario import Published
 
 _NO_VALUE = "–"
 _EQUAL_TIME_TICKS = 1.5
-"""Control periods by which times may differ that count as equal."""
+"""Largest difference of times that count as equal, control periods."""
 
 
 @dataclass(frozen=True)

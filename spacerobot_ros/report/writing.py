@@ -211,7 +211,7 @@ def write_figures(
                 made[name] = path = folder / f"{name}.{format.value}"
                 write_output(path, picture)
             else:
-                made[name] = figure or "The bag holds nothing for it."
+                made[name] = figure or "The bag has no data for it."
     return made
 
 

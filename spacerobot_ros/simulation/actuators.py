@@ -35,7 +35,7 @@ _MIN_STEP = 1e-5
 """Shortest Runge-Kutta step, s; shorter steps add more rounding than accuracy."""
 
 _MAX_STEPS_PER_TICK = 1e6
-"""Most Runge-Kutta steps of a tick: more take minutes."""
+"""Largest number of Runge-Kutta steps in a tick: more take minutes."""
 
 
 class ThrusterPlant(WrappedPlant):

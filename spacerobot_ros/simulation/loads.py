@@ -24,7 +24,7 @@ _PLANE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Loads of the place that a robot is in, which do not change in a flight.
+    """Loads by the environment of a robot, constant during a flight.
 
     Attributes
     ----------

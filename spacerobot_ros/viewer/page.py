@@ -512,7 +512,7 @@ and how far below it looks, as a share of the distance.
 
 
 def screen_up(away: Array) -> Array:
-    """Return the direction (3,) that is up for a camera at ``away`` (3,) of what it looks at."""
+    """Return the up direction (3,) of a camera at the position ``away`` (3,) from its target."""
     back = away / np.linalg.norm(away)
     up: Array = np.array([0.0, 0.0, 1.0]) - back[2] * back
     return up / np.linalg.norm(up)
@@ -692,7 +692,7 @@ class Page:
         self._target_drawing.base.visible = False
 
     def _show_layers(self) -> None:
-        """Show the layers that users have chosen, of what is drawn so far."""
+        """Show the layers that users have chosen."""
         shown = {name: bool(handle.value) for name, handle in self._layers.items()}
         if self._drawing is not None:
             self._drawing.show_collision_shapes(visible=shown["Collision shapes"])

@@ -55,7 +55,7 @@ _SEARCH_STARTS = 8
 """Joint positions from which the search starts: the current ones, and random ones."""
 
 _MAX_EVALUATIONS = 30
-"""Most evaluations of the error in each search."""
+"""Largest number of evaluations of the error in each search."""
 
 _REACHED_ERROR = 1e-4
 """Error below which an arm reaches its goal, m and rad."""

@@ -374,7 +374,7 @@ class ControlLaw(ABC):
         return {**integral, **self._inputs(), **self.robot.mass_arguments}
 
     def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:
-        """Return whether the results of :attr:`function` are the command as they are."""
+        """Return whether the results of :attr:`function` are the command without further steps."""
         return ca.SX(1)
 
     @abstractmethod

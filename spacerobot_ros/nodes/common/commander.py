@@ -79,7 +79,7 @@ class CommanderNode(FlightNode):
 
     _statuses: Subscription | None = None
     _goal_actions: GoalActions | None = None
-    """The doors of actions, once they are there."""
+    """The action servers, once they are created."""
 
     # -- life ---------------------------------------------------------------------------------
 
@@ -199,7 +199,7 @@ class CommanderNode(FlightNode):
                 logger.error(message)
 
     def log_about_goals(self, level: LogLevel, message: str) -> None:
-        """Write a line about a goal into the log; of goals that pour in, one line a second."""
+        """Log a line about a goal; where many goals arrive, one line a second."""
         self._write(self._goal_lines.offer(time.monotonic(), Line(level, message)))
 
     def _write(self, line: Line | None) -> None:

@@ -116,7 +116,7 @@ class DirectDelivery:
             self.end()
 
     def end(self) -> None:
-        """Leave delivery to the middleware from now on; what is under way arrives directly."""
+        """Leave delivery to the middleware from now on; pending messages still arrive directly."""
         links, self._links = self._links, []
         if not links:
             return
@@ -134,7 +134,7 @@ class DirectDelivery:
             _set_announcement(publisher, None)
 
     def _announce(self, outputs: Sequence[RawOutput], topics: set[str]) -> None:
-        """Count what is published on topics that the executor delivers to nodes here."""
+        """Count the messages on topics that the executor delivers to nodes here."""
         publishers = [
             each
             for node in self._nodes
@@ -169,7 +169,7 @@ class DirectDelivery:
         while queue:
             self._left -= 1
             if not self._left:
-                # What is published from now on waits until the executor calls again.
+                # Messages that are published from now on wait until the executor calls again.
                 self._in_turn = False
             take, raw = queue.popleft()
             take(raw)

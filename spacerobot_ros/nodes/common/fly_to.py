@@ -43,7 +43,7 @@ _BASE_GOAL_NAME = "The goal of the base"
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the reader of a goal is told by its node.
+    """Facts about a node that the reader of a goal needs.
 
     Attributes
     ----------

@@ -231,7 +231,7 @@ class FlightNode(LifecycleNode):
     # -- callbacks ----------------------------------------------------------------------------
 
     def create_publisher(self, msg_type: Any, topic: str, *args: Any, **kwargs: Any) -> Publisher:
-        """Return a new publisher, which announces what it publishes."""
+        """Return a new publisher, which announces each publication."""
         kwargs.setdefault("publisher_class", AnnouncedPublisher)
         return super().create_publisher(msg_type, topic, *args, **kwargs)
 

@@ -130,7 +130,7 @@ class RawStream:
         self.take = take
         """Called by the owner with each message; looked up every time."""
         self._acts: tuple[Take, ...] = (take,)
-        """What the stream does with a message, in order."""
+        """Functions that the stream calls with a message, in order."""
         self._listener: Take | None = None
 
     def add_listener(self, listener: Take) -> None:
@@ -144,7 +144,7 @@ class RawStream:
         self._compose()
 
     def _compose(self) -> None:
-        """Make ``take`` call the listener, if there is one, and then what the stream does."""
+        """Make ``take`` call the listener, if any, and then the functions of the stream."""
         listeners = () if self._listener is None else (self._listener,)
         self.take = _one_after_another(*listeners, *self._acts)
 

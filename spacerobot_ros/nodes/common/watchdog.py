@@ -182,7 +182,7 @@ class Liveness:
             )
 
     def begin(self) -> None:
-        """Give heartbeats, and watch, from now on."""
+        """Start to send heartbeats and to watch those of other nodes."""
         self._end_timers()
         # Compiling a function on its first call counts as a long computation.
         compilation_contexts.append(self.busy)

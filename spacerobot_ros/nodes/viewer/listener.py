@@ -335,7 +335,7 @@ class Listener:
             self._reporters[key] = message.name
             self._hidden.pop(message.name, None)
             if isinstance(status, PlannerStatus):
-                with suppress(SpaceRobotError):  # A goal that is none, of another package.
+                with suppress(SpaceRobotError):  # An unreadable goal, of another package.
                     self._take_planned_goal(status)
             self._on_status(key, message.name)
 

@@ -81,7 +81,7 @@ _LEAST_SHOWN_LOG_LEVEL = 30
 """Least level of shown log messages (rcl_interfaces/Log)."""
 
 _PARTS_WITH_RECEIVED_GOALS = (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
-"""Parts whose goals this node hears as well as it sends them."""
+"""Parts whose goals this node receives as well as sends."""
 
 _SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
     Request.ABORT: (("planner", "controller"), "abort", None),

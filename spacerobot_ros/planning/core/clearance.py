@@ -40,7 +40,7 @@ _DISTANCE_ERROR = 1e-6
 """Error of a distance, m."""
 
 _LOOP_ROOM_FACTOR = 5.0
-"""Distance of links in a shape round which loops go, in clearances."""
+"""Smallest distance of links in the centre shape of loops, in clearances."""
 
 _MIN_START_SHARE = 0.5
 """Share of the clearance from which on a start is refused: a flight that has ended at the clearance

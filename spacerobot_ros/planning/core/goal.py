@@ -156,7 +156,7 @@ class EndEffectorGoal:
         return replace(self, position=self.position + by, waypoints=waypoints)
 
     def as_goal(self) -> Goal:
-        """Return it as a pose for a message: the quaternion is zero where any attitude will do."""
+        """Return the goal as a pose for a message; a quaternion of zeros leaves the attitude free."""
         return Goal(self.position, np.zeros(4) if self.quaternion is None else self.quaternion)
 
     @property
@@ -202,7 +202,7 @@ class Goal:
         quaternion: npt.ArrayLike | None = None,
         joint_positions: npt.ArrayLike | None = None,
     ) -> Goal:
-        """Return a goal of end-effectors; the base is free but for what is given of its pose.
+        """Return a goal of end-effectors; the base is free except for the given parts of its pose.
 
         Raises
         ------

@@ -146,7 +146,7 @@ def _bounds(robot: SpaceRobot, within_limits: bool) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _Equations:
-    """Those of singular shapes of a link: ``J*^T u = 0`` and ``|u|^2 = 1``, in units of the reach.
+    """Equations of a link's singular shapes, ``J*^T u = 0``, ``|u|^2 = 1``, in units of the reach.
 
     Attributes
     ----------

@@ -379,7 +379,7 @@ class Executive:
         self._teleoperation.twist, self._teleoperation.received_ns = twist, self._stamp_ns
 
     def _require_no_goal(self, link: str) -> None:
-        """Raise PlanningError where no twist of a link is followed now."""
+        """Raise PlanningError if twists of a link cannot be followed now."""
         teleoperation, refused = self._teleoperation, self._refused_twist_ns
         if self.phase not in (Phase.IDLE, Phase.TELEOPERATING) or self._new_goal is not None:
             raise PlanningError("Twists are not followed while a goal is pursued: abort it first.")

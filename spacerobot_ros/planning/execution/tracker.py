@@ -348,7 +348,7 @@ class TrajectoryTracker:
         if self._commands_plant or not self._holds_position:
             setpoint.position[:] = q
         else:
-            # The reference of a controller follows what was commanded, not what was measured.
+            # The reference of a controller follows the commands, not the measurements.
             setpoint.position[:] += setpoint.velocity * self._config.control_period
         setpoint.velocity[:] = velocity
         self._holds_position = True

@@ -56,7 +56,7 @@ _BOX_GRID_POINTS = 7
 """Points per joint of the grid on which such boxes are looked for."""
 
 _MAX_BOXES = 300
-"""Boxes of one size that are looked at, the best first."""
+"""Largest number of boxes of one size that are examined, the best first."""
 
 ClearanceTest = Callable[[Array], bool]
 """Whether links keep clear at all of some shapes (N, n)."""

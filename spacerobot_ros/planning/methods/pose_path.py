@@ -36,7 +36,7 @@ _MIN_BLEND_COSINE = -0.5
 """Cosine of the largest angle of a corner that is rounded; beyond it the motion stops there."""
 
 _BLEND_PARTS = 4
-"""Parts of a blend at whose ends the way is looked at."""
+"""Parts of a blend between whose ends the path is checked."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ _STEP = 0.02
 """Longest step along a path of the joints, rad of the fastest one."""
 
 _MIN_STEPS = 20
-"""Steps along a path at least."""
+"""Smallest number of steps along a path."""
 
 LEAST_PROGRESS = 0.01
 """Progress on the line below which a singularity is near: the line in reaches of the end-effector,
@@ -70,7 +70,7 @@ _ZERO_PROGRESS = 1e-8
 """Progress below which the path has come to the singularity itself."""
 
 _SINGULARITY_STEP_SHARE = 0.25
-"""Share of the way to a singularity that is a step at most."""
+"""Largest step, as a share of the way to a singularity."""
 
 _KNOT_TOLERANCE = 1e-6
 """Share of the way within which a jump of its curvature counts as passed."""
@@ -88,7 +88,7 @@ _INTERVALS = 160
 """Intervals of the linear program."""
 
 _MOST_INTERVALS = 1600
-"""Its intervals for ways with many corners at most."""
+"""Largest number of intervals, for ways with many corners."""
 
 _USED_ACCELERATION = 0.99
 """Share of the limits of acceleration for the path; corrections of the ticks may use the rest."""
@@ -358,7 +358,7 @@ class JointPath:
 
     @property
     def is_complete(self) -> bool:
-        """Whether it gets to the ends of the lines."""
+        """Whether the path leads to the ends of the lines."""
         return bool(self.shares[-1] == 1.0)
 
     def until(self, last: int) -> JointPath:

@@ -242,7 +242,7 @@ class SquareLoop:
 
 @dataclass(frozen=True)
 class _SquareFamily:
-    """Growing squares of one pair of joints: centres (R, 2), sides (R,), phases (R,)
+    """Squares of increasing side for one pair of joints: centres (R, 2), sides (R,), phases (R,)
     counter-clockwise."""
 
     pair: tuple[int, int]
@@ -389,7 +389,7 @@ class SquareSearch:
         )
 
     def _squares_within_limits(self, psi_e: Array, pair: tuple[int, int]) -> _SquareFamily | None:
-        """Return squares of growing side within the joint limits; None without room for any."""
+        """Return squares of increasing side within the joint limits; None without room for any."""
         at, lower, upper = (x[list(pair)] for x in (psi_e, self._robot.lower, self._robot.upper))
         room = float(np.min(upper - lower))
         if self._centre is not None:

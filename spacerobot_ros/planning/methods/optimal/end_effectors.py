@@ -63,7 +63,7 @@ _SINGULAR_VALUE_TOLERANCE = 1e-7
 """Singular values below this share of the largest count as zero."""
 
 _MIN_MOTION = 1e-9
-"""Motion of a link a metre or radian of the joints that is none, m or rad."""
+"""Motion of a link per metre or radian of the joints that counts as zero, m or rad."""
 
 _PARAMETERS_PER_LINK = 7
 """Numbers that a goal of a link takes: r_CE and a quaternion."""
@@ -72,13 +72,13 @@ _HALF_TURN_ROUNDING = 1e-9
 """Keeps the derivatives of the rotation error finite at half a turn."""
 
 _STARTS, _ADDITIONAL_STARTS = 16, 96
-"""Shapes from which inverse kinematics begins, and those where none of these leads to the goal."""
+"""Start shapes of inverse kinematics, and additional ones where none of these succeeds."""
 
 _ITERATIONS = 40
 """Steps of inverse kinematics."""
 
 _DAMPING = 1e-4
-"""Of the least squares of a step, relative to the largest entry of their matrix."""
+"""Damping of the least squares of a step, relative to the largest entry of their matrix."""
 
 _END_ERROR = 2e-3
 """Error of a shape that may be the end of a guess, m or rad: the solver brings it to the goal."""
@@ -530,8 +530,8 @@ class EndEffectorSpecification:
         raise NotFoundError(
             f"No shape of robot '{self.rows.robot.description.name}' that puts {names} to the goal "
             f"was found from {2 * _STARTS + _ADDITIONAL_STARTS} shapes; the nearest is "
-            f"{nearest:.3g} m or rad away. A nearer goal may help, a position instead of a pose, or "
-            "more freedom of the base."
+            f"{nearest:.3g} m or rad away. A nearer goal may help, a position instead of a pose, "
+            "or more freedom of the base."
         )
 
     def _inverse_kinematics(
@@ -631,7 +631,7 @@ def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: s
     ]
 
     def chain(body: int, point: Array) -> dict[int, tuple[Array, float]]:
-        """Return, for a body and each that carries it, a point of it and the way from there."""
+        """Return, for a body and each that carries it, a point of it and the vector from there."""
         found, way = {body: (point, 0.0)}, 0.0
         while body > 0:
             way += float(np.linalg.norm(point)) + travel[body - 1]

@@ -71,7 +71,7 @@ _PROGRAM_STRETCH = 1.01
 
 _MAX_PROGRAMS_IN_TURN = 6
 _FIT_TOLERANCE = 1e-5
-"""Error before the last program, rad, m or m/s: what it leaves is far below."""
+"""Error before the last program, rad, m or m/s; the remaining error is far smaller."""
 
 _MIN_SMOOTH_TICKS = 20
 """Fewest ticks of a smooth manoeuvre; shorter manoeuvres are polygons."""

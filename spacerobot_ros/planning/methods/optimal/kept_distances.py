@@ -37,7 +37,7 @@ _MAX_ACTIVE_DISTANCE = 0.05
 """Distance beyond the clearance at which the rows of a pair are no longer compared with it, m."""
 
 _END_MARGIN = 1e-4
-"""Least room at the ends, where the shape is given, m."""
+"""Smallest margin at the ends, where the shape is given, m."""
 
 
 class DistanceLibrary:
@@ -163,12 +163,12 @@ class KeptDistances:
         return self._library.clearance.clause(approach, control_period)
 
     def include(self, other: KeptDistances) -> None:
-        """Keep the pairs of another search apart, too, with the room that it gave them."""
+        """Keep the pairs of another search apart, too, with their margins."""
         for pair, room in other._room.items():
             self._room[pair] = max(room, self._room.get(pair, 0.0))
 
     def copy(self) -> KeptDistances:
-        """Return the same pairs, to add others to."""
+        """Return a copy, to which pairs can be added."""
         other = KeptDistances(
             self._library, self._boundary, self._required, turn_is_known=self._turn_is_known
         )
@@ -176,7 +176,7 @@ class KeptDistances:
         return other
 
     def add(self, near: Sequence[Approach]) -> None:
-        """Keep pairs apart that have come too near; those that are kept already get more room."""
+        """Add pairs that have come too near; pairs that are kept already get a larger margin."""
         for each in near:
             lacking = self._required[each.pair] - each.distance if each.pair in self._room else 0.0
             self._room[each.pair] = (
@@ -184,8 +184,8 @@ class KeptDistances:
             )
 
     def reduce_margins(self, positions: Array, turns: Array) -> bool:
-        """Give pairs as much room as the rows are wrong by where they are nearest along held
-        commands, (N + 1, n) and (N + 1, 4); return whether any gets less than it had.
+        """Set margins to the errors of the rows where pairs are nearest along held
+        commands, (N + 1, n) and (N + 1, 4); return whether any margin decreases.
         """
         library, base = self._library, self._library.base_poses(self._boundary, positions, turns)
         spent = False

@@ -111,13 +111,13 @@ _COASTING_ANGLE = math.radians(5.0)
 """Angle between the attitudes at which it is looked whether the base passes the goal."""
 
 _COASTING_TURNS = 4.0
-"""Turns of the base for which it coasts at most."""
+"""Largest number of turns of the base while it coasts."""
 
 _MAX_COASTING_ENDS = 3
-"""Passes of the goal that are tried."""
+"""Largest number of instants at which the coasting base passes the goal that are tried."""
 
 _STARTS_PER_COASTING_END = 8
-"""Guesses of the turn at zero momentum that is left at a pass."""
+"""Guesses for the turn that remains when the base passes the goal."""
 
 _MAX_DURATION_RATIO = 2.5
 """Longest time of a manoeuvre that ends at a pass, as multiple of that at zero momentum."""
@@ -160,7 +160,7 @@ class _Searches:
 
     @classmethod
     def of(cls, model: ManoeuvreModel, *, compiling: bool) -> _Searches:
-        """Make both for one model."""
+        """Make both searches for one model."""
         search = ManoeuvreSearch(model, compiling=compiling)
         return cls(search, MotionSearch(model, search.solver))
 
@@ -854,12 +854,12 @@ class _CachedPlan:
     notes: Notes
 
     def to_bytes(self) -> bytes:
-        """Return it as an archive of numpy."""
+        """Return the plan as a numpy archive."""
         return pack_arrays(positions=self.positions, notes=json.dumps(self.notes))
 
     @classmethod
     def from_bytes(cls, content: bytes) -> _CachedPlan:
-        """Return it from an archive.
+        """Return the plan of a numpy archive.
 
         Raises
         ------

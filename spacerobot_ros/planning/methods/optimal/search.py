@@ -150,7 +150,7 @@ _ADDITIONAL_TICKS = (0, 1, 3, 7)
 """Control periods that lengthen a manoeuvre in motion whose commands exceed a limit."""
 
 _ADDITIONAL_TICKS_OF_DRIFT = (0, 0, 1, 3, 7)
-"""Likewise where the robot drifts; the second time, the aim is corrected."""
+"""Additional control periods where the robot drifts; the second time, the end is corrected."""
 
 
 @dataclass(frozen=True)
