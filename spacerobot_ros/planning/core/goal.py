@@ -156,7 +156,7 @@ class EndEffectorGoal:
         return replace(self, position=self.position + by, waypoints=waypoints)
 
     def as_goal(self) -> Goal:
-        """Return the goal as a pose for a message; a quaternion of zeros leaves the attitude free."""
+        """Return the goal as a pose for a message; a zero quaternion leaves the attitude free."""
         return Goal(self.position, np.zeros(4) if self.quaternion is None else self.quaternion)
 
     @property
