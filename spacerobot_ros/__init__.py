@@ -11,7 +11,7 @@ from spacerobot_ros.version import __version__
 
 if TYPE_CHECKING:
     from spacerobot_ros.bag import read_bag
-    from spacerobot_ros.campaign.sweep import sweep
+    from spacerobot_ros.campaign.running import sweep
     from spacerobot_ros.flight.api import fly, plan
     from spacerobot_ros.flight.reading import read_run
     from spacerobot_ros.scenario import load_scenario
@@ -27,7 +27,7 @@ __getattr__ = lazy_names(
         "plan": "spacerobot_ros.flight.api",
         "read_bag": "spacerobot_ros.bag",
         "read_run": "spacerobot_ros.flight.reading",
-        "sweep": "spacerobot_ros.campaign.sweep",
+        "sweep": "spacerobot_ros.campaign.running",
     },
 )
 

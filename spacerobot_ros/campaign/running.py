@@ -1,4 +1,7 @@
-"""Runs a campaign into its dataset, and flies single flights of it again through the ROS stack."""
+"""Runs a campaign into its dataset, and flies single flights of it again through the ROS stack.
+
+:func:`sweep` is a small campaign from Python: one function, in the words of ``fly``.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
-from spacerobot_ros.campaign.config import Campaign
+import numpy.typing as npt
+
+from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
@@ -22,8 +29,12 @@ from spacerobot_ros.campaign.workers import (
     open_workers,
 )
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.flight.api import scenario_to_fly
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -259,3 +270,57 @@ def largest_deviation(
         if deviation > largest:
             largest, at = deviation, name
     return largest, at
+
+
+# -- from Python ----------------------------------------------------------------------------------
+
+
+def sweep(
+    what: SpaceRobot | Scenario | str | Path,
+    disperse: Mapping[str, Any],
+    goal: Goal | npt.ArrayLike | None = None,
+    *,
+    position: npt.ArrayLike | None = None,
+    rotvec: npt.ArrayLike | None = None,
+    method: str | None = None,
+    seed: int = 0,
+    flights: int = 100,
+    folder: Path | None = None,
+    **section: Any,
+) -> Any:
+    """Fly a small campaign, and return a row for each flight.
+
+    ``sweep("coordinated_control", {"plant.sensors.position_noise": {"uniform": [0, 0.01]}})``.
+
+    Parameters
+    ----------
+    what, goal, position, rotvec, method
+        As for :func:`~spacerobot_ros.flight.api.fly`.
+    disperse
+        Distributions by the name of the quantity, as in a file of a campaign.
+    seed, flights
+        Seed of the draws, and their number.
+    folder
+        Where the dataset is kept, which a later call goes on with; None: nowhere.
+    section
+        Other keys of a file of a campaign: ``sampler``, ``criteria``, ``engine``, ``longest``.
+
+    Returns
+    -------
+    A table of pyarrow, whose ``to_pandas`` makes a data frame: the columns of a dataset.
+
+    Raises
+    ------
+    SpaceRobotError
+        A key or value is refused, or pyarrow or scipy is not installed.
+    """
+    scenario = scenario_to_fly(what, goal, position, rotvec)
+    scenario.require_goal()
+    if method is not None:
+        scenario = scenario.with_method(method)
+    given = {**section, "disperse": dict(disperse), "flights": flights, "seed": seed}
+    campaign = parse_campaign(scenario.name, given, scenario=scenario)
+    with TemporaryDirectory() as left_nowhere:
+        kept = Path(left_nowhere) / "sweep" if folder is None else folder
+        run_campaign(campaign, kept)
+        return Dataset(kept).table()

@@ -223,7 +223,7 @@ def environments(lanes: int, json_file: Path | None) -> None:
 
     Steps a CPU second are measured for an arm and a servicer, LANES [1024] of each.
     """
-    from spacerobot_ros.benchmarks.environments import environments_benchmark
+    from spacerobot_ros.benchmarks.engines import environments_benchmark
 
     _write_figures(json_file, environments_benchmark(lanes, click.echo))
 

@@ -13,12 +13,11 @@ from enum import Enum
 
 import numpy as np
 
-from spacerobot_ros.control.approach import ApproachPlan, plan_approach
+from spacerobot_ros.control.approach import ApproachPlan, TargetClearance, plan_approach
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.detumbling import Detumbling, shortest_detumbling
 from spacerobot_ros.control.state import ControlState, Reference
-from spacerobot_ros.control.target_clearance import TargetClearance
 from spacerobot_ros.control.target_motion import TorqueFreeMotion
 from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError
 from spacerobot_ros.events import Event, EventKind

@@ -5,11 +5,46 @@ Gymnasium is installed. Tasks and actions (:mod:`.tasks`) need no Gymnasium: a t
 without it.
 """
 
-from importlib.util import find_spec
+from __future__ import annotations
 
-from spacerobot_ros.environments.registration import register
+from importlib.util import find_spec
+from typing import Any
+
+from spacerobot_ros.lazy import optional_module
+
+__all__ = ["register"]
+
+
+NAMESPACE = "spacerobot"
+
+ENVIRONMENTS = {"ReorientArm-v0": "reorient", "Reach-v0": "reach"}
+"""Names of the environments within :data:`NAMESPACE`, and their tasks."""
+
+
+def import_gymnasium() -> Any:
+    """Return the module of Gymnasium; see :func:`.optional_module`."""
+    return optional_module("gymnasium", "rl", "Environments need")
+
+
+def register() -> None:
+    """Make the environments known to Gymnasium.
+
+    Raises
+    ------
+    SpaceRobotError
+        Gymnasium is not installed.
+    """
+    gymnasium = import_gymnasium()
+    module = "spacerobot_ros.environments.gymnasium_interface"
+    for name, task in ENVIRONMENTS.items():
+        if f"{NAMESPACE}/{name}" not in gymnasium.registry:
+            gymnasium.register(
+                f"{NAMESPACE}/{name}",
+                entry_point=f"{module}:SpaceRobotEnv",
+                vector_entry_point=f"{module}:SpaceRobotVectorEnv",
+                kwargs={"task": task},
+            )
+
 
 if find_spec("gymnasium") is not None:
     register()
-
-__all__ = ["register"]

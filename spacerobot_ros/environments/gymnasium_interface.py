@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from spacerobot_ros.environments import import_gymnasium
 from spacerobot_ros.environments.episodes import EpisodeConfig, Episodes
-from spacerobot_ros.environments.registration import import_gymnasium
 
 import_gymnasium()  # Says how to install it where it is missing.
 

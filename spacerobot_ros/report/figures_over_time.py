@@ -746,7 +746,7 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
             signal: Signal = getattr(errors, quantity)
             if not len(signal):
                 continue
-            tolerance = flight.tolerance(part)
+            tolerance = flight.flight.tolerance(part)
             groups.append(
                 TraceGroup(
                     signal,
@@ -793,7 +793,7 @@ def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
 def sensors_figure(flight: FlightReport) -> ReportFigure | None:
     """Measured minus true poses and joint positions; None if sensors have no errors."""
     true = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
-    pose, at = _match_times(flight.measured_pose_signal, true)
+    pose, at = _match_times(flight.signal("measured_pose"), true)
     turn = quaternion_multiply(pose.values[:, 3:], quaternion_inverse(true.values[at, 3:]))
     offset = pose.values[:, :3] - true.values[at, :3]
     errors = Signal(pose.time, np.hstack([offset, rotvecs_from_quaternions(turn)]))

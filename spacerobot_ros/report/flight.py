@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from spacerobot_ros.errors import MeshError
 from spacerobot_ros.flight.captures import (
     BUDGET_PARTS,
     momentum_budget_over_time,
-    payload_estimates,
 )
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.flight.flight import Flight, SentGoal, Signal, pose_error, reported_goal
@@ -33,7 +32,6 @@ from spacerobot_ros.model import RobotDescription
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, Pose, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh
-from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     rotation_angles,
@@ -47,7 +45,7 @@ from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.report.events import FlightEvent, timed_events
 from spacerobot_ros.report.signals import Cycles, find_cycles, nearest_rotvec, rotvecs
 from spacerobot_ros.report.solids import MAX_MESH_FACES, SolidRobot, Solids, obstacle_color, rgb
-from spacerobot_ros.scenario import COMMANDERS, Published
+from spacerobot_ros.scenario import COMMANDERS
 from spacerobot_ros.times import SECOND
 
 _BUDGET_STATES = 2000
@@ -237,17 +235,6 @@ class FlightReport:
         return _shift_time(found, self.bag.began)
 
     @cached_property
-    def payload_estimates(self) -> tuple[PayloadEstimate, ...]:
-        """Estimated parameters of each body that the robot held.
-
-        Raises
-        ------
-        SpaceRobotError
-            Loads whose impulse is not known acted on the robot, or it has no positive inertia.
-        """
-        return payload_estimates(self.flight)
-
-    @cached_property
     def tool(self) -> Signal:
         """Pose of the end-effector in the world (N, 7)."""
         return self.signal("end_effector_pose")
@@ -271,11 +258,6 @@ class FlightReport:
             self.bag.signal("joint_commands", ["effort"], len(names)), self.bag.began
         )
         return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
-
-    @property
-    def measured_pose_signal(self) -> Signal:
-        """Pose of the base link as measured while sensors err (M, 7)."""
-        return self.signal("measured_pose")
 
     @cached_property
     def planned(self) -> list[Array]:
@@ -363,33 +345,14 @@ class FlightReport:
         return f"{Path(self.file_name).stem} ({self.method})" if self.method else self.file_name
 
     @property
-    def description(self) -> str:
-        """Description of the scenario."""
-        return self.flight.scenario.description
-
-    @property
     def method(self) -> str:
         """Gait method: of the first schedule, or the planner's parameter; else the control law."""
         named = (status.method for status in self.statuses if status.method)
         return next(named, str(self.parameter("planner", "method") or ""))
 
-    @property
-    def robot_name(self) -> str:
-        """Name in the robot description."""
-        return self.robot.name if self.robot is not None else ""
-
     def parameter(self, node: str, name: str) -> Any:
         """Return a parameter of a node; None if the bag does not hold it."""
         return self.flight.scenario.in_file.get(node, {}).get(name)
-
-    def tolerance(self, of: Literal["position", "attitude"]) -> float | None:
-        """Return the tolerance of a part of the goal, m or rad, if known."""
-        return self.flight.tolerance(of)
-
-    @property
-    def published(self) -> tuple[Published, ...]:
-        """Published figures of the scenario."""
-        return self.flight.scenario.published
 
     # -- reports and goals ------------------------------------------------------------------------
 
@@ -539,14 +502,9 @@ class FlightReport:
         return [i for i, axis in enumerate(axes) if f"{part}.{axis}" in self.outputs]
 
     @property
-    def final_error(self) -> PoseError | None:
-        """Error of the last pose to the goal."""
-        return self.flight.error
-
-    @property
     def measured_error(self) -> PoseError | None:
         """Error of the last measured pose to the goal, where sensors err."""
-        return pose_error(self.measured_pose_signal, self.goal)
+        return pose_error(self.signal("measured_pose"), self.goal)
 
     def goal_rotvec(self, goal: Goal) -> Array:
         """Attitude of a goal (3,), rad, with the number of turns nearest to the last attitude."""

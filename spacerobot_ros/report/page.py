@@ -63,12 +63,13 @@ def page(
 ) -> str:
     """Return the whole page; flights ``beside`` this one get a row in a table."""
     charts = charts_of(flight, figures)
-    name = flight.scenario
-    title = ", ".join(filter(None, (name, flight.method, flight.robot_name)))
+    name, description = flight.scenario, flight.flight.scenario.description
+    robot_name = "" if flight.robot is None else flight.robot.name
+    title = ", ".join(filter(None, (name, flight.method, robot_name)))
     body = [
         "<header>",
         f"<h1>{escape(name)}</h1>",
-        f"<p>{escape(flight.description)}</p>" if flight.description else "",
+        f"<p>{escape(description)}</p>" if description else "",
         _facts_html(flight),
         _outcome_html(flight),
         tiles(headline(flight)),
@@ -93,7 +94,7 @@ def _facts_html(flight: FlightReport) -> str:
     if flight.robot is not None:
         count = len(flight.robot.joint_names)
         joints = "1 joint" if count == 1 else f"{count} joints"
-        found.append(f"robot {flight.robot_name}: {joints}, {flight.robot.total_mass:.5g} kg")
+        found.append(f"robot {flight.robot.name}: {joints}, {flight.robot.total_mass:.5g} kg")
     if flight.bag.namespace:
         found.append(f"namespace {flight.bag.namespace}")
     if flight.other_robots:

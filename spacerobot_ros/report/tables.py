@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.flight.captures import payload_estimates
 from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
@@ -34,7 +35,7 @@ class Table:
 def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     """Return label, value and note of each headline number."""
     rows: list[tuple[str, str, str]] = []
-    error, tool, sensed = flight.final_error, flight.tool_error, flight.measured_error
+    error, tool, sensed = flight.flight.error, flight.tool_error, flight.measured_error
     if error is not None:
         measured = "" if sensed is None else f"measured: {sensed.distance:.3g} m"
         near = f"{error.distance:.3g} m", measured
@@ -115,7 +116,7 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
 def result_table(flight: FlightReport) -> Table:
     """Return goal, final state, errors, times and momentum drift, as far as the bag has them."""
     rows: list[tuple[str, ...]] = []
-    goal, error = flight.goal, flight.final_error
+    goal, error = flight.goal, flight.flight.error
     if goal is not None and (flight.controls("base") or not flight.outputs):
         last = flight.statuses[-1].state if flight.statuses else ""
         refused = " (refused)" if last == "refused" and not flight.executing else ""
@@ -169,7 +170,7 @@ def result_table(flight: FlightReport) -> Table:
 def _payload_rows(flight: FlightReport) -> list[tuple[str, ...]]:
     """Return the estimated parameters of each body that the robot held."""
     try:
-        estimates = flight.payload_estimates
+        estimates = payload_estimates(flight.flight)
     except SpaceRobotError as error:
         return [("Held body, estimated", str(error))]
     return [("Held body, estimated", payload_text(each)) for each in estimates]
@@ -274,10 +275,10 @@ def joint_table(flight: FlightReport) -> Table | None:
 
 def published_table(flight: FlightReport) -> Table | None:
     """Return published figures beside those of this flight; None if the scenario has none."""
-    if not flight.published:
+    if not flight.flight.scenario.published:
         return None
     rows = []
-    for row in flight.published:
+    for row in flight.flight.scenario.published:
         measured, source = _measured_values(flight, row)
         ours = _NO_VALUE
         if measured:
@@ -299,7 +300,7 @@ def _measured_values(flight: FlightReport, row: Published) -> tuple[list[float],
         figures["final_joint_positions"] = flight.shape.values[-1]
     if len(flight.rates):
         figures["peak_joint_velocities"] = np.abs(flight.rates.values).max(axis=0)
-    if (error := flight.final_error) is not None:
+    if (error := flight.flight.error) is not None:
         figures["position_error_m"] = [error.distance]
         figures["attitude_error_rad"] = [error.angle]
     if (time := flight.manoeuvre_time) is not None:
@@ -331,7 +332,7 @@ def _format_attitude(rotvec: Iterable[float]) -> str:
 
 
 def _tolerance_text(flight: FlightReport, part: str, unit: str) -> str:
-    value = flight.tolerance("position" if part == "position" else "attitude")
+    value = flight.flight.tolerance("position" if part == "position" else "attitude")
     return "" if value is None else f" (tolerance {value:.3g} {unit})"
 
 

@@ -258,6 +258,6 @@ def _overview_figure(flight: FlightReport) -> Figure:
         view = view_of(flight)
         draw_robot(axes, robot, robot.points(), view)
         legend_above(axes, draw_goal_and_path(axes, flight, view))
-    title = f"{flight.scenario}: {flight.description}" if flight.description else flight.scenario
+    title = ": ".join(filter(None, (flight.scenario, flight.flight.scenario.description)))
     figure.text(0.1 / WIDTH, 1 - 0.24 / up, title, size=10.5, weight="bold")
     return figure

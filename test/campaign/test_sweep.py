@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spacerobot_ros.campaign import sweep as module
-from spacerobot_ros.campaign.sweep import sweep
+from spacerobot_ros.campaign import running as module
+from spacerobot_ros.campaign.running import sweep
 from spacerobot_ros.errors import ParameterError
 
 NOISE = {"plant.sensors.position_noise": {"uniform": [0.001, 0.003]}}

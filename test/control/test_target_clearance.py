@@ -14,9 +14,9 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.collision import ObstaclePair
 from spacerobot_ros.control import approach
+from spacerobot_ros.control.approach import NearestLinks, TargetClearance
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.servicing import Approach, MeasuredTarget
-from spacerobot_ros.control.target_clearance import NearestLinks, TargetClearance
 from spacerobot_ros.control.target_motion import (
     FrameMotion,
     PathInWorld,

@@ -19,8 +19,8 @@ from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatist
 from scipy.spatial.transform import Rotation
 
 import spacerobot_ros.environments
+from spacerobot_ros.environments import import_gymnasium
 from spacerobot_ros.environments.episodes import EpisodeConfig, Episodes
-from spacerobot_ros.environments.registration import import_gymnasium
 from spacerobot_ros.environments.tasks import (
     Reach,
     Reorient,

@@ -14,8 +14,8 @@ from support.plant_rig import SLIDERS, TICK_NS
 from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.commanding.log_rate_limiter import BURST
 from spacerobot_ros.nodes.common import commander
+from spacerobot_ros.nodes.common.commander import BURST
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from spacerobot_ros.planning.execution.stuck_joints import StuckJointWatch
+from spacerobot_ros.planning.execution.tracker import StuckJointWatch
 
 Array = npt.NDArray[np.float64]
 

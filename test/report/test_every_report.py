@@ -67,7 +67,7 @@ def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Brows
     flight = read_report(bag)
     # Terminal, JSON and report say the same.
     assert flight.manoeuvre_time == pytest.approx(summary["manoeuvre_time_s"], abs=1e-6)
-    error = flight.final_error
+    error = flight.flight.error
     assert (error is None) is (not scenario.goal.base)
     if error is not None:
         assert error.distance == pytest.approx(summary["position_error_m"], rel=1e-9, abs=1e-12)

@@ -12,6 +12,7 @@ import pytest
 from spacerobot_ros.errors import RobotDescriptionError, SpaceRobotError
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.report import flight as report_flight
+from spacerobot_ros.report import tables as report_tables
 from spacerobot_ros.report.figures import ReportFigure, drawing
 from spacerobot_ros.report.figures_over_time import momentum_budget_figure
 from spacerobot_ros.report.flight import read_report
@@ -69,7 +70,7 @@ def test_the_table_has_the_estimated_body(monkeypatch: pytest.MonkeyPatch) -> No
     def refuse(*_: object) -> None:
         raise SpaceRobotError("Loads acted.")
 
-    monkeypatch.setattr(report_flight, "payload_estimates", refuse)
+    monkeypatch.setattr(report_tables, "payload_estimates", refuse)
     rows = result_table(read_report(BAGS / "capture.mcap")).rows
     assert ("Held body, estimated", "Loads acted.") in rows
 

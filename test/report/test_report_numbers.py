@@ -449,8 +449,8 @@ def test_where_sensors_err_the_numbers_are_true_and_the_measured_ones_beside_the
     np.testing.assert_array_equal(found.position.values[:, 0], [0.7, 0.95, 0.95, 0.95])
     np.testing.assert_allclose(found.shape.values[:, 1], [-0.5, 0.35, 1.1, 1.85])
     assert found.rates.values[:, 1].tolist() == [0.0, 0.6, 0.6, 0.6]
-    assert found.final_error is not None
-    assert found.final_error.distance == pytest.approx(math.hypot(0.05, 0.4))
+    assert found.flight.error is not None
+    assert found.flight.error.distance == pytest.approx(math.hypot(0.05, 0.4))
     top = {label: (value, note) for label, value, note in headline(found)}
     assert top["Position error"] == ("0.403 m", "measured: 0.5 m")
     assert top["Attitude error"][1].endswith("; measured: 0.3 rad")

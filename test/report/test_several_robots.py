@@ -47,7 +47,8 @@ def bag(tmp_path: Path) -> Path:
 def test_the_robot_that_is_named_is_the_one_that_is_shown(name: str, bag: Path) -> None:
     for given in (name, name.strip("/")):
         flight = read_report(bag, given)
-        assert flight.robot_name == f"robot_{JOINTS[name]}"
+        assert flight.robot is not None
+        assert flight.robot.name == f"robot_{JOINTS[name]}"
         assert len(flight.joint_names) == JOINTS[name]
         (other,) = flight.other_robots
         assert {name, other} == set(JOINTS)

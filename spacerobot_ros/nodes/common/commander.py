@@ -1,4 +1,7 @@
-"""Base class of the nodes that command a plant: it converts the messages of a commander."""
+"""Base class of the nodes that command a plant: it converts the messages of a commander.
+
+Of lines about goals that pour in, its log has the last one of each period.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,8 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
@@ -23,7 +27,6 @@ from std_srvs.srv import Trigger
 
 from spacerobot_ros.commanding.commander import Commander, LogLevel
 from spacerobot_ros.commanding.goal_follower import Status
-from spacerobot_ros.commanding.log_rate_limiter import Line, LogRateLimiter
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
@@ -426,3 +429,61 @@ class CommanderNode(FlightNode):
         self._diagnosed_ns, self._diagnosed = stamps.now_ns, time.monotonic()
         set_stamp(array.header.stamp, stamps.now_ns)
         self._diagnostics.publish(array)
+
+
+# -- lines of the log -----------------------------------------------------------------------------
+
+BURST = 20
+"""Lines that pass at once after a quiet time: those of a goal with its corrections."""
+
+PERIOD = 1.0
+"""Time per line once the burst is used up, s."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """Severity and text of one line."""
+
+    level: Literal["debug", "info", "warning", "error"]
+    message: str
+
+
+class LogRateLimiter:
+    """Passes a burst of log lines at once, and then one line in each period.
+
+    A line that has to wait is replaced by the next one; the line that passes at last tells how
+    many were left out. So the log ends with the last line, whatever came before.
+    """
+
+    def __init__(self) -> None:
+        self._free, self._counted_s = float(BURST), 0.0
+        self._waiting: Line | None = None
+        self._left_out = 0
+
+    def offer(self, now_s: float, line: Line) -> Line | None:
+        """Return the line to write now; None if the line waits.
+
+        Parameters
+        ----------
+        now_s
+            Wall time, s.
+        line
+            The new line.
+        """
+        if self._waiting is not None:
+            self._left_out += 1
+        self._waiting = line
+        return self.due(now_s)
+
+    def due(self, now_s: float) -> Line | None:
+        """Return the waiting line once it may be written."""
+        self._free = min(BURST, self._free + (now_s - self._counted_s) / PERIOD)
+        self._counted_s = now_s
+        line, count = self._waiting, self._left_out
+        if line is None or self._free < 1.0:
+            return None
+        self._free -= 1.0
+        self._waiting, self._left_out = None, 0
+        if not count:
+            return line
+        return replace(line, message=f"{line.message} ({count} line(s) about goals left out.)")

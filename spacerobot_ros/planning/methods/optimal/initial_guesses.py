@@ -11,11 +11,14 @@ are near to theirs.
 from __future__ import annotations
 
 import hashlib
+import io
 import itertools
 import math
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -32,11 +35,6 @@ from spacerobot_ros.model.rotations import (
     quaternions_from_rotvecs,
 )
 from spacerobot_ros.planning.core.schedule import GaitSchedule
-from spacerobot_ros.planning.methods.optimal.archives import (
-    archive_name,
-    pack_arrays,
-    unpack_arrays,
-)
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -433,3 +431,34 @@ def load_library(path: str, key: str) -> SolutionLibrary | None:
             "makes one of this."
         )
     return found
+
+
+# -- archives of arrays ---------------------------------------------------------------------------
+
+
+def archive_name(key: str) -> str:
+    """Return the file name of an archive from the hash of its key."""
+    return f"{key[:32]}.npz"
+
+
+def pack_arrays(**arrays: Any) -> bytes:
+    """Return arrays and texts as the bytes of a numpy archive."""
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+def unpack_arrays(content: bytes, kind: str, *names: str) -> list[Array]:
+    """Return the named arrays of an archive.
+
+    Raises
+    ------
+    ValueError
+        It holds no such arrays; the message names the ``kind`` of thing that they would be.
+    """
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return [arrays[name] for name in names]
+    except (OSError, EOFError, KeyError, MemoryError, ValueError, zipfile.BadZipFile):
+        # The message of numpy recommends to trust the file.
+        raise ValueError(f"it holds no {kind}") from None

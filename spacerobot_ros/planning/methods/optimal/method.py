@@ -44,11 +44,6 @@ from spacerobot_ros.planning.core.goal import (
 )
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
-from spacerobot_ros.planning.methods.optimal.archives import (
-    archive_name,
-    pack_arrays,
-    unpack_arrays,
-)
 from spacerobot_ros.planning.methods.optimal.end_effectors import (
     EndEffectorSpecification,
 )
@@ -56,9 +51,12 @@ from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpeci
 from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
 from spacerobot_ros.planning.methods.optimal.initial_guesses import (
     SolutionLibrary,
+    archive_name,
     library_file,
     library_key,
     load_library,
+    pack_arrays,
+    unpack_arrays,
 )
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from spacerobot_ros.commanding.log_rate_limiter import Line, LogRateLimiter
+from spacerobot_ros.nodes.common.commander import Line, LogRateLimiter
 
 
 def test_goals_at_100_hz_write_a_line_a_second() -> None:
