@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,7 @@ from spacerobot_ros.model.description import (
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
 from spacerobot_ros.model.rotations import matrices_from_quaternions
+from spacerobot_ros.model.visuals import Visual, solid_mesh
 
 _SHAPES, _SEED = 1000, 0
 """Number of random shapes that find pairs which are always in contact, and their seed."""
@@ -458,10 +459,12 @@ def solids_of(
         for shape in link.collisions or link.shapes:
             if shape.kind == "mesh":
                 try:
-                    vertices = _hull(mesh_of(shape).vertices)
+                    vertices = mesh_of(shape).vertices
                 except MeshError as error:
                     notes.append(f"Contacts of link '{link.name}' are not all noticed: {error}")
                     continue
+                hull = _hull(vertices)
+                vertices = vertices if hull is None else vertices[hull.vertices]
                 enclosure = RoundedBox.around(shape, vertices)
                 solids.append(Solid(link.name, body, shape, enclosure, vertices))
             elif max(shape.size) > 0:
@@ -469,12 +472,54 @@ def solids_of(
     return tuple(solids), tuple(notes)
 
 
-def _hull(points: Array) -> Array:
-    """Return the points (V, 3) that are corners of the convex hull; of a flat one, all points."""
+def _hull(points: Array) -> Any:
+    """Return the convex hull of points (V, 3) by scipy; None where all lie in a plane."""
     # Slow to import, and few robots have meshes.
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        return np.asarray(points[ConvexHull(points).vertices])
+        return ConvexHull(points)
     except QhullError:
-        return points
+        return None
+
+
+# -- as triangles, for pages and pictures ---------------------------------------------------------
+
+
+def collision_visuals(
+    robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
+) -> tuple[Visual, ...]:
+    """Return the solids whose distances count; a mesh is its convex hull, and one that cannot be
+    read is left out.
+
+    ``mesh_of`` is that of :class:`~spacerobot_ros.collision.geometry.CollisionGeometry`.
+    """
+    solids, _ = solids_of(robot, mesh_of)
+    return tuple(Visual(each.link, each.body, each.shape, _mesh_of(each)) for each in solids)
+
+
+def obstacle_visuals(
+    world: RobotDescription | None, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
+) -> tuple[tuple[Visual, Pose], ...]:
+    """Return the solids of obstacles by which distances are measured, each with the pose of its
+    link in the world; None: there are none. ``mesh_of`` is that of :func:`collision_visuals`.
+    """
+    if world is None:
+        return ()
+    return tuple((each, world.frames[each.link][1]) for each in collision_visuals(world, mesh_of))
+
+
+def _mesh_of(solid: Solid) -> TriangleMesh:
+    """Return the triangles of a solid; of a flat hull there are none."""
+    points = solid.vertices
+    if points is None:
+        return solid_mesh(solid.shape)
+    hull = _hull(points)
+    if hull is None:
+        return TriangleMesh(points, np.zeros((0, 3), np.int32))
+    faces = hull.simplices.astype(np.int32)
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    # Corners go round counterclockwise, seen from outside.
+    inward = np.einsum("ka,ka->k", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return TriangleMesh(points, faces)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.collision.drawn import obstacle_visuals
+from spacerobot_ros.collision.geometry import obstacle_visuals
 from spacerobot_ros.control.status import CommandReport, ControllerStatus
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.flight.captures import (

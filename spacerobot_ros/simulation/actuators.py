@@ -21,9 +21,16 @@ from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.simulation import effort_plant
 from spacerobot_ros.simulation.capture import CapturePlant, Target, capture_in, load_target
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.disturbances import Disturbance, disturbance_timeline
 from spacerobot_ros.simulation.effort_plant import EffortPlant
-from spacerobot_ros.simulation.faults import FAULT_KINDS, WRENCH_AXES, Fault, FaultTimeline, Targets
+from spacerobot_ros.simulation.faults import (
+    FAULT_KINDS,
+    WRENCH_AXES,
+    Disturbance,
+    Fault,
+    Targets,
+    disturbance_timeline,
+    fault_timeline,
+)
 from spacerobot_ros.simulation.loads import PlantLoads, Surroundings
 from spacerobot_ros.simulation.plant import InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
@@ -244,7 +251,7 @@ class FaultyPlant(WrappedPlant):
         self.capturing = capture_in(plant)
         """The target, and what captures it; None: there is no target."""
         nozzles = self._thrusters.table.names if self._thrusters is not None else ()
-        self.timeline = FaultTimeline(faults, Targets(plant.robot.joint_names, wrench, nozzles))
+        self.timeline = fault_timeline(faults, Targets(plant.robot.joint_names, wrench, nozzles))
         self.takes_wrench = wrench
         """Whether a step takes a wrench on the base beside the joint commands."""
         self.tick = 0

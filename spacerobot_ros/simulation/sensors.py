@@ -81,7 +81,7 @@ class Sensors:
         """Copies of the true poses and twists of the last ticks."""
         self._apply_faults(plant.active)
         self.used = self.is_imperfect or any(
-            FAULT_KINDS[f.kind].sensor for f in plant.timeline.faults
+            FAULT_KINDS[f.kind].sensor for f in plant.timeline.entries
         )
         """Whether measurements ever differ from the truth: before, now or by a known fault."""
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spacerobot_ros.collision.drawn import collision_visuals, obstacle_visuals
+from spacerobot_ros.collision.geometry import collision_visuals, obstacle_visuals
 from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward

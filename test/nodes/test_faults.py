@@ -193,7 +193,7 @@ def test_bad_faults_are_refused_with_a_sentence(
 )
 def test_faults_are_a_list_or_a_text(ros_context: rclpy.Context, faults: Any) -> None:
     plant = PlantNode(**construction(ros_context, {**PLANT, "faults": faults}))
-    assert [str(f) for f in plant.plant.timeline.faults] == [
+    assert [str(f) for f in plant.plant.timeline.entries] == [
         "joint_stuck slider_1 at 0",
         "joint_slow slider_2 0.5 at 9",
     ]

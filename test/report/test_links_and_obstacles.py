@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.collision.drawn import obstacle_visuals
+from spacerobot_ros.collision.geometry import obstacle_visuals
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.flight.flight import SentGoal, goal_at_end, reported_goal
 from spacerobot_ros.model.description import Array, Shape

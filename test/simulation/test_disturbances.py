@@ -15,7 +15,7 @@ from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.disturbances import (
+from spacerobot_ros.simulation.faults import (
     Disturbance,
     disturbance_timeline,
     parse_disturbance,

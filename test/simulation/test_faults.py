@@ -28,8 +28,8 @@ from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
     FAULT_KINDS,
     Fault,
-    FaultTimeline,
     Targets,
+    fault_timeline,
     parse_fault,
 )
 from spacerobot_ros.simulation.plant import Plant
@@ -141,10 +141,10 @@ def test_times_of_a_long_flight_are_written_as_they_are() -> None:
 
 
 def test_so_many_faults_that_none_could_look_through_them_are_refused() -> None:
-    timeline = FaultTimeline(["joint_stuck elbow_pitch"] * 999, TARGETS)
+    timeline = fault_timeline(["joint_stuck elbow_pitch"] * 999, TARGETS)
     with pytest.raises(ParameterError, match="at most 1000"):
         timeline.read(["joint_stuck elbow_pitch"] * 2)
-    assert len(timeline.faults) == 999
+    assert len(timeline.entries) == 999
     timeline.read(["joint_stuck elbow_pitch"])
     timeline.clear()
     timeline.read(["joint_stuck elbow_pitch"])
@@ -190,7 +190,7 @@ def test_faults_are_active_from_their_start_until_before_their_end() -> None:
         "",
         "sensor_delay odom 1",
     ]
-    timeline = FaultTimeline(lines, TARGETS)
+    timeline = fault_timeline(lines, TARGETS)
     active = {t: [f.kind for f in timeline.at(t)] for t in (0.0, 0.999, 1.0, 2.0, 2.999, 3.0, 9.0)}
     assert active == {
         0.0: ["sensor_delay"],

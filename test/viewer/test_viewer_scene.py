@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial import ConvexHull
 from support.urdf_text import without_collisions
 
-from spacerobot_ros.collision.drawn import collision_visuals
+from spacerobot_ros.collision.geometry import collision_visuals
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.model import load_robot
