@@ -26,7 +26,7 @@ from spacerobot_ros.measures import metric_names
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.resources import is_path, robot_file
 from spacerobot_ros.scenario import load_scenario, scenario_text
-from spacerobot_ros.simulation.capture import load_target
+from spacerobot_ros.simulation.capture import load_target, target_parameters
 from spacerobot_ros.version import __version__
 
 DRAW_PREFIX = "draw."
@@ -376,6 +376,6 @@ def self_contained(campaign: Campaign) -> Campaign:
     if is_path(floating.robot) and not floating.robot_description:
         target = load_target(floating)
         assert target is not None
-        text = {"target.robot_description": target.urdf, "target.robot": ""}
+        text = {**target_parameters(target.urdf), "target.robot": ""}
         scenario = scenario.with_overrides("plant", text)
     return replace(campaign, scenario=scenario)

@@ -21,7 +21,7 @@ from spacerobot_ros.parameters import Parameter, declared, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file, suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario
-from spacerobot_ros.simulation.capture import load_target
+from spacerobot_ros.simulation.capture import load_target, target_parameters
 from spacerobot_ros.simulation.faults import FAULT_KINDS
 
 AXES = ("x", "y", "z")
@@ -406,8 +406,8 @@ def _floating_target(name: str, part: str, scenario: Scenario) -> Target:
         offset[0, column] = float(drawn) if column >= 0 else 0.0
         parameters = InertialParameters.of(target).scaled(mass, inertia).shifted(offset)
         parameters.require_physical([target.base_link])
-        text = {"target.robot_description": urdf_with(target, parameters)}
-        return replace(flight.with_overrides("plant", text), has_target_masses=True)
+        given = target_parameters(urdf_with(target, parameters))
+        return replace(flight.with_overrides("plant", given), has_target_masses=True)
 
     return Target(name, apply, "m" if column >= 0 else "1", False, frozenset({name}))
 

@@ -38,6 +38,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.scenario import COMMANDERS, CONFIGS, Published, Scenario
+from spacerobot_ros.simulation.capture import target_parameters
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS, StateField, Topic, goal_topic, path_topic, topic_named
 
@@ -521,7 +522,7 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
             nodes[node].setdefault(parameter, 0.0)
     target = recorded_target(bag.parts[0])
     if target and "plant" in nodes:
-        nodes["plant"]["target.robot_description"] = target
+        nodes["plant"] |= target_parameters(target)
     urdf, own = bag.parts[0].urdf, nodes.get("plant", {}).get("robot", "")
     for values in nodes.values():
         if urdf is not None and values.get("robot") in ("", own):

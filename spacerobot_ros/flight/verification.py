@@ -23,7 +23,7 @@ from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import build_plant
-from spacerobot_ros.simulation.capture import capture_values
+from spacerobot_ros.simulation.capture import capture_values, target_parameters
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
@@ -288,7 +288,7 @@ def _plant_config(recorded: RecordedRobot) -> PlantConfig:
     try:
         values = {name: json.loads(text) for name, text in texts.items()}
         if target := recorded_target(recorded):
-            values["target.robot_description"] = target
+            values |= target_parameters(target)
         config = configured(PlantConfig, values)
     except (ValueError, RecursionError, ParameterError) as error:
         reason = str(error).removesuffix(".")

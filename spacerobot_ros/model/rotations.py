@@ -63,6 +63,19 @@ def matrix_from_rpy(rpy: npt.ArrayLike) -> Array:
     )
 
 
+def rpy_from_matrix(R: npt.ArrayLike) -> Array:
+    """Return roll, pitch and yaw (3,), rad, of a rotation (3, 3): :func:`matrix_from_rpy` inverted.
+
+    Where the pitch is a right angle, roll and yaw are some of those that give the rotation.
+    """
+    m = np.asarray(R, dtype=float)
+    yaw = math.atan2(m[1, 0], m[0, 0])
+    c, s = math.cos(yaw), math.sin(yaw)
+    # The roll of what is left without the yaw is as exact near a right angle as elsewhere.
+    roll = math.atan2(s * m[0, 2] - c * m[1, 2], c * m[1, 1] - s * m[0, 1])
+    return np.array([roll, math.atan2(-m[2, 0], math.hypot(m[0, 0], m[1, 0])), yaw])
+
+
 def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Array:
     """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
     x, y, z, w = _components(quaternion)

@@ -39,7 +39,7 @@ from spacerobot_ros.model.description import (
 )
 from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
 from spacerobot_ros.model.meshes import mesh_beside, with_mesh_files
-from spacerobot_ros.model.rotations import matrix_from_rpy
+from spacerobot_ros.model.rotations import matrix_from_rpy, rpy_from_matrix
 from spacerobot_ros.model.srdf import disabled_pairs, with_srdf
 from spacerobot_ros.model.wheels import require_reaction_wheels
 from spacerobot_ros.resources import suggestion
@@ -171,6 +171,52 @@ def parse_robot(text: str) -> RobotDescription:
     _require_common_range(description)
     require_reaction_wheels(description)
     return description
+
+
+def with_held_joints(robot: RobotDescription, positions: Array | None = None) -> RobotDescription:
+    """Return a robot whose joints are held: one rigid body, in its URDF text as well.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    positions
+        (n,) m or rad, in the order of its joints; None: zero, or the nearest limit.
+
+    Raises
+    ------
+    RobotDescriptionError
+        The number of positions is wrong, or one is not finite or outside the limits.
+    """
+    names, limits = robot.joint_names, (robot.limits("lower"), robot.limits("upper"))
+    q = np.clip(0.0, *limits) if positions is None else np.asarray(positions, dtype=float)
+    if q.shape != (len(names),):
+        raise RobotDescriptionError(
+            f"{q.size} joint positions are given, and '{robot.name}' has {len(names)} joints"
+            f"{': ' if names else ''}{', '.join(names)}."
+        )
+    for name, value, lower, upper in zip(names, q, *limits, strict=True):
+        if not lower <= value <= upper:
+            raise RobotDescriptionError(
+                f"The position of joint '{name}', {value:g}, is outside its limits "
+                f"[{lower:g}, {upper:g}]."
+            )
+    if not names:
+        return robot
+    held = {
+        joint.name: joint for joint in robot.with_locked(dict(zip(names, q, strict=True))).joints
+    }
+    root = fromstring(robot.urdf)
+    for element in root.findall("joint"):
+        joint = held[element.get("name", "")]
+        if element.get("type") == "fixed":
+            continue
+        _remove_children(element, ("origin", "axis", "limit", "mimic", "wheel", "dynamics"))
+        element.set("type", "fixed")
+        place, turn = joint.origin.r.tolist(), rpy_from_matrix(joint.origin.R).tolist()
+        pose = {"xyz": " ".join(map(repr, place)), "rpy": " ".join(map(repr, turn))}
+        element.append(Element("origin", pose))
+    return parse_robot(tostring(root, encoding="unicode"))
 
 
 def parse_world(text: str) -> RobotDescription:

@@ -485,11 +485,6 @@ def build_plant(
     start = InitialState.of(config) if initial is None else initial
     surroundings = Surroundings.of(config.orbit, config.table)
     surroundings.require_suitable(robot, start.attitude())
-    if surroundings.act and config.target.given:
-        raise ParameterError(
-            "Parameters 'target.*' are set beside 'orbit.*' or 'table.*': targets feel neither the "
-            "gravity gradient nor a table; leave one of them out."
-        )
     description = load_target(config.target)
     plant: Plant
     if config.engine == "mujoco":

@@ -1,6 +1,6 @@
 """A target that floats beside the robot, and its capture: an inelastic impact, then one body.
 
-Until the capture robot and target move by themselves, each with its own constant momenta. The
+Until the capture robot and target move by themselves, each with its own momenta. The
 capture (:mod:`spacerobot_ros.model.grasp`) takes place between two ticks. After it the plant
 integrates the joined robot, whose momenta are the sum of both: no rounding of the impact changes
 them. A release parts them where they are, each with the velocity that it has.
@@ -37,7 +37,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_matrix,
     unit_quaternion,
 )
-from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.model.urdf import parse_robot, with_held_joints
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.config import CaptureConfig, PlantConfig, TargetConfig
 from spacerobot_ros.simulation.loads import PlantLoads
@@ -54,7 +54,7 @@ def load_target(config: TargetConfig) -> RobotDescription | None:
     Raises
     ------
     ParameterError
-        There is no such file; the target is refused, or its joints move.
+        There is no such file; the target or the positions of its joints are refused.
     """
     if not config.given:
         return None
@@ -63,6 +63,8 @@ def load_target(config: TargetConfig) -> RobotDescription | None:
             target = parse_robot(config.robot_description)
         else:
             target = load_robot(robot_file(config.robot))
+        at = np.array(config.joint_positions) if config.joint_positions else None
+        target = with_held_joints(target, at)
     except (ParameterError, RobotDescriptionError) as error:
         raise ParameterError(f"The target is refused: {error}") from error
     try:
@@ -72,8 +74,15 @@ def load_target(config: TargetConfig) -> RobotDescription | None:
     return target
 
 
+def target_parameters(text: str) -> dict[str, Any]:
+    """Return the plant's parameters that give the target by the URDF text of a loaded one, whose
+    joints are held already.
+    """
+    return {"target.robot_description": text, "target.joint_positions": []}
+
+
 class Target:
-    """A free rigid body: torque-free motion at constant momenta.
+    """A free rigid body: motion at constant momenta, or under the loads of an orbit or a table.
 
     Attributes
     ----------
@@ -112,6 +121,9 @@ class Target:
         )
         self._plant = VelocityPlant(self._model, period, self._start(self._initial), step)
         self.pose, self.twist = self._plant.pose, self._plant.twist
+        self.loads: PlantLoads | None = None
+        """External loads on it; None: none."""
+        self._clock: PlantLoads | None = None
 
     @property
     def motion(self) -> BodyMotion:
@@ -133,8 +145,24 @@ class Target:
         self._plant.initial = self._start(motion)
         self._plant.reset()
 
+    def load(self, loads: PlantLoads) -> None:
+        """Feel the surroundings of the robot's loads from now on, at their time; wrenches on the
+        robot's links do not act on the target.
+
+        Raises
+        ------
+        ParameterError
+            It would not stay on the table.
+        """
+        loads.surroundings.require_flat(self.description.name, self.motion, self.inertia)
+        if loads.surroundings.act:
+            self.loads, self._clock = PlantLoads(self._model, loads.surroundings), loads
+            self._plant.load(self.loads)
+
     def step(self) -> None:
         """Advance a tick."""
+        if self.loads is not None and self._clock is not None:
+            self.loads.time = self._clock.time
         self._plant.step(np.zeros(0))
 
     def _start(self, motion: BodyMotion) -> InitialState:
@@ -363,9 +391,10 @@ class CapturePlant(WrappedPlant):
 
     def load(self, loads: PlantLoads) -> None:
         """Step under external loads on the robot from now on, whether it holds the target or not;
-        their numbers may change before each step.
+        their numbers may change before each step. A free target feels their surroundings.
         """
         self._loads = loads
+        self.target.load(loads)
         self._alone.load(loads)
         if self.plant is not self._alone:
             self.plant.load(loads)

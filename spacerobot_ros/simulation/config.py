@@ -122,9 +122,16 @@ class TargetSensorConfig:
 class TargetConfig:
     """A body that floats beside the robot: its URDF, its grapple frame and its initial state."""
 
-    robot: str = parameter("", "URDF file of the target, one rigid body; '': no target")
+    robot: str = parameter("", "URDF file of the target, whose joints are held; '': no target")
     robot_description: str = parameter(
         "", "URDF text of the target; takes precedence over 'target.robot'"
+    )
+    joint_positions: tuple[float, ...] = parameter(
+        (),
+        "at which the joints of the target are held, by joint order of its URDF; []: zero",
+        unit="m or rad",
+        minimum=-_MAX_INITIAL_VALUE,
+        maximum=_MAX_INITIAL_VALUE,
     )
     grapple_frame: str = parameter("grapple", "link of the target at which it is captured")
     position: tuple[float, ...] = parameter(

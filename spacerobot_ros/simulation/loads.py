@@ -12,8 +12,9 @@ from spacerobot_ros.control.outputs import plane_normal
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, Inertia, Pose
 from spacerobot_ros.model.external_loads import LoadLayout
+from spacerobot_ros.model.grasp import BodyMotion
 from spacerobot_ros.model.orbit import mean_motion_at
 from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
@@ -110,6 +111,36 @@ class Surroundings:
                 "is not the x-y plane of the world: turn 'initial_orientation'."
             )
 
+    def require_flat(self, name: str, motion: BodyMotion, inertia: Inertia) -> None:
+        """Refuse a free body that would not stay in the plane of the table.
+
+        Parameters
+        ----------
+        name
+            Of the body.
+        motion
+            Its motion.
+        inertia
+            Its mass properties, in its frame.
+
+        Raises
+        ------
+        ParameterError
+            It moves out of the plane, or turns about an axis across its normal, or about one that
+            is not a principal axis.
+        """
+        if not self.on_table:
+            return
+        center = motion.at(Pose(r=inertia.com))
+        about = motion.R_WT @ inertia.about_com @ motion.R_WT.T
+        out_of_plane = np.array([center.v[2], *motion.omega[:2]])
+        tilting = about[:2, 2] / np.trace(about)
+        if np.abs(np.append(out_of_plane, tilting)).max() > _PLANE_TOLERANCE:
+            raise ParameterError(
+                f"Parameters 'table.*' are set, but the target '{name}' does not stay in the x-y "
+                "plane of the world: it must move in it, and turn about a principal axis along z."
+            )
+
 
 class PlantLoads:
     """The loads on a robot, which change in place; at first there are no wrenches.
@@ -130,6 +161,8 @@ class PlantLoads:
         ``robot.link_names``: in components of the link, and in those of W.
     last
         ``vector`` of the last tick.
+    surroundings
+        The loads that do not change.
     """
 
     def __init__(self, robot: SpaceRobot, surroundings: Surroundings | None = None) -> None:
@@ -149,7 +182,7 @@ class PlantLoads:
             )
         ]
         self._time = self.vector[layout.time]
-        given = surroundings or Surroundings()
+        given = self.surroundings = surroundings or Surroundings()
         self.vector[layout.mean_motion] = given.mean_motion
         self.vector[layout.quaternion_WO] = given.quaternion_WO
         self.vector[layout.gravity_W] = given.gravity_W

@@ -127,8 +127,10 @@ class MujocoPlant:
         self._root = int(model.body(robot.base_link).id)
         self._target_body = -1
         if self._target is not None:
-            root = self._target.description.base_link
-            self._target_body = int(model.body(f"{_TARGET}{root}").id)
+            root = f"{_TARGET}{self._target.description.base_link}"
+            self._target_body = int(model.body(root).id)
+            links = [f"{_TARGET}{name}" for name in self._target.description.frames]
+            self._applied_to_target = MujocoLoads(mujoco, model, self._data, links)
         self._locks = [model.equality(f"lock {name}").id for name in robot.joint_names]
         self._target_shapes = [model.geom(name).id for name in shapes]
         n, wheels = robot.n, robot.description.wheel_names
@@ -355,8 +357,13 @@ class MujocoPlant:
         self._mujoco.mj_fwdPosition(self._model, self._data)
         self._mujoco.mj_fwdVelocity(self._model, self._data)
         self._data.xfrc_applied[:] = 0.0
-        self._applied.apply(self._loads.vector, self._loads.time + step * h)
-        self.expected_momenta += h * self._applied.momentum_rates(self._center())
+        time, center = self._loads.time + step * h, self._center()
+        self._applied.apply(self._loads.vector, time)
+        self.expected_momenta += h * self._applied.momentum_rates(center)
+        if self._target is not None and self._target.loads is not None:
+            self._applied_to_target.apply(self._target.loads.vector, time)
+            if self.holds_target:
+                self.expected_momenta += h * self._applied_to_target.momentum_rates(center)
 
     def _add_impulse(self, before: tuple[Array, Array], duration: float) -> None:
         """Add the impulse of the wrench since a state to the expected momenta (Simpson)."""

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from support.oracles import Array
+from support.oracles import Array, PinocchioOracle
 
 from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.model import SpaceRobot, parse_robot
+from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.orbit import relative_motion
+from spacerobot_ros.model.urdf import with_held_joints
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
@@ -425,6 +427,12 @@ JOINTED = TUMBLER.replace('type="fixed"', 'type="continuous"').replace(
 )
 
 
+LEADING_JOINT = """<link name="slide"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"
+    ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="lead" type="prismatic">
+    <parent link="hull"/><child link="slide"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
+
+
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
@@ -434,9 +442,17 @@ JOINTED = TUMBLER.replace('type="fixed"', 'type="continuous"').replace(
             "parameter 'target.grapple_frame', or add the link.",
         ),
         (
-            {"target.robot_description": JOINTED},
-            "The target 'tumbler' has joints that move (ring_mount); a target is one rigid body: "
-            "make them fixed.",
+            {"target.robot_description": JOINTED, "target.joint_positions": [0.1, 0.2]},
+            "The target is refused: 2 joint positions are given, and 'tumbler' has 1 joints: "
+            "ring_mount.",
+        ),
+        (
+            {"target.joint_positions": [0.1]},
+            "The target is refused: 1 joint positions are given, and 'block' has 0 joints.",
+        ),
+        (
+            {"target.robot": "planar_manipulator", "target.joint_positions": [9.0, 0.0]},
+            "The target is refused: The position of joint 'shoulder', 9, is outside its limits ",
         ),
         (
             {"target.robot_description": TUMBLER.replace('value="21"', 'value="0"')},
@@ -460,6 +476,61 @@ def test_a_bad_target_is_refused(values: dict[str, Any], sentence: str) -> None:
     assert str(error.value).startswith(sentence)
 
 
+def test_a_target_of_several_bodies_is_rigid_at_the_positions_of_its_joints() -> None:
+    """Mass properties and grapple frame are those of Pinocchio's robot with locked joints."""
+    q = [0.7, -1.1, 0.4]
+    plant = plant_of(
+        {
+            **{name: x for name, x in SPATIAL.items() if name != "target.robot_description"},
+            "target.robot": "three_joint_arm",
+            "target.grapple_frame": "link_3",
+            "target.joint_positions": q,
+        }
+    )
+    target = capturing_of(plant).target
+    robot = load_robot(robot_file("three_joint_arm"))
+    oracle = PinocchioOracle(robot.urdf, robot.joint_names)
+    oracle.place(np.array(q), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+    whole = sum(
+        (
+            oracle.data.oMi[index].act(oracle.model.inertias[index])
+            for index in range(2, oracle.model.njoints)
+        ),
+        oracle.data.oMi[1].act(oracle.model.inertias[1]),
+    )
+    assert target.inertia.mass == pytest.approx(whole.mass, rel=1e-14)
+    np.testing.assert_allclose(target.inertia.com, whole.lever, atol=1e-14)
+    np.testing.assert_allclose(target.inertia.about_com, whole.inertia, atol=1e-12)
+    grapple = oracle.data.oMf[oracle.model.getFrameId("link_3")]
+    np.testing.assert_allclose(target.grapple.R, grapple.rotation, atol=1e-14)
+    np.testing.assert_allclose(target.grapple.r, grapple.translation, atol=1e-14)
+    # All who read the published description know one rigid body.
+    assert parse_robot(target.description.urdf).joint_names == ()
+    before = total_momentum(plant)
+    capturing_of(plant).capture()
+    for _ in range(20):
+        plant.step(*commands_of(plant, 0.1))
+    assert relative_change(total_momentum(plant), before) < 1e-12
+
+
+def test_joints_of_a_target_are_held_at_zero_or_the_nearest_limit() -> None:
+    target = parse_robot(
+        JOINTED.replace('type="continuous"', 'type="revolute"')
+        .replace(
+            "</joint>",
+            '<axis xyz="0 1 0"/><limit lower="0.2" upper="1.5707963267948966" velocity="1" '
+            'effort="1"/><mimic joint="lead" multiplier="2"/></joint>',
+        )
+        .replace("</robot>", LEADING_JOINT)
+    )
+    for given, lead in ((None, 0.1), (np.array([0.75]), 0.75)):
+        held = with_held_joints(target, given)
+        expected = Rotation.from_euler("xyz", [0.5, 0.2, -0.3]) * Rotation.from_euler("y", 2 * lead)
+        np.testing.assert_allclose(held.frames["ring"][1].R, expected.as_matrix(), atol=1e-15)
+        np.testing.assert_allclose(held.frames["slide"][1].r, [0.0, 0.0, lead], atol=1e-15)
+    assert held.joint_names == ()
+
+
 def test_a_robot_without_an_end_effector_captures_nothing() -> None:
     with pytest.raises(ParameterError) as error:
         plant_of({"robot": "seven_joint_arm", "target.robot": BLOCK})
@@ -473,3 +544,100 @@ def test_the_block_is_as_its_file_says() -> None:
     assert block.total_mass == 10.0
     np.testing.assert_array_equal(block.bodies[0].inertia.about_com, np.eye(3))
     np.testing.assert_array_equal(block.frames["grapple"][1].r, [-0.3, 0.0, 0.0])
+
+
+ENGINES = ["exact", pytest.param("mujoco", marks=pytest.mark.slow)]
+
+ORBITING: dict[str, Any] = {
+    **SPATIAL,
+    "linear_momentum": [0.0, 0.0, 0.0],
+    "angular_momentum": [0.0, 0.0, 0.0],
+    "orbit.mean_motion": 0.05,
+    "orbit.orientation": [0.3, -0.2, 0.4, 0.7],
+}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_target_in_an_orbit_moves_by_clohessy_and_wiltshire(engine: str) -> None:
+    """Its centre of mass follows their closed solution, its attitude an independent integration of
+    Euler's equations with the torque of the gravity gradient.
+    """
+    plant = plant_of(ORBITING, engine=engine, actuation="effort", integration_step=0.0)
+    target, n = capturing_of(plant).target, 0.05
+    inertia, motion = target.inertia, target.motion
+    frame = Rotation.from_quat(ORBITING["orbit.orientation"])
+    center = motion.r_WT + motion.R_WT @ inertia.com
+    velocity = motion.v + np.cross(motion.omega, motion.R_WT @ inertia.com)
+    start = frame.inv().apply(center)
+    relative = frame.inv().apply(velocity) - np.cross([0.0, 0.0, n], start)
+
+    def rates(t: float, y: Array) -> Array:
+        turned = Rotation.from_quat(y[:4])
+        outward = turned.inv().apply(frame.apply([np.cos(n * t), np.sin(n * t), 0.0]))
+        D, omega = inertia.about_com, y[4:]
+        torque = 3 * n**2 * np.cross(outward, D @ outward)
+        x, y_, z, w = y[:4]
+        turning = 0.5 * np.array([[w, -z, y_], [z, w, -x], [-y_, x, w], [-x, -y_, -z]]) @ omega
+        return np.append(turning, np.linalg.solve(D, torque - np.cross(omega, D @ omega)))
+
+    ticks = 80
+    for _ in range(ticks):
+        plant.step(*commands_of(plant))
+    end = ticks / 40.0
+    expected, _ = relative_motion(n, start, relative, end)
+    expected = (frame * Rotation.from_rotvec([0.0, 0.0, n * end])).apply(expected)
+    R = Rotation.from_quat(target.pose[3:])
+    tolerance = {"exact": 1e-9, "mujoco": 2e-4}[engine]
+    np.testing.assert_allclose(target.pose[:3] + R.apply(inertia.com), expected, atol=tolerance)
+    initial = np.append(Rotation.from_matrix(motion.R_WT).as_quat(), motion.R_WT.T @ motion.omega)
+    turned = solve_ivp(rates, (0.0, end), initial, rtol=1e-11, atol=1e-12).y[:, -1]
+    assert (R.inv() * Rotation.from_quat(turned[:4])).magnitude() < tolerance
+    np.testing.assert_allclose(target.twist[3:], turned[4:], atol=tolerance)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_robot_and_target_together_follow_the_ledger_of_an_orbit(engine: str) -> None:
+    """Nothing but the gravity gradient changes their momentum: before a capture, while the target
+    is held, and after its release.
+    """
+    plant = plant_of(ORBITING, engine=engine, actuation="effort", integration_step=0.0)
+    capturing, far = capturing_of(plant), np.zeros(0)
+    changed = 0.0
+    for tick in range(60):
+        if tick == 20:
+            capturing.capture()
+        if tick == 40:
+            capturing.release()
+        plant.step(*commands_of(plant, 0.2))
+        expected = capturing.expected_momenta
+        tolerance = {"exact": 1e-9, "mujoco": 2e-3}[engine]
+        np.testing.assert_allclose(plant.momentum[:6], expected, rtol=0, atol=tolerance)
+        far = expected.copy() if tick == 20 else far
+        changed = np.abs(expected - far).max() if 20 < tick < 40 else changed
+    assert changed > 1e-2, "the gravity gradient acts on both while they are joined"
+    assert target_momentum(capturing) == pytest.approx(capturing.target.momenta, abs=1e-3)
+
+
+def target_momentum(capturing: CapturePlant) -> Array:
+    motion = capturing.target.motion
+    return np.concatenate(motion.momenta(capturing.target.inertia))
+
+
+def test_a_target_slides_on_a_table_with_the_robot() -> None:
+    """Downhill with friction: ``v' = g sin(tilt) - d v``, the spin decays by itself."""
+    plant = plant_of(
+        PAPER_ROBOT, **{"table.tilt": 0.1, "table.direction": 0.6, "table.friction": 0.4}
+    )
+    capturing, ticks = capturing_of(plant), 100
+    for _ in range(ticks):
+        plant.step(*commands_of(plant))
+    left = np.exp(-0.4 * ticks / 100.0)
+    steady = 9.80665 * np.sin(0.1) / 0.4 * np.array([np.cos(0.6), np.sin(0.6)])
+    v = capturing.target.motion.v[:2]
+    np.testing.assert_allclose(v, steady + ([-0.05, 0.02] - steady) * left, atol=1e-9)
+    assert capturing.target.motion.omega[2] == pytest.approx(0.1 * left, abs=1e-12)
+    for flaw in ({"target.velocity": [0.0, 0.0, 0.1]}, {"target.angular_velocity": [0.1, 0, 0]}):
+        with pytest.raises(
+            ParameterError, match="the target 'block' does not stay in the x-y plane"
+        ):
+            plant_of(PAPER_ROBOT, **{"table.tilt": 0.1, **flaw})

@@ -19,7 +19,7 @@ from spacerobot_ros.model.orbit import EARTH_GRAVITATION, relative_motion
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import build_plant
-from spacerobot_ros.simulation.config import OrbitConfig, PlantConfig, TableConfig, TargetConfig
+from spacerobot_ros.simulation.config import OrbitConfig, PlantConfig, TableConfig
 from spacerobot_ros.simulation.loads import PlantLoads, Surroundings
 
 DUMBBELL = (
@@ -277,12 +277,6 @@ TABLE = TableConfig(tilt=0.01)
             {"table": TABLE},
             "Parameters 'table.*' are set, but robot 'servicer' is not planar: on a table with air "
             "bearings all joints move in its plane.",
-        ),
-        (
-            "servicer",
-            {"orbit": OrbitConfig(altitude=4e5), "target": TargetConfig(robot="any.urdf")},
-            "Parameters 'target.*' are set beside 'orbit.*' or 'table.*': targets feel neither the "
-            "gravity gradient nor a table; leave one of them out.",
         ),
         (
             "planar_manipulator",
