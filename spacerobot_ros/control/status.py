@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.planning.core.goal import Controlled
 
 _ERROR_PREFIX = "error."
 """Prefix of the keys of output errors."""
@@ -84,6 +85,22 @@ class CommandReport:
     wheels: Mapping[str, float] = field(default_factory=dict)
     momentum: Mapping[str, float] = field(default_factory=dict)
     dumping: bool = False
+
+    def controls(self, part: str = "base") -> frozenset[Controlled]:
+        """Return which of position, attitude and shape the outputs control.
+
+        ``part`` is the part of the robot whose pose is meant: ``base`` or ``end_effector``.
+        """
+        kinds: dict[Controlled, tuple[str, ...]] = {
+            "position": (f"{part}.x", f"{part}.y", f"{part}.z"),
+            "attitude": (f"{part}.r",),
+            "shape": ("joint.",),
+        }
+        return frozenset(
+            part
+            for part, beginnings in kinds.items()
+            if any(label.startswith(beginnings) for label in self.errors)
+        )
 
 
 @dataclass(frozen=True)

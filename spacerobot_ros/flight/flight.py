@@ -404,14 +404,8 @@ class Flight:
         if self.goal is None:
             return ()
         match self.status:
-            case ControllerStatus(command=CommandReport(errors=errors)) if errors:
-                controlled: set[Controlled] = (
-                    {"shape"} if _any_starts_with(errors, "joint.") else set()
-                )
-                controlled |= {"attitude"} if _any_starts_with(errors, "base.r") else set()
-                positions = _any_starts_with(errors, *(f"base.{axis}" for axis in "xyz"))
-                controlled |= {"position"} if positions else set()
-                return uncontrolled_parts(self.goal, frozenset(controlled))
+            case ControllerStatus(command=CommandReport(errors=errors) as command) if errors:
+                return uncontrolled_parts(self.goal, command.controls())
             case PlannerStatus(not_controlled=parts) if parts:
                 return parts
             case PlannerStatus(state=PlannerState.REACHED, position_error_m=float(left)) if left > (
@@ -428,7 +422,7 @@ class Flight:
     def turns_end_effector(self) -> bool:
         """Whether a controller turns the end-effector to an attitude."""
         command = self.status.command if isinstance(self.status, ControllerStatus) else None
-        return command is not None and _any_starts_with(command.errors, "end_effector.r")
+        return command is not None and "attitude" in command.controls("end_effector")
 
     @property
     def has_thrust(self) -> bool:
@@ -731,10 +725,6 @@ def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:
     if goal is None or not len(poses):
         return None
     return PoseError.between(poses.values[-1, :3], poses.values[-1, 3:], goal)
-
-
-def _any_starts_with(labels: Iterable[str], *beginnings: str) -> bool:
-    return any(label.startswith(beginnings) for label in labels)
 
 
 def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:

@@ -16,7 +16,12 @@ from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning import Goal, PoseError
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.core.goal import (
+    Controlled,
+    EndEffectorGoal,
+    Tolerance,
+    uncontrolled_parts,
+)
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import FAULT_KINDS, Targets, parse_fault
@@ -40,8 +45,9 @@ _MAX_NAME_LENGTH = 21
 
 COLORS: Mapping[Verdict, Color] = {
     Verdict.UNCHECKED: (150, 150, 160),
-    Verdict.PLANNING: (235, 190, 40),
+    Verdict.PLANNING: (120, 170, 235),
     Verdict.REACHABLE: (40, 180, 90),
+    Verdict.PARTLY: (240, 160, 30),
     Verdict.REFUSED: (220, 60, 60),
 }
 """Colours of the ghost, by the verdict on its goal."""
@@ -100,11 +106,16 @@ def progress(state: StackState) -> float | None:
 
 
 def status_html(
-    state: StackState, errors: Mapping[Part, GoalDistance] | None = None, *, described: bool = True
+    state: StackState,
+    errors: Mapping[Part, GoalDistance] | None = None,
+    tolerance: Tolerance | None = None,
+    *,
+    described: bool = True,
 ) -> str:
     """Return the state of the stack; ``described``: whether a robot is known.
 
-    ``errors`` are those of :func:`goal_errors`; those of links that the planner moves have lines.
+    ``errors`` are those of :func:`goal_errors`, ``tolerance`` is that of the planner or else of the
+    controller, if known.
     """
     lines = []
     silence = silence_message(state)
@@ -144,23 +155,45 @@ def status_html(
         if status.state is PlannerState.REACHED and status.not_controlled:
             level = 1
         lines.append(_node_html(state, "planner", status.state.value, status.message, level))
-        lines.extend(
-            _line_html(f"{part} is {error} from its goal.", None)
-            for part, error in (errors or {}).items()
-            if state.goals[part].end_effectors
-        )
     if state.controller is not None:
         control = state.controller
         word, level = control.state.value, control.state.level
         lines.append(_node_html(state, "controller", word, control.message, level))
-        left = time_to_go(state) if state.planner is None else None
-        to_go = "" if left is None else f", {left:.1f} s to go"
-        lines.extend(
-            _line_html(f"{part} is {error} from its goal{to_go}.", None)
-            for part, error in (errors or {}).items()
-            if not state.goals[part].end_effectors
-        )
+    lines.extend(_distance_lines(state, errors or {}, tolerance))
     return padded("".join(lines))
+
+
+def _distance_lines(
+    state: StackState, errors: Mapping[Part, GoalDistance], tolerance: Tolerance | None
+) -> list[str]:
+    """Return a line on each part with a goal: how far it is from it, and the time to go."""
+    left = time_to_go(state) if state.planner is None else None
+    to_go = "" if left is None else f", {left:.1f} s to go"
+    planner = state.planner
+    flies = planner is not None and planner.state is PlannerState.EXECUTING
+    lines = []
+    for part, error in errors.items():
+        of_link = bool(state.goals[part].end_effectors)
+        # Once a planner has decided on a goal of the base, its message has the numbers.
+        if planner is not None if of_link else flies or state.controller is not None:
+            text = error.describe(tolerance, not_controlled(state, part))
+            line = _line_html(f"{part} is {text}{'' if of_link else to_go}.", None)
+            whose = "planner" if state.controller is None or of_link else "controller"
+            lines.append(_grey_out(line, offline=whose in state.absent))
+    return lines
+
+
+def not_controlled(state: StackState, part: Part) -> tuple[Controlled, ...]:
+    """Return the parts of a goal that planner or controller do not control, as far as known."""
+    goal = state.goals.get(part)
+    if goal is None or goal.end_effectors:
+        return ()
+    if state.planner is not None and part == BASE_GOAL_KEY:
+        return state.planner.not_controlled
+    command = None if state.controller is None else state.controller.command
+    if command is None or not command.errors:
+        return ()
+    return uncontrolled_parts(goal, command.controls(part))
 
 
 def look_back_html(shown: StackState, live: StackState) -> str:
@@ -223,18 +256,12 @@ def _line_html(text: str, level: int | None) -> str:
 
 def check_html(check: Check) -> str:
     """Return the result of checking the goal."""
-    words = {
-        Verdict.UNCHECKED: "not checked",
-        Verdict.PLANNING: "planning",
-        Verdict.REACHABLE: "reachable",
-        Verdict.REFUSED: "refused",
-    }
     red, green, blue = COLORS[check.verdict]
     dot = (
         f'<span style="display:inline-block;width:.8em;height:.8em;border-radius:50%;'
         f'background:rgb({red},{green},{blue});margin-right:.4em"></span>'
     )
-    text = f"{dot}<b>Goal {words[check.verdict]}</b>"
+    text = f"{dot}<b>Goal {check.verdict.value}</b>"
     return padded(f"{text} {escape(check.message)}")
 
 
@@ -324,9 +351,23 @@ class GoalDistance:
     distance: float
     angle: float | None
 
-    def __str__(self) -> str:
-        turn = "" if self.angle is None else f" and {self.angle:.3g} rad"
-        return f"{self.distance:.3g} m{turn}"
+    def describe(
+        self, tolerance: Tolerance | None = None, left_out: Sequence[Controlled] = ()
+    ) -> str:
+        """Return a clause with the numbers, their tolerances, and parts that are not controlled."""
+        limits = (0.0, 0.0) if tolerance is None else (tolerance.position, tolerance.attitude)
+        numbers, tolerances = [], []
+        for part, value, unit, limit in (
+            ("position", self.distance, "m", limits[0]),
+            ("attitude", self.angle, "rad", limits[1]),
+        ):
+            if value is None:
+                continue
+            free = part in left_out
+            numbers.append(f"{value:.3g} {unit}" + (" (not controlled)" if free else ""))
+            tolerances += [] if free or tolerance is None else [f"{limit:.3g} {unit}"]
+        within = f" (tolerance {', '.join(tolerances)})" if tolerances else ""
+        return f"{' and '.join(numbers)} from its goal{within}"
 
     @property
     def numbers(self) -> tuple[float, ...]:
@@ -394,6 +435,30 @@ def planned_positions(
     _, places = kinematics.poses_in_world(motion[:, :7], motion[:, 7:])
     names = kinematics.links
     return {part: places[:, names.index(x)] for part, x in links.items() if x in names}
+
+
+def flown_check(state: StackState) -> Check | None:
+    """Return where the plan ends that is flown, as the check of its goal; None: none is flown.
+
+    Parts of the goal that the method controls are taken as met: later plans go on with what one
+    leaves.
+    """
+    planner, motion = state.planner, state.planned_motion
+    if planner is None or motion is None or "planner" in state.absent:
+        return None
+    if planner.state is not PlannerState.EXECUTING:
+        return None
+    left_out, base = not_controlled(state, BASE_GOAL_KEY), motion[-1, :7].copy()
+    goal = state.goals.get(BASE_GOAL_KEY)
+    if goal is not None and "position" in goal.base - {*left_out}:
+        base[:3] = goal.position
+    if goal is not None and "attitude" in goal.base - {*left_out}:
+        base[3:] = goal.quaternion
+    verdict = Verdict.PARTLY if left_out else Verdict.REACHABLE
+    message = "The robot flies to where the ghost is."
+    if left_out:
+        message += f" Not controlled: {' and '.join(left_out)}."
+    return Check(verdict, message, shape=motion[-1, 7:], base=base, source=motion)
 
 
 def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from spacerobot_ros.model.rotations import compose_poses, relative_pose
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
+from spacerobot_ros.planning.execution.status import end_effector_values, goal_values
 from spacerobot_ros.viewer.content import (
     COLORS,
     check_html,
@@ -58,6 +59,14 @@ class RequestedPart(Enum):
     POSE = "pose"
 
 
+class Origin(Enum):
+    """Origin of the goal that is shown."""
+
+    ROBOT = "the robot's own pose"
+    USER = "a user of the page, who has not sent it yet"
+    SENT = "the last goal that was sent, by this page or by others"
+
+
 class GoalEditor:
     """Lets users choose a goal; it sends nothing itself.
 
@@ -86,11 +95,15 @@ class GoalEditor:
         self._ghost_shown = True
         self._present: tuple[Array, Array] | None = None
         self._changed_at: float | None = None
+        self._origin = Origin.ROBOT
+        self._followed: object = None
+        """Numbers of the goals that were last followed."""
         self._check = Check(Verdict.UNCHECKED)
         gui = server.gui
         self._none_taken = gui.add_html(hint_html("A recording takes no goals."), visible=False)
         self._verdict = gui.add_html(check_html(self._check))
-        self._parts = _PartMenu(gui, defer, on_note, self._on_parts_chosen)
+        edit = self._defer_edit
+        self._parts = _PartMenu(gui, defer, edit, on_note, self._on_parts_chosen)
         # Any: for mypy viser's values are read-only.
         self._position: Any = gui.add_vector3("Goal (m)", (0.0, 0.0, 0.0), step=0.01)
         self._angles: Any = gui.add_vector3("Roll, pitch, yaw (deg)", (0.0, 0.0, 0.0), step=1.0)
@@ -100,11 +113,11 @@ class GoalEditor:
             hint="Off: the end-effector keeps its current goal, if any.",
         )
         self._tool_too.visible = False
-        self._final = _FinalShape(gui, defer, self._mark_changed)
+        self._final = _FinalShape(gui, edit, self._mark_changed)
 
         @self._tool_too.on_update
         async def _(event: Any) -> None:
-            self._defer(lambda: self.touch(time.monotonic()))
+            edit(lambda: self.touch(time.monotonic()))
 
         self._to_robot = gui.add_button("Goal to the robot", color="gray")
         for field in (self._position, self._angles):
@@ -140,6 +153,7 @@ class GoalEditor:
         self._marks.clear()
         self._poses.clear()
         self._ghost, self._present, self._changed_at = None, None, None
+        self._followed = None
         self._reach, self._robot = reach, robot
         self._kinematics = None if robot is None else ForwardKinematics(robot)
         self._parts.offer(())
@@ -169,6 +183,69 @@ class GoalEditor:
         self.robot_is_at(base, q)
         self._show_fields()
         self._changed_at = now
+        self._origin = Origin.ROBOT
+
+    def follow(self, goals: Mapping[Part, Goal], now: float) -> None:
+        """Show the goals that were sent last, by whomever, once.
+
+        A goal that a user is changing stays.
+
+        Parameters
+        ----------
+        goals
+            The goals by part.
+        now
+            Wall time, s.
+        """
+        numbers, links = _numbers(goals), _links_of(goals)
+        if not goals or not self.placed or numbers == self._followed:
+            return
+        if self._origin is Origin.USER or not set(links) <= set(self._parts.links):
+            return
+        self._followed = numbers
+        base, tool = goals.get(BASE_GOAL_KEY), goals.get(DEFAULT_END_EFFECTOR)
+        asked = {link: RequestedPart.POSITION if aim.quaternion is None else RequestedPart.POSE
+                 for link, aim in links.items()}  # fmt: skip
+        if base is not None or not links:
+            asked[BASE_GOAL_KEY] = RequestedPart.POSE
+        self._parts.choose(asked)
+        if base is not None:
+            self._move_gizmo(_BASE_GIZMO, np.concatenate([base.position, base.quaternion]))
+        if tool is not None and not tool.end_effectors and self.has_tool:
+            self._move_gizmo(_TOOL_GIZMO, np.concatenate([tool.position, tool.quaternion]))
+        for link, aim in links.items():
+            self._place_link_gizmo(link)
+            turn = self._poses[_link_gizmo(link)][3:] if aim.quaternion is None else aim.quaternion
+            self._move_gizmo(_link_gizmo(link), np.concatenate([aim.position, turn]))
+        self._show_parts()
+        self._show_fields()
+        self._changed_at = now
+        self._origin = Origin.SENT
+        if self._check.verdict is not Verdict.UNCHECKED:
+            self.show_check(Check(Verdict.PLANNING, "Another goal has been sent."))
+
+    def note_sent(self) -> None:
+        """Note that the goal shown has been sent."""
+        self._origin = Origin.SENT
+
+    @property
+    def shows_sent_goal(self) -> bool:
+        """Whether the goal shown is the one that was sent last."""
+        return self._origin is Origin.SENT
+
+    @property
+    def check(self) -> Check:
+        """The check that is shown."""
+        return self._check
+
+    def _defer_edit(self, act: Callable[[], None]) -> None:
+        """Queue a change of the goal by a user."""
+
+        def edit() -> None:
+            self._origin = Origin.USER
+            act()
+
+        self._defer(edit)
 
     def robot_is_at(self, pose: Array, q: Array) -> None:
         """Update the pose (7,) of the robot's base and the positions (n,) of its joints.
@@ -198,10 +275,11 @@ class GoalEditor:
             self.robot_is_at(*self._present)
 
     def _ghost_pose(self, pose: Array) -> Array:
-        """Return the pose (7,) of the ghost's base: of the goal, or, if free, as predicted."""
-        if self._parts.asked(BASE_GOAL_KEY) is not RequestedPart.NOTHING:
-            return self._poses[_BASE_GIZMO]
-        return pose if self._check.base is None else self._check.base
+        """Return the pose (7,) of the ghost's base: where it will end, or else that of the goal."""
+        if self._check.base is not None:
+            return self._check.base
+        free = self._parts.asked(BASE_GOAL_KEY) is RequestedPart.NOTHING
+        return pose if free else self._poses[_BASE_GIZMO]
 
     def _is_at_goal(self, goal: Array, pose: Array, q: Array, shape: Array) -> bool:
         """Whether a robot at a pose and joint positions ``q`` coincides with the ghost."""
@@ -327,12 +405,12 @@ class GoalEditor:
         @gizmo.on_update
         async def _(event: Any) -> None:
             pose = np.concatenate([event.target.position, xyzw(event.target.wxyz)])
-            self._defer(lambda: self._on_gizmo_moved(name, pose))
+            self._defer_edit(lambda: self._on_gizmo_moved(name, pose))
 
     async def _on_field(self, event: Any) -> None:
         if event.client is not None:  # Else the page itself wrote the value.
             position, angles = self._position.value, self._angles.value
-            self._defer(lambda: self._on_fields_typed(position, angles))
+            self._defer_edit(lambda: self._on_fields_typed(position, angles))
 
     def _on_gizmo_moved(self, name: str, pose: Array) -> None:
         if name not in self._gizmos or not np.all(np.isfinite(pose)):
@@ -427,6 +505,8 @@ class _PartMenu:
     ----------
     gui, defer, on_note
         As for :class:`GoalEditor`.
+    edit
+        Queues the changes of users that change the goal.
     on_change
         Called with the part when users have changed the parts of its goal, or the part whose
         numbers are shown.
@@ -436,10 +516,11 @@ class _PartMenu:
         self,
         gui: viser.GuiApi,
         defer: Defer,
+        edit: Defer,
         on_note: Callable[[str], None],
         on_change: Callable[[Part], None],
     ) -> None:
-        self._gui, self._defer = gui, defer
+        self._gui, self._edit = gui, edit
         self._on_note, self._on_change = on_note, on_change
         self._folder = gui.add_folder("Goal for", visible=False)
         self._menus: dict[Part, Any] = {}
@@ -452,7 +533,7 @@ class _PartMenu:
         @self._numbers.on_update
         async def _(event: Any) -> None:
             if event.client is not None:  # Else the page itself wrote the value.
-                self._defer(lambda: self._on_change(self.shown))
+                defer(lambda: self._on_change(self.shown))
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -486,6 +567,12 @@ class _PartMenu:
                 self._menus[part] = self._add_menu(part)
         self._update()
 
+    def choose(self, asked: Mapping[Part, RequestedPart]) -> None:
+        """Choose the parts of a goal that somebody else has sent."""
+        for part, menu in self._menus.items():
+            menu.value = asked.get(part, RequestedPart.NOTHING).value
+        self._update()
+
     def show(self, *, visible: bool) -> None:
         """Show or hide the controls."""
         if (visible and bool(self.links)) != self._there:
@@ -504,7 +591,7 @@ class _PartMenu:
         @menu.on_update
         async def _(event: Any) -> None:
             if event.client is not None:  # Else the page itself wrote the value.
-                self._defer(lambda: self._on_chosen(part))
+                self._edit(lambda: self._on_chosen(part))
 
         return menu
 
@@ -539,14 +626,16 @@ class _FinalShape:
 
     Parameters
     ----------
-    gui, defer
+    gui
         As for :class:`GoalEditor`.
+    edit
+        Queues the changes of users.
     on_change
         Called when users have changed them.
     """
 
-    def __init__(self, gui: viser.GuiApi, defer: Defer, on_change: Callable[[], None]) -> None:
-        self._gui, self._defer, self._on_change = gui, defer, on_change
+    def __init__(self, gui: viser.GuiApi, edit: Defer, on_change: Callable[[], None]) -> None:
+        self._gui, self._edit, self._on_change = gui, edit, on_change
         self._enabled: Any = gui.add_checkbox(
             "Final joint positions",
             initial_value=False,
@@ -559,7 +648,8 @@ class _FinalShape:
 
         @self._enabled.on_update
         async def _(event: Any) -> None:
-            defer(self._update_folder)
+            if event.client is not None:  # Else the page itself wrote the value.
+                edit(self._update_folder)
 
     @property
     def positions(self) -> Array | None:
@@ -621,7 +711,24 @@ class _FinalShape:
 
     async def _on_field(self, event: Any) -> None:
         if event.client is not None:  # Else the page itself wrote the value.
-            self._defer(self._on_change)
+            self._edit(self._on_change)
+
+
+def _links_of(goals: Mapping[Part, Goal]) -> dict[str, EndEffectorGoal]:
+    """Return the goals of links among goals by part."""
+    return {aim.link: aim for goal in goals.values() for aim in goal.end_effectors}
+
+
+def _numbers(goals: Mapping[Part, Goal]) -> dict[Part, object]:
+    """Return the numbers of goals, which can be compared, by part."""
+    return {
+        part: (
+            goal_values(goal),
+            end_effector_values(goal),
+            None if goal.joint_positions is None else goal.joint_positions.tolist(),
+        )
+        for part, goal in goals.items()
+    }
 
 
 def _link_gizmo(link: str) -> str:

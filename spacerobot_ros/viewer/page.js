@@ -24,6 +24,12 @@
     }
     [role="tab"] span { color: var(--mantine-color-text) !important; }
     [role="tab"][aria-selected="true"] span { color: var(--mantine-color-blue-outline) !important; }
+    /* Folders that are closed have no empty box, and the panel of a phone takes its whole width. */
+    .mantine-Paper-root > [role="button"] ~ div:last-child div:empty { padding: 2px !important; }
+    [style*="position: fixed"][style*="max-height: 60%"],
+    [style*="position: fixed"][style*="max-height: 60%"] [style*="width: 20em"] {
+      width: 100% !important;
+    }
     :focus-visible { outline: 2px solid #4dabf7; outline-offset: 1px; }
   `;
 

@@ -19,6 +19,7 @@ from spacerobot_ros.control.thrusters import ThrusterTable
 from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.faults import FAULT_KINDS, Targets
 from spacerobot_ros.viewer import content, scene
@@ -546,6 +547,7 @@ class Page:
         """The obstacles that were shown last; None: the robot carries its own."""
         self._drawn_obstacles: list[viser.MeshHandle] = []
         self._table: ThrusterTable | None = None
+        self._tolerance: Tolerance | None = None
         self._state = StackState()
         self._due: dict[str, float] = {}
         self._now = 0.0
@@ -715,6 +717,10 @@ class Page:
         """Set the thrusters, which are known later than the robot."""
         self._table = table
 
+    def show_tolerance(self, tolerance: Tolerance | None) -> None:
+        """Set the tolerance of goals, of the planner or controller; None: it is not known."""
+        self._tolerance = tolerance
+
     def note(self, notice: Notice) -> None:
         """Add a line to the log."""
         self._log.add(notice)
@@ -769,10 +775,12 @@ class Page:
             self._around = scene.Surroundings(self._server.scene, self._reach, _ROBOT_PATH, center)
             self._show_layers()
             self._aim_camera(self._server.initial_camera)
-            for client in self._server.get_clients().values():
-                self._aim_camera(client.camera)
-        if not self.editor.placed and state.replay is None:
-            self.editor.place(measured.pose, None, measured.q, self._now)
+            # Browsers receive the initial camera at the end of this update, and go there.
+            self._inbox.put(self._aim_cameras)
+        if state.replay is None:
+            if not self.editor.placed:
+                self.editor.place(measured.pose, None, measured.q, self._now)
+            self.editor.follow(state.goals, self._now)
         self.editor.robot_is_at(measured.pose, measured.q)
         self._plots.add(state, self._goal_errors(state))
         self._trail.add(measured.time_s, measured.pose[:3])
@@ -824,8 +832,10 @@ class Page:
 
     def _draw_texts(self, shown: StackState) -> None:
         state, errors = self._state, self._goal_errors(shown)
-        text = content.status_html(shown, errors, described=self._robot is not None)
-        if self._announced is not None and self._now < self._announced[1]:
+        described = self._robot is not None
+        text = content.status_html(shown, errors, self._tolerance, described=described)
+        announces = self._announced is not None and self._now < self._announced[1]
+        if self._announced is not None and announces and not content.has_stack_ended(state):
             text = content.announcement_html(self._announced[0]) + text
         if shown is not state:
             text = content.look_back_html(shown, state) + text
@@ -866,6 +876,11 @@ class Page:
             away = _PORTRAIT_DISTANCE * away
             at = at - _PORTRAIT_SHIFT * float(np.linalg.norm(away)) * screen_up(away)
         camera.position, camera.look_at = at + away, at
+
+    def _aim_cameras(self) -> None:
+        """Turn the cameras of all browsers to the robot."""
+        for client in self._server.get_clients().values():
+            self._aim_camera(client.camera)
 
     def _place_first_camera(self, camera: Any) -> None:
         """Turn the camera of a phone that has opened the page to the robot."""

@@ -28,6 +28,7 @@ from typing import IO
 import numpy as np
 
 from spacerobot_ros.errors import GoalError, SpaceRobotError
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import (
@@ -42,6 +43,7 @@ from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.core.prediction import coasting_positions
 from spacerobot_ros.planning.core.progress import report_progress
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -113,17 +115,16 @@ _NICENESS = 10
 _MAX_CANCELLATION_S = 2.0
 """Wall time after the cancellation of a plan at which the process is killed, s."""
 
-_MAX_PATH_POINTS = 200
-"""Largest number of points of the path in an answer."""
-
 
 class Verdict(Enum):
     """Verdict on a goal."""
 
-    UNCHECKED = "unchecked"
+    UNCHECKED = "not checked"
     """No check: it is disabled, or only a controller flies."""
     PLANNING = "planning"
     REACHABLE = "reachable"
+    PARTLY = "partly reachable"
+    """The goal asks for parts that the method does not control, and ends off in them."""
     REFUSED = "refused"
 
 
@@ -140,9 +141,10 @@ class Check:
     duration_s
         Duration of the manoeuvre, s; 0 if there is none.
     shape, base
-        (n,) joint positions at its end, m or rad, and (7,) pose of the base; None if there is none.
-    path
-        (k, 3) path of the base, m; None if there is none.
+        (n,) joint positions at its end, m or rad, and (7,) pose of the base, as predicted; None if
+        there is none.
+    source
+        The planned motion that it was read from, if that is flown already.
     """
 
     verdict: Verdict
@@ -150,7 +152,7 @@ class Check:
     duration_s: float = 0.0
     shape: Array | None = None
     base: Array | None = None
-    path: Array | None = None
+    source: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -249,6 +251,14 @@ def planner_config(parameters: Mapping[str, str]) -> PlannerConfig:
     # The robot is the viewer's, wherever the planner takes its own from.
     elsewhere = {"robot_description": "", "robot": "", "world": ""}
     return configured(PlannerConfig, {**values, **elsewhere})
+
+
+def goal_tolerance(parameters: Mapping[str, str] | None) -> Tolerance | None:
+    """Return the tolerance of goals in the parameters of a planner or controller, if known."""
+    names = ("position_tolerance", "attitude_tolerance", "joint_tolerance")
+    if parameters is None or not all(name in parameters for name in names):
+        return None
+    return Tolerance(*(float(json.loads(parameters[name])) for name in names))
 
 
 def planned_links(
@@ -398,25 +408,53 @@ class Planner:
             raise
         except SpaceRobotError as error:
             return Check(Verdict.REFUSED, str(error))
-        path = schedule.path.position
-        step = max(1, len(path) // _MAX_PATH_POINTS)
         duration = schedule.expected_duration
-        message = f"Reachable in {duration:.4g} s by '{schedule.method}'."
-        message += _uncontrolled_text(schedule, question.goal, request.tolerance)
-        shown = np.vstack([path[:-1:step], path[-1:]])
-        base = np.concatenate([path[-1], schedule.path.quaternion[-1]])
-        return Check(Verdict.REACHABLE, message, duration, schedule.positions[-1], base, shown)
+        base = _predicted_end(self._robot, request, schedule)
+        left_out = _uncontrolled_text(schedule, base, question.goal, request.tolerance)
+        message = f"Reachable in {duration:.4g} s by '{schedule.method}'.{left_out}"
+        verdict = Verdict.PARTLY if left_out else Verdict.REACHABLE
+        return Check(verdict, message, duration, schedule.positions[-1], base)
 
     def _build_planner(self, urdf: str, parameters: Mapping[str, str]) -> None:
         self._built = None
         self._config = planner_config(parameters)
-        self._worker = PlanningWorker(robot_from_text(urdf, self._config), self._config)
+        self._robot = robot_from_text(urdf, self._config)
+        self._worker = PlanningWorker(self._robot, self._config)
 
 
-def _uncontrolled_text(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance) -> str:
-    """Return a sentence on each goal component the method does not control, with its error."""
-    path, controls = schedule.path, schedule.controls
-    error = PoseError.between(path.position[-1], path.quaternion[-1], goal)
+def _predicted_end(robot: SpaceRobot, request: PlanRequest, schedule: GaitSchedule) -> Array:
+    """Return the pose (7,) in which the base is to end, after later schedules too.
+
+    Those bring the parts that the method controls to the goal; the position, where it is none of
+    them, follows from the centre of mass, which coasts.
+    """
+    position, quaternion = schedule.path.position[-1], schedule.path.quaternion[-1]
+    if schedule.partial:
+        goal = request.goal
+        if "attitude" in schedule.controls:
+            quaternion = goal.quaternion
+        if "position" in schedule.controls:
+            position = goal.position
+        else:
+            (position,) = coasting_positions(
+                robot,
+                request.state,
+                np.array([schedule.expected_duration]),
+                schedule.positions[-1:],
+                quaternion[np.newaxis],
+            )
+    return np.concatenate([position, quaternion])
+
+
+def _uncontrolled_text(
+    schedule: GaitSchedule, base: Array, goal: Goal, tolerance: Tolerance
+) -> str:
+    """Return a sentence on each goal component the method does not control, with its error.
+
+    ``base`` (7,) is the pose in which the base is to end.
+    """
+    controls = schedule.controls
+    error = PoseError.between(base[:3], base[3:], goal)
     parts = []
     uncontrolled = goal.base - controls
     if "position" in uncontrolled and error.distance > tolerance.position:
@@ -427,8 +465,7 @@ def _uncontrolled_text(schedule: GaitSchedule, goal: Goal, tolerance: Tolerance)
         parts.append(("final joint positions", ""))
     return "".join(
         f" '{schedule.method}' does not control the {part}"
-        # The end of later schedules is not known yet.
-        + (f": it ends {off} off." if off and not schedule.partial else ".")
+        + (f": it ends {off} off." if off else ".")
         for part, off in parts
     )
 

@@ -37,7 +37,7 @@ _LINE_WIDTH = 3.0
 _FRAME_SIZE = 0.12
 """Length of the axes of a link, in robot lengths."""
 
-_STARS, _SKY = 900, 40.0
+_STARS, _SKY = 1800, 40.0
 """Number of stars, and their distance in robot lengths."""
 
 _SPACE = np.full((1, 1, 3), 14, np.uint8)
@@ -363,13 +363,14 @@ class Surroundings:
         """Add stars, and the Sun with its light, around a point."""
         directions = np.random.default_rng(1957).normal(size=(_STARS, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        brightness = np.random.default_rng(1961).uniform(90, 255, _STARS)
+        # Most stars are faint.
+        brightness = 60 + 195 * np.random.default_rng(1961).uniform(size=_STARS) ** 3
         distance = _SKY * reach
         stars = self._scene.add_point_cloud(
             "/stars",
             (distance * directions).astype(np.float32),
             np.repeat(brightness[:, np.newaxis], 3, axis=1).astype(np.uint8),
-            point_size=0.004 * distance,
+            point_size=0.002 * distance,
             point_shape="circle",
             position=center,
         )

@@ -336,7 +336,7 @@ def test_a_plant_is_stopped_and_armed_again(fault: str, message: str, rearms: in
     node = plant("_on_abort")
     stopped = (True, "The joints come to rest; nothing moves until '~/rearm' is called.")
     assert answer(PlantNode._on_abort, node) == stopped
-    latched = ("commands.latch", "abort", "aborted on request", 2 * S)
+    latched = ("commands.latch", "abort", "stopped on request", 2 * S)
     assert node.done == [latched, ("report.latched",), "_publish_changed_status"]
     node.done.clear()
     node._commands = SimpleNamespace(rearm=lambda: fault)

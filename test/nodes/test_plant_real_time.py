@@ -195,11 +195,11 @@ def test_a_paused_plant_goes_on_to_report(harness: Harness, mode: str) -> None:
     before, states = rig.probe.count("/diagnostics"), rig.probe.count("joint_states")
     assert rig.trigger("plant/abort").success
     harness.spin_until(
-        lambda: "aborted on request" in status.last("plant/status").message, "the abort"
+        lambda: "stopped on request" in status.last("plant/status").message, "the abort"
     )
     assert status.last("plant/status").level == DiagnosticStatus.ERROR
     rig.wait("/diagnostics", before + 2)
     shown = rig.probe.last("/diagnostics").status[0]
     assert shown.level == DiagnosticStatus.ERROR
-    assert "aborted on request" in shown.message
+    assert "stopped on request" in shown.message
     assert rig.probe.count("joint_states") == states, "time stands still"

@@ -156,12 +156,12 @@ def test_abort_holds_everything_until_rearm(harness: Harness, mode: str) -> None
     wait_for_velocity(rig, 0.0)
     status = rig.diagnosis("commands")
     assert status.level == DiagnosticStatus.ERROR
-    assert_one_sentence(status.message, "aborted on request")
+    assert_one_sentence(status.message, "stopped on request")
     rig.pause(True)
     assert_state(rig, PlantState.PAUSED)
     rig.pause(False)
     assert_state(rig, PlantState.LATCHED)
-    assert "aborted" in rig.trigger("plant/rearm").message
+    assert "stopped" in rig.trigger("plant/rearm").message
     # In real time no command is in force yet; lockstep waits for one.
     assert_state(rig, PlantState.RUNNING if mode == "lockstep" else PlantState.RESTING)
     rig.send([0.3, 0.0, 0.0])

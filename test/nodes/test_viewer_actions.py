@@ -98,18 +98,21 @@ class Stand:
         self.at_rest: Any = None
         self.checking = False
         self.offered: list[tuple[str, ...]] = []
-        self.editor = SimpleNamespace(
+        self.editor: Any = SimpleNamespace(
             offer_end_effectors=self.offered.append,
             moving=False,
             touch=self.touched.append,
             settled_goals=lambda now: self.at_rest,
             show_check=lambda check: self.checks.append((check.verdict, check.message)),
+            shows_sent_goal=False,
+            note_sent=lambda: setattr(self.editor, "shows_sent_goal", True),
         )
         page = SimpleNamespace(
             editor=self.editor,
             faults=SimpleNamespace(offer=lambda targets: self.shown.append(targets)),
             show_robot=lambda robot: self.shown.append(robot),
             show_thrusters=lambda table: self.shown.append(table and table.names),
+            show_tolerance=lambda tolerance: None,
             note=lambda notice: self.notes.append((notice.message, notice.level, notice.source)),
             end=lambda: self.shown.append("end"),
             update=lambda state, now: [self.actions.pop()] if self.actions else [],

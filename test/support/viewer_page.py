@@ -137,7 +137,7 @@ class Page:
     def press(self, label: str) -> None:
         """Press the button with a label, or choose the tab."""
         element = (
-            "[...document.querySelectorAll('button, [role=tab]')]"
+            "[...document.querySelectorAll('button, [role=tab], [role=button]')]"
             f".find(each => each.textContent.trim() === {json.dumps(label)})"
         )
         self._window.wait_for(f"{element} !== undefined")

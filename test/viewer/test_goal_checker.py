@@ -16,16 +16,13 @@ import pytest
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer.reachability import (
     Check,
     GoalChecker,
-    Planner,
     Question,
     Verdict,
-    _uncontrolled_text,
     is_reached,
     make_question,
     planner_config,
@@ -197,41 +194,7 @@ def test_the_error_of_the_nearest_joint_positions_is_in_metres_and_radians() -> 
 # -- sentences ------------------------------------------------------------------------------------
 
 
-def schedule(controls: set[str], *, partial: bool = False) -> Any:
-    path = SimpleNamespace(
-        position=np.array([[0.0, 0, 0], [0.3, 0.0, 0.4]]),
-        quaternion=np.array([IDENTITY, [0.0, 0.0, math.sin(0.1), math.cos(0.1)]]),
-    )
-    return SimpleNamespace(
-        path=path, controls=frozenset(controls), method="area_loop", partial=partial
-    )
-
-
 BASE = Goal.checked([0.0, 0.0, 0.0], IDENTITY)
-
-
-@pytest.mark.parametrize(
-    ("controls", "partial", "tolerance", "joints", "text"),
-    [
-        ({"attitude"}, False, (0.49, 1.0), False,
-         " 'area_loop' does not control the position: it ends 0.5 m off."),
-        ({"attitude"}, False, (0.51, 1.0), False, ""),
-        ({"attitude"}, True, (0.49, 1.0), False, " 'area_loop' does not control the position."),
-        ({"position"}, False, (9.0, 0.19), False,
-         " 'area_loop' does not control the attitude: it ends 11.5 deg off."),
-        ({"position"}, False, (9.0, 0.21), False, ""),
-        ({"position", "attitude"}, False, (0.0, 0.0), True,
-         " 'area_loop' does not control the final joint positions."),
-        ({"position", "attitude", "shape"}, False, (0.0, 0.0), True, ""),
-        ({"position", "attitude"}, False, (0.0, 0.0), False, ""),
-    ],
-)  # fmt: skip
-def test_parts_of_a_goal_that_a_method_does_not_control_are_told(
-    controls: set[str], partial: bool, tolerance: tuple[float, float], joints: bool, text: str
-) -> None:
-    goal = Goal.checked([0.0, 0.0, 0.0], IDENTITY, [0.1, 0.2] if joints else None)
-    found = _uncontrolled_text(schedule(controls, partial=partial), goal, Tolerance(*tolerance))
-    assert found == text
 
 
 def test_why_a_goal_cannot_be_checked() -> None:
@@ -284,28 +247,3 @@ def test_parameters_of_a_planner_are_read_but_for_its_robot_and_what_is_null() -
     assert config.tick_rate == 7.0
     assert (config.robot, config.world, config.robot_description) == ("", "", "")
     assert config.clearance == planner_config({}).clearance
-
-
-@pytest.mark.parametrize(("points", "shown"), [(3, 3), (200, 200), (401, 201), (600, 201)])
-def test_a_long_path_is_thinned_and_keeps_its_ends(points: int, shown: int) -> None:
-    position = np.column_stack([np.arange(points), np.zeros((points, 2))]).astype(float)
-    path = SimpleNamespace(position=position, quaternion=np.tile(IDENTITY, (points, 1)))
-    made = SimpleNamespace(
-        path=path,
-        expected_duration=12.34567,
-        method="optimal",
-        controls=frozenset({"position", "attitude"}),
-        positions=np.array([[0.1, 0.2], [0.3, 0.4]]),
-        partial=False,
-    )
-    planner: Any = Planner()
-    planner._built = ("robot", {})
-    planner._config = SimpleNamespace(tolerance=Tolerance(1.0, 1.0))
-    planner._worker = SimpleNamespace(plan=lambda task, cancellation: made)
-    check = planner.answer(Question("robot", {}, None, BASE), None)  # type: ignore[arg-type]
-    assert check.message == "Reachable in 12.35 s by 'optimal'."
-    assert check.path.shape == (shown, 3)
-    np.testing.assert_array_equal(check.path[[0, -1], 0], [0.0, points - 1.0])
-    np.testing.assert_array_equal(check.shape, [0.3, 0.4])
-    np.testing.assert_array_equal(check.base, [points - 1.0, 0, 0, *IDENTITY])
-    assert check.duration_s == 12.34567

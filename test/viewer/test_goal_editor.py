@@ -16,6 +16,8 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer.content import COLORS
 from spacerobot_ros.viewer.goal_editor import GoalEditor
@@ -369,3 +371,92 @@ def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
     assert not parts._folder.visible
     assert not gizmo(page, HANDS[0]).visible
     assert set(page.editor.goals()) == {"base"}
+
+
+# -- goals of others ------------------------------------------------------------------------------
+
+
+def base_goal(*numbers: float) -> Goal:
+    return Goal.checked(list(numbers), [0.0, 0.0, 0.0, 1.0])
+
+
+def test_a_goal_that_others_send_is_shown_and_one_that_a_user_changes_stays(server: Any) -> None:
+    page = Editor(server, "sliding_masses")
+    editor = page.editor
+    editor.follow({"base": base_goal(1.0, 2.0, 3.0)}, 0.0)
+    assert not editor.placed, "there is no robot yet"
+    editor.place(POSE, None, np.zeros(3), 0.0)
+    assert not editor.shows_sent_goal
+    editor.follow({}, 1.0)
+    np.testing.assert_array_equal(editor.goals()["base"].position, POSE[:3])
+    sent = {"base": base_goal(1.0, 2.0, 3.0)}
+    editor.follow(sent, 2.0)
+    assert editor.shows_sent_goal
+    np.testing.assert_array_equal(editor.goals()["base"].position, [1.0, 2.0, 3.0])
+    assert editor._position.value == (1.0, 2.0, 3.0)
+    assert editor.settled_goals(LATER) is not None, "it is checked"
+    # A user's change is not lost, until it is sent.
+    page.set(editor._position, (0.5, 0.0, 0.0))
+    assert not editor.shows_sent_goal
+    editor.follow({"base": base_goal(7.0, 8.0, 9.0)}, 3.0)
+    np.testing.assert_array_equal(editor.goals()["base"].position, [0.5, 0.0, 0.0])
+    editor.note_sent()
+    assert editor.shows_sent_goal
+    editor.follow({"base": base_goal(7.0, 8.0, 9.0)}, 4.0)
+    np.testing.assert_array_equal(editor.goals()["base"].position, [7.0, 8.0, 9.0])
+    # The same goal is followed once: the goal can be put back to the robot.
+    editor.place(POSE, None, np.zeros(3), 5.0)
+    editor.follow({"base": base_goal(7.0, 8.0, 9.0)}, 6.0)
+    np.testing.assert_array_equal(editor.goals()["base"].position, POSE[:3])
+
+
+def test_goals_of_links_that_others_send_are_shown_with_their_parts(server: Any) -> None:
+    page = Editor(server, "three_joint_arm")
+    editor, link = page.editor, page.robot.links[-1].name
+    editor.place(POSE, None, np.zeros(3), 0.0)
+    aim = EndEffectorGoal.checked(link, [1.0, 2.0, 3.0])
+    sent = {link: Goal.of_end_effectors([aim])}
+    editor.follow(sent, 1.0)
+    assert set(editor.goals()) == {"base"}, "the page offers no goals of links yet"
+    editor.offer_end_effectors([link])
+    editor.show_end_effectors(there=True)
+    editor.follow(sent, 2.0)
+    found = editor.goals()
+    assert set(found) == {link}
+    (shown,) = found[link].end_effectors
+    np.testing.assert_array_equal(shown.position, aim.position)
+    assert shown.quaternion is None
+    assert editor._parts.shown == link
+    assert editor._position.value == (1.0, 2.0, 3.0)
+    assert editor._gizmos[f"/end_effector_goals/{link}"].visible
+    both = {
+        link: Goal.of_end_effectors([EndEffectorGoal.checked(link, [0, 1, 2, 0, 0, 0.6, 0.8])]),
+        "base": base_goal(0.5, 0.0, 0.0),
+    }
+    editor.follow(both, 3.0)
+    found = editor.goals()
+    turned = found[link].end_effectors[0].quaternion
+    assert turned is not None
+    np.testing.assert_allclose(turned, np.array([0.0, 0.0, 0.6, 0.8]))
+    np.testing.assert_array_equal(found["base"].position, [0.5, 0.0, 0.0])
+
+
+def test_the_ghost_stands_where_the_robot_will_end(server: Any) -> None:
+    page = Editor(server, "three_joint_arm")
+    editor = page.editor
+    editor.place(POSE, None, np.zeros(3), 0.0)
+    page.set(editor._position, (1.0, 0.0, 0.0))
+    end = np.array([0.2, 0.1, 0.3, 0.0, 0.0, 0.6, 0.8])
+    editor.show_check(Check(Verdict.PARTLY, shape=np.full(3, 0.1), base=end))
+    assert editor._ghost is not None
+    gizmo, ghost = editor._gizmos["/goal"], editor._ghost.base
+    # The ghost hangs on the gizmo, which stays at the goal.
+    np.testing.assert_array_equal(gizmo.position, [1.0, 0.0, 0.0])
+    R = matrix_from_quaternion(xyzw(gizmo.wxyz))
+    np.testing.assert_allclose(gizmo.position + R @ ghost.position, end[:3], atol=1e-12)
+    turned = Rotation.from_matrix(R) * Rotation.from_quat(xyzw(ghost.wxyz))
+    np.testing.assert_allclose(turned.as_quat(), end[3:], atol=1e-12)
+    assert {solid.color for solid in editor._ghost._solids} == {COLORS[Verdict.PARTLY]}
+    assert len({*COLORS.values()}) == len(COLORS)
+    page.set(editor._position, (0.9, 0.0, 0.0))
+    np.testing.assert_allclose(ghost.position, 0.0, atol=1e-12)

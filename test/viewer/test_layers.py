@@ -21,7 +21,7 @@ from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer import content, scene
 from spacerobot_ros.viewer.page import CAMERA, Page, screen_up
 from spacerobot_ros.viewer.server import ViewerConfig
-from spacerobot_ros.viewer.state import Measured, StackState
+from spacerobot_ros.viewer.state import Measured, Notice, StackState
 
 ROBOT = load_robot(robot_file("planar_manipulator"))
 REACH = scene.reach_of(ROBOT)
@@ -275,6 +275,7 @@ def test_the_camera_looks_from_a_side(
 
 def test_cameras_follow_the_robot_if_asked(server: Server, page: Page) -> None:
     page.update(FIRST, 1.0)
+    page.update(FIRST, 1.1)
     before = np.array(server.camera.position), np.array(server.camera.look_at)
     page.update(LATER, 2.0)
     np.testing.assert_allclose(server.camera.position, before[0])
@@ -338,6 +339,22 @@ def test_nodes_that_have_ended_are_never_green(
     assert (ENDED in head) is content.has_stack_ended(state) is ended
     assert head.count(GREEN) == greens
     assert ("offline, last executing:" in head) is ("planner" in absent)
+
+
+def test_a_node_that_was_started_again_is_no_news_once_the_stack_has_ended(
+    server: Server, page: Page
+) -> None:
+    again = Notice("Node 'planner' was ended by SIGKILL. It is started again.", 1)
+    page.update(FLYING, 1.0)
+    page.announce(again)
+    page.update(FLYING, 2.0)
+    assert "It is started again." in page._status.content
+    ended = replace(
+        FLYING, absent=frozenset({"plant", "planner"}), silent={"/plant": 3.0, "/planner": 3.0}
+    )
+    page.update(ended, 3.0)
+    assert ENDED in page._status.content
+    assert "It is started again." not in page._status.content
 
 
 def test_nothing_has_ended_where_nothing_has_begun() -> None:

@@ -57,9 +57,7 @@ def test_an_answer_is_what_the_planner_would_plan() -> None:
     assert answer.verdict == Verdict.REACHABLE
     assert answer.duration_s == pytest.approx(own.duration)
     assert answer.shape is not None
-    assert answer.path is not None
     np.testing.assert_allclose(answer.shape, own.positions[-1], atol=1e-9)
-    np.testing.assert_allclose(answer.path[-1], own.path.position[-1], atol=1e-12)
     end = np.concatenate([own.path.position[-1], own.path.quaternion[-1]])
     assert answer.base is not None
     np.testing.assert_allclose(answer.base, end, atol=1e-12)
@@ -69,24 +67,52 @@ def test_joint_positions_of_a_goal_are_asked_for_and_a_method_without_them_says_
     asked = question(0.1, 0.0, 0.05)
     wanted = replace(asked, goal=replace(asked.goal, joint_positions=np.array([0.1, -0.05, 0.2])))
     answer = Planner().answer(wanted, Cancellation())
-    assert answer.verdict == Verdict.REACHABLE
+    assert answer.verdict == Verdict.PARTLY
     assert "'lie_bracket' does not control the final joint positions" in answer.message
 
 
+def arm_question(*position: float) -> Question:
+    """Ask for a position of an arm, of a planner whose method controls the attitude alone."""
+    urdf = load_robot(robot_file("three_joint_arm")).urdf
+    return replace(question(*position, method="area_loop"), urdf=urdf)
+
+
 def test_goal_components_that_a_method_does_not_control_are_named_with_their_errors() -> None:
-    chain = replace(
-        question(0.3, -0.4, 0.0, method="area_loop"),
-        urdf=load_robot(robot_file("three_joint_arm")).urdf,
-    )
+    chain = arm_question(0.3, -0.4, 0.0)
     answer = Planner().answer(chain, Cancellation())
-    assert answer.verdict == Verdict.REACHABLE, answer
+    assert answer.verdict == Verdict.PARTLY, answer
     assert "'area_loop' does not control the position: it ends 0.5 m off." in answer.message
     hand = Goal.of_end_effectors([EndEffectorGoal("link_3", np.ones(3))])
     refused = Planner().answer(replace(chain, goal=hand), Cancellation())
     assert refused.verdict == Verdict.REFUSED
     assert refused.message.startswith("area_loop plans for the pose of the base")
     here = replace(chain, goal=Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
-    assert "control" not in Planner().answer(here, Cancellation()).message
+    answer = Planner().answer(here, Cancellation())
+    assert answer.verdict == Verdict.REACHABLE
+    assert "control" not in answer.message
+
+
+def test_a_base_whose_position_is_not_controlled_ends_where_the_centre_of_mass_stays() -> None:
+    """The goal takes many pieces, of which one is planned: the attitude will be that of the goal,
+    and the position follows from the centre of mass, by Pinocchio.
+    """
+    asked = arm_question(0.3, -0.4, 0.0)
+    turned = Goal.from_rotvec([0.3, -0.4, 0.0], [0.05, -0.03, 0.09])
+    state = replace(asked.state, q=np.array([0.4, -0.9, 1.1]))
+    answer = Planner().answer(replace(asked, goal=turned, state=state), Cancellation())
+    assert answer.verdict == Verdict.PARTLY, answer
+    assert answer.base is not None
+    assert answer.shape is not None
+    np.testing.assert_allclose(answer.base[3:], turned.quaternion, atol=1e-12)
+    model = pin.buildModelFromXML(asked.urdf, pin.JointModelFreeFlyer())
+    data = model.createData()
+    start = np.concatenate([state.position, state.quaternion, state.q])
+    end = np.concatenate([answer.base, answer.shape])
+    before, after = (pin.centerOfMass(model, data, each).copy() for each in (start, end))
+    np.testing.assert_allclose(after, before, atol=1e-9)
+    left = np.linalg.norm(turned.position - answer.base[:3])
+    assert left > 0.1
+    assert f"does not control the position: it ends {left:.3g} m off." in answer.message
 
 
 def test_a_refusal_has_the_sentence_of_the_planner_and_the_next_goal_is_planned() -> None:
@@ -206,8 +232,8 @@ def test_the_last_goal_is_the_one_that_is_answered(checker: GoalChecker) -> None
         checker.ask(question(x, 0.0, 0.0))
     seen = looked(checker, lambda check: check.verdict is not Verdict.PLANNING)
     assert seen[-1].verdict is Verdict.REACHABLE
-    assert seen[-1].path is not None
-    assert seen[-1].path[-1][0] == pytest.approx(0.05, abs=1e-3)
+    assert seen[-1].base is not None
+    assert seen[-1].base[0] == pytest.approx(0.05, abs=1e-3)
     assert {check.verdict for check in seen[:-1]} <= {Verdict.PLANNING}
     assert checker.latest_answer() is None
     # One that is cancelled has no answer, and a process that is killed has a successor.

@@ -27,7 +27,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.clearance import ClearanceStatus
@@ -212,10 +212,80 @@ def test_errors_of_links_are_those_of_their_measured_poses() -> None:
     assert f"{link} is 0.5 m from its goal." in content.status_html(place, errors)
     assert "from its goal" not in content.status_html(place)
     base = replace(state, goals={"base": Goal(HERE[:3], HERE[3:])})
-    assert "from its goal" not in content.status_html(base, content.goal_errors(base, kinematics))
+    errors, limits = content.goal_errors(base, kinematics), Tolerance(0.001, 0.002)
+    head = content.status_html(base, errors, limits)
+    assert "base is 0 m and 0 rad from its goal (tolerance 0.001 m, 0.002 rad)." in head
+    flown = PlannerStatus(PlannerState.EXECUTING, not_controlled=("position",))
+    head = content.status_html(replace(base, planner=flown), errors, limits)
+    free = "base is 0 m (not controlled) and 0 rad from its goal (tolerance 0.002 rad)."
+    assert free in head
+    # Its message has the numbers once the planner has decided.
+    done = replace(base, planner=PlannerStatus(PlannerState.REACHED, "It is there."))
+    assert "from its goal" not in content.status_html(done, errors)
     unknown = {"hand": Goal.of_end_effectors([replace(pose, link="hand")])}
     assert content.goal_errors(replace(state, goals=unknown), kinematics) == {}
     assert content.goal_errors(replace(state, measured=None), kinematics) == {}
+
+
+def test_the_plan_that_is_flown_tells_where_the_robot_ends() -> None:
+    turned = quaternion_of((0.0, 0.0, 0.5))
+    goal = Goal(np.array([4.0, 5.0, 6.0]), turned)
+    motion = np.column_stack([np.tile(HERE, (2, 1)), [[0.0, 0.0, 0.0], [0.1, -0.2, 0.3]]])
+    motion[1, :3] = [1.5, 2.5, 3.5]
+    flying = replace(
+        STATE,
+        goals={"base": goal},
+        planned_motion=motion,
+        planner=PlannerStatus(PlannerState.EXECUTING, not_controlled=("position",)),
+    )
+    check = content.flown_check(flying)
+    assert check is not None
+    assert (check.verdict, check.source is motion) == (Verdict.PARTLY, True)
+    assert check.message.endswith("Not controlled: position.")
+    assert "partly reachable" in content.check_html(check)
+    # The attitude, which later pieces bring to the goal, and the position as it is predicted.
+    assert check.base is not None
+    np.testing.assert_allclose(check.base, [1.5, 2.5, 3.5, *turned])
+    np.testing.assert_allclose(motion[1, 3:7], HERE[3:])
+    assert check.shape is not None
+    np.testing.assert_array_equal(check.shape, [0.1, -0.2, 0.3])
+    whole = content.flown_check(replace(flying, planner=PlannerStatus(PlannerState.EXECUTING)))
+    assert whole is not None
+    assert whole.verdict is Verdict.REACHABLE
+    assert whole.base is not None
+    np.testing.assert_allclose(whole.base, [*goal.position, *turned])
+    free = content.flown_check(replace(flying, goals={}))
+    assert free is not None
+    assert free.base is not None
+    np.testing.assert_allclose(free.base, motion[1, :7])
+    for still in (
+        replace(flying, planner=PlannerStatus(PlannerState.REACHED)),
+        replace(flying, planned_motion=None),
+        replace(flying, absent=frozenset({"planner"})),
+        replace(flying, planner=None),
+    ):
+        assert content.flown_check(still) is None
+
+
+def test_what_a_controller_does_not_control_is_said_beside_its_number() -> None:
+    def head(*labels: str) -> str:
+        report = CommandReport(
+            "model_based", False, 1.0, 0.0, 0.0, 0.0, 0.0, dict.fromkeys(labels, 0.0)
+        )
+        control = ControllerStatus(ControllerState.TRACKING, command=report)
+        goals = {name: Goal(HERE[:3], HERE[3:]) for name in ("base", "end_effector")}
+        distances = {name: content.GoalDistance(0.25, 0.5) for name in goals}
+        state = replace(STATE, controller=control, goals=goals)
+        return content.status_html(state, distances, Tolerance(0.01, 0.02))
+
+    turned = "0.25 m (not controlled) and 0.5 rad from its goal (tolerance 0.02 rad)"
+    both = "0.25 m and 0.5 rad from its goal (tolerance 0.01 m, 0.02 rad)"
+    neither = "0.25 m (not controlled) and 0.5 rad (not controlled) from its goal."
+    assert f"base is {turned}." in head("base.rz", "joint.elbow")
+    assert f"end_effector is {neither}" in head("base.rz", "joint.elbow")
+    assert f"base is {both}." in head("base.y", "base.rx", "end_effector.x")
+    placed = "0.25 m and 0.5 rad (not controlled) from its goal (tolerance 0.01 m)"
+    assert f"end_effector is {placed}." in head("base.y", "base.rx", "end_effector.x")
 
 
 def test_momenta_are_compared_with_what_they_should_be() -> None:

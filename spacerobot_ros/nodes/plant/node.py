@@ -504,7 +504,7 @@ class PlantNode(FlightNode):
         return response
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._commands.latch("abort", "aborted on request", self.time_ns)
+        self._commands.latch("abort", "stopped on request", self.time_ns)
         self._report.latched()
         self._publish_changed_status()
         response.success = True

@@ -41,12 +41,14 @@ from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import Targets
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.topics import goal_topic
+from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.page import Page
 from spacerobot_ros.viewer.reachability import (
     Check,
     GoalChecker,
     Question,
     Verdict,
+    goal_tolerance,
     make_question,
     planned_links,
 )
@@ -239,6 +241,14 @@ class ViewerNode(FlightNode):
         editor = self._page.editor
         if editor.moving:
             self._checker.cancel()
+        flown = content.flown_check(state) if editor.shows_sent_goal else None
+        if flown is not None:
+            # The plan that is flown tells where the robot ends.
+            self._checker.cancel()
+            editor.settled_goals(now)
+            if editor.check.source is not flown.source:
+                editor.show_check(flown)
+            return
         goals = editor.settled_goals(now)
         if goals is not None:
             question = self._question(state, goals)
@@ -361,6 +371,8 @@ class ViewerNode(FlightNode):
                 continue
             if key == "planner":
                 self._offer_end_effectors()
+            known = self._remote_values
+            self._page.show_tolerance(goal_tolerance(known.get("planner", known.get("controller"))))
             self._page.editor.touch(time.monotonic())
 
     def _offer_end_effectors(self) -> None:
@@ -460,6 +472,7 @@ class ViewerNode(FlightNode):
             goal_id = GoalIds().of(stamp.sec, stamp.nanosec)
             self._unanswered_goal = goal_id, time.monotonic() + _LONGEST_GOAL_ANSWER_WAIT
         editor = self._page.editor
+        editor.note_sent()
         if self._checker.cancel() and not editor.moving:
             editor.show_check(Check(Verdict.UNCHECKED, "It was sent before it was checked."))
 

@@ -16,6 +16,29 @@ _MIN_PATH_POSES = 200
 """Fewest poses of a predicted base path; a path has at most twice as many."""
 
 
+def coasting_positions(
+    robot: SpaceRobot, state: RobotState, time: Array, shapes: Array, quaternions: Array
+) -> Array:
+    """Return the base position (K, 3) in W, m: off the coasting centre of mass by c(q).
+
+    Parameters
+    ----------
+    robot, state
+        The model, and its state at time zero.
+    time, shapes, quaternions
+        (K,) s, (K, n) m or rad, and (K, 4) of R_WB, (x, y, z, w).
+    """
+    start = matrix_from_quaternion(state.quaternion) @ robot.center_of_mass(state.q)
+    r_cm = state.position + start
+    drift = state.linear_momentum / robot.total_mass
+    return np.array(
+        [
+            r_cm + t * drift - matrix_from_quaternion(quaternion) @ robot.center_of_mass(q)
+            for t, q, quaternion in zip(time, shapes, quaternions, strict=True)
+        ]
+    )
+
+
 class BasePrediction:
     """Predicts attitude and position of the base under held joint velocities.
 
@@ -58,17 +81,8 @@ class BasePrediction:
         return attitudes
 
     def positions(self, state: RobotState, time: Array, shapes: Array, quaternions: Array) -> Array:
-        """Return the base position (K, 3) in W: off the coasting centre of mass by c(q)."""
-        robot = self._robot
-        start = matrix_from_quaternion(state.quaternion) @ robot.center_of_mass(state.q)
-        r_cm = state.position + start
-        drift = state.linear_momentum / robot.total_mass
-        return np.array(
-            [
-                r_cm + t * drift - matrix_from_quaternion(quaternion) @ robot.center_of_mass(q)
-                for t, q, quaternion in zip(time, shapes, quaternions, strict=True)
-            ]
-        )
+        """Return the base position (K, 3) in W, as :func:`coasting_positions` has it."""
+        return coasting_positions(self._robot, state, time, shapes, quaternions)
 
     def poses(
         self, state: RobotState, positions: Array, attitudes: Array | None = None
