@@ -62,7 +62,7 @@ def test_schedule_and_path_are_written_and_drawn(tmp_path: Path) -> None:
     ("words", "key", "text"),
     [
         (("plan", "planar_chain", "--method", "square_path"), "schedule", "planned in"),
-        (("analyze", "three_joint_arm"), "robot", "three_joint_arm"),
+        (("analyze", "sliding_masses"), "robot", "sliding_masses"),
     ],
 )
 def test_json_on_standard_output_is_alone_there(
