@@ -43,6 +43,8 @@ from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.times import SECOND
 
 _STATE_TOPICS = ("odom", "joint_states", "momentum")
+_WITHOUT_STATES = ("inactive", "failed")
+"""States of a plant that publishes no states of the robot."""
 _CHUNK_SIZE = 65536
 _CHANNEL_AND_TIME = struct.Struct("<H4xQ")
 """Head of a message: channel, sequence number (skipped) and log time."""
@@ -281,7 +283,12 @@ class LastState:
     joint_names, joints, rates
         Names, positions and velocities (n,) of the joints.
     momenta
-        Linear over angular momentum in the world (6,).
+        Linear over angular momentum in the world (6,); of robot and held body together.
+    target
+        Pose (7,) of the root link of the target in the world, over its twist (6,) in T; None:
+        there is no target.
+    payload
+        The body that the robot holds, as the text of ``plant/status``; empty: none.
     """
 
     time_ns: int
@@ -291,6 +298,8 @@ class LastState:
     joints: Array
     rates: Array
     momenta: Array
+    target: Array | None = None
+    payload: str = ""
 
 
 def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
@@ -339,4 +348,34 @@ def _last_state(robot: RecordedRobot) -> LastState:
         joints=positions,
         rates=rates,
         momenta=momenta,
+        target=_last_target(robot, int(common[-1])),
+        payload=_last_payload(robot, int(common[-1])),
     )
+
+
+def _last_target(robot: RecordedRobot, time_ns: int) -> Array | None:
+    """Return pose over twist (13,) of the target in a state; None: it was not recorded."""
+    for name in ("target/odom_true", "target/odom"):
+        series = robot.get(name)
+        if series is None:
+            continue
+        found = np.flatnonzero(series.stamp_ns == time_ns)
+        if len(found):
+            columns_of_state = (*columns("odom", "pose.pose"), *columns("odom", "twist.twist"))
+            state: Array = series.table(columns_of_state)[found[-1]]
+            return state if np.isfinite(state).all() else None
+    return None
+
+
+def _last_payload(robot: RecordedRobot, time_ns: int) -> str:
+    """Return the text of the body that the robot held in a state; empty: none."""
+    series, payload = robot.get("plant/status"), ""
+    for _, message in () if series is None else series.messages():
+        values = {pair.key: pair.value for pair in message.values}
+        with suppress(KeyError, ValueError):
+            # A capture changes the states after that in which it took place. A plant that was
+            # started meanwhile knows of nothing.
+            since = round(float(values["time_s"]) * SECOND)
+            if values["state"] not in _WITHOUT_STATES and since < time_ns:
+                payload = values.get("payload", "")
+    return payload

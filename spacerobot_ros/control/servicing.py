@@ -30,7 +30,6 @@ from spacerobot_ros.model.grasp import (
     TargetBody,
     frame_motion,
 )
-from spacerobot_ros.model.rotations import matrix_from_quaternion
 
 _PREDICTION_TOLERANCE = 0.02
 """Distance (m) and angle (rad) of a target from its predicted motion beyond which the approach is
@@ -115,9 +114,7 @@ class MeasuredTarget:
 
     def measure(self, time: float, pose: Array, twist: Array) -> None:
         """Take pose (7,) and twist (6,), in its own frame, of its root link at a time, s."""
-        R = matrix_from_quaternion(pose[3:])
-        self.motion = BodyMotion(R, pose[:3].copy(), R @ twist[:3], R @ twist[3:])
-        self.time = time
+        self.motion, self.time = BodyMotion.of(pose, twist), time
 
 
 class Approach:

@@ -189,6 +189,12 @@ class BodyMotion:
     v: Array
     omega: Array
 
+    @classmethod
+    def of(cls, pose: Array, twist: Array) -> BodyMotion:
+        """Return the motion with a pose (7,) in W and a twist (6,) in T: velocity over rate."""
+        R = matrix_from_quaternion(pose[3:])
+        return cls(R, pose[:3].copy(), R @ twist[:3], R @ twist[3:])
+
     def at(self, frame: Pose) -> BodyMotion:
         """Return the motion of a frame that is fixed to the body, with this pose in T."""
         arm = self.R_WT @ frame.r

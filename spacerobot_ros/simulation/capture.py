@@ -128,8 +128,7 @@ class Target:
     @property
     def motion(self) -> BodyMotion:
         """Its present motion."""
-        R = matrix_from_quaternion(self.pose[3:])
-        return BodyMotion(R, self.pose[:3].copy(), R @ self.twist[:3], R @ self.twist[3:])
+        return BodyMotion.of(self.pose, self.twist)
 
     @property
     def momenta(self) -> Array:
@@ -406,6 +405,52 @@ class CapturePlant(WrappedPlant):
         self.target.reset()
         self.payload, self._changed, self._ready = None, None, True
         self._update()
+
+    def resume(self, state: InitialState, payload: Payload | None, body: BodyMotion) -> None:
+        """Go on from a later state of a flight.
+
+        Parameters
+        ----------
+        state
+            State of the robot; its momenta are those of robot and held body together.
+        payload
+            The body that the robot holds; None: the target floats freely.
+        body
+            Motion of the target.
+
+        Raises
+        ------
+        ParameterError
+            Another link holds the body, or the state is not one of this robot.
+        """
+        robot = self._alone.robot
+        if payload is not None and payload.link != self.link:
+            raise ParameterError(
+                f"The link '{payload.link}' holds the target, but this plant captures with "
+                f"'{self.link}': set parameter 'capture.end_effector'."
+            )
+        joined = robot if payload is None else payload.attached_to(robot)
+        quaternion, momenta, q = state.attitude(), state.momenta(), state.shape(robot)
+        rates = state.rates(robot)
+        twist = joined.base_twist(quaternion, q, rates, momenta[:3], momenta[3:])
+        motion = RobotMotion(
+            np.concatenate([state.position, quaternion]), np.concatenate(twist), q, rates
+        )
+        self.payload = payload
+        self._grasp = _relative_pose(frame_motion(robot, self.link, motion), body)
+        self._resume_dynamics(joined, motion, momenta, body)
+        self._changed = None
+        self._update()
+        # What hinders a capture now did so before.
+        self._ready = bool(self.approach().misses(self._config))
+
+    def _resume_dynamics(
+        self, robot: SpaceRobot, motion: RobotMotion, momenta: Array, body: BodyMotion
+    ) -> None:
+        """Integrate the robot, and the target where it is free, from these motions on."""
+        if self.payload is None:
+            self.target.release(body)
+        self._continue(robot, motion, momenta)
 
     def step(self, *commands: Any) -> bool:
         """Advance a tick under the commands of the robot; first capture the target where that is

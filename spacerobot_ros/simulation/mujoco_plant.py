@@ -188,6 +188,16 @@ class MujocoPlant:
         self.hold(self._held)
         self._update()
 
+    def go_on(self, motion: RobotMotion, target: BodyMotion) -> None:
+        """Go on from these motions of robot and target, which are not joined."""
+        data = self._data
+        data.qpos[:3], data.qpos[3:7] = motion.pose[:3], np.roll(motion.pose[3:], 1)
+        data.qpos[self._q], data.qvel[self._qdot] = motion.q, motion.qdot
+        data.qvel[:3], data.qvel[3:6] = motion.R_WB @ motion.twist[:3], motion.twist[3:]
+        self._aim[:] = motion.qdot
+        self._place_target(target)
+        self._update()
+
     def hold(self, joints: Flags) -> None:
         """Lock the marked joints (n,) at their positions, and release all other joints."""
         for joint in np.flatnonzero(joints & ~self._held | (joints & (self._locked() == 0))):
@@ -503,6 +513,16 @@ class MujocoCapturePlant(CapturePlant):
             self._joined = robot
             engine.weld()
         engine.expected_momenta[:] = momenta
+
+    def _resume_dynamics(
+        self, robot: SpaceRobot, motion: RobotMotion, momenta: Array, body: BodyMotion
+    ) -> None:
+        self._engine.go_on(motion, body)
+        self.target.step()
+        if self.payload is None:
+            self._engine.expected_momenta[:] = momenta
+        else:
+            self._continue(robot, motion, momenta)
 
     def _body(self) -> BodyMotion:
         return self._engine.target_motion

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
+from rclpy.lifecycle import TransitionCallbackReturn
 from std_msgs.msg import Float64MultiArray, String
+from support.made_bags import array, joint_states, made_bag, odometry
+from support.odometry import pose_of, twist_of
 from support.plant_rig import Rig
 from support.ros_harness import Harness
 from visualization_msgs.msg import MarkerArray
 
+from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.resources import share_directory
 
 BLOCK = share_directory() / "config" / "targets" / "block.urdf"
@@ -102,6 +107,60 @@ def test_a_target_is_captured_and_released_on_request(harness: Harness) -> None:
     at = rig.wait("target/odom", 3).pose.pose.position
     assert markers[-2].pose.position.x == pytest.approx(at.x)
     assert markers[-2].pose.position.y == pytest.approx(at.y)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_plant_that_was_killed_goes_on_with_the_body_that_it_holds(
+    harness: Harness, tmp_path: Path, held: bool
+) -> None:
+    rig = Rig(harness, PARAMETERS, topics=TARGET_TOPICS)
+    if held:
+        assert rig.trigger("plant/capture").success
+    for _ in range(3):
+        rig.step([0.0, 0.0], JOINTS)
+    rig.wait("target/odom", 4)
+    harness.settle(rig.probe)
+    before = {name: rig.probe.last(name) for name in ("odom", "target/odom", "plant/status")}
+    bag = tmp_path / "cut.mcap"
+    with made_bag(bag) as (_, say):
+        for topic in ("plant/status", "momentum", "odom", "joint_states", "target/odom"):
+            for message in rig.probe.messages[topic]:
+                say(f"/{topic}", message, 0.15)
+        # What a plant says that was started meanwhile counts for nothing.
+        rig.plant.trigger_deactivate()
+        harness.spin_until(
+            lambda: values_of(rig.probe.last("plant/status"))["state"] == "inactive", "its end"
+        )
+        say("/plant/status", rig.probe.last("plant/status"), 0.2)
+    parameters = {**PARAMETERS, "resume_bag": str(bag), "time_mode": "lockstep"}
+    again = harness.make(PlantNode, parameters, name="again", autostart=False)
+    assert again.trigger_configure() is TransitionCallbackReturn.SUCCESS
+    assert again.tick == 3
+    capturing = again.plant.capturing
+    assert capturing is not None
+    told = values_of(before["plant/status"]).get("payload", "")
+    payload = capturing.payload.to_text() if capturing.payload is not None else ""
+    assert payload == told
+    assert bool(payload) is held
+    for name, pose, twist in (
+        ("odom", again.plant.pose, again.plant.twist),
+        ("target/odom", capturing.target_pose, capturing.target_twist),
+    ):
+        was = before[name]
+        np.testing.assert_allclose(np.concatenate(pose_of(was)), pose, atol=1e-14)
+        np.testing.assert_allclose(np.concatenate(twist_of(was)), twist, atol=1e-14)
+
+
+def test_a_bag_without_the_target_is_not_gone_on_with(harness: Harness, tmp_path: Path) -> None:
+    bag = tmp_path / "a.mcap"
+    with made_bag(bag) as (_, say):
+        say("/momentum", array(*([0.0] * 7)), 0.05)
+        say("/odom", odometry(0.05, 0, 0, 0, 0, 0, 0, 1, *([0.0] * 6)), 0.05)
+        say("/joint_states", joint_states(0.05, JOINTS, [0.0, 0.0], [0.0, 0.0]), 0.05)
+    parameters = {**PARAMETERS, "resume_bag": str(bag)}
+    plant = harness.make(PlantNode, parameters, name="plant", autostart=False)
+    plant.trigger_configure()
+    assert "whose last state has no target: set 'target.robot' as in that" in str(plant.fault)
 
 
 def test_a_latched_paused_or_stopped_plant_captures_nothing_but_a_paused_one(

@@ -15,11 +15,13 @@ from support.oracles import Array, PinocchioOracle
 from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
-from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.description import Inertia
+from spacerobot_ros.model.grasp import BodyMotion, Payload
 from spacerobot_ros.model.orbit import relative_motion
 from spacerobot_ros.model.urdf import with_held_joints
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file, share_directory
+from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
 from spacerobot_ros.simulation.capture import Approach, CapturePlant, capture_values
 from spacerobot_ros.simulation.commands import CommandValidator
@@ -641,3 +643,68 @@ def test_a_target_slides_on_a_table_with_the_robot() -> None:
             ParameterError, match="the target 'block' does not stay in the x-y plane"
         ):
             plant_of(PAPER_ROBOT, **{"table.tilt": 0.1, **flaw})
+
+
+@pytest.mark.parametrize("held", [True, False])
+@pytest.mark.parametrize(
+    ("engine", "actuation"),
+    [
+        ("exact", "effort"),
+        ("exact", "velocity"),
+        pytest.param("mujoco", "effort", marks=pytest.mark.slow),
+    ],
+)
+def test_a_plant_goes_on_from_a_state_with_its_target(
+    engine: str, actuation: str, held: bool
+) -> None:
+    """The flight goes on as the one that was not interrupted, and a release works."""
+    values = {**SPATIAL, "engine": engine, "actuation": actuation, "integration_step": 0.001}
+    flown, resumed = plant_of(values), plant_of(values)
+    first, second = capturing_of(flown), capturing_of(resumed)
+    if held:
+        first.capture()
+    for _ in range(12):
+        flown.step(*commands_of(flown, 0.1))
+    moving = actuation == "effort"
+    if not moving:
+        flown.step(*commands_of(flown))  # Servos at rest: those of a plant that is started are.
+    state = InitialState(
+        position=flown.pose[:3].copy(),
+        quaternion=flown.pose[3:].copy(),
+        joint_positions=flown.q.copy(),
+        joint_velocities=flown.qdot.copy() if moving else None,
+        linear_momentum=flown.momentum[:3].copy(),
+        angular_momentum=flown.momentum[3:6].copy(),
+    )
+    told = first.payload.to_text() if first.payload is not None else ""
+    second.resume(
+        state,
+        Payload.from_text(told) if told else None,
+        BodyMotion.of(first.target_pose, first.target_twist),
+    )
+    tolerance = 1e-12 if engine == "exact" else 1e-3
+    for tick in range(12):
+        for name in ("pose", "twist", "q", "qdot"):
+            pair = getattr(flown, name), getattr(resumed, name)
+            np.testing.assert_allclose(*pair, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(first.target_pose, second.target_pose, atol=tolerance)
+        np.testing.assert_allclose(first.target_twist, second.target_twist, atol=tolerance)
+        np.testing.assert_allclose(flown.momentum, resumed.momentum, atol=100 * tolerance)
+        if tick == 6 and held:
+            assert first.present_robot.total_mass == second.present_robot.total_mass
+            first.release(), second.release()
+        for plant in (flown, resumed):
+            plant.step(*commands_of(plant, 0.05))
+    assert second.payload is None
+    if engine == "exact":
+        resumed.plant.reset()
+        fresh = plant_of(values)
+        np.testing.assert_array_equal(resumed.pose, fresh.pose)
+        np.testing.assert_array_equal(second.target_pose, capturing_of(fresh).target_pose)
+
+
+def test_a_body_that_another_link_holds_is_not_gone_on_with() -> None:
+    plant = plant_of(SPATIAL)
+    body = BodyMotion.of(plant.pose, plant.twist)
+    with pytest.raises(ParameterError, match="The link 'link_1' holds the target, but this plant"):
+        capturing_of(plant).resume(InitialState(), Payload("link_1", Inertia(1.0)), body)

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -26,6 +26,7 @@ from spacerobot_ros.errors import (
 from spacerobot_ros.messages.readers import CommandReader
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.grasp import BodyMotion, Payload
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.model.world import obstacles_from_topic, with_obstacles_around
 from spacerobot_ros.nodes.common.messages import message_class
@@ -40,7 +41,7 @@ from spacerobot_ros.nodes.plant.publisher import (
     TransformPublisher,
 )
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.actuators import build_plant
+from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
 from spacerobot_ros.simulation.capture import CapturePlant, CaptureReport, ReleaseReport
 from spacerobot_ros.simulation.commands import CommandValidator, PublisherTracker
 from spacerobot_ros.simulation.config import PlantConfig
@@ -49,6 +50,9 @@ from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStat
 from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS
+
+if TYPE_CHECKING:
+    from spacerobot_ros.bag.salvage import LastState
 
 _READER_CHECK_PERIOD = 0.1
 """Wall time between two checks for new subscribers and commanders, s."""
@@ -137,8 +141,11 @@ class PlantNode(FlightNode):
                 "robot of this package, or 'robot_description' to a URDF text."
             )
         self._period_ns = config.period_ns
-        initial, self._tick = self._initial_state_and_tick(robot)
-        self.plant = build_plant(robot, config, initial)
+        last = self._last_state(robot)
+        self._tick = 0 if last is None else round(last.time_ns / self._period_ns)
+        self.plant = (
+            build_plant(robot, config) if last is None else self._resumed_plant(robot, last)
+        )
         self.plant.tick = self._tick
         self._reported = ReportedState(self.plant, config)
         self._commands = CommandValidator(self.plant, config)
@@ -304,16 +311,11 @@ class PlantNode(FlightNode):
         record = StatusRecord(name, status.level, status.message, status.to_values())
         self._status.take(record.encoded())
 
-    def _initial_state_and_tick(self, robot: SpaceRobot) -> tuple[InitialState | None, int]:
-        """Return the initial state (None: as configured) and its tick."""
+    def _last_state(self, robot: SpaceRobot) -> LastState | None:
+        """Return the state to go on from; None: the initial one."""
         path = self.config.resume_bag
         if not path:
-            return None, 0
-        if self.config.target.given:
-            raise ParameterError(
-                "A plant with a target does not go on from a bag: leave out 'resume_bag' or "
-                "'target.robot'."
-            )
+            return None
         from spacerobot_ros.bag.salvage import last_state  # Few plants begin from a bag.
 
         state = last_state(path, self.get_namespace().rstrip("/"))
@@ -322,6 +324,16 @@ class PlantNode(FlightNode):
                 f"Parameter 'resume_bag' is '{path}', a bag of a robot with the joints "
                 f"{', '.join(state.joint_names)}; this one has {', '.join(robot.joint_names)}."
             )
+        if self.config.target.given != (state.target is not None):
+            other = "no target" if state.target is None else "a target"
+            raise ParameterError(
+                f"Parameter 'resume_bag' is '{path}', whose last state has {other}: set "
+                "'target.robot' as in that flight."
+            )
+        return state
+
+    def _resumed_plant(self, robot: SpaceRobot, state: LastState) -> FaultyPlant:
+        """Return the plant in the last state of a bag."""
         # Servos hold the rates that they are commanded: only motors leave joints moving.
         moving = self.config.actuation == "effort"
         initial = InitialState(
@@ -332,7 +344,13 @@ class PlantNode(FlightNode):
             angular_momentum=state.momenta[3:],
             joint_velocities=state.rates if moving else None,
         )
-        return initial, round(state.time_ns / self._period_ns)
+        if state.target is None:
+            return build_plant(robot, self.config, initial)
+        plant = build_plant(robot, self.config)
+        assert plant.capturing is not None
+        payload = Payload.from_text(state.payload) if state.payload else None
+        plant.capturing.resume(initial, payload, BodyMotion.of(state.target[:7], state.target[7:]))
+        return plant
 
     # -- time ---------------------------------------------------------------------------------
 
