@@ -7,8 +7,7 @@ from spacerobot_ros.collision.geometry import (
     ObstaclePair,
     Solid,
 )
-from spacerobot_ros.collision.nearest import NearestPair
-from spacerobot_ros.collision.path_check import Approach, PathCheck
+from spacerobot_ros.collision.nearest import Approach, NearestPair, PathCheck
 
 __all__ = [
     "Approach",

@@ -1,6 +1,16 @@
-"""The nearest pair of a robot at one state after another, as fast as a plant in flight needs it."""
+"""Nearest pairs: at one state after another, as fast as in flight, and along held commands.
+
+Along held commands a pair of solids moves against each other by at most v in a tick
+(``CollisionGeometry.reaches``). So its distance within the tick is at least
+``(d_0 + d_1 - v) / 2``, with d_0 and d_1 those at its ends. Ticks where that is less than the
+clearance are halved until v is small. Against obstacles the base moves, too, along a straight line
+and about one axis within a tick.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -80,3 +90,195 @@ class NearestPair:
         centers = r + (R @ self._centers)[:, :, 0]
         between = centers[self._first] - centers[self._second]
         return np.sqrt(np.einsum("pa,pa->p", between, between)) - self._reach
+
+
+# -- along held commands --------------------------------------------------------------------------
+
+_MOTION_RESOLUTION = 5e-4
+"""Largest relative motion of a pair between two evaluations of its distance, m."""
+
+
+@dataclass(frozen=True)
+class Approach:
+    """The nearest approach of a pair.
+
+    Attributes
+    ----------
+    links
+        Names of the links.
+    pair
+        Number of the pair of solids in :attr:`CollisionGeometry.pairs`.
+    distance
+        m; negative: the depth of the contact.
+    tick
+        When, in ticks from the first shape.
+    shape
+        (n,) there, m or rad.
+    place
+        (3,) there, in W, m, on the obstacle; None: the pair are two links.
+    """
+
+    links: LinkPair
+    pair: int
+    distance: float
+    tick: float
+    shape: Array
+    place: Array | None = None
+
+    def __str__(self) -> str:
+        where = "" if self.place is None else f" near {np.round(self.place, 3).tolist()} m"
+        if self.distance <= 0:
+            return f"{self.links.subject} touch, {-self.distance:.3g} m deep{where}"
+        return f"{self.links.subject} come within {self.distance:.3g} m{where}"
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A path of the shape, with the base where obstacles count.
+
+    Attributes
+    ----------
+    positions
+        (N + 1, n) shapes at the ticks, m or rad.
+    base
+        Poses of the base at the ticks; None: obstacles do not count.
+    bounds
+        (N + 1, P) lower bounds of the distances of pairs at the ticks, m.
+    motion
+        (N, P): how far pairs move against each other at most in each tick, m.
+    """
+
+    positions: Array
+    base: BasePoses | None
+    bounds: Array
+    motion: Array
+
+    @classmethod
+    def of(cls, geometry: CollisionGeometry, positions: Array, base: BasePoses | None) -> _Path:
+        bounds = geometry.lower_bounds(geometry.poses(positions, base))
+        reaches, from_base = geometry.reaches(positions)
+        moved = np.abs(np.diff(geometry.moving_positions(positions), axis=0))
+        motion = moved @ reaches.T
+        if base is not None and geometry.with_obstacles.any():
+            straight = np.linalg.norm(np.diff(base.position, axis=0), axis=1)
+            # Quaternions turn by half the angle.
+            chord = np.linalg.norm(np.diff(base.quaternion, axis=0), axis=1)
+            turned = 4 * np.arcsin(np.minimum(np.minimum(chord, np.sqrt(4 - chord**2)) / 2, 1.0))
+            motion += np.outer(turned, from_base) + np.outer(straight, geometry.with_obstacles)
+        return cls(positions, base, bounds, motion)
+
+    @property
+    def least(self) -> Array:
+        """Lower bounds (P,) of the distances along the whole path, m."""
+        if not len(self.motion):
+            return np.asarray(self.bounds.min(axis=0))
+        return np.asarray(((self.bounds[:-1] + self.bounds[1:] - self.motion) / 2).min(axis=0))
+
+    def at(self, ticks: Array) -> tuple[Array, BasePoses | None]:
+        """Return shapes (K, n) and poses of the base at times (K,) in ticks."""
+        if len(self.positions) == 1:
+            return self.positions, self.base
+        before = np.minimum(ticks.astype(int), len(self.positions) - 2)
+        share = (ticks - before)[:, np.newaxis]
+        shapes = (1 - share) * self.positions[before] + share * self.positions[before + 1]
+        return shapes, None if self.base is None else self.base.between(before, share)
+
+
+class PathCheck:
+    """Nearest approaches of the pairs of a robot along paths.
+
+    Parameters
+    ----------
+    geometry
+        The solids and pairs.
+    """
+
+    def __init__(self, geometry: CollisionGeometry) -> None:
+        self.geometry = geometry
+
+    def approaches(
+        self, positions: Array, required: Array, base: BasePoses | None = None
+    ) -> list[Approach]:
+        """Return the nearest approaches of all pairs that come nearer than required.
+
+        Parameters
+        ----------
+        positions
+            (N + 1, n) shapes at the ticks, along straight lines in between; m or rad.
+        required
+            (P,) smallest distances of the pairs, m; minus infinity: any.
+        base
+            Poses of the base at the ticks; None: obstacles do not count.
+        """
+        if not len(self.geometry.pairs):
+            return []
+        path = _Path.of(self.geometry, positions, base)
+        near = np.flatnonzero(path.least < required)
+        found = (self._nearest(path, p, required[p]) for p in near.tolist())
+        return sorted((each for each in found if each), key=lambda each: each.distance)
+
+    def nearest(self, positions: Array, base: BasePoses | None = None) -> Approach | None:
+        """Return the nearest approach of all pairs along a path (N + 1, n); None without pairs.
+
+        ``base`` are the poses of the base at the ticks; None: obstacles do not count.
+        """
+        if not len(self.geometry.pairs):
+            return None
+        path = _Path.of(self.geometry, positions, base)
+        least = path.least
+        best: Approach | None = None
+        for pair in np.argsort(least, kind="stable").tolist():
+            if best is not None and least[pair] >= best.distance:
+                break
+            limit = np.inf if best is None else best.distance
+            best = self._nearest(path, pair, limit) or best
+        return best
+
+    def _nearest(self, path: _Path, pair: int, limit: float) -> Approach | None:
+        """Return the nearest approach of a pair; None where it does not come nearer than limit."""
+        geometry, motion, bounds = self.geometry, path.motion, path.bounds
+
+        def distances(ticks: Array) -> Array:
+            return geometry.distances(pair, geometry.poses(*path.at(ticks)))
+
+        def approach(distance: float, tick: float) -> Approach:
+            shapes, base = path.at(np.array([tick]))
+            place = None
+            if base is not None and geometry.with_obstacles[pair]:
+                place = geometry.place(pair, shapes[0], base)
+            return Approach(geometry.links_of(pair), pair, distance, tick, shapes[0], place)
+
+        if not len(motion):
+            distance = float(distances(np.zeros(1))[0])
+            return approach(distance, 0.0) if distance < limit else None
+        close = (bounds[:-1, pair] + bounds[1:, pair] - motion[:, pair]) / 2 < limit
+        starts = np.flatnonzero(close)
+        if not len(starts):
+            return None
+        ticks = np.unique(np.concatenate([starts, starts + 1])).astype(float)
+        known = distances(ticks)
+        least = int(np.argmin(known))
+        best, at = float(known[least]), float(ticks[least])
+        index = np.searchsorted(ticks, starts)
+        left, right = starts.astype(float), starts + 1.0
+        d_0, d_1, v = known[index], known[index + 1], motion[starts, pair]
+        while True:
+            # Only where the distance may be less than any that is known, and matters.
+            open_ = ((d_0 + d_1 - v) / 2 < min(best, limit)) & (v > _MOTION_RESOLUTION)
+            if not open_.any():
+                break
+            left, right, d_0, d_1, v = (x[open_] for x in (left, right, d_0, d_1, v))
+            middle = (left + right) / 2
+            d = distances(middle)
+            least = int(np.argmin(d))
+            if d[least] < best:
+                best, at = float(d[least]), float(middle[least])
+            left, right = np.concatenate([left, middle]), np.concatenate([middle, right])
+            d_0, d_1 = np.concatenate([d_0, d]), np.concatenate([d, d_1])
+            v = np.concatenate([v, v]) / 2
+        return approach(best, at) if best < limit else None
+
+
+def names(approaches: Iterable[Approach]) -> list[LinkPair]:
+    """Return the links of approaches, each pair once."""
+    return list(dict.fromkeys(each.links for each in approaches))

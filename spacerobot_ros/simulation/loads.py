@@ -13,9 +13,8 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array, Inertia, Pose
-from spacerobot_ros.model.external_loads import LoadLayout
+from spacerobot_ros.model.external_loads import LoadLayout, mean_motion_at
 from spacerobot_ros.model.grasp import BodyMotion
-from spacerobot_ros.model.orbit import mean_motion_at
 from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from support.branched_robot import branched_robot
 
-from spacerobot_ros.collision import CollisionGeometry, compiled_rows
-from spacerobot_ros.collision.compiled_rows import CompiledRows
-from spacerobot_ros.collision.rows import DistanceRows
+from spacerobot_ros.collision import CollisionGeometry
+from spacerobot_ros.collision import rows as rows_module
+from spacerobot_ros.collision.rows import CompiledRows, DistanceRows
 from spacerobot_ros.model import compilation, load_robot
 from spacerobot_ros.resources import robot_file
 
@@ -63,7 +63,7 @@ def test_pairs_of_robots_have_the_rows_of_casadi(name: str) -> None:
 
 def test_without_a_compiler_there_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    monkeypatch.setattr(compiled_rows, "DistanceRows", None)  # Nothing is derived in vain.
+    monkeypatch.setattr(rows_module, "DistanceRows", None)  # Nothing is derived in vain.
     assert CompiledRows.of(CollisionGeometry(branched_robot(tmp_path))) is None
 
 
@@ -74,7 +74,7 @@ def test_rows_from_the_cache_derive_none_for_a_trial(
         pytest.skip("no C compiler")
     geometry = CollisionGeometry(branched_robot(tmp_path))
     first = CompiledRows.of(geometry)
-    monkeypatch.setattr(compiled_rows, "_rows_of_pair", None)
+    monkeypatch.setattr(rows_module, "_rows_of_pair", None)
     again = CompiledRows.of(geometry)
     assert first is not None
     assert again is not None
@@ -90,9 +90,9 @@ def test_wrong_functions_are_not_used(
     if compilation.c_compiler() is None:
         pytest.skip("no C compiler")
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
-    right = compiled_rows._SOURCE.read_text("utf-8")
+    right = rows_module._SOURCE.read_text("utf-8")
     wrong = tmp_path / "wrong.c"
     wrong.write_text(right.replace("field->gradient[i] = ", "field->gradient[i] = -"), "utf-8")
     assert wrong.read_text("utf-8") != right
-    monkeypatch.setattr(compiled_rows, "_SOURCE", wrong)
+    monkeypatch.setattr(rows_module, "_SOURCE", wrong)
     assert CompiledRows.of(CollisionGeometry(branched_robot(tmp_path))) is None

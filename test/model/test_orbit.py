@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.orbit import (
+from spacerobot_ros.model.external_loads import (
     EARTH_GRAVITATION,
     EARTH_RADIUS,
     mean_motion_at,

@@ -45,7 +45,6 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     f"{PACKAGE}.nodes": (
         ("__init__",),
-        ("node_types",),
         ("plant", "planner", "controller", "recorder", "replay", "viewer"),
         ("common",),
     ),

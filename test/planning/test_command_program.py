@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import minimize
 
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.methods.optimal.command_program import least_change
+from spacerobot_ros.planning.methods.optimal.held_commands import least_change
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 
 PERIOD = 0.3

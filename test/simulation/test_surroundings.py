@@ -15,7 +15,7 @@ from support.oracles import Array, PinocchioOracle, assert_agrees, random_motion
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.orbit import EARTH_GRAVITATION, relative_motion
+from spacerobot_ros.model.external_loads import EARTH_GRAVITATION, relative_motion
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import build_plant

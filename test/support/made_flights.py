@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from support.flight_bags import cyclic_shapes, urdf_of
 
 from spacerobot_ros.collision.geometry import LinkPair
-from spacerobot_ros.collision.path_check import Approach
+from spacerobot_ros.collision.nearest import Approach
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.flight import Flight, SentGoal, Signal

@@ -16,8 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from spacerobot_ros.collision import Approach, BasePoses
-from spacerobot_ros.collision.compiled_rows import CompiledRows
-from spacerobot_ros.collision.rows import DistanceRows, world_values
+from spacerobot_ros.collision.rows import CompiledRows, DistanceRows, world_values
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
