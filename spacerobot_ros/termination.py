@@ -338,6 +338,16 @@ def run_child(
     )
 
 
+def end_with_parent() -> None:
+    """End a process of :mod:`multiprocessing` when its parent ends; call it in a thread."""
+    import multiprocessing  # It takes a while, and few processes are of it.
+
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
 def end_child(process: subprocess.Popen[bytes], signals: Mapping[int, float]) -> int:
     """End a child of :func:`start_child` and return its exit code.
 

@@ -33,7 +33,7 @@ from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.run import ros
 from spacerobot_ros.session.viewing import viewing
-from spacerobot_ros.termination import ended_on_request, tool
+from spacerobot_ros.termination import end_with_parent, ended_on_request, tool
 from spacerobot_ros.times import SECOND
 
 _MEMORY_PERIOD = 1.0
@@ -274,7 +274,7 @@ def _wait_for_ticks(period: float, duration: float) -> tuple[int, float]:
 
     Return the number of delays above a period, and the largest excess, ms.
     """
-    Thread(target=_end_with_parent, daemon=True).start()
+    Thread(target=end_with_parent, daemon=True).start()
     began = time.perf_counter()
     late, worst = 0, 0.0
     for tick in range(1, round(duration / period)):
@@ -284,13 +284,6 @@ def _wait_for_ticks(period: float, duration: float) -> tuple[int, float]:
         late += beyond > 0
         worst = max(worst, 1e3 * beyond)
     return late, worst
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def process_facts(pid: int, name: str = "status") -> dict[str, str]:

@@ -33,6 +33,7 @@ from spacerobot_ros.campaign.engines import engine_by_name, fly_all
 from spacerobot_ros.campaign.rows import FLIGHTS, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.files import warn_once
+from spacerobot_ros.termination import end_with_parent
 from spacerobot_ros.version import __version__
 
 TASK_TIME = 2.0
@@ -227,7 +228,7 @@ class LocalWorkers:
 
 def _run_worker(connection: Connection) -> None:
     """Fly the tasks that come through a pipe until it is closed."""
-    Thread(target=_end_with_parent, daemon=True).start()
+    Thread(target=end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):
         while True:
             arguments = connection.recv()
@@ -236,13 +237,6 @@ def _run_worker(connection: Connection) -> None:
             except Exception as error:  # The parent process raises it again.
                 answer = error
             connection.send(answer)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def _resident_bytes(process: int | None) -> int:

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from support.campaigns import campaign
 
+from spacerobot_ros import termination
 from spacerobot_ros.campaign import workers as module
 from spacerobot_ros.campaign.draws import Draw, Draws
 from spacerobot_ros.campaign.rows import Fallback, Row
@@ -222,14 +223,14 @@ def test_a_worker_answers_until_its_pipe_ends(monkeypatch: pytest.MonkeyPatch) -
     one, error, two = pipe.sent
     assert (one, two) == ([("a", 1)], [("b",)])
     assert isinstance(error, ValueError)
-    assert threads == [{"target": workers._end_with_parent, "daemon": True}, "started"]
+    assert threads == [{"target": termination.end_with_parent, "daemon": True}, "started"]
 
 
 def test_a_worker_ends_with_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
     parent, codes = Process(), list[int]()
-    monkeypatch.setattr(workers.multiprocessing, "parent_process", lambda: parent)
-    monkeypatch.setattr(workers.os, "_exit", codes.append)
-    workers._end_with_parent()
+    monkeypatch.setattr("multiprocessing.parent_process", lambda: parent)
+    monkeypatch.setattr(termination.os, "_exit", codes.append)
+    termination.end_with_parent()
     assert (parent.calls, codes) == (["join"], [1])
 
 
