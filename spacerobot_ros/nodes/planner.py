@@ -132,7 +132,6 @@ class PlannerNode(CommanderNode):
 
     def _follow_trajectories(self) -> None:
         """Send schedules to the robot's own controller from now on."""
-
         if self._trajectories is None:
             self._trajectories = TrajectoryClients(self)
         self.commander.trajectories = self._trajectories.connect(

@@ -229,7 +229,7 @@ def test_a_worker_answers_until_its_pipe_ends(monkeypatch: pytest.MonkeyPatch) -
 def test_a_worker_ends_with_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
     parent, codes = Process(), list[int]()
     monkeypatch.setattr("multiprocessing.parent_process", lambda: parent)
-    monkeypatch.setattr(termination.os, "_exit", codes.append)
+    monkeypatch.setattr(os, "_exit", codes.append)
     termination.end_with_parent()
     assert (parent.calls, codes) == (["join"], [1])
 
