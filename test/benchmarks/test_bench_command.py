@@ -42,7 +42,7 @@ CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
         {"other": OTHER},
     ),
     "campaign": ("engines.lanes_benchmark", "", {}),
-    "environments 48": ("environments.environments_benchmark", "", {"lanes": 48}),
+    "environments 48": ("engines.environments_benchmark", "", {"lanes": 48}),
     f"ticks 222 --against {OTHER} --rounds 3": (
         "checkouts.compare",
         "measure tick_times {'ticks': 222}",
