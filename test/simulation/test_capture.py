@@ -16,8 +16,8 @@ from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Inertia
+from spacerobot_ros.model.external_loads import relative_motion
 from spacerobot_ros.model.grasp import BodyMotion, Payload
-from spacerobot_ros.model.orbit import relative_motion
 from spacerobot_ros.model.urdf import with_held_joints
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file, share_directory
