@@ -154,6 +154,19 @@ def test_a_goal_shape_in_collision_is_refused(arm: SpaceRobot) -> None:
     assert refusal.value.proof is Proof.COLLISION
 
 
+def test_loops_do_not_begin_for_a_goal_shape_in_collision(arm: SpaceRobot) -> None:
+    """They would fly for an hour before the last way, to the shape, is refused."""
+    touching = np.array([-0.01, -0.073, 2.175])
+    for method in ("area_loop", "auto"):
+        with pytest.raises(UnreachableError, match="The shape of the goal is in coll") as refusal:
+            plan(arm, rotvec=(0.05, 0.0, 0.0), joint_positions=touching, method=method)
+        assert refusal.value.proof is Proof.COLLISION
+    flat = bare("planar_chain")
+    folded = np.array([3.1, 3.1])
+    with pytest.raises(UnreachableError, match="The shape of the goal is in collision"):
+        plan(flat, rotvec=(0.0, 0.0, 0.1), joint_positions=folded, method="square_path")
+
+
 @pytest.mark.slow
 def test_loops_of_three_joints_shrink(arm: SpaceRobot) -> None:
     goal = (0.1, -0.05, 0.08), (0.0, -np.pi / 4, np.pi / 2)

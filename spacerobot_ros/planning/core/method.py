@@ -282,6 +282,22 @@ class GaitMethod(ABC):
             )
         return np.clip(wanted, robot.lower, robot.upper)
 
+    def _clear_goal_shape(self, request: PlanRequest) -> Array | None:
+        """Return the goal shape (n,) as :meth:`_goal_shape`, and refuse one in collision.
+
+        Raises
+        ------
+        UnreachableError
+            It is beyond the joint limits, or links come too near in it.
+        PlanningError
+            Links are too near at the start.
+        """
+        shape = self._goal_shape(request.goal)
+        if shape is not None and self.clearance is not None:
+            # Where the base will be among obstacles depends on the motion.
+            self.clearance.require_shape(shape, self.clearance.required(request.state.q))
+        return shape
+
     def _require_goal_of_base(self, goal: Goal) -> None:
         """Refuse goals of end-effectors, by methods that reach none."""
         self._require_no_path(goal)

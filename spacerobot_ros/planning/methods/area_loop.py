@@ -146,7 +146,7 @@ class AreaLoopGait(GaitMethod):
         state, goal, tolerance = request.state, request.goal, request.tolerance
         self._require_rest(state)
         self._require_goal_of_base(goal)
-        final = self._goal_shape(goal)
+        final = self._clear_goal_shape(request)
         gait = _PlannedMotion(state.q[np.newaxis], state.quaternion[np.newaxis])
         notes: Notes = {"cycles": 0.0}
         progress = None if request.previous is None else request.previous.progress

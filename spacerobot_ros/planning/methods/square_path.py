@@ -143,7 +143,7 @@ class SquarePathGait(GaitMethod):
         self._require_rest(state)
         self._require_goal_of_base(goal)
         turn = self._requested_turn(request)
-        psi_e = self._goal_shape(goal)
+        psi_e = self._clear_goal_shape(request)
         if psi_e is None:
             psi_e = np.clip(state.q, self.robot.lower, self.robot.upper)
         step_1 = float(self._phase.leg_turns(state.q[np.newaxis], psi_e[np.newaxis])[0])
