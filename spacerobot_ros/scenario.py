@@ -6,7 +6,6 @@ This module also reads parameter files and settings of the command line.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -35,6 +34,7 @@ from spacerobot_ros.resources import (
 )
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.faults import line_refusal, parse_times
 from spacerobot_ros.simulation.trials import PlanningProblem
 from spacerobot_ros.viewer.server import ViewerConfig
 
@@ -69,8 +69,6 @@ _SCENARIO_KEYS = (
 
 _LONGEST_TF_PERIOD = 0.1
 """Longest wall time between transforms of a flight in real time, s."""
-
-_KILL_PATTERN = re.compile(r"(\S+) at (\S+)(?: until (\S+))?")
 
 
 @dataclass(frozen=True)
@@ -606,26 +604,16 @@ def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
 
 
 def _parse_kill(line: object, where: str) -> Kill:
-    match = _KILL_PATTERN.fullmatch(" ".join(str(line).split()))
-    if match is None:
-        raise ParameterError(
-            f"The kill {str(line)!r} in {where} is not NODE at SECONDS [until SECONDS]."
-        )
-    node, at, until = match[1], match[2], match[3] or "inf"
+    refusal = line_refusal(str(line), f"kill in {where}")
+    node, *words = str(line).split() or [""]
     if node not in ("plant", *COMMANDERS):
-        raise ParameterError(
-            f"The kill {str(line)!r} in {where} names '{node}'; it may name "
-            f"{', '.join(('plant', *COMMANDERS))}."
-        )
-    try:
-        kill = Kill(node, float(at), float(until))
-    except ValueError:
-        kill = Kill(node, 0.0, 0.0)
-    if not 0 <= kill.at < kill.until:
-        raise ParameterError(
-            f"The kill {str(line)!r} in {where} needs times in s, the second after the first."
-        )
-    return kill
+        raise refusal(f"its node is one of {', '.join(('plant', *COMMANDERS))}")
+    if words[:1] != ["at"]:
+        raise refusal("it must be NODE at SECONDS [until SECONDS]")
+    at, until = parse_times(words, node, 0.0, refusal)
+    if at < 0.0:
+        raise refusal(f"it is at {at:g} s, before the flight begins")
+    return Kill(node, at, until)
 
 
 def _parse_published(rows: Any, path: Path) -> tuple[Published, ...]:

@@ -545,18 +545,19 @@ def test_kills_of_nodes(line: str, kills: tuple[Kill, ...]) -> None:
     ("lines", "sentence"),
     [
         ("planner at 1", "'kills' in here is 'planner at 1', not a list of lines NODE at SECONDS."),
-        (["planner"], "The kill 'planner' in here is not NODE at SECONDS [until SECONDS]."),
-        (
-            ["viewer at 1"],
-            "The kill 'viewer at 1' in here names 'viewer'; it may name plant, planner, "
-            "coordinated_control.",
-        ),
         *(
-            ([line], f"The kill '{line}' in here needs times in s, the second after the first.")
-            for line in (
-                *("plant at x", "plant at -1", "plant at 2 until 2", "plant at 2 until 1"),
-                *("plant at inf", "plant at nan"),
-            )
+            ([line], f"The kill in here '{line}' is refused: {reason}.")
+            for line, reason in {
+                "planner": "it must be NODE at SECONDS [until SECONDS]",
+                "planner until 5": "it must be NODE at SECONDS [until SECONDS]",
+                "viewer at 1": "its node is one of plant, planner, coordinated_control",
+                "plant at x": "'x' is not a finite number",
+                "plant at inf": "'inf' is not a finite number",
+                "plant at nan": "'nan' is not a finite number",
+                "plant at -1": "it is at -1 s, before the flight begins",
+                "plant at 2 until 2": "it ends at 2 s and begins at 2 s",
+                "plant at 2 until 1": "it ends at 1 s and begins at 2 s",
+            }.items()
         ),
     ],
 )
