@@ -47,9 +47,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from spacerobot_ros.model.compilation import dense_function
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.external_loads import ExternalLoads, LoadLayout, external_loads
-from spacerobot_ros.model.inertial_parameters import rotational, symmetric
+from spacerobot_ros.model.inertial_parameters import rotational, sparse_constant, symmetric
 from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
 
@@ -254,7 +253,7 @@ def motion_forces(
         rate = kin.axis[k] * qdot[k - 1]
         push = ca.SX(3, 1) if qddot is None else kin.axis[k] * qddot[k - 1]
         # A difference of origins would keep CasADi from cancelling and sharing terms.
-        arm = kin.R[i] @ _to_constant(kin.robot.bodies[k].origin.r)
+        arm = kin.R[i] @ sparse_constant(kin.robot.bodies[k].origin.r)
         if kin.is_revolute(k):
             accelerations.append(accelerations[i] + A[i] @ arm)
             omegas.append(omegas[i] + rate)
@@ -504,7 +503,3 @@ def _angular_operator(omega: ca.SX, alpha: ca.SX) -> ca.SX:
     """Return ``hat(alpha) + hat(omega)^2`` (3, 3)."""
     squares = symmetric(omega @ omega.T)
     return ca.skew(alpha) - rotational(squares)
-
-
-def _to_constant(vector: Array) -> ca.DM:
-    return ca.sparsify(ca.DM(vector))

@@ -219,14 +219,14 @@ class MassProperties:
         self._inertias = [body.inertia for body in robot.bodies]
         self.masses: tuple[float | ca.SX, ...] = tuple(each.mass for each in self._inertias)
         self.centers: tuple[ca.DM | ca.SX, ...] = tuple(
-            _to_constant(each.com) for each in self._inertias
+            sparse_constant(each.com) for each in self._inertias
         )
         self.total: float | ca.SX = robot.total_mass
         self.inputs: dict[str, ca.SX] = {}
 
     def inertia(self, k: int, R: ca.SX) -> ca.SX:
         """Return the inertia (3, 3) of body k about its centre, turned by R, kg m^2."""
-        return R @ _to_constant(self._inertias[k].about_com) @ R.T
+        return R @ sparse_constant(self._inertias[k].about_com) @ R.T
 
     def second_moment(self, k: int, R: ca.SX) -> ca.SX:
         """Return the second moment of mass ``tr(I)/2 1 - I`` (3, 3) of body k, turned by R, kg m^2.
@@ -238,7 +238,7 @@ class MassProperties:
         moments, axes = np.linalg.eigh(np.trace(about) / 2 * np.eye(3) - about)
         J = moments[1] * ca.SX.eye(3)
         for moment, axis in ((moments[0], axes[:, 0]), (moments[2], axes[:, 2])):
-            u = R @ _to_constant(axis)
+            u = R @ sparse_constant(axis)
             J = J + symmetric(((moment - moments[1]) * u) @ u.T)
         return J
 
@@ -311,5 +311,6 @@ def symmetric(matrix: ca.SX) -> ca.SX:
     return ca.tril2symm(ca.tril(matrix))
 
 
-def _to_constant(array: Array) -> ca.DM:
+def sparse_constant(array: Array) -> ca.DM:
+    """Return constants for expressions, in which zeros take no operations."""
     return ca.sparsify(ca.DM(array))
