@@ -550,6 +550,7 @@ def test_kills_of_nodes(line: str, kills: tuple[Kill, ...]) -> None:
             for line, reason in {
                 "planner": "it must be NODE at SECONDS [until SECONDS]",
                 "planner until 5": "it must be NODE at SECONDS [until SECONDS]",
+                "recorder at 5": "its node is one of plant, planner, coordinated_control",
                 "viewer at 1": "its node is one of plant, planner, coordinated_control",
                 "plant at x": "'x' is not a finite number",
                 "plant at inf": "'inf' is not a finite number",

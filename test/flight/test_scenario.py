@@ -152,11 +152,6 @@ def test_kills_are_read_in_order_of_time() -> None:
         Kill("coordinated_control", 6.0, float("inf")),
         Kill("plant", 20.0, float("inf")),
     )
-    for line in ("plant at 5 until 5", "plant at 5 until 4", "plant at -1", "plant at nan"):
-        with pytest.raises(ParameterError, match="the second after the first"):
-            parse_kills([line], "a test")
-    with pytest.raises(ParameterError, match="names 'recorder'"):
-        parse_kills(["recorder at 5"], "a test")
 
 
 @pytest.mark.parametrize("prefix", ["", "/", "/**/", "/robot_1/", "/*/"])
