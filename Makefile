@@ -81,6 +81,10 @@ $(STAMP)/axe.min.js: | $(STAMP)/test
 accessibility: $(STAMP)/test $(STAMP)/axe.min.js ## check contrast, names and keys of all pages with axe-core; pictures in out/pages
 	SPACEROBOT_PICTURES=out/pages $(BIN)/python3 -m pytest -m slow -rs test/viewer/test_accessibility.py
 
+.PHONY: page-pictures
+page-pictures: $(STAMP)/test ## drive the live page in flight, desktop and phone, dark and light; pictures in out/pages
+	SPACEROBOT_PICTURES=out/pages $(BIN)/python3 -m pytest -m slow -rs test/viewer/test_page_pictures.py
+
 .PHONY: fuzz
 fuzz: $(STAMP)/test ## try more than ten thousand inputs that nobody would send, and count them
 	SPACEROBOT_FUZZ=long $(BIN)/python3 -m pytest -q test/fuzz

@@ -23,11 +23,14 @@ from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight
 from spacerobot_ros.measures import Outcome, metrics_of
 from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.goal import Tolerance
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.scenario import load_scenario
-from spacerobot_ros.viewer.content import goal_errors
+from spacerobot_ros.viewer.content import goal_errors, status_html
 from spacerobot_ros.viewer.state import StackState
 
 pytest.importorskip("mcap_ros2")
@@ -70,6 +73,26 @@ def truth_in(bag: Path) -> Truth:
     turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_quat(goal[3:])
     distance = float(np.linalg.norm(goal[:3] - pose[:3]))
     return Truth(distance, float(turn.magnitude()), pose, goal)
+
+
+def end_effector_errors_in(bag: Path) -> tuple[float, float] | None:
+    """Return distance, m, and angle, rad, of a controller's end-effector from its goal at the end
+    of a bag; None: it has no such goal.
+    """
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    last: dict[str, np.ndarray] = {}
+    topics = ["/end_effector_pose", "/end_effector/goal_pose"]
+    with bag.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages(topics):
+            last[channel.topic] = _vector(message.pose)
+    if len(last) < 2:
+        return None
+    pose, goal = (last[topic] for topic in topics)
+    turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_quat(goal[3:])
+    return float(np.linalg.norm(goal[:3] - pose[:3])), float(turn.magnitude())
 
 
 def shape_error_in(bag: Path) -> np.ndarray:
@@ -156,6 +179,82 @@ def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
     live = goal_errors(state_of(flight), ForwardKinematics(flight.robot))["base"]
     assert live.angle is not None
     same(live.distance, live.angle, 9)
+    head = live_head(flight, bag)
+    line = next(text for text in head if text.startswith("base is "))
+    same(shown(line, r"base is # m"), shown(line, r"and # rad"), 3)
+    assert ("m (not controlled)" in line) is not position_counts
+    limits = [f"{flight.tolerance('position'):.3g} m"] if position_counts else []
+    limits += [f"{flight.tolerance('attitude'):.3g} rad"]
+    assert f"(tolerance {', '.join(limits)})" in line
+
+
+def assert_all_say_of_the_end_effector(bag: Path, flight: Flight) -> None:
+    """Compare the errors of a controller's end-effector likewise."""
+    found = end_effector_errors_in(bag)
+    assert found is not None
+    distance, angle = found
+    summary = flight.summary() | {"bag": str(bag), "messages_recorded": 0}
+    assert summary["end_effector_position_error_m"] == pytest.approx(distance, rel=1e-9)
+    assert flight.robot is not None
+    metrics = metrics_of(flight.measured(clearance=False), flight.robot)
+    assert metrics["end_effector_position_error_m"] == pytest.approx(distance, rel=1e-9)
+    report = FlightReport.of(open_flight_bag(bag))
+    texts = Cells(page(report, PagePart(""), [])).texts
+    card = " ".join(texts[texts.index("End-effector error") :][:3])
+    lines = _summary_lines(summary | {"plan_time_s": 0.0, "wall_time_s": 1.0})
+    printed = next(line for line in lines if line.startswith("end-effector"))
+    live = next(x for x in live_head(flight, bag) if x.startswith("end_effector is "))
+    numbers = (
+        shown(card, r"error # m"),
+        shown(printed, r"\) m, # m"),
+        shown(live, r"end_effector is # m"),
+    )
+    assert numbers == pytest.approx((distance,) * 3, rel=6e-3)
+    if flight.turns_end_effector:
+        assert summary["end_effector_attitude_error_rad"] == pytest.approx(angle, rel=1e-9)
+        turns = (
+            shown(card, r" # rad;"),
+            shown(printed, r"and # rad"),
+            shown(live, r"and # rad"),
+        )
+        assert turns == pytest.approx((angle,) * 3, rel=6e-3)
+    else:
+        assert "end_effector_attitude_error_rad" not in summary
+        assert "rad" not in card
+        assert "rad" not in printed
+        assert f"{angle:.3g} rad (not controlled) from its goal" in live
+
+
+def live_head(flight: Flight, bag: Path) -> list[str]:
+    """Return the lines of the live page at the end of a flight, while its goal is pursued."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    assert flight.robot is not None
+    state = state_of(flight)
+    with bag.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages(
+            ["/end_effector_pose", "/end_effector/goal_pose"]
+        ):
+            pose = _vector(message.pose)
+            if channel.topic == "/end_effector_pose":
+                state = replace(state, tool=pose)
+            else:
+                goals = {**state.goals, "end_effector": Goal(pose[:3], pose[3:])}
+                state = replace(state, goals=goals)
+    if isinstance(flight.status, PlannerStatus):
+        # Planners of earlier versions, and of their bags, did not name the parts.
+        left_out = flight.not_controlled
+        flying = replace(flight.status, state=PlannerState.EXECUTING, not_controlled=left_out)
+        state = replace(state, planner=flying)
+    else:
+        state = replace(state, controller=flight.status)
+    position, attitude = flight.tolerance("position"), flight.tolerance("attitude")
+    assert position is not None
+    assert attitude is not None
+    errors = goal_errors(state, ForwardKinematics(flight.robot))
+    return Cells(status_html(state, errors, Tolerance(position, attitude))).texts
 
 
 def state_of(flight: Flight) -> StackState:
@@ -175,6 +274,9 @@ def test_errors_of_recorded_flights(name: str, position_counts: bool) -> None:
     bag = BAGS / f"{name}.mcap"
     flight = read_flight(open_flight_bag(bag))
     assert_all_say(bag, flight, position_counts=position_counts)
+    if name == "servicer_thrusters":
+        assert flight.turns_end_effector
+        assert_all_say_of_the_end_effector(bag, flight)
     # The report reads the goals in the messages, the terminal that of the scenario.
     assert flight.verdict.sentence == read_run(bag).verdict.sentence
     if name == "planar_chain":
@@ -223,3 +325,4 @@ def test_errors_of_a_flight_that_is_aborted(tmp_path: Path) -> None:
     flight.save(tmp_path / "aborted.mcap")
     read = read_flight(open_flight_bag(tmp_path / "aborted.mcap"))
     assert_all_say(tmp_path / "aborted.mcap", read, position_counts=True)
+    assert_all_say_of_the_end_effector(tmp_path / "aborted.mcap", read)

@@ -161,6 +161,8 @@ class Page:
     def tick(self, label: str) -> None:
         """Press the checkbox with a label."""
         self._window.evaluate(f"{_fields(label)}[0].click()")
+        # Of clicks within 50 ms, which nobody does, viser sends the first and the last.
+        self._window.evaluate("new Promise(done => setTimeout(done, 100))")
 
     def choose(self, label: str, option: str) -> None:
         """Choose an option of the menu with a label."""
@@ -188,7 +190,10 @@ class Page:
 
     def slide(self, share: float) -> None:
         """Press the page's slider at a share of its length."""
-        box = "document.querySelector('[role=slider]').parentElement.getBoundingClientRect()"
+        slider = "document.querySelector('[role=slider]').parentElement"
+        self._window.evaluate(f"{slider}.scrollIntoView({{block: 'center'}})")
+        self.draw()
+        box = f"{slider}.getBoundingClientRect()"
         x, y = self._window.evaluate(f"(b => [b.x + {share} * b.width, b.y + b.height / 2])({box})")
         self._window.mouse("mouseMoved", x, y)
         self._window.mouse("mousePressed", x, y, held=True)

@@ -1,0 +1,230 @@
+"""The page in flight, desktop and phone, dark and light: the robot is visible, no text is cut off.
+
+`make page-pictures` keeps the pictures in out/pages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.chromium import Browser, browser, chromium, keep_picture
+from support.up import PATIENCE, Up
+from support.viewer_page import Page
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(chromium() is None, reason="no Chromium to open the page with"),
+]
+
+SIZES = {"desktop": (1440, 900), "phone": (390, 844)}
+
+# A browser without a graphics card leaves little of the processor: it draws less often.
+RATE = ("--set", "viewer.update_rate=8")
+
+_NODE = """
+(name => {
+  const viewer = window.__viserMutable, node = viewer.nodeRefFromName[name];
+  node.updateWorldMatrix(true, false);
+  return node.matrixWorld.elements.slice(12, 15);
+})
+"""
+
+_UNDER = """
+(([x, y, z]) => {
+  const {camera} = window.__viserMutable;
+  camera.updateMatrixWorld();
+  const at = camera.position.clone().set(x, y, z).project(camera);
+  const [px, py] = [(at.x + 1) / 2 * innerWidth, (1 - at.y) / 2 * innerHeight];
+  const element = document.elementFromPoint(px, py);
+  return [px, py, element ? element.tagName : "nothing"];
+})
+"""
+"""The pixel of a point of the scene, and the element that is seen there."""
+
+_CUT = """
+[...document.querySelectorAll("button, label, [role=tab], .mantine-Text-root, div")]
+  .filter(each => each.checkVisibility() && !each.closest("canvas"))
+  .filter(each => [...each.childNodes].some(part => part.nodeType === 3 && part.data.trim()))
+  .filter(each => each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0)
+  .filter(each => getComputedStyle(each).overflowX !== "visible")
+  .map(each => each.textContent.trim().slice(0, 60))
+"""
+"""Texts that are wider than the element that clips them."""
+
+
+class Looked:
+    """A page that is looked at in both sizes and both themes."""
+
+    def __init__(self, window: Browser, url: str) -> None:
+        self.window = window
+        self.page = Page(window, url, *SIZES["desktop"])
+        # A notice of browsers without a graphics card, which covers the scene.
+        window.evaluate("document.querySelector('.mantine-Notification-root button')?.click()")
+
+    def at(self, node: str) -> np.ndarray:
+        """Return where a node of the scene is in the world, m."""
+        return np.array(self.window.evaluate(f"{_NODE}({node!r})"))
+
+    def element_at(self, point: np.ndarray) -> str:
+        """Return the kind of element that is seen where a point of the scene is."""
+        x, y, element = self.window.evaluate(f"{_UNDER}({point.tolist()})")
+        assert x >= 0
+        assert y >= 0
+        return str(element)
+
+    def keep(self, name: str) -> None:
+        """Check and keep the page in both sizes and both themes."""
+        for size, (width, height) in SIZES.items():
+            self.window.call(
+                "Emulation.setDeviceMetricsOverride",
+                width=width, height=height, deviceScaleFactor=1, mobile=width < 600,
+            )  # fmt: skip
+            self.page.draw()
+            self.page.press("Look at the robot")
+            self.window.wait_for(
+                f"({_UNDER}({_NODE}('/robot')))[2] === 'CANVAS'"  # Not below the panel.
+            )
+            assert self.window.evaluate("document.documentElement.scrollWidth") <= width
+            for theme in ("dark", "light"):
+                self.window.wait_for(
+                    "document.documentElement.dataset.mantineColorScheme === " + repr(theme)
+                )
+                self.window.evaluate(
+                    "document.querySelectorAll('.mantine-ScrollArea-viewport')"
+                    ".forEach(each => each.scrollTo(0, 0))"
+                )
+                self.page.draw()
+                assert self.window.evaluate(_CUT) == [], (name, size, theme)
+                keep_picture(self.window, f"{name}-{theme}-{size}")
+                self.page.press("Dark or light")
+        self.window.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=SIZES["desktop"][0], height=SIZES["desktop"][1],
+            deviceScaleFactor=1, mobile=False,
+        )  # fmt: skip
+
+
+@contextmanager
+def flying(folder: Path, domain: int, *words: str) -> Iterator[tuple[Up, Looked]]:
+    """A stack and its page."""
+    up = Up(folder, domain, *words, *RATE)
+    try:
+        with browser(folder / "profile") as window:
+            yield up, Looked(window, up.url)
+            assert window.complaints == []
+    finally:
+        up.close()
+
+
+def ghost_color(looked: Looked) -> list[float]:
+    """Return red, green and blue of the ghost, 0 to 1."""
+    return list(
+        looked.window.evaluate(
+            "(() => { let found = null; window.__viserMutable.nodeRefFromName['/goal/ghost']"
+            ".traverse(each => { if (each.isMesh) found = each.material.color; });"
+            "return [found.r, found.g, found.b]; })()"
+        )
+    )
+
+
+def test_a_goal_that_is_partly_controlled_is_amber_and_the_ghost_is_where_the_robot_ends(
+    tmp_path: Path, ros_domain: int
+) -> None:
+    with flying(tmp_path, ros_domain, "arm_attitude") as (_, looked):
+        page = looked.page
+        page.wait_for_text("Waiting for a goal pose.", "Goal reachable")
+        page.type("Roll, pitch, yaw (deg)", [4, 3, 8])
+        page.type("Goal (m)", [0.3, 0.16, 0.0])
+        page.wait_for_text(
+            "Goal partly reachable", "'area_loop' does not control the position: it ends 0.34"
+        )
+        looked.keep("partly-reachable")
+        red, green, blue = ghost_color(looked)
+        assert red > green > blue
+        left = np.linalg.norm(looked.at("/goal") - looked.at("/goal/ghost"))
+        assert left == pytest.approx(0.34, abs=0.01)
+        assert np.linalg.norm(looked.at("/goal/ghost") - looked.at("/robot")) < 0.03
+        page.press("Fly")
+        page.wait_for_text("executing", "Not controlled: position.", " m (not controlled) and ")
+        looked.keep("partly-controlled")
+        assert ghost_color(looked) == [red, green, blue]
+
+
+def test_layers_settings_and_views_of_a_flight_of_an_end_effector(
+    tmp_path: Path, ros_domain: int
+) -> None:
+    with flying(tmp_path, ros_domain, "reach") as (up, looked):
+        page = looked.page
+        page.wait_for_text("Waiting for a goal pose.")
+        up.goal("--end-effector-position", "1.0", "0.6", "0.7", "--end-effector", "link_7")
+        # The page shows the goal of others, and where the plan ends.
+        page.wait_for_text("The robot flies to where the ghost is.", "link_7 is")
+        assert page.numbers("Goal (m)") == [1.0, 0.6, 0.7]
+        page.wait_for_text("reached")
+        looked.keep("end-effector")
+        page.press("Layers")
+        for layer in ("Frames", "Collision shapes", "Names"):
+            page.tick(layer)
+        looked.window.wait_for(
+            "Object.keys(window.__viserMutable.nodeRefFromName).some(n => n.includes('collision'))"
+        )
+        looked.keep("layers")
+        for layer in ("Frames", "Collision shapes", "Names"):
+            page.tick(layer)
+        page.press("Layers")
+        page.choose("Setting", "Grid")
+        looked.keep("grid")
+        page.choose("Setting", "Space")
+        for view in ("Front", "Side", "Top"):
+            page.press(view)
+            page.draw()
+            assert looked.element_at(looked.at("/robot")) == "CANVAS"
+            keep_picture(looked.window, f"view-{view.lower()}")
+        for tab in ("Plots", "Joints", "Log"):
+            page.press(tab)
+            looked.keep(f"tab-{tab.lower()}")
+
+
+def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
+    tmp_path: Path, ros_domain: int
+) -> None:
+    with flying(tmp_path, ros_domain, "servicer_thrusters") as (_, looked):
+        page = looked.page
+        page.wait_for_text("Goal reachable")
+        page.type("Goal (m)", [0.8, 0.4, 0.2])
+        page.wait_for_text("Goal reachable", without="being moved")
+        page.press("Fly")
+        page.wait_for_text("s to go.", "from the reference", "(tolerance 0.0005 m, 0.001 rad)")
+        looked.keep("controlled")
+        page.slide(0.3)
+        page.wait_for_text("Looking back")
+        looked.keep("look-back")
+        page.press("Back to the present")
+        page.press("Abort goal")
+        page.wait_for_text("Aborted on request; the robot holds.", "Plant running")
+        looked.keep("aborted")
+        page.press("Stop all")
+        page.wait_for_text("Plant latched", "stopped on request")
+        looked.keep("stopped")
+
+
+def test_nodes_that_die_and_the_end_of_the_stack(tmp_path: Path, ros_domain: int) -> None:
+    with flying(tmp_path, ros_domain, "reach", "--processes") as (up, looked):
+        page = looked.page
+        page.wait_for_text("Waiting for a goal pose.")
+        up.kill("planner")
+        page.wait_for_text("Node 'planner' was ended by SIGKILL. It is started again.")
+        looked.keep("restarted")
+        up.kill_until("planner", "3 times within a minute, which is the limit (--restarts).")
+        assert up.process.wait(PATIENCE) == 2
+        page.wait_for_text("This page shows its last state, and steers nothing")
+        # Buttons do nothing any more: one picture.
+        keep_picture(looked.window, "ended-light-desktop")
+        ended: Any = looked.window.evaluate("document.body.innerText")
+        assert "Planner executing" not in ended
+        looked.window.complaints.clear()  # The page asks for its viewer.
