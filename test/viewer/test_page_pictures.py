@@ -77,7 +77,7 @@ class Looked:
         assert y >= 0
         return str(element)
 
-    def keep(self, name: str) -> None:
+    def keep(self, name: str, *, tab: str = "Goal") -> None:
         """Check and keep the page in both sizes and both themes."""
         for size, (width, height) in SIZES.items():
             self.window.call(
@@ -85,6 +85,7 @@ class Looked:
                 width=width, height=height, deviceScaleFactor=1, mobile=width < 600,
             )  # fmt: skip
             self.page.draw()
+            self.page.press(tab)  # Another size begins with the first one.
             self.page.press("Look at the robot")
             self.window.wait_for(
                 f"({_UNDER}({_NODE}('/robot')))[2] === 'CANVAS'"  # Not below the panel.
@@ -186,8 +187,7 @@ def test_layers_settings_and_views_of_a_flight_of_an_end_effector(
             assert looked.element_at(looked.at("/robot")) == "CANVAS"
             keep_picture(looked.window, f"view-{view.lower()}")
         for tab in ("Plots", "Joints", "Log"):
-            page.press(tab)
-            looked.keep(f"tab-{tab.lower()}")
+            looked.keep(f"tab-{tab.lower()}", tab=tab)
 
 
 def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
