@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,31 @@ def test_killed_nodes_go_on_to_the_goal(tmp_path: Path) -> None:
     assert not ((commands.stamp > 12.0) & (commands.stamp <= 14.0)).any()
     # The recorder needs a moment to find the plant again; the flight goes on to its end.
     assert states.stamp[-1] > 80.0
+
+
+@pytest.mark.slow
+def test_nodes_that_are_killed_between_capture_and_goal_go_on_with_the_held_body(
+    tmp_path: Path,
+) -> None:
+    """First the controller, then the plant: the momenta are those of the thrust all the time."""
+    kills = parse_kills(["coordinated_control at 2 until 3", "plant at 6 until 8"], "the test")
+    scenario = (
+        replace(load_scenario("capture").in_real_time(1.0), kills=kills)
+        .with_overrides("plant", {"tick_rate": 50.0})
+        .with_overrides("coordinated_control", {"tick_rate": 50.0, "settle_time": 8.0})
+        .with_overrides("recorder", {"flush_period": 0.1})
+    )
+    result = run_scenario(scenario, tmp_path / "run.mcap", processes=True)
+    assert result.succeeded, result.message
+    bag = read_bag(tmp_path / "run.mcap")
+    momenta, expected = (
+        np.array([each[:6] for each in bag[topic].field("data")])
+        for topic in ("/momentum", "/momentum_expected")
+    )
+    # The robot is alone in the first state: the target's momentum is not its own.
+    assert np.abs(momenta[1:2]).max() > 0.1
+    count = min(len(momenta), len(expected))
+    np.testing.assert_allclose(momenta[-count:], expected[-count:], rtol=0, atol=1e-12)
 
 
 def test_kills_need_processes_in_real_time(tmp_path: Path) -> None:
