@@ -7,8 +7,8 @@ from spacerobot_ros.batch.flights import (
     Flights,
     FollowedSchedule,
     HeldCommands,
+    InitialStates,
     SensorErrors,
-    Starts,
 )
 from spacerobot_ros.batch.lanes import fly_lanes
 from spacerobot_ros.batch.scalar import fly_one_by_one
@@ -23,8 +23,8 @@ __all__ = [
     "Flights",
     "FollowedSchedule",
     "HeldCommands",
+    "InitialStates",
     "SensorErrors",
-    "Starts",
     "SteppedFlights",
     "fly_lanes",
     "fly_one_by_one",

@@ -15,7 +15,7 @@ from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.reference import (
-    Errors,
+    OutputErrors,
     ReferenceProfile,
     profile_expression,
     profile_numbers,
@@ -232,7 +232,7 @@ class BatchController:
             rate_share = ca.fmax(rate_share, ca.fabs(rate) * (1.0 / limit))
         monitor = GoalMonitor(0.0, *ca.vertsplit(memory))
         verdict = monitor.decide(
-            time, time >= profile[0], Errors(**largest), rate_share, error_share, self._config
+            time, time >= profile[0], OutputErrors(**largest), rate_share, error_share, self._config
         )
         command = ca.vertcat(actuation[6:], actuation[:6])
         outputs = command, exact, measured, ca.vertcat(*astuple(monitor)[1:]), verdict

@@ -40,7 +40,7 @@ NOISES = (
 
 
 @dataclass(frozen=True)
-class Starts:
+class InitialStates:
     """Initial states, one row per flight; see :class:`.InitialState`.
 
     Attributes
@@ -65,7 +65,7 @@ class Starts:
     is_center_of_mass: npt.NDArray[np.bool_]
 
     @classmethod
-    def of(cls, robot: SpaceRobot, initial: Sequence[InitialState]) -> Starts:
+    def of(cls, robot: SpaceRobot, initial: Sequence[InitialState]) -> InitialStates:
         """Return initial states as rows.
 
         Raises
@@ -88,7 +88,7 @@ class Starts:
         )
 
     @classmethod
-    def repeated(cls, robot: SpaceRobot, initial: InitialState, count: int) -> Starts:
+    def repeated(cls, robot: SpaceRobot, initial: InitialState, count: int) -> InitialStates:
         """Return ``count`` equal rows, of which the caller may change columns.
 
         Raises
@@ -289,7 +289,7 @@ class Flights:
     actuation: str
     control_period: float
     ticks: int
-    starts: Starts
+    starts: InitialStates
     program: FlightProgram
     inertial: InertialParameters | None = None
     sensors: SensorErrors | None = None

@@ -22,7 +22,7 @@ from spacerobot_ros.batch.flights import (
     HeldCommands,
     SensorErrors,
 )
-from spacerobot_ros.batch.native import CompiledTick, Job, Pending, Program
+from spacerobot_ros.batch.native import CommandProgram, CompiledTick, Job, PendingStep
 from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of, pose_of_link
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.reference import ReferenceProfile
@@ -47,9 +47,9 @@ _CHUNK_TICKS = 2000
 """Number of ticks, with their noise, between two checks for signals."""
 
 _PROGRAMS = {
-    HeldCommands: Program.HELD,
-    FollowedSchedule: Program.FOLLOWED,
-    Controlled: Program.CONTROLLED,
+    HeldCommands: CommandProgram.HELD,
+    FollowedSchedule: CommandProgram.FOLLOWED,
+    Controlled: CommandProgram.CONTROLLED,
 }
 
 Flags = npt.NDArray[np.bool_]
@@ -86,7 +86,7 @@ def _fly_all_in_lanes(flights: Flights) -> BatchResult:
     rows = np.flatnonzero(fit)
     size = _block_size(flights, tick)
     for first in range(0, len(rows), size):
-        block = Block(flights, tick, model, p, rows[first : first + size])
+        block = LaneBlock(flights, tick, model, p, rows[first : first + size])
         block.fly(result, failures)
     engine = f"{tick.unit.lanes} lanes ({tick.unit.name})"
     return replace(result, engine=engine, failures=failures)
@@ -130,7 +130,7 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
     return int(groups * lanes)
 
 
-class Block:
+class LaneBlock:
     """Memory of the flights that are in lanes at the same time.
 
     Surplus lanes repeat the last flight; their results are dropped.
@@ -320,12 +320,12 @@ class Block:
 
     def begin_stepping(self) -> None:
         """Prepare for :meth:`restart` and :meth:`step`: surplus lanes are idle."""
-        self._job.program = Program.GIVEN
+        self._job.program = CommandProgram.GIVEN
         count = len(self._flown)
         self.idle(np.arange(count, count + self._surplus))
         self._write_rows("h", np.full(len(self._rows_of_lanes), self._flights.control_period))
 
-    def continue_from(self, other: Block) -> None:
+    def continue_from(self, other: LaneBlock) -> None:
         """Take over the states of a block of the same flights, whose model has other masses."""
         for name in ("state", "before", "momenta", "r_cm", "alive"):
             if name in self._rows.slices:
@@ -411,15 +411,15 @@ class Block:
     def _step_outside_lanes(self, result: BatchResult, failures: dict[int, str]) -> None:
         """Do the step that lanes wait for: a command, an allocation, or a tick of the plant."""
         rows, alive = self._rows, self._rows.first("alive")
-        steps: dict[Pending, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
-            Pending.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._step_lane)
+        steps: dict[PendingStep, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
+            PendingStep.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._step_lane)
         }
         if self._tick.controller is not None:
-            steps[Pending.TICK] = rows.first("exact"), self._command_lane
+            steps[PendingStep.TICK] = rows.first("exact"), self._command_lane
         if self._modulator is not None:
-            steps[Pending.FIRE] = rows.first("unallocated"), self._allocate_lane
+            steps[PendingStep.FIRE] = rows.first("unallocated"), self._allocate_lane
         for group in np.flatnonzero(self._pending):
-            waiting, step = steps[Pending(self._pending[group])]
+            waiting, step = steps[PendingStep(self._pending[group])]
             lanes = (self._memory[group, waiting] != 0.0) & (self._memory[group, alive] != 0.0)
             for lane in np.flatnonzero(lanes):
                 index = int(group * self._lanes + lane)

@@ -2,7 +2,8 @@
 
 CasADi's functions become C++ in which every number is a vector register; ``driver.hpp`` loops over
 ticks and groups of lanes. Everything that Python and C++ have in common is declared here once and
-generated as C++: the rows of a group's memory (:class:`Rows`), the enumerations, and :class:`Job`.
+generated as C++: the rows of a group's memory (:class:`RowLayout`), the enumerations, and
+:class:`Job`.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ def vector_unit() -> VectorUnit:
     return next((unit for flag, unit in UNITS.items() if flag in flags), _PORTABLE_UNIT)
 
 
-class Program(IntEnum):
+class CommandProgram(IntEnum):
     """Kind of commands: held, along a schedule, of a controller, or given before each step."""
 
     HELD = 0
@@ -93,7 +94,7 @@ class Program(IntEnum):
     GIVEN = 3
 
 
-class Pending(IntEnum):
+class PendingStep(IntEnum):
     """Step of a tick that a group of lanes waits for."""
 
     NOTHING = 0
@@ -112,7 +113,7 @@ _JOB_MEMBERS = (
     ("unsigned char *", "pending", "(groups,) Pending"),
     ("double", "period", "s"),
     ("long long", "period_ns", ""),
-    ("long long", "program", "Program"),
+    ("long long", "program", "CommandProgram"),
     ("const double *", "table", "(ticks, COMMANDS); each_table: (groups, ticks, COMMANDS, LANES)"),
     ("long long", "table_ticks", "FOLLOWED: the table has shapes, one more than ticks"),
     ("long long", "each_table", ""),
@@ -143,7 +144,7 @@ class Job(ctypes.Structure):
     _fields_ = [(name, _MEMBER_TYPES.get(kind, ctypes.c_void_p)) for kind, name, _ in _JOB_MEMBERS]
 
 
-class Rows:
+class RowLayout:
     """The rows of a group's memory by name; a row is one number of each flight in the group."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
@@ -193,7 +194,7 @@ class CompiledTick:
 
     library: Any
     unit: VectorUnit
-    rows: Rows
+    rows: RowLayout
     report_width: int
     link: str = ""
     controller: BatchController | None = None
@@ -272,7 +273,7 @@ class CompiledTick:
             if function := functions.get(kind):
                 sizes |= {each: function.nnz_in(i) for i, each in enumerate(arguments[kind])}
                 sizes |= {each: function.nnz_out(i) for i, each in enumerate(results[kind])}
-        rows = Rows(
+        rows = RowLayout(
             {
                 **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
                 **{"limits": n if effort else 2 * n, "peak_rate": n, "peak_effort": n},
@@ -410,7 +411,7 @@ def _compile_library(
 
 
 def _shared_declarations(
-    rows: Rows,
+    rows: RowLayout,
     constants: Mapping[str, int],
     arrays: Mapping[str, Iterable[int]],
     spans: Mapping[str, Iterable[tuple[int, int, int]]],
@@ -420,7 +421,7 @@ def _shared_declarations(
     lines.append("namespace row {")
     lines += [f"constexpr long long {name} = {at.start};" for name, at in rows.slices.items()]
     lines.append("}")
-    for enum in (Program, Pending, Decision):
+    for enum in (CommandProgram, PendingStep, Decision):
         members = ", ".join(f"{each.name} = {each.value}" for each in enum)
         lines.append(f"namespace {enum.__name__.lower()} {{ enum {{ {members} }}; }}")
     lines.append("struct Span { long long from, to, count; };  // rows")

@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.batch.flights import BatchResult, Counts, Flights, HeldCommands, Starts
-from spacerobot_ros.batch.lanes import Block, starts_accepted_by_plant, symbolic_model_of
+from spacerobot_ros.batch.flights import BatchResult, Counts, Flights, HeldCommands, InitialStates
+from spacerobot_ros.batch.lanes import LaneBlock, starts_accepted_by_plant, symbolic_model_of
 from spacerobot_ros.batch.native import CompiledTick
 from spacerobot_ros.batch.scalar import plant_of, pose_of_link
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
@@ -89,7 +89,7 @@ class SteppedFlights:
         robot: SpaceRobot,
         actuation: str,
         control_period: float,
-        starts: Starts,
+        starts: InitialStates,
         inertial: InertialParameters | None = None,
         *,
         integration_step: float = 0.0,
@@ -107,7 +107,7 @@ class SteppedFlights:
         # Rows are replaced at resets: the arrays are copies.
         self._flights = Flights(
             *(robot, actuation, control_period, 1),
-            Starts(*(getattr(starts, each.name).copy() for each in fields(starts))),
+            InitialStates(*(getattr(starts, each.name).copy() for each in fields(starts))),
             HeldCommands(np.zeros((1, robot.n))),
             InertialParameters(
                 inertial.masses.copy(), inertial.centers.copy(), inertial.inertias.copy()
@@ -145,7 +145,7 @@ class SteppedFlights:
         return np.asarray(self.ticks * self.control_period)
 
     def reset(
-        self, rows: npt.ArrayLike, starts: Starts, inertial: InertialParameters | None = None
+        self, rows: npt.ArrayLike, starts: InitialStates, inertial: InertialParameters | None = None
     ) -> None:
         """Begin some flights anew; the others are not changed.
 
@@ -286,12 +286,12 @@ class _Lanes:
         self._result = BatchResult.empty(flights)
         self._block = self._new_block()
 
-    def _new_block(self) -> Block:
+    def _new_block(self) -> LaneBlock:
         flights = self._flights
         self._model, p = symbolic_model_of(flights)
         tick = CompiledTick.of(flights, self._model, self._link)
         self.name = f"{tick.unit.lanes} lanes ({tick.unit.name})"
-        block = Block(flights, tick, self._model, p, np.arange(len(flights)))
+        block = LaneBlock(flights, tick, self._model, p, np.arange(len(flights)))
         block.begin_stepping()
         return block
 

@@ -16,7 +16,7 @@ from spacerobot_ros.batch import (
     Flights,
     FollowedSchedule,
     HeldCommands,
-    Starts,
+    InitialStates,
     fly_lanes,
     fly_one_by_one,
 )
@@ -217,7 +217,7 @@ class _LaneCase:
         inertial = robot.inertial.scaled(
             rng.uniform(low, high, (count, bodies)), rng.uniform(low, high, (count, bodies))
         )
-        starts = Starts.repeated(robot, InitialState(), count)
+        starts = InitialStates.repeated(robot, InitialState(), count)
         starts.position[:] = 0.01 * rng.normal(size=(count, 3))
         program = (
             HeldCommands(self.commands)

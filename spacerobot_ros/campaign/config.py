@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from spacerobot_ros.campaign.targets import DrawnFlight, Target, description_of, targets_of
+from spacerobot_ros.campaign.targets import (
+    DispersionTarget,
+    DrawnFlight,
+    description_of,
+    targets_of,
+)
 from spacerobot_ros.errors import ParameterError, printable
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.measures import CLEARANCE, METRICS, metric_names
@@ -75,7 +80,7 @@ class Distribution:
 class Dispersion:
     """A quantity that varies from flight to flight, and its distribution."""
 
-    target: Target
+    target: DispersionTarget
     distribution: Distribution
 
     @property
@@ -327,7 +332,7 @@ _ARGUMENT_HELP = {
 """Meaning of loc and scale in messages about unknown arguments."""
 
 
-def _read_distribution(target: Target, given: Any) -> Distribution:
+def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
     name = target.name
     if not isinstance(given, dict) or len(given) != 1:
         raise ParameterError(
@@ -374,7 +379,7 @@ def _read_distribution(target: Target, given: Any) -> Distribution:
     return Distribution(str(kind), values)
 
 
-def _read_choice(target: Target, value: Any) -> Any:
+def _read_choice(target: DispersionTarget, value: Any) -> Any:
     """Return a value to choose from, a text or a finite number as its target takes it."""
     if target.text:
         if not isinstance(value, str):
@@ -385,7 +390,7 @@ def _read_choice(target: Target, value: Any) -> Any:
     )
 
 
-def _require_node_accepts(target: Target, value: Any, scenario: Scenario) -> None:
+def _require_node_accepts(target: DispersionTarget, value: Any, scenario: Scenario) -> None:
     """Refuse a value that a node would refuse in every flight."""
     flight = target.apply(DrawnFlight.of(scenario), value)
     for node in ("plant", *scenario.commanders):

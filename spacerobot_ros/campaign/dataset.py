@@ -261,9 +261,9 @@ class Dataset:
         ParameterError
             The dataset has no rows.
         """
-        return self.unsorted().sort_by("flight")
+        return self.table_in_written_order().sort_by("flight")
 
-    def unsorted(self, columns: Sequence[str] | None = None) -> Any:
+    def table_in_written_order(self, columns: Sequence[str] | None = None) -> Any:
         """Return all rows as a pyarrow table, as they were written.
 
         Columns that are not among ``columns`` are not read; those that no file has are left out.

@@ -21,8 +21,8 @@ from spacerobot_ros.batch import (
     Decision,
     Flights,
     FollowedSchedule,
+    InitialStates,
     SensorErrors,
-    Starts,
     fly_lanes,
 )
 from spacerobot_ros.batch.flights import BatchResult
@@ -472,7 +472,7 @@ def _batch_of_flights(
         actuation="effort" if isinstance(program, Controlled) else "velocity",
         control_period=plants[0].control_period,
         ticks=ticks,
-        starts=Starts.of(robot, [InitialState.of(plant) for plant in plants]),
+        starts=InitialStates.of(robot, [InitialState.of(plant) for plant in plants]),
         program=program,
         inertial=InertialParameters.stacked([each.inertial or nominal for each in drawn]),
         sensors=SensorErrors.of(robot, [plant.sensors for plant in plants]),

@@ -106,14 +106,14 @@ class Columns(Mapping[str, Any]):
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
         self._known: dict[str, Any] = {}
-        numbers = dataset.unsorted(["flight"])["flight"].to_numpy()
+        numbers = dataset.table_in_written_order(["flight"])["flight"].to_numpy()
         self._order = np.argsort(numbers, kind="stable")
         self._known["flight"] = numbers[self._order].astype(float)
 
     def read(self, names: Iterable[str]) -> None:
         """Read columns together: each file is opened once."""
         left = [name for name in names if name not in self._known]
-        table = self._dataset.unsorted(left)
+        table = self._dataset.table_in_written_order(left)
         text = require_module("pyarrow").string()
         for name in left:
             self._known[name] = None
@@ -356,7 +356,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
         if message and outcome in (ERROR, Outcome.REFUSED, Outcome.ABORTED)
     ]
     found = results.influences()
-    drivers = [each for each in found if each.beyond_chance]
+    drivers = [each for each in found if each.is_significant]
     lines += [f"driver      {each}" for each in _sort_passing_first(drivers)[:3]]
     if found and not drivers:
         lines.append(f"driver      none: {NO_INFLUENCES_TEXT}")
@@ -577,7 +577,7 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
     note += "that grows to both sides correlates with the distance of the draw from its median."
     if not sobol:
         note += " The sampler 'saltelli' adds Sobol indices."
-    if not any(each.beyond_chance for each in found):
+    if not any(each.is_significant for each in found):
         note += f" Here {NO_INFLUENCES_TEXT}"
     return f'<p class="facts">{escape(note)}</p>' + table("drivers", head, rows)
 

@@ -92,7 +92,7 @@ class Influence:
     total: tuple[float, float] | None = None
 
     @property
-    def beyond_chance(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the total index, or else the larger correlation, is unlikely to be by chance."""
         if self.total is not None:
             return self.total[0] > self.total[1]

@@ -55,7 +55,7 @@ TARGET_KINDS = (
 
 
 @dataclass(frozen=True)
-class Target:
+class DispersionTarget:
     """One number (or text) that differs from flight to flight.
 
     Attributes
@@ -106,7 +106,7 @@ class DrawnFlight:
     inertia: Array
     com: Array
     parameters: InertialParameters
-    physical: bool
+    is_physical: bool
     has_target_masses: bool = False
 
     @classmethod
@@ -124,7 +124,7 @@ class DrawnFlight:
             inertia=np.ones(count),
             com=np.zeros((count, 3)),
             parameters=parameters,
-            physical=_are_exactly_physical(parameters),
+            is_physical=_are_exactly_physical(parameters),
         )
 
     def with_overrides(self, node: str, parameters: Mapping[str, Any]) -> DrawnFlight:
@@ -152,7 +152,7 @@ class DrawnFlight:
         small, large = factors.min(), factors.max()
         # Positive factors leave the ratios of principal moments: the slow check is not needed.
         mild = _LEAST_FACTOR < small <= large < 1.0 / _LEAST_FACTOR
-        if self.physical and mild and np.isfinite(self.com).all():
+        if self.is_physical and mild and np.isfinite(self.com).all():
             return
         self.inertial.require_physical([body.name for body in self.nominal.bodies])
 
@@ -208,7 +208,7 @@ def _load_description(robot: str, text: str, world: str) -> RobotDescription:
 # -- names ------------------------------------------------------------------------------------
 
 
-def targets_of(name: str, scenario: Scenario) -> list[Target]:
+def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
     """Return the targets of a name: one, or one for each body.
 
     Raises
@@ -239,7 +239,7 @@ def targets_of(name: str, scenario: Scenario) -> list[Target]:
     )
 
 
-def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Target:
+def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> DispersionTarget:
     if node not in ("plant", *scenario.commanders):
         raise ParameterError(
             f"'{name}' is of a node that does not fly: the scenario '{scenario.name}' flies with "
@@ -267,18 +267,20 @@ def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Ta
     return _list_entry_target(name, node, declaration, index, scenario)
 
 
-def _scalar_target(name: str, node: str, declaration: Parameter, value: Any) -> Target:
+def _scalar_target(name: str, node: str, declaration: Parameter, value: Any) -> DispersionTarget:
     whole = isinstance(declaration.default, int)
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         return flight.with_overrides(node, {declaration.name: round(drawn) if whole else drawn})
 
-    return Target(name, apply, declaration.unit, isinstance(value, str), frozenset({name}))
+    return DispersionTarget(
+        name, apply, declaration.unit, isinstance(value, str), frozenset({name})
+    )
 
 
 def _list_entry_target(
     name: str, node: str, declaration: Parameter, index: str, scenario: Scenario
-) -> Target:
+) -> DispersionTarget:
     """Return the target of a number in a list, by its index or by its joint."""
     values = _list_values(name, node, declaration, scenario)
     of_joints = declaration.of_joints or (node == "plant" and declaration.length is None)
@@ -300,7 +302,7 @@ def _list_entry_target(
         return flight.with_overrides(node, {declaration.name: values})
 
     one = frozenset({f"{node}.{declaration.name}[{place}]"})
-    return Target(name, apply, declaration.unit, False, one)
+    return DispersionTarget(name, apply, declaration.unit, False, one)
 
 
 def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenario) -> list[float]:
@@ -342,8 +344,10 @@ def _find_bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
     return [(names.index(name), name)]
 
 
-def _mass_property_targets(kind: str, dot: str, rest: str, scenario: Scenario) -> list[Target]:
-    def target(bodies: Sequence[tuple[int, str]], name: str) -> Target:
+def _mass_property_targets(
+    kind: str, dot: str, rest: str, scenario: Scenario
+) -> list[DispersionTarget]:
+    def target(bodies: Sequence[tuple[int, str]], name: str) -> DispersionTarget:
         indices = [index for index, _ in bodies]
 
         def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
@@ -351,14 +355,16 @@ def _mass_property_targets(kind: str, dot: str, rest: str, scenario: Scenario) -
             factors[indices] *= float(drawn)
             return replace(flight, **{kind: factors})
 
-        return Target(name, apply, "1", False, frozenset(f"{kind}.{body}" for _, body in bodies))
+        return DispersionTarget(
+            name, apply, "1", False, frozenset(f"{kind}.{body}" for _, body in bodies)
+        )
 
     if not dot:
         return [target(_find_bodies("*", scenario), kind)]
     return [target([body], f"{kind}.{body[1]}") for body in _find_bodies(rest, scenario)]
 
 
-def _center_targets(rest: str, scenario: Scenario) -> list[Target]:
+def _center_targets(rest: str, scenario: Scenario) -> list[DispersionTarget]:
     body, dot, axis = rest.rpartition(".")
     if rest == "*":
         body, dot, axis = "*", ".", "*"
@@ -375,16 +381,16 @@ def _center_targets(rest: str, scenario: Scenario) -> list[Target]:
     ]
 
 
-def _center_target(index: int, column: int, name: str) -> Target:
+def _center_target(index: int, column: int, name: str) -> DispersionTarget:
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         com = flight.com.copy()
         com[index, column] += float(drawn)
         return replace(flight, com=com)
 
-    return Target(name, apply, "m", False, frozenset({name}))
+    return DispersionTarget(name, apply, "m", False, frozenset({name}))
 
 
-def _floating_target(name: str, part: str, scenario: Scenario) -> Target:
+def _floating_target(name: str, part: str, scenario: Scenario) -> DispersionTarget:
     """Return a mass property of the body that floats beside the robot."""
     if load_target(scenario.plant.target) is None:
         raise ParameterError(
@@ -409,10 +415,10 @@ def _floating_target(name: str, part: str, scenario: Scenario) -> Target:
         given = target_parameters(urdf_with(target, parameters))
         return replace(flight.with_overrides("plant", given), has_target_masses=True)
 
-    return Target(name, apply, "m" if column >= 0 else "1", False, frozenset({name}))
+    return DispersionTarget(name, apply, "m" if column >= 0 else "1", False, frozenset({name}))
 
 
-def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
+def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> DispersionTarget:
     part, _, axis = rest.partition(".")
     if kind == "initial" and part == "joints":
         return _initial_joint_target(name, axis, scenario)
@@ -443,7 +449,9 @@ def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Target:
     sets = {name}
     if kind == "initial" and part == "position":
         sets = {f"plant.initial_{what}[{column}]" for what in ("position", "center_of_mass")}
-    return Target(name, apply, "m" if part == "position" else "rad", False, frozenset(sets))
+    return DispersionTarget(
+        name, apply, "m" if part == "position" else "rad", False, frozenset(sets)
+    )
 
 
 def _move_start(flight: DrawnFlight, part: str, offset: Array) -> DrawnFlight:
@@ -457,7 +465,7 @@ def _move_start(flight: DrawnFlight, part: str, offset: Array) -> DrawnFlight:
     return flight.with_overrides("plant", {"initial_orientation": turned.tolist()})
 
 
-def _initial_joint_target(name: str, joint: str, scenario: Scenario) -> Target:
+def _initial_joint_target(name: str, joint: str, scenario: Scenario) -> DispersionTarget:
     joints = list(description_of(scenario).joint_names)
     if joint not in joints:
         raise ParameterError(
@@ -472,10 +480,10 @@ def _initial_joint_target(name: str, joint: str, scenario: Scenario) -> Target:
         return flight.with_overrides("plant", {"initial_joint_positions": values})
 
     one = frozenset({f"plant.initial_joint_positions[{index}]"})
-    return Target(name, apply, "m or rad", False, one)
+    return DispersionTarget(name, apply, "m or rad", False, one)
 
 
-def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Target:
+def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> DispersionTarget:
     faults = scenario.plant.faults
     if index >= len(faults):
         raise ParameterError(
@@ -490,7 +498,7 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Targe
         lines[index] = _edit_fault_line(lines[index].split(), part, repr(float(drawn)))
         return flight.with_overrides("plant", {"faults": lines})
 
-    return Target(name, apply, "" if part == "value" else "s", False, frozenset({name}))
+    return DispersionTarget(name, apply, "" if part == "value" else "s", False, frozenset({name}))
 
 
 def _edit_fault_line(words: list[str], part: str, text: str) -> str:

@@ -17,7 +17,7 @@ from spacerobot_ros.cli.options import (
     METHODS,
     EndEffectorOptions,
     GoalOptions,
-    Registered,
+    RegisteredName,
     attitude_options,
     bag_option,
     end_effector_options,
@@ -44,7 +44,9 @@ if TYPE_CHECKING:
 @end_effector_options
 @goal_options
 @click.option(
-    "--method", type=Registered(METHODS, LAWS), help="Gait method or control law [the scenario's]."
+    "--method",
+    type=RegisteredName(METHODS, LAWS),
+    help="Gait method or control law [the scenario's].",
 )
 @settings_option
 @bag_option("Bag to write [out/SCENARIO.mcap, or the next free name].")

@@ -349,7 +349,7 @@ def warn_of_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> Non
         )
 
 
-class Registered(_Choice):
+class RegisteredName(_Choice):
     """A choice of the names in registries, which are imported when the names are needed.
 
     Parameters

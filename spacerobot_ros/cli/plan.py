@@ -16,7 +16,7 @@ from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import (
     METHODS,
     GoalOptions,
-    Registered,
+    RegisteredName,
     end_effector_options,
     goal_options,
     json_option,
@@ -42,7 +42,7 @@ _NO_GOAL = GoalOptions(None, None, None)
 @click.argument("scenario", metavar="SCENARIO|ROBOT")
 @end_effector_options
 @goal_options
-@click.option("--method", type=Registered(METHODS), help="Gait method [the scenario's].")
+@click.option("--method", type=RegisteredName(METHODS), help="Gait method [the scenario's].")
 @settings_option
 @json_option("Write schedule and predicted path as JSON.")
 @picture_option("Draw schedule and predicted path (.png, .svg, .pdf).")
@@ -58,7 +58,7 @@ _NO_GOAL = GoalOptions(None, None, None)
 )
 @within_option((0.3, 180.0), "With --random: largest")
 @click.option(
-    "--beside", type=Registered(METHODS), help="With --random: plan them by this method too."
+    "--beside", type=RegisteredName(METHODS), help="With --random: plan them by this method too."
 )
 def plan_command(
     scenario: str,

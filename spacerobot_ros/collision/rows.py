@@ -61,7 +61,7 @@ SQUARE_ROOT_OFFSET = 1e-10
 
 
 @dataclass(frozen=True)
-class Form:
+class SmoothForm:
     """The form of a solid in rows: a rounded box in the frame of its link, and balls in it.
 
     ``balls`` are the middles (K, 3), m, in the frame of the link, of balls of ``radius``.
@@ -77,7 +77,7 @@ class Form:
         return bool(np.count_nonzero(self.box.half) < 2)
 
     @classmethod
-    def of(cls, solid: Solid) -> Form:
+    def of(cls, solid: Solid) -> SmoothForm:
         """Return the form of a solid."""
         shape = solid.shape
         if shape.kind == "cylinder" and shape.size[1] >= _MIN_CYLINDER_LENGTH_RATIO * shape.size[0]:
@@ -109,7 +109,7 @@ class Form:
         return cls(box, _moved(box.pose, points[surface]), radius)
 
     @classmethod
-    def _rod(cls, box: RoundedBox) -> Form:
+    def _rod(cls, box: RoundedBox) -> SmoothForm:
         longest = int(np.argmax(box.half))
         half = box.half[longest]
         count = int(
@@ -174,7 +174,8 @@ class DistanceRows:
         multipliers = ca.SX.sym("lambda", len(pairs))
         solids = geometry.solids
         rows = [
-            _row(robot, solids[i], solids[j], q) for i, j in geometry.pairs[list(pairs)].tolist()
+            _distance_row(robot, solids[i], solids[j], q)
+            for i, j in geometry.pairs[list(pairs)].tolist()
         ]
         d = ca.vertcat(*rows)
         hessian = ca.SX(q.numel(), q.numel())
@@ -202,7 +203,7 @@ class DistanceRows:
         R_X = symbolic_rotations.matrix_from_quaternion(X / ca.norm_2(X))
         of_link = R_X @ R_BL, R_X @ (r_BL - center_of_mass(q))
         of_world = ca.reshape(w[:9], 3, 3), w[9:]
-        d = _smooth_distance((Form.of(link), Form.of(obstacle)), [of_link, of_world])
+        d = _smooth_distance((SmoothForm.of(link), SmoothForm.of(obstacle)), [of_link, of_world])
         hessian = ca.hessian(multiplier * d, y)[0]
         return cls(
             ca.Function("distances", [y, w], [ca.cse(d)]),
@@ -219,12 +220,14 @@ def world_values(R_0W: Array, r_0W: Array) -> Array:
     return np.concatenate([R_0W.T.ravel(), r_0W])
 
 
-def _row(robot: RobotDescription, first: Solid, second: Solid, q: ca.SX) -> ca.SX:
-    forms = Form.of(first), Form.of(second)
+def _distance_row(robot: RobotDescription, first: Solid, second: Solid, q: ca.SX) -> ca.SX:
+    forms = SmoothForm.of(first), SmoothForm.of(second)
     return _smooth_distance(forms, _relative_poses(robot, first, second, q))
 
 
-def _smooth_distance(forms: tuple[Form, Form], poses: Sequence[tuple[ca.SX, ca.SX]]) -> ca.SX:
+def _smooth_distance(
+    forms: tuple[SmoothForm, SmoothForm], poses: Sequence[tuple[ca.SX, ca.SX]]
+) -> ca.SX:
     """Return the approximate distance of two forms, whose links are at poses in one frame, m."""
     values = []
     for balls, field in ball_and_field_roles(*forms):
@@ -236,7 +239,7 @@ def _smooth_distance(forms: tuple[Form, Form], poses: Sequence[tuple[ca.SX, ca.S
     return _smooth_minimum(ca.vertcat(*values), SHARPNESS_OF_MINIMUM)
 
 
-def ball_and_field_roles(first: Form, second: Form) -> list[tuple[int, int]]:
+def ball_and_field_roles(first: SmoothForm, second: SmoothForm) -> list[tuple[int, int]]:
     """Return which of two forms are balls and which are fields."""
     if first.is_rod and second.is_rod:
         return [(0, 1)] if len(first.balls) <= len(second.balls) else [(1, 0)]
@@ -351,11 +354,13 @@ class CompiledRows:
         moving = np.abs(robot.coupling[0][np.array(bodies) - 1]).any(axis=0)
         return DistanceRows(
             ca.Function("distances", [q], [value(q, pair)]),
-            ca.Function("distances_jac", [q], [_only(jacobian(q, pair), moving[np.newaxis])]),
+            ca.Function(
+                "distances_jac", [q], [_without_zero_entries(jacobian(q, pair), moving[np.newaxis])]
+            ),
             ca.Function(
                 "distances_hess",
                 [q, multiplier],
-                [_only(hessian(q, pair, multiplier), np.outer(moving, moving))],
+                [_without_zero_entries(hessian(q, pair, multiplier), np.outer(moving, moving))],
             ),
         )
 
@@ -397,14 +402,16 @@ class _Tables:
 
     def add(self, links: Sequence[Solid]) -> None:
         """Add a pair of links; of none, one without rows."""
-        forms = [Form.of(each) for each in links]
+        forms = [SmoothForm.of(each) for each in links]
         roles = ball_and_field_roles(forms[0], forms[1]) if forms else []
         self._pairs.append(_structure([len(self._roles), len(roles)]))
         for balls, field in roles:
             self._add_role(links[balls], forms[balls], links[field], forms[field])
 
-    def _add_role(self, solid: Solid, form: Form, field_solid: Solid, field: Form) -> None:
-        first, way = _way(self._robot, field_solid, field, solid)
+    def _add_role(
+        self, solid: Solid, form: SmoothForm, field_solid: Solid, field: SmoothForm
+    ) -> None:
+        first, way = _joints_between_links(self._robot, field_solid, field, solid)
         places = [len(self._steps), len(way), len(self._balls), len(form.balls)]
         numbers = [field.box.radius + form.radius, *field.box.half, *first.R.ravel(), *first.r]
         self._roles.append(_structure([int(field.is_rod), *places], numbers))
@@ -451,8 +458,8 @@ def _structure(integers: Sequence[int], numbers: Iterable[float] = ()) -> str:
     return f"{{{', '.join(values)}}}"
 
 
-def _way(
-    robot: RobotDescription, field_solid: Solid, field: Form, solid: Solid
+def _joints_between_links(
+    robot: RobotDescription, field_solid: Solid, field: SmoothForm, solid: Solid
 ) -> tuple[Pose, list[_Step]]:
     """Return the way from the frame of a field to the link of a solid: a pose, and the joints."""
     pose_of_field = robot.frames[field_solid.link][1] @ field.box.pose
@@ -483,7 +490,7 @@ def _joints_between(robot: RobotDescription, start: int, end: int) -> list[tuple
     return [(i, False) for i in reversed(back[common:])] + [(i, True) for i in out[common:]]
 
 
-def _only(matrix: ca.MX, kept: npt.NDArray[np.bool_]) -> ca.MX:
+def _without_zero_entries(matrix: ca.MX, kept: npt.NDArray[np.bool_]) -> ca.MX:
     """Return a matrix without entries that are always zero."""
     return ca.project(matrix, ca.sparsify(ca.DM(kept.astype(float))).sparsity())
 

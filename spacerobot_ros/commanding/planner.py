@@ -367,4 +367,4 @@ class PlannerCommander(Commander):
                 case Transition(source, event, target):
                     host.log("debug", f"{source.value} -> {target.value}: {event.value}")
                     if self.trajectories is not None:
-                        self.trajectories.phase_changed(target)
+                        self.trajectories.on_phase_change(target)

@@ -137,7 +137,7 @@ class TrajectoryOutput:
         self._server.cancel(self._sent)
         self._end(TrajectoryEnd(why, final=True))
 
-    def phase_changed(self, phase: Phase) -> None:
+    def on_phase_change(self, phase: Phase) -> None:
         """Cancel the schedule if the planner has left it."""
         sent = self._sent
         if sent is None or phase in _PHASES_OF_MOTION:

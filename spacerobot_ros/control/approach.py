@@ -139,20 +139,20 @@ class ApproachPlan:
     distance: float = math.inf
 
     @property
-    def closes_at(self) -> float:
+    def closing_time(self) -> float:
         """When the end-effector leaves the standoff."""
         return self.start + self.outward.duration + self.standoff_time
 
     @property
     def contact(self) -> float:
         """When the end-effector has the pose of the grapple frame."""
-        return self.closes_at + self.closing.duration
+        return self.closing_time + self.closing.duration
 
     def relative(self, times: Array) -> RelativeMotionOverTime:
         """Return the motion relative to the grapple frame at times (K,) from the start on."""
         out = self.outward.at(times - self.start)
-        inward = self.closing.at(np.maximum(times - self.closes_at, 0.0))
-        late = (times >= self.closes_at)[:, np.newaxis]
+        inward = self.closing.at(np.maximum(times - self.closing_time, 0.0))
+        late = (times >= self.closing_time)[:, np.newaxis]
         names = ("x", "xdot", "xddot", "phi", "phidot", "phiddot")
         return RelativeMotionOverTime(
             *(np.where(late, getattr(inward, name), getattr(out, name)) for name in names)
@@ -331,7 +331,7 @@ def plan_approach(
                 ticks = np.r_[0:first:every, first:last:every]
                 shapes = np.concatenate([reach.waiting(len(ticks) - len(shapes)), shapes])
                 # A hand that is planned for in motion may be beside the target already.
-                closes = 0 if moving else int(np.sum(ticks * _SAMPLE_PERIOD < plan.closes_at))
+                closes = 0 if moving else int(np.sum(ticks * _SAMPLE_PERIOD < plan.closing_time))
                 near = clearance.nearest(reach.base, shapes, grapple.rows(ticks), closes)
                 if near is not None and near.distance < clearance.least:
                     break

@@ -12,7 +12,7 @@ from spacerobot_ros.control.detumbling import DetumbleOptions
 from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import MotionLimits
-from spacerobot_ros.control.reference import PROFILES, Errors
+from spacerobot_ros.control.reference import PROFILES, OutputErrors
 from spacerobot_ros.control.wheels import WheelOptions
 from spacerobot_ros.model.shared_parameters import CommanderConfig
 from spacerobot_ros.parameters import group, parameter, registered
@@ -35,9 +35,9 @@ class ErrorMargin:
         minimum=0.0,
     )
 
-    def as_errors(self) -> Errors:
+    def as_errors(self) -> OutputErrors:
         """Return the margins: infinite for 0, and for joints, which have limits of their own."""
-        return Errors(self.position or math.inf, self.attitude or math.inf, math.inf)
+        return OutputErrors(self.position or math.inf, self.attitude or math.inf, math.inf)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from spacerobot_ros.control.laws.law import ControlLaw, Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import ActuatorLimits, JointRateLimits, MotionLimits, Saturated
 from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
-from spacerobot_ros.control.reference import PROFILES, Errors, ReferenceProfile, StepReference
+from spacerobot_ros.control.reference import PROFILES, OutputErrors, ReferenceProfile, StepReference
 from spacerobot_ros.control.state import (
     Actuation,
     ControlState,
@@ -104,7 +104,7 @@ class CoordinatedController:
         self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
         self.coming_to_rest = False
         """Whether the robot is being brought to rest, at any pose."""
-        self._to_rest: Callable[[ControlState], Actuation] = rates.to_rest
+        self._to_rest: Callable[[ControlState], Actuation] = rates.braking_command
 
     def reset(self) -> None:
         """Drop goals and measurements; the next state counts as the first."""
@@ -116,7 +116,7 @@ class CoordinatedController:
         if self.wheels is not None:
             self.wheels.reset()
 
-    def continue_for(self, other: CoordinatedController) -> None:
+    def take_over_goals(self, other: CoordinatedController) -> None:
         """Pursue the goals of another controller from now on."""
         self.profile, self._began = other.profile, other._began
         self._followed, self.coming_to_rest = other._followed, other.coming_to_rest
@@ -152,7 +152,7 @@ class CoordinatedController:
             goal = replace(goal, joints=JointReference.at_rest(joints))
         motion = self._motion.within_thruster_limits(self._limits, self.law.robot, state.q)
         if self.wheels is not None:
-            motion = self.wheels.motion_within(motion, state.q)
+            motion = self.wheels.limits_with_wheels(motion, state.q)
         self.profile = self._profile_type(start, goal, motion)
         self._began = time
 
@@ -173,7 +173,7 @@ class CoordinatedController:
         ``law`` returns the command for a state, not limited; None: that of the joint rate limits.
         """
         self.coming_to_rest = True
-        self._to_rest = law or self.joint_rate_limits.to_rest
+        self._to_rest = law or self.joint_rate_limits.braking_command
 
     def detumbling(self, payload: Payload | None, torque_limit: float) -> Detumbling:
         """Return the law that brings the robot to rest by its thrusters, wheels and joints.
@@ -271,14 +271,14 @@ class CoordinatedController:
         self, wheels: WheelControl, state: ControlState, commanded: Actuation, periods: int
     ) -> Saturated:
         """Return the realised part of a command on the gyrostat, by wheels first."""
-        given = self._give(wheels, commanded)
+        given = self._realised_with_wheels(wheels, commanded)
         kept = self.joint_rate_limits.apply(state, given, self._limits.effort, periods)
         if kept is not given:
             # Joints that are too fast have the wrench lowered.
-            kept = self._give(wheels, kept)
+            kept = self._realised_with_wheels(wheels, kept)
         return Saturated.of(commanded, kept)
 
-    def _give(self, wheels: WheelControl, wanted: Actuation) -> Actuation:
+    def _realised_with_wheels(self, wheels: WheelControl, wanted: Actuation) -> Actuation:
         """Return what wheels and then thrusters and joints give of a command."""
         torque = wheels.give(wanted.wrench_B[3:])
         rest = wanted.wrench_B.copy()
@@ -315,12 +315,12 @@ class CoordinatedController:
         """Time at which the reference reaches its goal, s; None without a reference."""
         return None if self.profile is None else self._began + self.profile.duration
 
-    def errors(self) -> Errors:
+    def errors(self) -> OutputErrors:
         """Return the errors of the last command's outputs from the reference."""
         worst, error = {"position": 0.0, "attitude": 0.0, "joints": 0.0}, self.law.error.tolist()
         for kind, places in self._distances:
             worst[kind] = max(worst[kind], math.hypot(*[error[i] for i in places]))
-        return Errors(**worst)
+        return OutputErrors(**worst)
 
     def distance_from_reference(self) -> OutputDistance:
         """Return the distance of the last command's outputs from the reference."""
@@ -339,7 +339,7 @@ class CoordinatedController:
         """Return the error of each output by its label."""
         return dict(zip(self.law.outputs.labels, self.law.error.tolist(), strict=True))
 
-    def error_bounds(self, margins: Errors) -> Array:
+    def error_bounds(self, margins: OutputErrors) -> Array:
         """Return the errors (m,) of the outputs beyond which control is lost.
 
         Call it after the first command towards the present goals. The bound is the same for all

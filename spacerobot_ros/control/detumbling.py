@@ -177,8 +177,8 @@ class Detumbling:
         C = robot.bias(state.q, v_cm, state.omega_WB_B, state.qdot)
         # A force at the base turns the robot about its centre of mass, too.
         to_cm = J[:3, 3:6].T
-        n = _within(-r * self.angular_momentum(state), self.torque)
-        f = _within(-r * robot.total_mass * v_cm, self._force)
+        n = _limit_norm(-r * self.angular_momentum(state), self.torque)
+        f = _limit_norm(-r * robot.total_mass * v_cm, self._force)
         f = f * largest_share(n, -(to_cm @ f), self.torque) if f.any() else f
         wanted = np.concatenate([f, n, -r * state.qdot])
 
@@ -202,6 +202,6 @@ class Detumbling:
         return Actuation(np.concatenate([force, torque]), tau)
 
 
-def _within(vector: Array, limit: float) -> Array:
+def _limit_norm(vector: Array, limit: float) -> Array:
     size = float(np.linalg.norm(vector))
     return vector if size <= limit else vector * (limit / size)

@@ -13,7 +13,7 @@ from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
-from spacerobot_ros.control.servicing import Progress, Servicing, Task, TaskState
+from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, TaskState
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError
@@ -318,7 +318,7 @@ class ControlExecutive:
         The goal begins anew at the next measured state; without a goal the robot holds where it
         held. ``payload`` is the body that the robot holds from now on.
         """
-        controller.continue_for(self.controller)
+        controller.take_over_goals(self.controller)
         self.controller = controller
         self.servicing.hold(payload)
         self._begin_anew = self._goal_state is ControllerState.TRACKING
@@ -521,7 +521,7 @@ class ControlExecutive:
         self._next_report, self._error_bounds = time, None
         self._save(self._pending)
 
-    def _end_tasks(self, time: float, state: ControlState, progress: Progress) -> None:
+    def _end_tasks(self, time: float, state: ControlState, progress: TaskProgress) -> None:
         """Give up the tasks, and the goals after them, and hold the measured pose."""
         goal_id = self._latest_id() if self._pending else self._goal_id
         self._give_up(progress.message)

@@ -12,7 +12,7 @@ from enum import IntEnum
 from typing import Any
 
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.reference import Errors
+from spacerobot_ros.control.reference import OutputErrors
 
 Scalar = Any
 """A number or a CasADi symbol."""
@@ -92,7 +92,7 @@ class GoalMonitor:
         return self.large_error_states >= LOST_STATES
 
     def decide_by_errors(
-        self, time: Scalar, at_rest: Scalar, errors: Errors, config: ControllerConfig
+        self, time: Scalar, at_rest: Scalar, errors: OutputErrors, config: ControllerConfig
     ) -> Scalar:
         """Return the :class:`Decision` about a goal under control, by the errors of a state.
 
@@ -126,7 +126,7 @@ class GoalMonitor:
         self,
         time: Scalar,
         at_rest: Scalar,
-        errors: Errors,
+        errors: OutputErrors,
         rate_share: Scalar,
         error_share: Scalar,
         config: ControllerConfig,

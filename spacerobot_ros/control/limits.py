@@ -264,7 +264,7 @@ class JointRateLimits:
             share = max(share, abs(rate * inverse))
         return share
 
-    def to_rest(self, state: ControlState) -> Actuation:
+    def braking_command(self, state: ControlState) -> Actuation:
         """Return the command, not limited, under which joint rates and momenta decay.
 
         The thrusters remove both total momenta, which joint efforts do not change, and the motors

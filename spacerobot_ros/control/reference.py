@@ -32,7 +32,7 @@ _QUINTIC_PEAK_ACCELERATION = 10 / math.sqrt(3)
 
 
 @dataclass(frozen=True)
-class Errors:
+class OutputErrors:
     """Largest errors of the outputs: distances of positions (m), angles of attitudes (rad), and of
     single joints (m or rad).
     """
@@ -78,7 +78,7 @@ class ReferenceProfile(ABC):
     def at(self, time: float) -> Reference:
         """Return the reference ``time`` s after its start."""
 
-    def distances(self) -> Errors:
+    def distances(self) -> OutputErrors:
         """Return the distances between start and goal."""
         start, goal, joints = self.start, self.goal, 0.0
         if start.joints is not None and goal.joints is not None:
@@ -91,7 +91,7 @@ class ReferenceProfile(ABC):
             )
             if line is not None
         ]
-        return Errors(
+        return OutputErrors(
             max((line.length for line in lines), default=0.0),
             max((line.angle for line in lines), default=0.0),
             joints,

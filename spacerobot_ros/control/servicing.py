@@ -74,14 +74,14 @@ class TaskState(Enum):
 
 
 @dataclass(frozen=True)
-class Progress:
+class TaskProgress:
     """The state of a task, with a sentence where it is refused or has failed."""
 
     state: TaskState
     message: str = ""
 
 
-_ACTIVE, _DONE = Progress(TaskState.ACTIVE), Progress(TaskState.DONE)
+_ACTIVE, _DONE = TaskProgress(TaskState.ACTIVE), TaskProgress(TaskState.DONE)
 
 
 class MeasuredTarget:
@@ -117,7 +117,7 @@ class MeasuredTarget:
         self.motion, self.time = BodyMotion.of(pose, twist), time
 
 
-class Approach:
+class ApproachTask:
     """One approach: it is planned in its first state, and again where the target leaves its way.
 
     Parameters
@@ -139,7 +139,9 @@ class Approach:
         self._remaining = math.inf
         """Time until contact, s."""
 
-    def step(self, time: float, state: ControlState, controller: CoordinatedController) -> Progress:
+    def step(
+        self, time: float, state: ControlState, controller: CoordinatedController
+    ) -> TaskProgress:
         """Give the controller the reference of a state."""
         options = self.config.target
         target, link = self.target, controller.law.outputs.selection.end_effector_link
@@ -177,8 +179,8 @@ class Approach:
         self._far = RelativeMotion.between(hand, grapple.body_motion())
         if now > plan.contact + options.patience:
             return self._ended(
-                f"the target is missed: at contact the end-effector is {self._miss}, and nothing "
-                f"captured it within {options.patience:g} s"
+                f"the target is missed: at contact the end-effector is {self._distance_text}, and "
+                f"nothing captured it within {options.patience:g} s"
             )
         if now >= plan.start:
             moving = grapple.carrying(plan.relative(np.array([now])))
@@ -193,10 +195,10 @@ class Approach:
             return "Approaching the target."
         left = self._remaining
         when = f"contact in {left:.3g} s" if left > 0 else "in contact"
-        return f"Approaching the target: the end-effector is {self._miss}; {when}."
+        return f"Approaching the target: the end-effector is {self._distance_text}; {when}."
 
     @property
-    def _miss(self) -> str:
+    def _distance_text(self) -> str:
         far = self._far
         assert far is not None
         return (
@@ -204,10 +206,10 @@ class Approach:
             "rad/s from the grapple frame"
         )
 
-    def _ended(self, why: str) -> Progress:
+    def _ended(self, why: str) -> TaskProgress:
         if self._predicted is None:
-            return Progress(TaskState.REFUSED, f"The approach is refused: {why}.")
-        return Progress(TaskState.FAILED, f"The approach is given up: {why}.")
+            return TaskProgress(TaskState.REFUSED, f"The approach is refused: {why}.")
+        return TaskProgress(TaskState.FAILED, f"The approach is given up: {why}.")
 
     def _is_off_prediction(self, time: float, measured: BodyMotion) -> bool:
         """Whether the target is away from its predicted motion."""
@@ -256,11 +258,12 @@ class Approach:
         self._plan, self._predicted, self._planned_at = plan, target, time
         message = (
             f"The end-effector sets out at {time + plan.start:.4g} s, closes in at "
-            f"{time + plan.closes_at:.4g} s, and meets the target at {time + plan.contact:.4g} s."
+            f"{time + plan.closing_time:.4g} s, and meets the target at "
+            f"{time + plan.contact:.4g} s."
         )
         about = {
             "starts_s": f"{time + plan.start:.9g}",
-            "closes_s": f"{time + plan.closes_at:.9g}",
+            "closes_s": f"{time + plan.closing_time:.9g}",
             "contact_s": f"{time + plan.contact:.9g}",
         }
         self.events.append(Event(EventKind.APPROACH_STARTED, message, about=about))
@@ -284,7 +287,9 @@ class DetumblingTask:
         self._began = self._momentum = self._fastest = 0.0
         self._at_rest_since: float | None = None
 
-    def step(self, time: float, state: ControlState, controller: CoordinatedController) -> Progress:
+    def step(
+        self, time: float, state: ControlState, controller: CoordinatedController
+    ) -> TaskProgress:
         """Have the controller bring the robot to rest."""
         options = self.config.detumble
         if self._law is None:
@@ -305,7 +310,7 @@ class DetumblingTask:
             return _DONE
         limit = self.config.time_limit
         if limit and time - self._began > limit:
-            return Progress(
+            return TaskProgress(
                 TaskState.FAILED,
                 f"The robot is not at rest after {limit:g} s: it still turns at "
                 f"{self._fastest:.3g} rad/s, its centre of mass moves at {speed:.3g} m/s.",
@@ -363,7 +368,7 @@ class Servicing:
         self.payload: Payload | None = None
         """The body that the robot holds."""
         self._left: list[Task] = []
-        self._present: Approach | DetumblingTask | None = None
+        self._present: ApproachTask | DetumblingTask | None = None
         self._events: list[Event] = []
 
     def configure(self, config: ControllerConfig) -> None:
@@ -402,7 +407,9 @@ class Servicing:
         self.payload = payload
         self._present = None if self.task is Task.DETUMBLE else self._present
 
-    def step(self, time: float, state: ControlState, controller: CoordinatedController) -> Progress:
+    def step(
+        self, time: float, state: ControlState, controller: CoordinatedController
+    ) -> TaskProgress:
         """Work on the present task; DONE with the last one."""
         while self._left:
             if self.task is not Task.APPROACH or self.payload is None:
@@ -423,7 +430,7 @@ class Servicing:
         events, self._events = self._events, []
         return events
 
-    def _made(self, task: Task) -> Approach | DetumblingTask:
+    def _made(self, task: Task) -> ApproachTask | DetumblingTask:
         if task is Task.APPROACH:
-            return Approach(self.target, self._config)
+            return ApproachTask(self.target, self._config)
         return DetumblingTask(self.payload, self._config)

@@ -96,8 +96,8 @@ class FrameMotion:
     def carrying(self, path: RelativeMotionOverTime) -> FrameMotion:
         """Return the motion of a frame that moves relative to this one."""
         R, omega, alpha = self.R, self.omega, self.alpha
-        arm, v_rel, a_rel = (_turned(R, each) for each in (path.x, path.xdot, path.xddot))
-        w_rel, wdot_rel = (_turned(R, each) for each in path.rotation)
+        arm, v_rel, a_rel = (_rotate_vectors(R, each) for each in (path.x, path.xdot, path.xddot))
+        w_rel, wdot_rel = (_rotate_vectors(R, each) for each in path.rotation)
         return FrameMotion(
             R @ matrices_from_quaternions(quaternions_from_rotvecs(path.phi)),
             self.r + arm,
@@ -227,7 +227,7 @@ class RelativePath:
     def at(self, times: npt.ArrayLike) -> RelativeMotionOverTime:
         """Return the motion at times (K,), s since the beginning; at rest after the end."""
         t = np.minimum(np.asarray(times, dtype=float), self.duration)
-        parts = _along(self._coefficients, t)
+        parts = _evaluate_polynomials(self._coefficients, t)
         rested = np.asarray(times, dtype=float) >= self.duration
         parts[0][rested], parts[1][rested], parts[2][rested] = self._end, 0.0, 0.0
         y, ydot, yddot = parts
@@ -256,7 +256,7 @@ def _quintic(start: Sequence[Array], end: Sequence[Array], T: float) -> Array:
     return np.array([c / T**i for i, c in enumerate(scaled)])
 
 
-def _along(coefficients: Array, t: Array) -> list[Array]:
+def _evaluate_polynomials(coefficients: Array, t: Array) -> list[Array]:
     """Return values, rates and accelerations (K, m) of polynomials at times (K,)."""
     powers, c, parts = t[:, np.newaxis] ** np.arange(6), coefficients, []
     for _ in range(3):
@@ -294,7 +294,7 @@ class TorqueFreeMotion:
         inertia, grapple = self._body.inertia, self._body.grapple
         omega_T = self._rates(R)
         spin = cross(omega_T, omega_T @ inertia.about_com)
-        omega, alpha = _turned(R, omega_T), _turned(R, -spin @ self._inverse)
+        omega, alpha = _rotate_vectors(R, omega_T), _rotate_vectors(R, -spin @ self._inverse)
         arm = R @ (grapple.r - inertia.com)
         return FrameMotion(
             R @ grapple.R,
@@ -335,7 +335,7 @@ class TorqueFreeMotion:
         return quaternion_multiply(q, np.hstack([omega_T / 2, np.zeros((len(q), 1))]))
 
 
-def _turned(R: Array, vectors: Array) -> Array:
+def _rotate_vectors(R: Array, vectors: Array) -> Array:
     """Return vectors (K, 3) turned by matrices (K, 3, 3)."""
     return np.asarray(np.einsum("kij,kj->ki", R, vectors))
 
@@ -383,7 +383,7 @@ class PathInWorld:
         on_way = t < self.duration
         if not on_way.any():
             return found
-        r, v, a = _along(self._coefficients, t[on_way])
+        r, v, a = _evaluate_polynomials(self._coefficients, t[on_way])
         frame = self._target.grapple(self._start + t[on_way])
         arm, omega = r - frame.r, frame.omega
         v_rel = v - frame.v - cross(omega, arm)
@@ -391,5 +391,5 @@ class PathInWorld:
         a_rel = a_rel - 2 * cross(omega, v_rel)
         R_GW = np.swapaxes(frame.R, 1, 2)
         for values, each in ((found.x, arm), (found.xdot, v_rel), (found.xddot, a_rel)):
-            values[on_way] = _turned(R_GW, each)
+            values[on_way] = _rotate_vectors(R_GW, each)
         return found

@@ -281,7 +281,7 @@ class WheelControl:
         """Command no torque."""
         self.torque, self.thrust = np.zeros(len(self.wheels)), np.zeros(6)
 
-    def motion_within(self, motion: MotionLimits, q: Array) -> MotionLimits:
+    def limits_with_wheels(self, motion: MotionLimits, q: Array) -> MotionLimits:
         """Return limits of references that wheels alone can follow, for a shape (n - k,)."""
         if self.has_thrusters or self.rank < 3:
             return motion

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.batch import SensorErrors, Starts, SteppedFlights
+from spacerobot_ros.batch import InitialStates, SensorErrors, SteppedFlights
 from spacerobot_ros.campaign.config import Campaign, load_campaign
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.targets import DrawnFlight, description_of
@@ -128,9 +128,9 @@ class EpisodeConfig:
 
 @dataclass(frozen=True)
 class _Start:
-    """Start of an episode: one row of :class:`.Starts`, masses, and the scenario that it is of."""
+    """Start of an episode: a row of :class:`.InitialStates`, masses, and its scenario."""
 
-    starts: Starts
+    starts: InitialStates
     inertial: InertialParameters | None
     scenario: Scenario
 
@@ -158,8 +158,8 @@ class EpisodeStarts:
         self.nominal = _Start(self._row(self.scenario), None, self.scenario)
         self._made: dict[int, _Start] = {}
 
-    def _row(self, scenario: Scenario) -> Starts:
-        return Starts.of(self.robot, [InitialState.of(scenario.plant)])
+    def _row(self, scenario: Scenario) -> InitialStates:
+        return InitialStates.of(self.robot, [InitialState.of(scenario.plant)])
 
     def draw(self, rng: np.random.Generator) -> _Start:
         """Return a start; that of a campaign is one of its draws at random."""
@@ -228,7 +228,7 @@ class Episodes:
             self.robot,
             plant.actuation,
             plant.control_period,
-            Starts(
+            InitialStates(
                 *(np.repeat(getattr(first, each.name), count, axis=0) for each in fields(first))
             ),
             integration_step=plant.integration_step,
@@ -312,10 +312,10 @@ class Episodes:
         chosen = np.asarray(rows, dtype=np.int64)
         given = None if goal is None else self._checked_goals(goal)
         drawn = [self._source.draw(generators[row]) for row in chosen.tolist()]
-        starts = Starts(
+        starts = InitialStates(
             *(
                 np.concatenate([getattr(each.starts, part.name) for each in drawn])
-                for part in fields(Starts)
+                for part in fields(InitialStates)
             )
         )
         masses = [each.inertial for each in drawn if each.inertial is not None]

@@ -24,7 +24,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvecs_from_quaternions,
 )
-from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
+from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 
 LARGEST_OBSERVATION = 1e6
 """Bound of observed quantities that have none of their own; observations are clipped to it."""
@@ -153,7 +153,7 @@ class Reorient(Task):
 
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
         """Return an attitude within ``spread`` rad of the start; planar robots turn in plane."""
-        axes = Turning.of(self.robot).axes
+        axes = BaseRotations.of(self.robot).axes
         axis = rng.normal(size=3)
         if len(axes) == 1:
             axis = axes[0] * np.copysign(1.0, axis[0])

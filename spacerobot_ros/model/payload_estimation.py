@@ -88,7 +88,7 @@ class PayloadEstimate:
         """The body; None where a parameter is not determined."""
         if self.undetermined:
             return None
-        mass, h, about = _parts(self.parameters)
+        mass, h, about = _mass_moment_inertia(self.parameters)
         com = h / mass
         about_com = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
         return Payload(self.link, Inertia(float(mass), com, about_com))
@@ -219,7 +219,7 @@ def _nearest_physical_parameters(fit: _Fit) -> tuple[Array, bool]:
     if not len(fit.deviations):
         return fit.x, False
     aim, weights = fit.determined @ fit.x, fit.deviations.min() / fit.deviations
-    start = _start(fit.x)
+    start = _initial_log_cholesky(fit.x)
 
     def left(theta: Array) -> Array:
         of_data = weights * (fit.determined @ _from_log_cholesky(theta) - aim)
@@ -239,7 +239,7 @@ def _nearest_physical_parameters(fit: _Fit) -> tuple[Array, bool]:
     return (found, True) if corrected else (fit.x, False)
 
 
-def _parts(x: Array) -> tuple[float, Array, Array]:
+def _mass_moment_inertia(x: Array) -> tuple[float, Array, Array]:
     """Return mass, first moment (3,) and inertia (3, 3) of parameters (10,)."""
     about = np.zeros((3, 3))
     for value, (i, j) in zip(x[4:], INERTIA_ENTRIES, strict=True):
@@ -249,7 +249,7 @@ def _parts(x: Array) -> tuple[float, Array, Array]:
 
 def _pseudo_inertia(x: Array) -> Array:
     """Return the pseudo-inertia matrix (4, 4) of parameters (10,)."""
-    mass, h, about = _parts(x)
+    mass, h, about = _mass_moment_inertia(x)
     J = np.empty((4, 4))
     J[:3, :3] = np.trace(about) / 2 * np.eye(3) - about
     J[:3, 3] = J[3, :3] = h
@@ -257,7 +257,7 @@ def _pseudo_inertia(x: Array) -> Array:
     return J
 
 
-def _start(x: Array) -> Array:
+def _initial_log_cholesky(x: Array) -> Array:
     """Return the logarithmic Cholesky factor of a body near parameters (10,)."""
     values, vectors = np.linalg.eigh(_pseudo_inertia(x))
     size = max(float(np.abs(values).max()), 1e-12)

@@ -52,7 +52,7 @@ from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_sta
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
-from spacerobot_ros.nodes.common.streams import StreamListeners, Take
+from spacerobot_ros.nodes.common.streams import RawCallback, StreamListeners
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns, set_stamp
 from spacerobot_ros.topics import TOPICS_NOT_RECORDED
@@ -450,7 +450,7 @@ class _RecordedTransforms:
         self._frames: RobotTransforms | None = None
         self._channel = -1
 
-    def listener(self, topic: str, channel: int) -> Take | None:
+    def listener(self, topic: str, channel: int) -> RawCallback | None:
         """Return the callback of every message of a topic that is recorded one by one."""
         if topic in self._callbacks:
             self._channels[topic] = channel
@@ -461,7 +461,9 @@ class _RecordedTransforms:
     ) -> list[Derived]:
         """Return the messages that listeners derive from messages that are written together."""
         of_odom, of_joints, _ = self._channels.values()
-        odoms, joints = (_latest(channels == channel) for channel in (of_odom, of_joints))
+        odoms, joints = (
+            _last_chosen_indices(channels == channel) for channel in (of_odom, of_joints)
+        )
         latest = self._odom, self._joint_states
         if odoms[-1] >= 0:
             self._odom = messages[odoms[-1]]
@@ -482,7 +484,7 @@ class _RecordedTransforms:
             odom = latest[0] if odoms[k] < 0 else messages[odoms[k]]
             state = latest[1] if joints[k] < 0 else messages[joints[k]]
             frames = self._frames
-            if self._accept(odom, state, int(odom_ns[k])):
+            if self._read_state(odom, state, int(odom_ns[k])):
                 if frames is None:
                     static = self._static_messages(int(odom_ns[k]), int(of_state[k]))
                 after.append(int(of_state[k]))
@@ -536,7 +538,7 @@ class _RecordedTransforms:
         if not self._recording.running or self._is_published():
             return
         new = self._frames is None
-        if not self._accept(self._odom, self._joint_states, time_ns):
+        if not self._read_state(self._odom, self._joint_states, time_ns):
             return
         assert self._frames is not None
         static = self._static_messages(time_ns) if new else []
@@ -544,7 +546,7 @@ class _RecordedTransforms:
         for each in [*static, Derived(0, self._channel, message, time_ns)]:
             self._recording.record(each.channel, each.message, each.published_ns)
 
-    def _accept(self, odom: bytes, joints: bytes, time_ns: int) -> bool:
+    def _read_state(self, odom: bytes, joints: bytes, time_ns: int) -> bool:
         """Take a state whose transforms are due; return whether it is one of the robot."""
         state = self._state
         assert state is not None
@@ -574,7 +576,7 @@ class _RecordedTransforms:
         return [Derived(after, channel, static, time_ns)]
 
 
-def _latest(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
+def _last_chosen_indices(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Return for each index the last chosen index up to it; -1: none."""
     return np.maximum.accumulate(np.where(chosen, np.arange(len(chosen)), -1))
 
@@ -601,8 +603,8 @@ def _recording_callback(
     kind: Any,
     channel: int,
     clock: str = _CLOCK_TOPIC,
-    listener: Take | None = None,
-) -> Take:
+    listener: RawCallback | None = None,
+) -> RawCallback:
     """Return the callback of a topic's messages: the clock sets the time of all others.
 
     ``listener`` is called after each message that is recorded alone.
@@ -637,7 +639,7 @@ def _recording_callback(
     return recording.collector(channel, first_time, _record_and_listen(take, listener))
 
 
-def _record_and_listen(record: Take, listener: Take | None) -> Take:
+def _record_and_listen(record: RawCallback, listener: RawCallback | None) -> RawCallback:
     """Return a callback that records a message, then calls a listener."""
     if listener is None:
         return record

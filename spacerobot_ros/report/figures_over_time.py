@@ -49,7 +49,7 @@ from spacerobot_ros.report.figures import (
     sheet,
     short,
 )
-from spacerobot_ros.report.flight import FlightReport, Target, joint_unit
+from spacerobot_ros.report.flight import FlightReport, GoalSpan, joint_unit
 from spacerobot_ros.report.signals import Cycles, Indices, envelope
 
 SHOWN_CYCLES = 3
@@ -776,7 +776,7 @@ def _error_decades(values: Array, tolerance: float | None) -> int:
     return int(np.clip(np.ceil(np.log10(top / down_to)), 3, _MAX_DECADES))
 
 
-def pose_errors(pose: Signal, targets: Sequence[Target]) -> Signal:
+def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:
     """Return the goal minus poses (N, 7) while there is one: position, rotation vector (M, 6)."""
     times, values = [np.empty(0)], [np.empty((0, 6))]
     for target in targets:

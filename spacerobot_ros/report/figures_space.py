@@ -54,7 +54,7 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     indices = _choose_instants(flight)
     scenes = [
         flight.drawn.at(flight.joints[index], flight.base_at(index))
-        + flight.target_at(flight.position.time[index])
+        + flight.target_solids_at(flight.position.time[index])
         for index in indices
     ]
     across = min(len(indices), 2 if narrow() else 3)

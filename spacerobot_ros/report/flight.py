@@ -56,7 +56,7 @@ _LINK_STATES = 2000
 
 
 @dataclass(frozen=True)
-class Status:
+class TimedStatus:
     """A recorded status of the planner or the controller.
 
     Attributes
@@ -118,7 +118,7 @@ class Status:
 
 
 @dataclass(frozen=True)
-class Target:
+class GoalSpan:
     """A goal and when it was flown to, ``start`` to ``end`` in s."""
 
     start: float
@@ -364,11 +364,11 @@ class FlightReport:
         return max([0.0, *times, *(status.time for status in self.statuses)])
 
     @cached_property
-    def statuses(self) -> list[Status]:
+    def statuses(self) -> list[TimedStatus]:
         """Statuses of the planner, or else of the controller."""
         for commander in COMMANDERS:
             found = [
-                Status(time_ns / SECOND - self.bag.began, status)
+                TimedStatus(time_ns / SECOND - self.bag.began, status)
                 for time_ns, status in self.bag.statuses(commander)
             ]
             if found:
@@ -376,7 +376,7 @@ class FlightReport:
         return []
 
     @property
-    def executing(self) -> list[Status]:
+    def executing(self) -> list[TimedStatus]:
         """One status for each schedule that was flown."""
         return [status for status in self.statuses if status.executing]
 
@@ -386,12 +386,12 @@ class FlightReport:
         return frozenset[str]().union(*(status.outputs for status in self.statuses))
 
     @cached_property
-    def targets(self) -> list[Target]:
+    def targets(self) -> list[GoalSpan]:
         """Goals of the base, of the schedules; without any schedule, those that were sent."""
         return [target for target in self._all_targets if target.goal.base]
 
     @cached_property
-    def _all_targets(self) -> list[Target]:
+    def _all_targets(self) -> list[GoalSpan]:
         sent = self.flight.goals
         found = [
             (status.time, goal)
@@ -446,7 +446,7 @@ class FlightReport:
         numbers = {link: k for k, link in enumerate(kinematics.links) if link in links}
         return {link: (R_WL[:, k], r_WL[:, k]) for link, k in numbers.items()}
 
-    def _errors_of_link(self, link: str, targets: Sequence[Target]) -> LinkErrors:
+    def _errors_of_link(self, link: str, targets: Sequence[GoalSpan]) -> LinkErrors:
         time = self.position.time[self.samples(_LINK_STATES)]
         R_WL, r_WL = self._link_poses[link]
         distances, angles = [Signal.empty(1)], [Signal.empty(1)]
@@ -469,16 +469,16 @@ class FlightReport:
         return () if DEFAULT_END_EFFECTOR in self.link_goals else self.flight.end_effector_goals
 
     @property
-    def tool_targets(self) -> list[Target]:
+    def tool_targets(self) -> list[GoalSpan]:
         """Goals of the end-effector, each until the next."""
         return self._targets_until_next(self._timed_goals(self.tool_goals))
 
     def _timed_goals(self, goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
         return [(sent.time - self.bag.began, sent.goal) for sent in goals]
 
-    def _targets_until_next(self, goals: list[tuple[float, Goal]]) -> list[Target]:
+    def _targets_until_next(self, goals: list[tuple[float, Goal]]) -> list[GoalSpan]:
         ends = [*(time for time, _ in goals), self.end][1:]
-        return [Target(t, end, goal) for (t, goal), end in zip(goals, ends, strict=True)]
+        return [GoalSpan(t, end, goal) for (t, goal), end in zip(goals, ends, strict=True)]
 
     @property
     def tool_error(self) -> PoseError | None:
@@ -535,7 +535,7 @@ class FlightReport:
             return None
         return SolidRobot(self.robot, self.meshes, self.obstacles)
 
-    def target_at(self, time: float) -> Solids:
+    def target_solids_at(self, time: float) -> Solids:
         """Return the target in its pose at a time, s; empty where there is none."""
         solids, poses = Solids(), self.target_pose
         if self.target is None or not len(poses):

@@ -161,7 +161,7 @@ def _planar_figure(found: Analysis) -> Figure:
 def _draw_square_turns(axes: Axes, plane: PhasePlane, centre: Array, room: float) -> None:
     """Draw the turn by a square round a centre against its side (paper 3, figure 3)."""
     sides = np.linspace(0.0, min(np.pi, room), _SQUARE_COUNT)
-    turns = np.abs(plane.square_turns(np.tile(centre, (_SQUARE_COUNT, 1)), sides))
+    turns = np.abs(plane.turns_by_squares(np.tile(centre, (_SQUARE_COUNT, 1)), sides))
     small = abs(float(plane.curvature(centre))) * sides**2
     axes.plot(sides, turns, color=PALETTE[0], label="round the best centre")
     axes.plot(

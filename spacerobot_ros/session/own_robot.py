@@ -17,7 +17,7 @@ from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_q
 from spacerobot_ros.model.urdf import describe_inertia_flaw
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
+from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.trials import PlanningProblem
 
@@ -187,7 +187,7 @@ def first_problem(name: str, robot: SpaceRobot, file: Path) -> PlanningProblem:
     PlanningError
         The joints do not turn the base.
     """
-    turning = Turning.of(robot)
+    turning = BaseRotations.of(robot)
     if not len(turning.axes):
         how = "only to and fro along one curve of attitudes" if turning.moves else "not at all"
         raise PlanningError(

@@ -33,7 +33,7 @@ from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.messages import diagnostic_status
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
-from spacerobot_ros.nodes.common.streams import Connections
+from spacerobot_ros.nodes.common.streams import MatchedEndpoints
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import COMMANDERS, Kill, Scenario
@@ -317,7 +317,9 @@ class MultiProcessStack(Stack):
         """Ask every node for its connections; return whether all endpoints are matched."""
         requests = {name: Trigger.Request() for name in self.names}
         answers = self._call_services(self._get_connections, requests)
-        nodes = {name: Connections.from_json(answer.message) for name, answer in answers.items()}
+        nodes = {
+            name: MatchedEndpoints.from_json(answer.message) for name, answer in answers.items()
+        }
         self._spin_for(_CONNECTION_CHECK_PERIOD)
         recorder = nodes.get("recorder")
         recorded = () if recorder is None else dict(recorder.subscriptions)

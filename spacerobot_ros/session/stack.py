@@ -29,7 +29,7 @@ from spacerobot_ros.nodes import (
     RecorderNode,
 )
 from spacerobot_ros.nodes.common.direct_delivery import DirectDelivery
-from spacerobot_ros.nodes.common.streams import Connections, topics_without_all_matches
+from spacerobot_ros.nodes.common.streams import MatchedEndpoints, topics_without_all_matches
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.execution.status import PlannerStatistics
@@ -184,9 +184,11 @@ class Stack(ABC):
     def close(self) -> None:
         """End all nodes that still run; a second call does nothing."""
 
-    def _all_connected(self, nodes: Mapping[str, Connections], recorded: Iterable[str]) -> bool:
+    def _all_connected(
+        self, nodes: Mapping[str, MatchedEndpoints], recorded: Iterable[str]
+    ) -> bool:
         """Whether nodes and client are connected, and all topics to record are in ``recorded``."""
-        client = Connections.of(self.client.node)
+        client = MatchedEndpoints.of(self.client.node)
         if topics_without_all_matches([*nodes.values(), client]):
             return False
         if self.bag is None:
@@ -391,7 +393,7 @@ class InProcessStack(Stack):
 
     def _connected(self) -> bool:
         nodes = {
-            node.get_name(): Connections.of(node)
+            node.get_name(): MatchedEndpoints.of(node)
             for node in self._nodes
             if node is not self.client.node
         }

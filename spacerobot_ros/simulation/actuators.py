@@ -27,7 +27,7 @@ from spacerobot_ros.simulation.faults import (
     WRENCH_AXES,
     Disturbance,
     Fault,
-    Targets,
+    FaultTargets,
     disturbance_timeline,
     fault_timeline,
 )
@@ -251,7 +251,9 @@ class FaultyPlant(WrappedPlant):
         self.capturing = capture_in(plant)
         """The target, and what captures it; None: there is no target."""
         nozzles = self._thrusters.table.names if self._thrusters is not None else ()
-        self.timeline = fault_timeline(faults, Targets(plant.robot.joint_names, wrench, nozzles))
+        self.timeline = fault_timeline(
+            faults, FaultTargets(plant.robot.joint_names, wrench, nozzles)
+        )
         self.takes_wrench = wrench
         """Whether a step takes a wrench on the base beside the joint commands."""
         self.tick = 0

@@ -174,7 +174,7 @@ class Target:
         )
 
 
-class Approach(RelativeMotion):
+class GrappleMotion(RelativeMotion):
     """The motion of the grapple frame relative to the end-effector."""
 
     def misses(self, limits: CaptureConfig) -> list[str]:
@@ -478,10 +478,10 @@ class CapturePlant(WrappedPlant):
 
     # -- captures -----------------------------------------------------------------------------
 
-    def approach(self) -> Approach:
+    def approach(self) -> GrappleMotion:
         """Return the present motion of the grapple frame relative to the end-effector."""
         end_effector = frame_motion(self.robot, self.link, self._motion())
-        return Approach.between(end_effector, self._body().at(self.target.grapple))
+        return GrappleMotion.between(end_effector, self._body().at(self.target.grapple))
 
     def capture(self) -> CaptureReport:
         """Capture the target; the next tick begins with the motion after the impact.

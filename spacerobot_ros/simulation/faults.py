@@ -100,7 +100,7 @@ class Fault:
 
 
 @dataclass(frozen=True)
-class Targets:
+class FaultTargets:
     """Targets of faults: joint names, the wrench on the base if there is one, and thruster names if
     thrusters are modelled.
     """
@@ -122,7 +122,7 @@ class Targets:
         return names
 
 
-def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
+def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
     """Read a fault from its line.
 
     Parameters
@@ -165,7 +165,7 @@ def parse_fault(line: str, targets: Targets, now: float = 0.0) -> Fault:
     return Fault(name, target, value, start, end)
 
 
-def fault_timeline(lines: Iterable[str], targets: Targets) -> Timeline[Fault]:
+def fault_timeline(lines: Iterable[str], targets: FaultTargets) -> Timeline[Fault]:
     """Return the faults of one plant by time.
 
     Raises

@@ -27,7 +27,7 @@ from spacerobot_ros.planning import (
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
+from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.simulation.config import period_ns
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
@@ -253,7 +253,7 @@ def random_goals(problem: PlanningProblem, count: int, distance: float, angle: f
         )
     rng = np.random.default_rng(0)
     start = problem.plant().pose
-    axes = Turning.of(problem.robot).axes
+    axes = BaseRotations.of(problem.robot).axes
     goals = []
     for _ in range(count):
         offset = rng.normal(size=3)

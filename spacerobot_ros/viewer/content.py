@@ -24,9 +24,9 @@ from spacerobot_ros.planning.core.goal import (
 )
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import PlannerState
-from spacerobot_ros.simulation.faults import FAULT_KINDS, Targets, parse_fault
+from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets, parse_fault
 from spacerobot_ros.simulation.status import PlantState
-from spacerobot_ros.viewer.reachability import Check, Verdict
+from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
 from spacerobot_ros.viewer.state import Measured, Momenta, Notice, Part, StackState
 
 Color = tuple[int, int, int]
@@ -254,7 +254,7 @@ def _line_html(text: str, level: int | None) -> str:
     return f'<div style="{style}margin:2px 0">{escape(text)}</div>'
 
 
-def check_html(check: Check) -> str:
+def check_html(check: GoalCheck) -> str:
     """Return the result of checking the goal."""
     red, green, blue = COLORS[check.verdict]
     dot = (
@@ -437,7 +437,7 @@ def planned_positions(
     return {part: places[:, names.index(x)] for part, x in links.items() if x in names}
 
 
-def flown_check(state: StackState) -> Check | None:
+def flown_check(state: StackState) -> GoalCheck | None:
     """Return where the plan ends that is flown, as the check of its goal; None: none is flown.
 
     Parts of the goal that the method controls are taken as met: later plans go on with what one
@@ -458,7 +458,7 @@ def flown_check(state: StackState) -> Check | None:
     message = "The robot flies to where the ghost is."
     if left_out:
         message += f" Not controlled: {' and '.join(left_out)}."
-    return Check(verdict, message, shape=motion[-1, 7:], base=base, source=motion)
+    return GoalCheck(verdict, message, shape=motion[-1, 7:], base=base, source=motion)
 
 
 def momentum_drift(momenta: Momenta, first: Array) -> tuple[float, float]:
@@ -525,14 +525,14 @@ def has_tool(state: StackState) -> bool:
 # -- faults -------------------------------------------------------------------------------------
 
 
-def fault_kinds(targets: Targets) -> dict[str, list[str]]:
+def fault_kinds(targets: FaultTargets) -> dict[str, list[str]]:
     """Return the possible targets of each kind of fault that has any."""
     found = {name: targets.of(kind) for name, kind in FAULT_KINDS.items()}
     return {name: names for name, names in found.items() if names}
 
 
 def fault_line(
-    kind: str, target: str, value: float, lasts_s: float, now_s: float, targets: Targets
+    kind: str, target: str, value: float, lasts_s: float, now_s: float, targets: FaultTargets
 ) -> str:
     """Return the description of a fault that begins now and lasts ``lasts_s``; 0: forever.
 
@@ -571,7 +571,7 @@ def hint_html(text: str) -> str:
 T = TypeVar("T")
 
 
-class Recent(Generic[T]):
+class RecentItems(Generic[T]):
     """Items of the last minutes of simulated time, the oldest first, at least a step apart.
 
     Parameters
@@ -622,11 +622,11 @@ class History:
     width
         Numbers in a row.
     span_s, most
-        As of :class:`Recent`.
+        As of :class:`RecentItems`.
     """
 
     def __init__(self, width: int, span_s: float = 300.0, most: int = 600) -> None:
-        self._rows: Recent[Array] = Recent(span_s, most)
+        self._rows: RecentItems[Array] = RecentItems(span_s, most)
         self._width = width
 
     def add(self, time_s: float, values: Sequence[float] | Array) -> None:

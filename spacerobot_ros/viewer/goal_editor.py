@@ -29,7 +29,7 @@ from spacerobot_ros.viewer.content import (
     hint_html,
     shortened,
 )
-from spacerobot_ros.viewer.reachability import Check, Verdict
+from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
 from spacerobot_ros.viewer.scene import RobotDrawing, wxyz, xyzw
 from spacerobot_ros.viewer.state import Part
 
@@ -98,7 +98,7 @@ class GoalEditor:
         self._origin = Origin.ROBOT
         self._followed: object = None
         """Numbers of the goals that were last followed."""
-        self._check = Check(Verdict.UNCHECKED)
+        self._check = GoalCheck(Verdict.UNCHECKED)
         gui = server.gui
         self._none_taken = gui.add_html(hint_html("A recording takes no goals."), visible=False)
         self._verdict = gui.add_html(check_html(self._check))
@@ -158,7 +158,7 @@ class GoalEditor:
         self._kinematics = None if robot is None else ForwardKinematics(robot)
         self._parts.offer(())
         # The check of another robot's goal does not apply: it has other joints.
-        self.show_check(Check(Verdict.UNCHECKED))
+        self.show_check(GoalCheck(Verdict.UNCHECKED))
         self._final.show_robot(robot)
 
     def place(self, base: Array, tool: Array | None, q: Array, now: float) -> None:
@@ -173,14 +173,14 @@ class GoalEditor:
                 color=COLORS[Verdict.UNCHECKED],
             )
         self._present = base, q
-        self._final.robot_is_at(q)
+        self._final.update_robot(q)
         self._final.fill()
         self._move_gizmo(_BASE_GIZMO, base)
         for link in self._parts.links:
             self._place_link_gizmo(link)
         if tool is not None and self.has_tool:
             self._move_gizmo(_TOOL_GIZMO, tool)
-        self.robot_is_at(base, q)
+        self.update_robot(base, q)
         self._show_fields()
         self._changed_at = now
         self._origin = Origin.ROBOT
@@ -222,7 +222,7 @@ class GoalEditor:
         self._changed_at = now
         self._origin = Origin.SENT
         if self._check.verdict is not Verdict.UNCHECKED:
-            self.show_check(Check(Verdict.PLANNING, "Another goal has been sent."))
+            self.show_check(GoalCheck(Verdict.PLANNING, "Another goal has been sent."))
 
     def note_sent(self) -> None:
         """Note that the goal shown has been sent."""
@@ -234,7 +234,7 @@ class GoalEditor:
         return self._origin is Origin.SENT
 
     @property
-    def check(self) -> Check:
+    def check(self) -> GoalCheck:
         """The check that is shown."""
         return self._check
 
@@ -247,14 +247,14 @@ class GoalEditor:
 
         self._defer(edit)
 
-    def robot_is_at(self, pose: Array, q: Array) -> None:
+    def update_robot(self, pose: Array, q: Array) -> None:
         """Update the pose (7,) of the robot's base and the positions (n,) of its joints.
 
         The ghost takes these joint positions unless a plan or a user sets others, and is hidden
         where it would only colour the robot.
         """
         self._present = pose, q
-        self._final.robot_is_at(q)
+        self._final.update_robot(q)
         if self._ghost is None:
             return
         shape = self._check.shape
@@ -272,7 +272,7 @@ class GoalEditor:
         """Show or hide the ghost, wherever it is not hidden anyway."""
         self._ghost_shown = visible
         if self._present is not None:
-            self.robot_is_at(*self._present)
+            self.update_robot(*self._present)
 
     def _ghost_pose(self, pose: Array) -> Array:
         """Return the pose (7,) of the ghost's base: where it will end, or else that of the goal."""
@@ -341,7 +341,7 @@ class GoalEditor:
             goals[BASE_GOAL_KEY] = self._goal_at(_BASE_GIZMO, shape)
         if self._tool_too.visible and self._tool_too.value and self.has_tool:
             goals[DEFAULT_END_EFFECTOR] = self._goal_at(_TOOL_GIZMO)
-        for link, asked in self._parts.asked_links().items():
+        for link, asked in self._parts.requested_links().items():
             pose = self._poses[_link_gizmo(link)]
             aim = EndEffectorGoal.checked(link, pose if asked is RequestedPart.POSE else pose[:3])
             goals[link] = Goal.of_end_effectors([aim], joint_positions=shape)
@@ -363,7 +363,7 @@ class GoalEditor:
         try:
             return self.goals()
         except GoalError as error:
-            self.show_check(Check(Verdict.REFUSED, str(error)))
+            self.show_check(GoalCheck(Verdict.REFUSED, str(error)))
             return None
 
     @property
@@ -376,7 +376,7 @@ class GoalEditor:
         if self.placed:
             self._changed_at = now
 
-    def show_check(self, check: Check) -> None:
+    def show_check(self, check: GoalCheck) -> None:
         """Show the result of a check of the goal."""
         self._check = check
         text = check_html(check)
@@ -389,7 +389,7 @@ class GoalEditor:
             if check.shape is not None:
                 self._ghost.set_joint_positions(check.shape)
             if self._present is not None:
-                self.robot_is_at(*self._present)
+                self.update_robot(*self._present)
 
     # -- changes by users --------------------------------------------------------------------------
 
@@ -444,7 +444,7 @@ class GoalEditor:
             return
         self._changed_at = time.monotonic()
         if self._check.verdict is not Verdict.UNCHECKED:
-            self.show_check(Check(Verdict.PLANNING, "The goal is being moved."))
+            self.show_check(GoalCheck(Verdict.PLANNING, "The goal is being moved."))
 
     def _move_gizmo(self, name: str, pose: Array) -> None:
         self._poses[name] = pose
@@ -551,7 +551,7 @@ class _PartMenu:
             return RequestedPart(self._menus[part].value)
         return RequestedPart.POSE if part == BASE_GOAL_KEY else RequestedPart.NOTHING
 
-    def asked_links(self) -> dict[str, RequestedPart]:
+    def requested_links(self) -> dict[str, RequestedPart]:
         """Return for each link of the goal whether it is for its position or its pose."""
         asked = {link: self.asked(link) for link in self.links}
         return {link: each for link, each in asked.items() if each is not RequestedPart.NOTHING}
@@ -598,7 +598,7 @@ class _PartMenu:
     def _on_chosen(self, part: Part) -> None:
         if part not in self._menus:
             return  # The menu of an earlier robot.
-        base, for_links = self._menus[BASE_GOAL_KEY], self.asked_links()
+        base, for_links = self._menus[BASE_GOAL_KEY], self.requested_links()
         chosen = self.asked(part)
         if not for_links:
             if part == BASE_GOAL_KEY and chosen is RequestedPart.NOTHING:
@@ -614,7 +614,7 @@ class _PartMenu:
         """Show the numbers of a part, if the goal asks for it, else of those of before."""
         self._folder.visible = self._there
         parts = [BASE_GOAL_KEY] if self.asked(BASE_GOAL_KEY) is not RequestedPart.NOTHING else []
-        parts += self.asked_links()
+        parts += self.requested_links()
         wanted = [each for each in (part, self.shown) if each in parts]
         self._numbers.options = tuple(parts)
         self._numbers.value = [*wanted, *parts][0]
@@ -684,7 +684,7 @@ class _FinalShape:
         )
         return self._gui.add_slider(label, low, high, step, min(max(0.0, low), high), hint=name)
 
-    def robot_is_at(self, q: Array) -> None:
+    def update_robot(self, q: Array) -> None:
         """Update the joint positions (n,) of the robot."""
         self._q = q
 

@@ -21,20 +21,20 @@ from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
-from spacerobot_ros.simulation.faults import FAULT_KINDS, Targets
+from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets
 from spacerobot_ros.viewer import content, scene
-from spacerobot_ros.viewer.content import History, Recent, Trail
+from spacerobot_ros.viewer.content import History, RecentItems, Trail
 from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor
 from spacerobot_ros.viewer.server import ViewerConfig
 from spacerobot_ros.viewer.state import (
     Action,
-    Fly,
-    Inject,
+    FlyAction,
+    InjectAction,
     Measured,
     Notice,
     Part,
     Request,
-    Seek,
+    SeekAction,
     StackState,
 )
 
@@ -71,7 +71,7 @@ _SLIDER_HOLD_S = 1.5
 """Wall time for which the page does not move the time slider after a user has, s."""
 
 
-class Buttons:
+class ButtonPanel:
     """Buttons whose requests the stack carries out at once."""
 
     def __init__(
@@ -151,7 +151,7 @@ class TimeLine:
 
     def _seek(self, seconds: float) -> None:
         self._left_alone_until = time.monotonic() + _SLIDER_HOLD_S
-        self._act(Seek(seconds))
+        self._act(SeekAction(seconds))
 
 
 class LookBack:
@@ -209,14 +209,14 @@ class LookBack:
         self._slider.visible, self._live.visible = True, self.time_s is not None
 
 
-class Faults:
+class FaultPanel:
     """Menu of the faults that can be injected, and list of the active ones."""
 
     def __init__(
         self, gui: viser.GuiApi, defer: Defer, act: RequestAction, on_note: Callable[[str], None]
     ) -> None:
         self._act, self._on_note = act, on_note
-        self._targets, self._now_s = Targets(), 0.0
+        self._targets, self._now_s = FaultTargets(), 0.0
         self._names: dict[str, list[str]] = {}
         self._kind: Any = gui.add_dropdown("Fault", ("-",))
         self._target: Any = gui.add_dropdown("Target", ("-",))
@@ -239,9 +239,9 @@ class Faults:
 
         @self._clear.on_click
         async def _(event: Any) -> None:
-            defer(lambda: act(Inject("clear")))
+            defer(lambda: act(InjectAction("clear")))
 
-    def offer(self, targets: Targets) -> None:
+    def offer(self, targets: FaultTargets) -> None:
         """Offer the faults that the targets of a plant can have."""
         if targets == self._targets:
             return
@@ -297,7 +297,7 @@ class Faults:
         except ParameterError as error:
             self._on_note(str(error))
             return
-        self._act(Inject(line))
+        self._act(InjectAction(line))
 
 
 class Plots:
@@ -450,7 +450,7 @@ class _Plot:
         self.handle.data = self.history.columns()
 
 
-class Log:
+class LogPanel:
     """Events and warnings, the newest first."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
@@ -566,7 +566,7 @@ class Page:
         gui.configure_theme(**self._theme_options(dark=self._config.dark))
         # Buttons come first, so that a growing status text does not move them under the mouse.
         self._time_line = TimeLine(gui, defer, self._request)
-        self._buttons = Buttons(gui, defer, self._request, self._fly)
+        self._buttons = ButtonPanel(gui, defer, self._request, self._fly)
         self._look_back = LookBack(gui, defer)
         self._status = gui.add_html(content.status_html(StackState()))
         self._bar: Any = gui.add_progress_bar(0.0, visible=False)
@@ -578,9 +578,9 @@ class Page:
         with tabs.add_tab("Joints"):
             self._joints = gui.add_html("")
         with tabs.add_tab("Faults"):
-            self.faults = Faults(gui, defer, self._request, self._refuse)
+            self.faults = FaultPanel(gui, defer, self._request, self._refuse)
         with tabs.add_tab("Log"):
-            self._log = Log(gui)
+            self._log = LogPanel(gui)
         self.editor.on_reset_goal(self._goal_to_robot)
         look = gui.add_button(
             "Look at the robot", color="gray", hint="Turn the camera of this browser to the robot."
@@ -647,7 +647,7 @@ class Page:
         """Start over with another robot; None: there is none."""
         self._robot, self._table, self._drawing = robot, None, None
         self._last = self._drawn = None
-        self._past: Recent[StackState] = Recent()
+        self._past: RecentItems[StackState] = RecentItems()
         self._look_back.time_s = None
         self._kinematics = None if robot is None else ForwardKinematics(robot)
         self._around: scene.Surroundings | None = None
@@ -781,7 +781,7 @@ class Page:
             if not self.editor.placed:
                 self.editor.place(measured.pose, None, measured.q, self._now)
             self.editor.follow(state.goals, self._now)
-        self.editor.robot_is_at(measured.pose, measured.q)
+        self.editor.update_robot(measured.pose, measured.q)
         self._plots.add(state, self._goal_errors(state))
         self._trail.add(measured.time_s, measured.pose[:3])
         assert self._kinematics is not None
@@ -918,7 +918,7 @@ class Page:
         if not goals:
             self._refuse("There is no goal to send: no state of the robot has been received yet.")
             return
-        self._request(Fly(goals))
+        self._request(FlyAction(goals))
 
     def _goal_to_robot(self) -> None:
         measured = self._state.measured

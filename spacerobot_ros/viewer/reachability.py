@@ -129,7 +129,7 @@ class Verdict(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Check:
+class GoalCheck:
     """Result of a check of a goal.
 
     Attributes
@@ -156,7 +156,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Question:
+class GoalQuestion:
     """A goal to check, and the situation to check it in.
 
     Attributes
@@ -185,7 +185,7 @@ def make_question(
     goals: Mapping[Part, Goal],
     robot: RobotDescription | None,
     parameters: Mapping[str, Mapping[str, str]],
-) -> Question | str:
+) -> GoalQuestion | str:
     """Return the question whether goals are reachable, or the reason why none is asked.
 
     Parameters
@@ -211,7 +211,7 @@ def make_question(
         link = robot.end_effector(json.loads(known.get("end_effector_frame", '""')))
         if link not in robot.frames:
             return "The end-effector is not a link of the robot."
-        return Question(robot.urdf, {}, RobotState(*pose, q), goal, tool, link)
+        return GoalQuestion(robot.urdf, {}, RobotState(*pose, q), goal, tool, link)
     if "planner" in state.absent:
         return "The planner is offline."
     if state.planner.state is PlannerState.PLANNING:
@@ -220,7 +220,7 @@ def make_question(
         return "The planner's parameters have not been received yet."
     momenta = np.zeros(6) if state.momenta is None else state.momenta.actual
     start = RobotState(*pose, q, momenta[:3], momenta[3:])
-    return Question(robot.urdf, parameters["planner"], start, planned_goal(goals))
+    return GoalQuestion(robot.urdf, parameters["planner"], start, planned_goal(goals))
 
 
 def planned_goal(goals: Mapping[Part, Goal]) -> Goal:
@@ -281,15 +281,15 @@ class GoalChecker:
         self._process: subprocess.Popen[bytes] | None = None
         self._answer_thread: threading.Thread | None = None
         self._number = self._begun = 0
-        self._last: Question | None = None
+        self._last: GoalQuestion | None = None
         self._progress = ""
         self._asked_at = 0.0
         self._cancelled_at: float | None = None
         self._answered = True
-        self._answers: dict[int, Check] = {}
+        self._answers: dict[int, GoalCheck] = {}
         self._lock = threading.Lock()
 
-    def ask(self, question: Question) -> None:
+    def ask(self, question: GoalQuestion) -> None:
         """Cancel the check in progress, and start the check of a question."""
         process = self._running_process()
         self._number += 1
@@ -309,7 +309,7 @@ class GoalChecker:
         self._send_question(self._process, None)
         return True
 
-    def latest_answer(self) -> Check | None:
+    def latest_answer(self) -> GoalCheck | None:
         """Return the answer to the last question once; before that, the time spent on it."""
         if self._answered:
             return None
@@ -321,13 +321,13 @@ class GoalChecker:
             return answer
         if self._process is not None and self._process.poll() is not None:
             self._answered = True
-            return Check(Verdict.UNCHECKED, "The process that checks goals has ended.")
+            return GoalCheck(Verdict.UNCHECKED, "The process that checks goals has ended.")
         if self._cancellation_ignored():
             # A solver, or a compiler, that does not look for its cancellation.
             self.close()
             self._send_question(self._running_process(), self._last)
         seconds, found = time.monotonic() - self._asked_at, self._progress
-        return Check(Verdict.PLANNING, f"Planning for {seconds:.0f} s{found}.")
+        return GoalCheck(Verdict.PLANNING, f"Planning for {seconds:.0f} s{found}.")
 
     def close(self) -> None:
         """End the child process that checks goals."""
@@ -358,7 +358,9 @@ class GoalChecker:
             self._answer_thread.start()
         return self._process
 
-    def _send_question(self, process: subprocess.Popen[bytes], question: Question | None) -> None:
+    def _send_question(
+        self, process: subprocess.Popen[bytes], question: GoalQuestion | None
+    ) -> None:
         """Send a numbered question; None cancels the earlier question."""
         assert process.stdin is not None
         with suppress(OSError):  # The process has ended; latest_answer notices it.
@@ -387,7 +389,7 @@ class Planner:
     def __init__(self) -> None:
         self._built: tuple[str, Mapping[str, str]] | None = None
 
-    def answer(self, question: Question, cancellation: Cancellation) -> Check:
+    def answer(self, question: GoalQuestion, cancellation: Cancellation) -> GoalCheck:
         """Return the result of a check.
 
         Raises
@@ -407,13 +409,13 @@ class Planner:
         except PlanningCancelled:
             raise
         except SpaceRobotError as error:
-            return Check(Verdict.REFUSED, str(error))
+            return GoalCheck(Verdict.REFUSED, str(error))
         duration = schedule.expected_duration
         base = _predicted_end(self._robot, request, schedule)
         left_out = _uncontrolled_text(schedule, base, question.goal, request.tolerance)
         message = f"Reachable in {duration:.4g} s by '{schedule.method}'.{left_out}"
         verdict = Verdict.PARTLY if left_out else Verdict.REACHABLE
-        return Check(verdict, message, duration, schedule.positions[-1], base)
+        return GoalCheck(verdict, message, duration, schedule.positions[-1], base)
 
     def _build_planner(self, urdf: str, parameters: Mapping[str, str]) -> None:
         self._built = None
@@ -470,19 +472,19 @@ def _uncontrolled_text(
     )
 
 
-def _check_arm(question: Question, tool: Goal) -> Check:
+def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
     """Return whether the arm reaches its goal."""
     robot = parse_robot(question.urdf)
     q = question.state.q
     shape, distance, angle = reaching_positions(robot, question.link, question.goal, tool, q)
     if is_reached(distance, angle):
         message = "The end-effector can reach its goal there."
-        return Check(Verdict.REACHABLE, message, shape=shape)
+        return GoalCheck(Verdict.REACHABLE, message, shape=shape)
     message = (
         f"The end-effector cannot reach its goal: the nearest joint positions found leave "
         f"{distance:.3g} m and {angle:.3g} rad."
     )
-    return Check(Verdict.REFUSED, message, shape=shape)
+    return GoalCheck(Verdict.REFUSED, message, shape=shape)
 
 
 class _LastQuestion:
@@ -490,16 +492,16 @@ class _LastQuestion:
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
-        self._question: tuple[int, Question | None] | None = None
+        self._question: tuple[int, GoalQuestion | None] | None = None
         self._cancellation = Cancellation()
 
-    def put(self, question: tuple[int, Question | None]) -> None:
+    def put(self, question: tuple[int, GoalQuestion | None]) -> None:
         with self._condition:
             self._question = question
             self._cancellation.cancel()
             self._condition.notify()
 
-    def take(self) -> tuple[tuple[int, Question | None], Cancellation]:
+    def take(self) -> tuple[tuple[int, GoalQuestion | None], Cancellation]:
         with self._condition:
             while self._question is None:
                 # A bounded wait lets signals through.
@@ -524,7 +526,7 @@ def main() -> None:
                     last.put(pickle.load(sys.stdin.buffer))
             os._exit(0)
 
-        def send_answer(number: int, answer: Check | str | None) -> None:
+        def send_answer(number: int, answer: GoalCheck | str | None) -> None:
             pickle.dump((number, answer), answers)
             answers.flush()
 

@@ -153,25 +153,25 @@ class Request(Enum):
 
 
 @dataclass(frozen=True)
-class Fly:
+class FlyAction:
     """Send goals, by part, all with one stamp."""
 
     goals: Mapping[Part, Goal]
 
 
 @dataclass(frozen=True)
-class Inject:
+class InjectAction:
     """Send fault descriptions to the plant, one a line, or ``clear``."""
 
     text: str
 
 
 @dataclass(frozen=True)
-class Seek:
+class SeekAction:
     """Continue the replay at a time, s from its start."""
 
     seconds: float
 
 
-Action = Request | Fly | Inject | Seek
+Action = Request | FlyAction | InjectAction | SeekAction
 """An action of a user of the page."""

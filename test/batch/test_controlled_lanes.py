@@ -16,8 +16,8 @@ from spacerobot_ros.batch import (
     Controlled,
     Decision,
     Flights,
+    InitialStates,
     SensorErrors,
-    Starts,
     fly_lanes,
     fly_one_by_one,
     scalar,
@@ -65,7 +65,7 @@ def controlled(
     robot = SpaceRobot(load_robot(share_directory() / "urdf" / f"{name}.urdf"))
     wanted: dict[str, Any] = {"tick_rate": 100.0, "settle_time": 0.2, "profile": "quintic"}
     config = dataclasses.replace(ControllerConfig(), **(wanted | parameters))
-    starts = Starts.repeated(robot, InitialState(joint_positions=shape), count)
+    starts = InitialStates.repeated(robot, InitialState(joint_positions=shape), count)
     starts.position[:, :2] = 0.01 * rng.normal(size=(count, 2))
     sensors = SensorErrors.none(robot, count)
     sensors.noise[1:] = noise

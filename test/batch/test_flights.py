@@ -16,8 +16,8 @@ from spacerobot_ros.batch import (
     Flights,
     FollowedSchedule,
     HeldCommands,
+    InitialStates,
     SensorErrors,
-    Starts,
 )
 from spacerobot_ros.batch.flights import NOISES
 from spacerobot_ros.errors import ParameterError
@@ -34,7 +34,7 @@ def sliders() -> SpaceRobot:
 
 def flights(sliders: SpaceRobot, program: Any, **changes: Any) -> Flights:
     """Return two flights of 10 ticks under velocity commands, but for what is given."""
-    starts = Starts.repeated(sliders, InitialState(), 2)
+    starts = InitialStates.repeated(sliders, InitialState(), 2)
     chosen: dict[str, Any] = {"actuation": "velocity", "ticks": 10, "starts": starts, **changes}
     actuation, ticks, starts = (chosen.pop(name) for name in ("actuation", "ticks", "starts"))
     return Flights(sliders, actuation, 0.05, ticks, starts, program, **chosen)
@@ -107,7 +107,7 @@ def test_masses_are_those_of_all_bodies_of_all_flights(sliders: SpaceRobot) -> N
 
 def test_joints_that_move_at_the_start_need_efforts(sliders: SpaceRobot) -> None:
     moving = InitialState(joint_velocities=np.array([0.0, 0.1, 0.0]))
-    starts = Starts.of(sliders, [InitialState(), moving])
+    starts = InitialStates.of(sliders, [InitialState(), moving])
     with pytest.raises(ParameterError) as refusal:
         flights(sliders, STILL, starts=starts)
     assert str(refusal.value) == "Joints under velocity commands must start at rest."
@@ -138,7 +138,7 @@ def test_starts_are_rows_of_initial_states(sliders: SpaceRobot) -> None:
         angular_momentum=np.array([7.0, 8.0, 9.0]),
     )
     second = InitialState(center_of_mass=np.array([-1.0, -2.0, -3.0]))
-    starts = Starts.of(sliders, [first, second])
+    starts = InitialStates.of(sliders, [first, second])
     assert starts.position.tolist() == [[1, 2, 3], [-1, -2, -3]]
     assert starts.quaternion.tolist() == [[0, 0.6, 0, 0.8], [0, 0, 0, 1]]
     assert starts.q[0].tolist() == [0.1, 0.2, 0.3]
@@ -146,11 +146,11 @@ def test_starts_are_rows_of_initial_states(sliders: SpaceRobot) -> None:
     assert starts.momenta.tolist() == [[4, 5, 6, 7, 8, 9], [0] * 6]
     assert starts.is_center_of_mass.tolist() == [False, True]
     for index, wanted in enumerate((first, second)):
-        again = Starts.of(sliders, [starts.initial_state(index)])
-        once = Starts.of(sliders, [wanted])
-        for each in dataclasses.fields(Starts):
+        again = InitialStates.of(sliders, [starts.initial_state(index)])
+        once = InitialStates.of(sliders, [wanted])
+        for each in dataclasses.fields(InitialStates):
             assert getattr(again, each.name).tolist() == getattr(once, each.name).tolist()
-    three = Starts.repeated(sliders, first, 3)
+    three = InitialStates.repeated(sliders, first, 3)
     assert (len(three), three.momenta.shape, three.is_center_of_mass.shape) == (3, (3, 6), (3,))
     three.q[1] = 0.0
     assert three.q[2].tolist() == [0.1, 0.2, 0.3]

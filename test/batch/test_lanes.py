@@ -14,8 +14,8 @@ from spacerobot_ros.batch import (
     Flights,
     FollowedSchedule,
     HeldCommands,
+    InitialStates,
     SensorErrors,
-    Starts,
     fly_lanes,
     fly_one_by_one,
     native,
@@ -51,12 +51,12 @@ def assert_equal_flights(here: BatchResult, there: BatchResult, rtol: float = 1e
 
 def draws(
     robot: SpaceRobot, count: int, rng: np.random.Generator, *, moving: bool
-) -> tuple[Starts, SensorErrors, InertialParameters]:
+) -> tuple[InitialStates, SensorErrors, InertialParameters]:
     """Return starts, sensors and masses that all differ, some without noise, some without bias."""
     n, bodies = robot.n, len(robot.description.bodies)
     quaternion = rng.normal(size=(count, 4))
     lower, upper = np.maximum(robot.lower, -1.0), np.minimum(robot.upper, 1.0)
-    starts = Starts(
+    starts = InitialStates(
         rng.normal(size=(count, 3)),
         quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
         lower + (upper - lower) * rng.uniform(0.3, 0.7, (count, n)),

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from spacerobot_ros.batch import Flights, FollowedSchedule, HeldCommands, Starts, fly_one_by_one
+from spacerobot_ros.batch import (
+    Flights,
+    FollowedSchedule,
+    HeldCommands,
+    InitialStates,
+    fly_one_by_one,
+)
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model import InertialParameters, SpaceRobot, load_robot
 from spacerobot_ros.model.description import Inertia
@@ -25,7 +31,7 @@ def test_a_heavier_slider_carries_the_base_further(sliders: SpaceRobot) -> None:
     inertial = nominal.scaled(masses=np.array([[1, 1, 1, 1], [1, 1.5, 1, 1.0]]), inertias=1.0)
     start = InitialState(joint_positions=np.zeros(3))
     flights = Flights(
-        *(sliders, "velocity", 0.05, 10, Starts.repeated(sliders, start, 2)),
+        *(sliders, "velocity", 0.05, 10, InitialStates.repeated(sliders, start, 2)),
         FollowedSchedule(positions),
         inertial,
     )
@@ -64,7 +70,7 @@ def test_a_payload_is_welded_on(sliders: SpaceRobot) -> None:
 
 
 def test_flights_that_do_not_go_together_are_refused(sliders: SpaceRobot) -> None:
-    starts = Starts.repeated(sliders, InitialState(), 2)
+    starts = InitialStates.repeated(sliders, InitialState(), 2)
     commands = HeldCommands(np.zeros((5, 3)))
     for arguments, sentence in (
         (("speed", 0.05, 10, starts, commands), "not velocity or effort"),

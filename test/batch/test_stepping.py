@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spacerobot_ros.batch import Starts, SteppedFlights
+from spacerobot_ros.batch import InitialStates, SteppedFlights
 from spacerobot_ros.errors import CommandError, ParameterError, RobotDescriptionError
 from spacerobot_ros.model import InertialParameters, SpaceRobot, load_robot
 from spacerobot_ros.model.compilation import cxx_compiler
@@ -26,8 +26,8 @@ def sliders() -> SpaceRobot:
     return SpaceRobot(load_robot(robot_file("sliding_masses")))
 
 
-def drawn_starts(robot: SpaceRobot, count: int, rng: np.random.Generator) -> Starts:
-    starts = Starts.repeated(robot, InitialState(), count)
+def drawn_starts(robot: SpaceRobot, count: int, rng: np.random.Generator) -> InitialStates:
+    starts = InitialStates.repeated(robot, InitialState(), count)
     lower, upper = np.maximum(robot.lower, -1.0), np.minimum(robot.upper, 1.0)
     starts.q[:] = lower + (upper - lower) * rng.uniform(0.2, 0.8, starts.q.shape)
     starts.position[:] = rng.normal(size=(count, 3))
@@ -36,7 +36,7 @@ def drawn_starts(robot: SpaceRobot, count: int, rng: np.random.Generator) -> Sta
     return starts
 
 
-def near_a_stop(robot: SpaceRobot, starts: Starts, rate: float) -> Starts:
+def near_a_stop(robot: SpaceRobot, starts: InitialStates, rate: float) -> InitialStates:
     """Return starts whose first joint is about to arrive at its stop."""
     starts.q[:, 0], starts.qdot[:, 0] = robot.upper[0] - 0.002, rate
     return starts
@@ -55,7 +55,7 @@ class OnePlant:
         self.link = link
         self.plants: list[Plant] = []
 
-    def make(self, starts: Starts, masses: InertialParameters, row: int) -> Plant:
+    def make(self, starts: InitialStates, masses: InertialParameters, row: int) -> Plant:
         kind = PLANTS[self.kind]
         robot = self.robot.with_inertial(masses[row])
         initial = starts.initial_state(row)

@@ -114,7 +114,7 @@ def test_what_is_said_of_an_influence() -> None:
     ],
 )
 def test_a_driver_is_what_is_unlikely_to_be_chance(given: Influence, beyond: bool) -> None:
-    assert given.beyond_chance is beyond
+    assert given.is_significant is beyond
 
 
 def test_chances_are_corrected_for_the_number_of_tests() -> None:

@@ -18,7 +18,7 @@ from spacerobot_ros.cli.errors import sentences
 from spacerobot_ros.cli.options import (
     EndEffectorOptions,
     GoalOptions,
-    Registered,
+    RegisteredName,
     viewer_if_requested,
     warn_of_large_angles,
 )
@@ -129,7 +129,7 @@ def test_a_rotation_of_more_than_a_turn_is_noted(
 def test_a_choice_of_names_in_registries_is_sorted(monkeypatch: pytest.MonkeyPatch) -> None:
     module = SimpleNamespace(A={"two": 1, "one": 2}, B={"three": 3, "one": 4})
     monkeypatch.setitem(sys.modules, "some_registry", module)
-    choice = Registered("some_registry:A", "some_registry:B")
+    choice = RegisteredName("some_registry:A", "some_registry:B")
     assert tuple(choice.choices) == ("one", "three", "two")
 
 

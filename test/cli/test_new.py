@@ -16,7 +16,7 @@ from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import JointLimits
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
+from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.resources import resource_names, robot_file
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.own_robot import (
@@ -111,7 +111,7 @@ def test_the_first_turn_is_one_that_the_joints_make_without_loops(name: str) -> 
     path = robot_file(name)
     robot = SpaceRobot.from_file(path)
     shape = first_shape(robot)
-    turn = first_turn(robot, shape, Turning.of(robot).axes)
+    turn = first_turn(robot, shape, BaseRotations.of(robot).axes)
     if name == "sliding_masses":  # Only loops turn it.
         assert turn == pytest.approx(np.radians([0.0, 0.0, 5.0]))
         return

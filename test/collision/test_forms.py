@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.collision.geometry import Solid, solids_of
 from spacerobot_ros.collision.rounded_box import RoundedBox
-from spacerobot_ros.collision.rows import Form
+from spacerobot_ros.collision.rows import SmoothForm
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.model.description import Pose, Shape
 
@@ -19,14 +19,14 @@ TURN = Rotation.from_rotvec([0.3, -0.5, 0.2])
 POSE = Pose(TURN.as_matrix(), np.array([0.5, -1.0, 2.0]))
 
 
-def form(kind: str, *size: float, half: Any = None, radius: float = 0.0) -> Form:
+def form(kind: str, *size: float, half: Any = None, radius: float = 0.0) -> SmoothForm:
     """Return the form of a solid, whose enclosure has these half edges."""
     shape = Shape(kind, size, POSE)
     box = RoundedBox(POSE, np.array(size if half is None else half, dtype=float), radius)
-    return Form.of(Solid("link", 1, shape, box))
+    return SmoothForm.of(Solid("link", 1, shape, box))
 
 
-def local(found: Form) -> list[list[float]]:
+def local(found: SmoothForm) -> list[list[float]]:
     """Return the balls in the axes of the solid."""
     here = TURN.inv().apply(found.balls - POSE.r)
     return sorted(np.round(here, 9).tolist())

@@ -56,14 +56,14 @@ def test_a_schedule_is_sent_and_ends_with_its_result() -> None:
     number = sent.start("first")
     assert sent.server.sent == [(number, "first")]
     assert sent.output.waits
-    sent.output.phase_changed(Phase.EXECUTING)
+    sent.output.on_phase_change(Phase.EXECUTING)
     sent.output.ended(number, Outcome.SUCCEEDED, 0, "")
     assert sent.ends == [TrajectoryEnd()]
     assert not sent.output.waits
     # Each schedule ends once, and nothing that has ended is cancelled.
     sent.output.ended(number, Outcome.ABORTED, -4, "")
     sent.output.rejected(number)
-    sent.output.phase_changed(Phase.EVALUATING)
+    sent.output.on_phase_change(Phase.EVALUATING)
     assert len(sent.ends) == 1
     assert sent.server.cancelled == []
 
@@ -99,7 +99,7 @@ def test_what_is_left_is_cancelled_and_its_result_does_not_count() -> None:
     for phase in Phase:
         sent = Sent()
         number = sent.start()
-        sent.output.phase_changed(phase)
+        sent.output.on_phase_change(phase)
         goes_on = phase in (
             Phase.EXECUTING, Phase.PLANNING, Phase.REPLANNING, Phase.TAKING_OVER
         )  # fmt: skip
@@ -149,9 +149,9 @@ def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
     later = sent.start()
     for second in range(20):
         sent.output.watch(FIRST + second * SECOND)
-    sent.output.phase_changed(Phase.EVALUATING)
+    sent.output.on_phase_change(Phase.EVALUATING)
     reset = sent.start(accepted=False)
-    sent.output.phase_changed(Phase.EVALUATING)
+    sent.output.on_phase_change(Phase.EVALUATING)
     sent.output.watch(FIRST + 60 * SECOND)
     assert len(sent.ends) == 1
     assert sent.server.cancelled == [number, later, reset]

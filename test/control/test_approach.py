@@ -76,10 +76,10 @@ def test_an_approach_sets_out_at_once_and_keeps_all_limits_to_contact() -> None:
     motion = target((1.7, -0.5))
     made = plan(motion)
     assert made.start == 0.0
-    assert made.closes_at == made.outward.duration + 1.5
+    assert made.closing_time == made.outward.duration + 1.5
     # The closing path of 0.206 m takes 15/8 of its length over its speed.
     length = math.hypot(0.2, 0.05)
-    assert made.contact - made.closes_at == pytest.approx(15 / 8 * length / 0.05)
+    assert made.contact - made.closing_time == pytest.approx(15 / 8 * length / 0.05)
     times = np.linspace(0.0, made.contact + 1.0, 2000)
     hand = motion.grapple(times).carrying(made.relative(times))
     np.testing.assert_allclose(hand.r[0], TIP, atol=1e-12)
@@ -87,8 +87,8 @@ def test_an_approach_sets_out_at_once_and_keeps_all_limits_to_contact() -> None:
     speed, acceleration = (np.linalg.norm(each, axis=1).max() for each in (hand.v, hand.a))
     assert 0.02 < speed <= 0.3
     assert 0.01 < acceleration <= 0.1 * 1.01
-    waiting = motion.grapple([made.closes_at - 0.4])
-    beside = waiting.carrying(made.relative(np.array([made.closes_at - 0.4])))
+    waiting = motion.grapple([made.closing_time - 0.4])
+    beside = waiting.carrying(made.relative(np.array([made.closing_time - 0.4])))
     offset = waiting.R[0].T @ (beside.r[0] - waiting.r[0])
     np.testing.assert_allclose(offset, OPTIONS.standoff, atol=1e-12)
     met = motion.grapple([made.contact])

@@ -10,7 +10,7 @@ import pytest
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
-from spacerobot_ros.control.reference import Errors
+from spacerobot_ros.control.reference import OutputErrors
 
 CONFIG = dataclasses.replace(
     ControllerConfig(),
@@ -20,11 +20,11 @@ CONFIG = dataclasses.replace(
     attitude_tolerance=0.03,
     joint_tolerance=0.05,
 )
-WITHIN, ASTRAY = Errors(0.02, 0.03, 0.05), Errors(0.02, 0.031, 0.05)
+WITHIN, ASTRAY = OutputErrors(0.02, 0.03, 0.05), OutputErrors(0.02, 0.031, 0.05)
 
 
 def decisions(
-    states: list[tuple[float, Errors, float, float]], config: ControllerConfig = CONFIG
+    states: list[tuple[float, OutputErrors, float, float]], config: ControllerConfig = CONFIG
 ) -> list[int]:
     """Return the decision at each state of (at rest, errors, rate share, error share)."""
     monitor, found = GoalMonitor(), []
@@ -90,7 +90,7 @@ def test_symbols_give_the_decisions_of_numbers() -> None:
     memory, state = ca.SX.sym("memory", 4), ca.SX.sym("state", 7)
     monitor = GoalMonitor(*ca.vertsplit(memory))
     time, at_rest, *errors, rate, error = ca.vertsplit(state)
-    decision = monitor.decide(time, at_rest, Errors(*errors), rate, error, CONFIG)
+    decision = monitor.decide(time, at_rest, OutputErrors(*errors), rate, error, CONFIG)
     after = ca.vertcat(*dataclasses.astuple(monitor))
     function = ca.Function("monitor", [memory, state], [after, decision])
     rng = np.random.default_rng(7)
@@ -106,7 +106,7 @@ def test_symbols_give_the_decisions_of_numbers() -> None:
             rest = float(tick > 2)
             position, attitude, joints, rate_, error_ = values.tolist()
             found = numbers.decide(
-                *(0.1 * tick, rest, Errors(position, attitude, joints), rate_, error_, CONFIG)
+                *(0.1 * tick, rest, OutputErrors(position, attitude, joints), rate_, error_, CONFIG)
             )
             symbols, other = function(symbols, [0.1 * tick, rest, *values])
             assert int(found) == int(other)

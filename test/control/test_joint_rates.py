@@ -96,7 +96,7 @@ def test_a_command_that_keeps_the_rates_is_not_touched() -> None:
     assert limits.apply(slow, given, robot.effort_limit) is given
     # As fast as may be, and slowed down.
     fast = replace(slow, qdot=0.99 * robot.velocity_limit)
-    _, qddot = plant_of(robot, fast).acceleration(braking := limits.to_rest(fast))
+    _, qddot = plant_of(robot, fast).acceleration(braking := limits.braking_command(fast))
     np.testing.assert_allclose(qddot, -2.0 * fast.qdot, rtol=1e-6)
     assert limits.apply(fast, braking, np.full(6, np.inf)) is braking
 
@@ -144,7 +144,7 @@ def test_momenta_and_rates_decay_and_energy_only_falls(seed: int) -> None:
     began, rates, last = plant.momentum(), state.qdot, energy(plant)
     first = last
     for _ in range(50):
-        plant.step(limits.to_rest(plant.state), PERIOD)
+        plant.step(limits.braking_command(plant.state), PERIOD)
         now = energy(plant)
         assert now < last
         last = now

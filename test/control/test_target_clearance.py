@@ -16,7 +16,7 @@ from spacerobot_ros.collision import ObstaclePair
 from spacerobot_ros.control import approach
 from spacerobot_ros.control.approach import NearestLinks, TargetClearance
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.servicing import Approach, MeasuredTarget
+from spacerobot_ros.control.servicing import ApproachTask, MeasuredTarget
 from spacerobot_ros.control.target_motion import (
     FrameMotion,
     PathInWorld,
@@ -144,7 +144,7 @@ def test_a_way_that_is_clear_is_taken_as_it_is() -> None:
     # Few samples first, then all; the hand counts until it leaves the standoff.
     (few, _), (count, closes) = answers.closes
     assert few == -(-count // 8)
-    assert 0 <= 0.25 * closes - found.closes_at < 0.25
+    assert 0 <= 0.25 * closes - found.closing_time < 0.25
     assert plan(NEAR, clearance=Answers(None)).distance == np.inf
     exactly: Any = Answers(0.05)
     assert plan(NEAR, clearance=exactly).distance == 0.05
@@ -235,7 +235,7 @@ def test_the_clearance_of_a_controller_is_its_parameter() -> None:
     controller: Any = SimpleNamespace(law=law)
     for least in (0.03, 0.0):
         config = configured(ControllerConfig, {"target.clearance": least})
-        made = Approach(measured, config)
+        made = ApproachTask(measured, config)
         assert made._clearance(controller) is None
         measured.describe(body, "ring")
         found = made._clearance(controller)

@@ -415,10 +415,10 @@ def test_the_parts_of_the_momentum_add_up_to_that_of_pinocchio() -> None:
 def test_references_keep_within_the_torque_and_momentum_of_wheels_alone() -> None:
     motion = MotionLimits(angular_acceleration=1e3, angular_speed=1e3, speed=0.7)
     q = np.array([0.4])
-    assert control(1.0).motion_within(motion, q) is motion
-    assert control(0.0, excluded="spin_c").motion_within(motion, q) is motion
+    assert control(1.0).limits_with_wheels(motion, q) is motion
+    assert control(0.0, excluded="spin_c").limits_with_wheels(motion, q) is motion
     wheels = control(0.0)
-    within = wheels.motion_within(motion, q)
+    within = wheels.limits_with_wheels(motion, q)
     inertia = np.linalg.eigvalsh(SpaceRobot(WHEELS.gyrostat).inertia_matrix(q)[3:6, 3:6])[-1]
     rows = np.linalg.norm(np.linalg.inv(WHEELS.axes_B), axis=1)
     torque, momentum = (WHEELS.torque / rows).min(), (0.03 * WHEELS.rate / rows).min()

@@ -17,7 +17,7 @@ from spacerobot_ros.simulation.faults import (
     POSE_AXES,
     SENSOR_GROUPS,
     WRENCH_AXES,
-    Targets,
+    FaultTargets,
     fault_timeline,
     parse_fault,
 )
@@ -59,7 +59,7 @@ LINES = st.one_of(
 
 @fuzz("fault line", LINES, st.booleans(), fast=50, long=1500)
 def test_a_line_is_refused_or_says_the_same_when_written_again(line: str, wrench: bool) -> None:
-    targets = Targets(JOINTS, wrench, ("nozzle_1",) if wrench else ())
+    targets = FaultTargets(JOINTS, wrench, ("nozzle_1",) if wrench else ())
     fault = attempt("fault line", parse_fault, line, targets, 3.0)
     if fault is not None:
         assert math.isfinite(fault.value)
@@ -71,7 +71,7 @@ def test_a_line_is_refused_or_says_the_same_when_written_again(line: str, wrench
     "fault timeline", st.lists(LINES, max_size=4), st.lists(NUMBERS, max_size=4), fast=20, long=400
 )
 def test_a_timeline_of_lines(lines: list[str], times: list[float]) -> None:
-    timeline = attempt("fault timeline", fault_timeline, lines, Targets(JOINTS, True))
+    timeline = attempt("fault timeline", fault_timeline, lines, FaultTargets(JOINTS, True))
     if timeline is not None:
         for time in sorted(t for t in times if math.isfinite(t)):
             assert all(f.start <= time < f.end for f in timeline.at(time))

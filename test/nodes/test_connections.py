@@ -11,30 +11,30 @@ from std_srvs.srv import Trigger
 from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import PlantNode
-from spacerobot_ros.nodes.common.streams import Connections, topics_without_all_matches
+from spacerobot_ros.nodes.common.streams import MatchedEndpoints, topics_without_all_matches
 
-PLANT = Connections((("/odom", 2), ("/clock", 1)), (("/joint_commands", 1),))
-PLANNER = Connections((("/joint_commands", 2),), (("/odom", 1),))
-RECORDER = Connections((), (("/odom", 1), ("/clock", 1), ("/joint_commands", 1)))
+PLANT = MatchedEndpoints((("/odom", 2), ("/clock", 1)), (("/joint_commands", 1),))
+PLANNER = MatchedEndpoints((("/joint_commands", 2),), (("/odom", 1),))
+RECORDER = MatchedEndpoints((), (("/odom", 1), ("/clock", 1), ("/joint_commands", 1)))
 
 
 def test_all_have_met_or_the_topics_say_who_has_not() -> None:
     assert topics_without_all_matches([PLANT, PLANNER, RECORDER]) == set()
-    early = Connections((("/odom", 1), ("/clock", 1)), PLANT.subscriptions)
+    early = MatchedEndpoints((("/odom", 1), ("/clock", 1)), PLANT.subscriptions)
     assert topics_without_all_matches([early, PLANNER, RECORDER]) == {"/odom"}, (
         "a publisher knows one reader"
     )
-    deaf = Connections((), (("/odom", 1), ("/clock", 0), ("/joint_commands", 1)))
+    deaf = MatchedEndpoints((), (("/odom", 1), ("/clock", 0), ("/joint_commands", 1)))
     assert topics_without_all_matches([PLANT, PLANNER, deaf]) == {"/clock"}, (
         "a reader knows no publisher"
     )
     # Readers from elsewhere are no matter.
-    more = Connections((("/odom", 7), ("/clock", 7)), PLANT.subscriptions)
+    more = MatchedEndpoints((("/odom", 7), ("/clock", 7)), PLANT.subscriptions)
     assert topics_without_all_matches([more, PLANNER, RECORDER]) == set()
 
 
 def test_two_readers_of_one_node_are_two() -> None:
-    twice = Connections((), (("/clock", 1), ("/clock", 1)))
+    twice = MatchedEndpoints((), (("/clock", 1), ("/clock", 1)))
     assert topics_without_all_matches([PLANT, PLANNER, RECORDER, twice]) == {"/clock"}
 
 
@@ -48,14 +48,17 @@ def test_a_node_answers_with_its_endpoints(harness: Harness, plant: PlantNode) -
     probe = harness.probe({"odom": _odometry()})
     harness.connect()
     client = probe.create_client(Trigger, "plant/connections")
-    found = Connections.from_json(harness.call(client, Trigger.Request()).message)
-    assert found == Connections.of(plant)
+    found = MatchedEndpoints.from_json(harness.call(client, Trigger.Request()).message)
+    assert found == MatchedEndpoints.of(plant)
     assert ("/odom", 1) in found.publishers
     assert ("/joint_commands", 0) in found.subscriptions
     assert not {"/rosout", "/parameter_events"} & {topic for topic, _ in found.publishers}
     probe.create_publisher(String, "fault_injection", 10)
     harness.connect()
-    assert topics_without_all_matches([Connections.of(plant), Connections.of(probe)]) == set()
+    assert (
+        topics_without_all_matches([MatchedEndpoints.of(plant), MatchedEndpoints.of(probe)])
+        == set()
+    )
 
 
 def _odometry() -> Any:

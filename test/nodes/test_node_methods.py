@@ -22,7 +22,13 @@ from spacerobot_ros.nodes import recorder, replay
 from spacerobot_ros.nodes.common import messages, ros_parameters, watchdog
 from spacerobot_ros.nodes.common.messages import KnownFrames
 from spacerobot_ros.nodes.common.node import FlightNode
-from spacerobot_ros.nodes.common.watchdog import HeartbeatState, Liveness, Role, Silence, Watchdog
+from spacerobot_ros.nodes.common.watchdog import (
+    HeartbeatState,
+    Liveness,
+    Role,
+    SilenceReport,
+    Watchdog,
+)
 from spacerobot_ros.nodes.recorder import RecorderNode
 from spacerobot_ros.nodes.replay import ReplayNode
 from spacerobot_ros.planning import Goal
@@ -473,7 +479,7 @@ class Beating:
         self.published: list[Any] = []
         self.timers: list[Any] = []
         self.destroyed: list[Any] = []
-        self.silences: list[Silence] = []
+        self.silences: list[SilenceReport] = []
         self.topics: list[str] = []
         monkeypatch.setattr(watchdog, "time", SimpleNamespace(monotonic=lambda: self.now))
         monkeypatch.setattr(
@@ -582,8 +588,8 @@ def test_a_node_that_was_suspended_gives_the_others_their_time_again(
         now[0] += seconds
         lost = dog.look()
     assert len(lost) == found
-    assert Silence("/a", 0.123).message == "Node '/a' is silent for 0.12 s."
-    assert Silence("/a", 12.6, over=True).message == "Node '/a' is back after 13 s."
+    assert SilenceReport("/a", 0.123).message == "Node '/a' is silent for 0.12 s."
+    assert SilenceReport("/a", 12.6, over=True).message == "Node '/a' is back after 13 s."
 
 
 @pytest.mark.parametrize("over", [False, True])
@@ -591,7 +597,7 @@ def test_a_node_that_is_silent_or_back_is_an_event(over: bool) -> None:
     done: list[Any] = []
     log = Calls(done, "log")
     node: Any = SimpleNamespace(get_logger=lambda: log, report_event=done.append)
-    silence = Silence("/plant", 1.23456, over=over)
+    silence = SilenceReport("/plant", 1.23456, over=over)
     FlightNode.on_silence(node, silence)
     line, event = done
     assert line == ("log.info" if over else "log.error", silence.message)

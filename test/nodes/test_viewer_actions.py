@@ -30,10 +30,18 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.faults import Targets
+from spacerobot_ros.simulation.faults import FaultTargets
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer.reachability import Verdict
-from spacerobot_ros.viewer.state import Fly, Inject, Measured, Part, Request, Seek, StackState
+from spacerobot_ros.viewer.state import (
+    FlyAction,
+    InjectAction,
+    Measured,
+    Part,
+    Request,
+    SeekAction,
+    StackState,
+)
 
 ROBOT = load_robot(robot_file("servicer"))
 GOAL = Goal.checked([1.0, -2.0, 3.0], [0.5, -0.1, 0.7, 0.5])
@@ -227,7 +235,7 @@ def test_buttons_call_services_of_the_nodes_that_offer_them(
 
 
 def test_faults_and_times_of_a_replay_are_sent(stand: Stand) -> None:
-    stand.draw(Inject("stuck arm_1"), Seek(12.5))
+    stand.draw(InjectAction("stuck arm_1"), SeekAction(12.5))
     assert [each.data for each in stand.node.sent["fault_injection"].sent] == ["stuck arm_1"]
     assert [each.data for each in stand.node.sent["replay/seek"].sent] == [12.5]
     assert stand.notes == [("Sent to the plant: stuck arm_1", 0, "page")]
@@ -238,7 +246,7 @@ def test_goals_of_one_request_have_one_stamp_and_all_requests_different_ones(
 ) -> None:
     goals: dict[Part, Goal] = {"base": GOAL, "end_effector": HAND}
     stand.checking = True
-    stand.draw(Fly(goals))
+    stand.draw(FlyAction(goals))
     sent = stand.node.sent
     stamps = []
     for topic, goal in (("goal_pose", GOAL), ("end_effector/goal_pose", HAND)):
@@ -255,7 +263,7 @@ def test_goals_of_one_request_have_one_stamp_and_all_requests_different_ones(
     stand.checking = False
     shape = replace(GOAL, joint_positions=np.array([0.25] * len(ROBOT.joint_names)))
     stand.hear("robot_description", String(data=ROBOT.urdf))
-    stand.draw(Fly({"base": shape}))
+    stand.draw(FlyAction({"base": shape}))
     assert sent["goal_pose"].sent[-1].header.stamp.nanosec == 456_002
     assert sent["goal_joint_states"].sent[-1].name == list(ROBOT.joint_names)
     assert len(sent["end_effector/goal_pose"].sent) == 1
@@ -279,7 +287,7 @@ def test_goals_of_links_are_offered_and_sent_as_the_planner_takes_them(stand: St
     right = EndEffectorGoal("right_link_7", np.array([-0.5, 0.25, 8.0]))
     shape = np.linspace(0.1, 0.7, 14)
     hands = {aim.link: Goal.of_end_effectors([aim], joint_positions=shape) for aim in (left, right)}
-    stand.draw(Fly(hands))
+    stand.draw(FlyAction(hands))
     sent = stand.node.sent
     assert sent["goal_pose"].sent == [], "the base is free"
     messages = [sent[f"{link}/goal_pose"].sent[0] for link in hands]
@@ -299,10 +307,10 @@ def test_goals_of_links_are_offered_and_sent_as_the_planner_takes_them(stand: St
     sent["left_link_7/goal_pose"].matched = 0
     sent["right_link_7/goal_pose"].matched = 1
     stand.node.count_subscribers = lambda topic_name: 0  # type: ignore[method-assign]
-    stand.draw(Fly(hands))
+    stand.draw(FlyAction(hands))
     assert stand.notes[-1] == ("Goal sent.", 0, "page")
     sent["right_link_7/goal_pose"].matched = 0
-    stand.draw(Fly(hands))
+    stand.draw(FlyAction(hands))
     assert stand.notes[-1][0].startswith("No planner or controller takes the goal")
     # Another robot, and a planner of another kind.
     stand.hear("robot_description", String(data=ROBOT.urdf))
@@ -317,7 +325,7 @@ def test_a_goal_waits_for_subscribers_that_are_known_but_not_matched(
     stand: Stand, unmatched: bool, seconds: float
 ) -> None:
     stand.node.sent["goal_joint_states"].matched = 1 if unmatched else 2
-    stand.draw(Fly({"base": GOAL}))
+    stand.draw(FlyAction({"base": GOAL}))
     if unmatched:
         stand.draw(after=3.75)
         assert stand.node.sent["goal_pose"].sent == []
@@ -328,19 +336,19 @@ def test_a_goal_waits_for_subscribers_that_are_known_but_not_matched(
 def test_a_goal_that_nobody_takes_or_answers_is_reported(stand: Stand) -> None:
     stand.node.sent["goal_pose"].matched = 1
     stand.node.count_subscribers = lambda topic_name: 1  # type: ignore[method-assign]
-    stand.draw(Fly({"base": GOAL}))
+    stand.draw(FlyAction({"base": GOAL}))
     nobody = ("No planner or controller takes the goal: none is running.", 2, "page")
     assert stand.notes == [nobody]
     stand.draw(after=60.0)
     assert stand.notes == [nobody]
     stand.node.sent["goal_pose"].matched = 2
-    stand.draw(Fly({"base": GOAL}))
+    stand.draw(FlyAction({"base": GOAL}))
     stand.draw(after=4.75)
     assert len(stand.notes) == 2
     stand.draw(after=0.25)
     late = ("No planner or controller has answered the goal: send it again.", 2, "page")
     assert stand.notes[2:] == [late]
-    stand.draw(Fly({"base": GOAL}))
+    stand.draw(FlyAction({"base": GOAL}))
     stand.state = StackState(planner=PlannerStatus(PlannerState.PLANNING, goal_id="2.000456003"))
     stand.draw()
     stand.draw(after=60.0)
@@ -393,8 +401,8 @@ def test_parameters_are_read_again_when_they_change_or_their_node_comes_back(
     stand: Stand,
 ) -> None:
     stand.hear("robot_description", String(data=ROBOT.urdf))
-    assert isinstance(stand.shown[-1], Targets)
-    assert stand.shown[-1] == Targets()
+    assert isinstance(stand.shown[-1], FaultTargets)
+    assert stand.shown[-1] == FaultTargets()
     stand.on_status("plant", "/x")
     stand.on_status("plant", "/x")
     assert [each.name for each in stand.requests] == ["/x"]
@@ -403,14 +411,14 @@ def test_parameters_are_read_again_when_they_change_or_their_node_comes_back(
     first = stand.requests[0]
     first.values, first.over = {"actuation": '"velocity"'}, True
     stand.draw()
-    assert stand.shown[-2:] == [None, Targets(ROBOT.joint_names, False, ())]
+    assert stand.shown[-2:] == [None, FaultTargets(ROBOT.joint_names, False, ())]
     assert len(stand.requests) == 2, "it was asked for meanwhile"
     again = stand.requests[1]
     again.values, again.over = {"actuation": '"effort"', "thrusters": '"urdf"'}, True
     stand.draw()
     names, offered = stand.shown[-2:]
     assert len(names) > 1
-    assert offered == Targets(ROBOT.joint_names, True, names)
+    assert offered == FaultTargets(ROBOT.joint_names, True, names)
     for node in ("/other", "/x"):
         stand.hear("/parameter_events", ParameterEvent(node=node))
     assert len(stand.requests) == 3
@@ -422,7 +430,7 @@ def test_parameters_are_read_again_when_they_change_or_their_node_comes_back(
     assert stand.requests[4].name == "/y"
     stand.requests[4].values, stand.requests[4].over = {"thrusters": '"missing.yaml"'}, True
     stand.draw()
-    assert stand.shown[-2:] == [None, Targets(ROBOT.joint_names, False, ())]
+    assert stand.shown[-2:] == [None, FaultTargets(ROBOT.joint_names, False, ())]
     assert stand.notes[-1][1:] == (1, "")
     assert "missing.yaml" in stand.notes[-1][0]
 
@@ -462,7 +470,7 @@ def test_a_description_that_is_no_robot_is_in_the_log_and_shows_none(stand: Stan
 
 
 def test_a_paused_plant_and_a_busy_planner_are_given_their_time(stand: Stand) -> None:
-    stand.draw(Fly({"base": GOAL}))
+    stand.draw(FlyAction({"base": GOAL}))
     paused = PlantStatus(PlantState.PAUSED, "Time stands still.")
     for state in (StackState(busy=True), StackState(plant=paused)):
         stand.state = state

@@ -63,7 +63,7 @@ class Viewed:
         self.now, self.streams, self.reported = 1000.0, Streams(), list[tuple[str, str]]()
         wall = SimpleNamespace(monotonic=lambda: self.now, time_ns=lambda: 77)
         monkeypatch.setattr(listening, "time", wall)
-        monkeypatch.setattr(listening, "Latest", self.streams.latest)
+        monkeypatch.setattr(listening, "LatestMessage", self.streams.latest)
         self.heard: dict[str, Any] = {}
 
         def create(kind: type[Any], topic: str, callback: Any, qos: object) -> None:

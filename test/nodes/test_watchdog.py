@@ -16,7 +16,13 @@ from support.ros_harness import Harness
 
 from spacerobot_ros.model.compilation import c_compiler, compiled
 from spacerobot_ros.nodes import RecorderNode
-from spacerobot_ros.nodes.common.watchdog import HeartbeatState, Liveness, Role, Silence, Watchdog
+from spacerobot_ros.nodes.common.watchdog import (
+    HeartbeatState,
+    Liveness,
+    Role,
+    SilenceReport,
+    Watchdog,
+)
 from spacerobot_ros.simulation.status import PlantState
 
 REAL_TIME = {"time_mode": "realtime", "real_time_factor": 1.0, "command_timeout": 5.0}
@@ -28,7 +34,7 @@ class Watch:
     def __init__(self, timeout: float = 0.8) -> None:
         self.now = 50.0
         self.watchdog = Watchdog(timeout, clock=lambda: self.now)
-        self.found: list[Silence] = []
+        self.found: list[SilenceReport] = []
 
     def spend(self, seconds: float, *beating: str, every: float = 0.2) -> None:
         """Let time pass; these nodes give their heartbeats."""

@@ -15,10 +15,10 @@ from spacerobot_ros.planning.core import clearance as module
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts, given_effort_limits
 from spacerobot_ros.planning.methods.optimal.problem import (
-    CandidateError,
     MotionLimits,
     MotionOptions,
     PathConstraints,
+    UnusableCandidateError,
 )
 
 Array = npt.NDArray[np.float64]
@@ -75,7 +75,7 @@ def test_a_base_may_turn_at_its_bound_and_a_millionth_more() -> None:
     bound = PathConstraints(base_rate=0.2)
     shapes = np.zeros((3, 2))
     bound.check(shapes, turning(0.2 * (1 + 0.9e-6)), 0.5)
-    with pytest.raises(CandidateError, match=r"^the base turns at 0\.2001 rad/s$"):
+    with pytest.raises(UnusableCandidateError, match=r"^the base turns at 0\.2001 rad/s$"):
         bound.check(shapes, turning(0.2001), 0.5)
     PathConstraints().check(shapes, turning(9.0), 0.5)
     assert bound.imposed_base_rate == pytest.approx(0.196)
@@ -88,7 +88,7 @@ def test_an_axis_may_touch_its_cone() -> None:
     nearest = np.pi / 2 - 0.9
     PathConstraints(axis_B=axis, direction_W=sun, cone=nearest).check(shapes, attitudes, 0.5)
     wider = PathConstraints(axis_B=axis, direction_W=sun, cone=nearest + 1e-6)
-    with pytest.raises(CandidateError) as refusal:
+    with pytest.raises(UnusableCandidateError) as refusal:
         wider.check(shapes, attitudes, 0.5)
     assert str(refusal.value) == f"the axis comes within {nearest:.4g} rad of keep_direction"
 
@@ -99,7 +99,9 @@ def test_shapes_may_touch_a_box_and_its_first_entry_is_told() -> None:
     attitudes = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
     kept.check(np.array([[0.1, 0.0], [0.4, 0.0], [0.2, 0.5], [0.2, -0.5]]), attitudes, 0.5)
     inside = np.array([[0.0, 0.0], [0.05, 0.0], [0.2, 0.1], [0.3, 0.2]])
-    with pytest.raises(CandidateError, match=r"^the shape enters a box of keep_out at 1 s$"):
+    with pytest.raises(
+        UnusableCandidateError, match=r"^the shape enters a box of keep_out at 1 s$"
+    ):
         kept.check(inside, attitudes, 0.5)
 
 

@@ -55,7 +55,7 @@ class Scripted:
     converged: bool = True
 
     def solve(self, *_: object) -> Trajectory:
-        return self.path.retimed(next(self.durations) / self.path.duration)
+        return self.path.stretched(next(self.durations) / self.path.duration)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from spacerobot_ros.collision.rows import DistanceRows
-from spacerobot_ros.planning.methods.optimal.transcription import _distances
+from spacerobot_ros.planning.methods.optimal.transcription import _distance_block
 
 N = 2
 
@@ -59,7 +59,7 @@ def by_hand(z: np.ndarray) -> np.ndarray:
 
 
 def test_rows_are_those_of_the_shapes_between_the_knots() -> None:
-    block = _distances(N, [rows_of_links(), rows_of_obstacles()], 3)
+    block = _distance_block(N, [rows_of_links(), rows_of_obstacles()], 3)
     np.testing.assert_allclose(block.values(Z, P).full().ravel(), by_hand(Z), atol=1e-13)
     values, J = block.jacobian(Z, P)
     np.testing.assert_allclose(values.full().ravel(), by_hand(Z), atol=1e-13)
@@ -69,7 +69,7 @@ def test_rows_are_those_of_the_shapes_between_the_knots() -> None:
 
 
 def test_second_derivatives_are_those_of_differences() -> None:
-    block = _distances(N, [rows_of_links(), rows_of_obstacles()], 3)
+    block = _distance_block(N, [rows_of_links(), rows_of_obstacles()], 3)
     multipliers = np.array([0.7, -1.2, 0.4, 2.0, -0.6, 1.1])
 
     def gradient(z: np.ndarray) -> np.ndarray:

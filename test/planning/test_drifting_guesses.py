@@ -179,7 +179,7 @@ def test_a_joint_that_brakes_at_each_tick_comes_to_rest_within_its_room() -> Non
     """Rates are held for a tick; from each to the next they change by what the joint can."""
     follower, room = follower_of(), np.array([0.3, 0.02, 0.7])
     a, h = np.array([0.6, 0.8, 1.1]), PERIOD
-    rates = follower._stoppable(room)
+    rates = follower._rates_that_can_stop(room)
     # Uniform braking, v^2 / 2 a, half a tick at full rate, and what rounding to ticks adds.
     np.testing.assert_allclose(rates**2 / (2 * a) + rates * h / 2 + a * h**2 / 8, room, rtol=1e-12)
     for rate, one, most in zip(rates, room, a, strict=True):
@@ -189,7 +189,7 @@ def test_a_joint_that_brakes_at_each_tick_comes_to_rest_within_its_room() -> Non
         # From the middle of the first tick on.
         assert moved - rate * h / 2 <= one
         assert moved > 0.9 * (one - rate * h)
-    np.testing.assert_array_equal(follower._stoppable(np.array([-0.1, 0.0, 1e-5])), 0.0)
+    np.testing.assert_array_equal(follower._rates_that_can_stop(np.array([-0.1, 0.0, 1e-5])), 0.0)
 
 
 def test_rates_change_together_and_by_no_more_than_accelerations_allow() -> None:

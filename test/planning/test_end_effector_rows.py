@@ -139,7 +139,7 @@ def test_ends_of_guesses_are_at_the_goal_and_the_soonest_is_first(arm: SpaceRobo
     way = np.array([1.3, -0.2, 0.4])
     found, parameters = position_goal(arm, way)
     turn = np.array([0.0, 0.0, 0.0, 1.0])
-    ends = found._possible_ends(ARM, LIMITS, parameters, turn)
+    ends = found._find_possible_ends(ARM, LIMITS, parameters, turn)
     assert 1 <= len(ends) <= 6
     times = [np.max(np.abs(each.shape - ARM) / VELOCITY) for each in ends]
     assert times == sorted(times)
@@ -152,7 +152,7 @@ def test_ends_of_guesses_are_at_the_goal_and_the_soonest_is_first(arm: SpaceRobo
         np.testing.assert_allclose(each.turn, exact, atol=1e-12)
         for other in ends[:k]:
             assert np.max(np.abs(each.shape - other.shape) / half) > 0.05
-    again = found._possible_ends(ARM, LIMITS, parameters, turn)
+    again = found._find_possible_ends(ARM, LIMITS, parameters, turn)
     for one, other in zip(ends, again, strict=True):
         np.testing.assert_array_equal(one.shape, other.shape)
 
@@ -187,7 +187,7 @@ def test_a_place_that_no_shape_reaches_is_not_found(arm: SpaceRobot) -> None:
     found, parameters = position_goal(arm, np.array([1.3, -0.2, 0.4]))
     inside = np.concatenate([[0.05, 0.0, 0.02], parameters[3:]])
     with pytest.raises(NotFoundError) as refusal:
-        found._possible_ends(ARM, LIMITS, inside, np.array([0.0, 0.0, 0.0, 1.0]))
+        found._find_possible_ends(ARM, LIMITS, inside, np.array([0.0, 0.0, 0.0, 1.0]))
     text = str(refusal.value)
     assert text.startswith(
         "No shape of robot 'three_joint_arm' that puts 'end_effector' to the goal was found from "

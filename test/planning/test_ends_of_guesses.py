@@ -59,7 +59,7 @@ class Kinematics:
 def ends_of(kinematics: Kinematics, *, attitude: bool = False) -> Any:
     made = specification(attitude=attitude)
     object.__setattr__(made, "_inverse_kinematics", kinematics)
-    return made._possible_ends(START, LIMITS, "goals", IDENTITY)
+    return made._find_possible_ends(START, LIMITS, "goals", IDENTITY)
 
 
 def test_ends_are_sought_from_the_start_from_nearby_and_from_anywhere() -> None:

@@ -20,11 +20,11 @@ from spacerobot_ros.planning.methods.optimal.initial_guesses import (
 )
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
-    CandidateError,
     MotionLimits,
     OptimalOptions,
     PathConstraints,
     Trajectory,
+    UnusableCandidateError,
 )
 from spacerobot_ros.resources import robot_file
 
@@ -127,7 +127,7 @@ def test_shapes_at_ticks_are_those_of_constant_accelerations() -> None:
     assert motion.duration == 2.0
     time = np.linspace(0.0, 2.0, 8)
     np.testing.assert_allclose(motion.at_ticks(7)[:, 0], 2.0 * time - 1.5 * time**2, atol=1e-12)
-    slower = motion.retimed(2.0)
+    slower = motion.stretched(2.0)
     assert slower.duration == 4.0
     np.testing.assert_allclose(slower.at_ticks(7), motion.at_ticks(7), atol=1e-12)
     assert slower.velocities[:, 0].tolist() == (motion.velocities[:, 0] / 2).tolist()
@@ -196,7 +196,7 @@ def test_a_base_that_turns_too_fast_or_an_axis_too_near_is_refused(arm: SpaceRob
     shapes = np.zeros((3, 3))
     calm = PathConstraints.of(arm, OptimalOptions(max_base_rate=0.5))
     calm.check(shapes, turning([0.0, 0.2, 0.45]), 0.5)
-    with pytest.raises(CandidateError, match=r"the base turns at 0\.6 rad/s"):
+    with pytest.raises(UnusableCandidateError, match=r"the base turns at 0\.6 rad/s"):
         calm.check(shapes, turning([0.0, 0.2, 0.5]), 0.5)
     assert calm.imposed_base_rate == pytest.approx(0.49)
     quick = Trajectory(0.5, shapes, shapes + 1.0, turning([0.0, 0.49, 0.5]))
@@ -209,7 +209,7 @@ def test_a_base_that_turns_too_fast_or_an_axis_too_near_is_refused(arm: SpaceRob
     away = PathConstraints.of(arm, OptimalOptions(**cone, keep_angle=angle - 1e-6))
     away.check(shapes, turning([0.0, np.pi / 3, 0.5]), 1.0)
     inside = PathConstraints.of(arm, OptimalOptions(**cone, keep_angle=angle + 1e-6))
-    with pytest.raises(CandidateError, match=r"comes within 0\.5236 rad of keep_direction"):
+    with pytest.raises(UnusableCandidateError, match=r"comes within 0\.5236 rad of keep_direction"):
         inside.check(shapes, turning([0.0, np.pi / 3, 0.5]), 1.0)
     assert (away.on_knots, away.base_rate) == (1, 0.0)
     q, x, d = ca.SX.sym("q", 3), ca.SX.sym("x", 4), ca.SX.sym("d", 3)
@@ -230,7 +230,7 @@ def test_a_box_of_shapes_is_left_out_with_a_body_round_it(arm: SpaceRobot) -> No
     outside = np.array([[0.0, 0.2, 0.0], [-0.5, 0.5, 0.0], [0.0, 0.75, 0.0]])
     constraints.check(outside, np.tile(IDENTITY, (3, 1)), 0.5)
     entering = np.vstack([outside[:2], [[0.0, 0.5, 9.0]]])
-    with pytest.raises(CandidateError, match=r"enters a box of keep_out at 1 s"):
+    with pytest.raises(UnusableCandidateError, match=r"enters a box of keep_out at 1 s"):
         constraints.check(entering, np.tile(IDENTITY, (3, 1)), 0.5)
     q, x, d = ca.SX.sym("q", 3), ca.SX.sym("x", 4), ca.SX.sym("d", 3)
     value = ca.Function("value", [q, x, d], [constraints.symbolic(q, x, d)])
@@ -351,7 +351,7 @@ def test_ticks_of_a_schedule_are_a_guess_that_goes_on_with_their_velocity(
 def test_a_guess_may_begin_with_a_velocity_that_it_loses_soon(guesses: InitialGuesses) -> None:
     """After four times the braking time of the joint that brakes longest it is as before."""
     through = guesses.from_shapes(np.array([START, FINAL]), LIMITS)
-    rest = through.retimed(2.0 / through.duration)
+    rest = through.stretched(2.0 / through.duration)
     assert guesses.with_initial_velocity(rest, np.zeros(3), LIMITS) is rest
     velocity = np.array([0.5, -0.125, 0.25])  # Braking takes 1/16, 1/8 and 1/8 s.
     moving = guesses.with_initial_velocity(rest, velocity, LIMITS)

@@ -44,6 +44,6 @@ def test_any_law_of_proportional_joints_turns_the_base_alike_in_step_1(profile: 
     phase = PlanarPhase(robot_of("planar_chain"))
     along = np.asarray(profile(np.linspace(0.0, 1.0, 400)))[:, np.newaxis]
     shapes = (1 - along) * [np.pi, -np.pi]
-    turn = phase.leg_turns(shapes[:-1], shapes[1:]).sum()
+    turn = phase.turns_by_legs(shapes[:-1], shapes[1:]).sum()
     assert turn == pytest.approx(np.pi / 2 - 0.571293, abs=1e-6)
     assert abs(np.pi / 2 - turn - 0.39) > 0.1

@@ -51,7 +51,7 @@ def test_the_curvature_is_the_turn_of_small_loops() -> None:
 
 def test_a_square_turns_the_base_by_its_curvature_and_by_its_sides() -> None:
     centres, sides = np.array([[0.4, -0.7], [2.0, 1.0]]), np.array([1.3, 0.6])
-    found = PLANE.square_turns(centres, sides)
+    found = PLANE.turns_by_squares(centres, sides)
     for (x, y), side, turn in zip(centres, sides, found, strict=True):
         ends = x - side / 2, x + side / 2, y - side / 2, y + side / 2
         area, _ = dblquad(lambda b, a: float(PLANE.curvature(np.array([a, b]))), *ends)

@@ -19,10 +19,10 @@ from spacerobot_ros.planning.methods.resolved_rate import (
     JointPath,
     ResolvedRateGait,
     _fastest_speeds,
-    _LinkLine,
+    _LinkPath,
+    _SmoothPath,
     _TimedPath,
     _trace,
-    _Way,
 )
 
 Array = npt.NDArray[np.float64]
@@ -35,7 +35,7 @@ IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 def test_a_way_through_points_is_a_natural_spline_by_the_lengths_of_its_chords() -> None:
     points = np.array([[0.0, 0, 0], [0.3, 0.4, 0], [0.3, 0.4, 1.2], [1.3, 0.4, 1.2]])
-    way = _Way(points)
+    way = _SmoothPath(points)
     assert way.length == pytest.approx(0.5 + 1.2 + 1.0)
     assert not way.is_straight
     spline = CubicSpline(np.array([0.0, 0.5, 1.7, 2.7]) / 2.7, points, bc_type="natural")
@@ -46,28 +46,28 @@ def test_a_way_through_points_is_a_natural_spline_by_the_lengths_of_its_chords()
 
 def test_points_that_come_twice_are_no_way_and_two_are_a_straight_one() -> None:
     points = np.array([[0.0, 0, 0], [0.0, 0, 0], [0.6, 0.0, -0.8], [0.6, 0.0, -0.8]])
-    way = _Way(points)
+    way = _SmoothPath(points)
     assert way.is_straight
     assert way.length == pytest.approx(1.0)
     np.testing.assert_allclose(way.place(0.25), [0.15, 0.0, -0.2], atol=1e-15)
     np.testing.assert_allclose(way.rate(0.7), [0.6, 0.0, -0.8], atol=1e-14)
-    none = _Way(points[:2])
+    none = _SmoothPath(points[:2])
     assert (none.is_straight, none.length) == (True, 0.0)
     np.testing.assert_array_equal(none.place(0.5), 0.0)
     np.testing.assert_array_equal(none.rate(0.5), 0.0)
-    three = _Way(np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 0.2, 0]]))
+    three = _SmoothPath(np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 0.2, 0]]))
     assert not three.is_straight
 
 
 def test_the_error_of_a_link_is_seen_along_its_directions() -> None:
     turn = np.array([0.0, 0.0, 0.8])
-    line = _LinkLine(
+    line = _LinkPath(
         "hand",
         np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
         np.array([[0.0, 0.0, 1.0]]),
         np.array([0.5, -0.2, 0.1]),
         Rotation.from_rotvec([0.3, 0.1, 0.0]).as_quat(),
-        _Way(np.array([[0.0, 0, 0], [2.0, 1.0, 0.0]]), turn),
+        _SmoothPath(np.array([[0.0, 0, 0], [2.0, 1.0, 0.0]]), turn),
     )
     wanted = Rotation.from_rotvec(0.25 * turn) * Rotation.from_rotvec([0.3, 0.1, 0.0])
     off = Rotation.from_rotvec([0.0, 0.0, 0.05])

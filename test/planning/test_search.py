@@ -300,17 +300,17 @@ def progress(**changes: Any) -> _Progress:
 
 def test_solutions_agree_by_number_and_two_are_enough_with_a_library() -> None:
     same = [path(5.0)] * 5
-    assert progress(agreeing=5).agreed(same)
-    assert not progress(agreeing=5).agreed(same[1:])
-    assert not progress(agreeing=0).agreed(same)
-    assert not progress(agreeing=1).agreed([])
+    assert progress(agreeing=5).solutions_agree(same)
+    assert not progress(agreeing=5).solutions_agree(same[1:])
+    assert not progress(agreeing=0).solutions_agree(same)
+    assert not progress(agreeing=1).solutions_agree([])
     with_library = progress(agreeing=5)
     with_library.library = SimpleNamespace()  # type: ignore[assignment]
-    assert with_library.agreed(same[:2])
-    assert not with_library.agreed(same[:1])
+    assert with_library.solutions_agree(same[:2])
+    assert not with_library.solutions_agree(same[:1])
     one = progress(agreeing=1)
     one.library = with_library.library
-    assert one.agreed(same[:1])
+    assert one.solutions_agree(same[:1])
 
 
 def test_the_first_guesses_are_those_of_a_library(

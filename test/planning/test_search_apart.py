@@ -41,10 +41,10 @@ from spacerobot_ros.planning.methods.optimal.held_commands import (
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import TOLERANCE
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
-    CandidateError,
     MotionLimits,
     PathConstraints,
     Trajectory,
+    UnusableCandidateError,
 )
 from spacerobot_ros.planning.methods.optimal.search import (
     Manoeuvre,
@@ -388,9 +388,11 @@ def test_drifting_robots_hold_whole_ticks_and_others_stretch(model: ManoeuvreMod
     assert search._make_held_commands(at_rest, path(5.0)).duration == pytest.approx(5.0)
     assert search._make_held_commands(drifting, path(5.0)).duration == pytest.approx(0.15)
     search._hold_in_whole_ticks = lambda *_: None
-    with pytest.raises(CandidateError, match="held commands could not be brought to the goal"):
+    with pytest.raises(
+        UnusableCandidateError, match="held commands could not be brought to the goal"
+    ):
         search._make_held_commands(drifting, path(5.0))
-    with pytest.raises(CandidateError, match="no path"):
+    with pytest.raises(UnusableCandidateError, match="no path"):
         search._make_held_commands(drifting, None)
 
 
@@ -422,7 +424,7 @@ def test_commands_that_turn_the_base_a_little_too_fast_are_made_slower(
     search._holder = Turning()
     asked = progress(Kept({}, {}), duration=given)
     if expected is None:
-        with pytest.raises(CandidateError, match="the base turns at"):
+        with pytest.raises(UnusableCandidateError, match="the base turns at"):
             search._make_held_commands(asked, path(duration))
     else:
         found = search._make_held_commands(asked, path(duration))

@@ -37,7 +37,7 @@ def test_phase_of_a_unit_square(
     chain: SpaceRobot, centre: tuple[float, float], printed: float
 ) -> None:
     corners = np.array(centre) + np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-    phase = float(PlanarPhase(chain).leg_turns(corners, np.roll(corners, -1, axis=0)).sum())
+    phase = float(PlanarPhase(chain).turns_by_legs(corners, np.roll(corners, -1, axis=0)).sum())
     assert phase == pytest.approx(printed, abs=5e-7)
     # Eq. (11) with the printed functions, and Stokes' surface integral.
     along = sum(
@@ -53,7 +53,7 @@ def test_phase_of_a_unit_square(
 
 
 def test_step_1_of_the_paper_turns_the_base_by_one_radian(chain: SpaceRobot) -> None:
-    phase = PlanarPhase(chain).leg_turns(FOLDED[np.newaxis], DEPLOYED[np.newaxis])
+    phase = PlanarPhase(chain).turns_by_legs(FOLDED[np.newaxis], DEPLOYED[np.newaxis])
     assert phase[0] == pytest.approx(0.999503, abs=5e-7)
     gait = paper_gait(chain)
     assert gait.notes["turn_of_step_1"] == pytest.approx(0.999503, abs=5e-7)

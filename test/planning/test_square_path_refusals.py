@@ -150,7 +150,7 @@ def test_joints_without_speed_are_refused(chain: SpaceRobot) -> None:
     assert "velocity limit above zero" in refusal_of(robot, at_rest(DEPLOYED), NEAR)
     # No loop is needed here, and step 1 takes for ever.
     shape = np.array([np.pi, 0.0])
-    turn = float(PlanarPhase(chain).leg_turns(FOLDED[np.newaxis], shape[np.newaxis])[0])
+    turn = float(PlanarPhase(chain).turns_by_legs(FOLDED[np.newaxis], shape[np.newaxis])[0])
     text = refusal_of(robot, at_rest(FOLDED), goal_of(about_z(turn), shape))
     assert "'pin_2'" in text
     assert "inf s" in text

@@ -16,9 +16,9 @@ from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.methods.optimal.method import OptimalGait
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
-    CandidateError,
     MotionLimits,
     OptimalOptions,
+    UnusableCandidateError,
 )
 
 Array = npt.NDArray[np.float64]
@@ -76,7 +76,7 @@ def refusal(made: Any, positions: Array, **changes: Any) -> str:
     request: Any = SimpleNamespace(state=STATE, goal=goal)
     try:
         OptimalGait._require_valid_manoeuvre(made, positions, request, boundary, LIMITS)
-    except CandidateError as error:
+    except UnusableCandidateError as error:
         return str(error)
     return ""
 

@@ -24,7 +24,7 @@ from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
 from spacerobot_ros.report.figures_over_time import _error_decades, link_errors_figure
 from spacerobot_ros.report.figures_space import configurations_figure, path_figure
-from spacerobot_ros.report.flight import FlightReport, Target, read_report
+from spacerobot_ros.report.flight import FlightReport, GoalSpan, read_report
 from spacerobot_ros.report.page import _chart_data, _numbers_html
 from spacerobot_ros.report.scene import WORLD, Scene, scene_of
 from spacerobot_ros.report.tables import headline, result_table
@@ -93,9 +93,9 @@ def test_each_goal_counts_until_the_next(hands: FlightReport) -> None:
     base = Goal.checked([5.0, 6.0, 7.0], TURNED)
     both = replace(base, end_effectors=(replace(left, position=np.zeros(3)),))
     targets = [
-        Target(0.0, 0.4, Goal.of_end_effectors([left, right])),
-        Target(0.4, 0.7, base),
-        Target(0.7, 1.35, both),
+        GoalSpan(0.0, 0.4, Goal.of_end_effectors([left, right])),
+        GoalSpan(0.4, 0.7, base),
+        GoalSpan(0.7, 1.35, both),
     ]
     report = other(hands, _all_targets=targets)
     assert report.targets == targets[1:], "goals of the base"
@@ -106,7 +106,7 @@ def test_each_goal_counts_until_the_next(hands: FlightReport) -> None:
     _, r = poses_by_pinocchio(hands, LEFT)
     off = [*np.linalg.norm(r[early] - left.position, axis=1), *np.linalg.norm(r[late], axis=1)]
     np.testing.assert_allclose(errors[LEFT].distance.values[:, 0], off, atol=1e-12)
-    unknown = Target(0.0, 1.0, Goal.of_end_effectors([replace(left, link="nobody")]))
+    unknown = GoalSpan(0.0, 1.0, Goal.of_end_effectors([replace(left, link="nobody")]))
     assert other(hands, _all_targets=[unknown]).link_errors == {}
     assert other(hands, _all_targets=[]).link_errors == {}
 

@@ -35,7 +35,7 @@ from spacerobot_ros.report.figures_over_time import (
     thrusters_figure,
 )
 from spacerobot_ros.report.figures_space import cycles_figure
-from spacerobot_ros.report.flight import FlightReport, Status, joint_unit, read_report
+from spacerobot_ros.report.flight import FlightReport, TimedStatus, joint_unit, read_report
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.tables import (
@@ -668,7 +668,7 @@ def test_cycles_are_those_of_a_method_that_repeats_them(
     reports: list[PlannerStatus | ControllerStatus], repeats: bool, looping: Path
 ) -> None:
     found = read_report(looping)
-    vars(found)["statuses"] = [Status(0.1, each) for each in reports]
+    vars(found)["statuses"] = [TimedStatus(0.1, each) for each in reports]
     assert found.repeats_cycles is repeats
     assert (found.cycles is not None) is repeats
     assert (cycles_figure(found) is not None) is repeats

@@ -111,7 +111,7 @@ def test_pictures_draw_the_target_where_it_is_held() -> None:
     gone = np.linalg.norm(positions - positions[0], axis=1)
     assert gone[-1] > 0.5
     for k in (0, len(times) // 2, len(times) - 1):
-        drawn = np.concatenate([face.corners for face in report.target_at(times[k]).faces])
+        drawn = np.concatenate([face.corners for face in report.target_solids_at(times[k]).faces])
         wanted = positions[k] + attitudes[k].apply(corners)
         assert np.abs(drawn[:, None] - wanted[None]).max(axis=2).min(axis=1).max() < 1e-9
     figure = configurations_figure(report)

@@ -18,7 +18,7 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.nodes.common.streams import Connections
+from spacerobot_ros.nodes.common.streams import MatchedEndpoints
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerStatistics
@@ -415,9 +415,9 @@ def test_the_topics_of_end_effectors_that_nobody_takes_are_named(time: Time) -> 
 
 def endpoints(
     publishers: dict[str, int] | None = None, subscriptions: dict[str, int] | None = None
-) -> Connections:
+) -> MatchedEndpoints:
     """Return the endpoints of a node, with the number of partners that each has met."""
-    return Connections(tuple((publishers or {}).items()), tuple((subscriptions or {}).items()))
+    return MatchedEndpoints(tuple((publishers or {}).items()), tuple((subscriptions or {}).items()))
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
-from spacerobot_ros.simulation.capture import Approach, CapturePlant, capture_values
+from spacerobot_ros.simulation.capture import CapturePlant, GrappleMotion, capture_values
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import CaptureConfig, PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
@@ -262,7 +262,7 @@ def test_an_automatic_capture_waits_for_the_target_and_after_a_release_for_its_r
 
 
 def test_a_capture_needs_every_quantity_within_its_bound() -> None:
-    approach = Approach(distance=0.2, angle=0.3, speed=0.04, rate=0.5)
+    approach = GrappleMotion(distance=0.2, angle=0.3, speed=0.04, rate=0.5)
     loose = CaptureConfig(distance=0.2, angle=0.3, speed=0.04, rate=0.5)
     assert approach.misses(loose) == []
     assert approach.misses(CaptureConfig(distance=0.05, angle=0.2, speed=0.03, rate=0.1)) == [

@@ -28,7 +28,7 @@ from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
     FAULT_KINDS,
     Fault,
-    Targets,
+    FaultTargets,
     fault_timeline,
     parse_fault,
 )
@@ -38,7 +38,7 @@ from spacerobot_ros.simulation.sensors import Sensors
 URDF = Path(__file__).parents[2] / "urdf"
 TICK = 0.05
 ARM = ("shoulder_yaw", "shoulder_pitch", "elbow_pitch")
-TARGETS = Targets(ARM, wrench=True, nozzles=("plus_x", "minus_x"))
+TARGETS = FaultTargets(ARM, wrench=True, nozzles=("plus_x", "minus_x"))
 
 
 def urdf(name: str) -> str:
@@ -159,7 +159,7 @@ def test_the_largest_faults_leave_numbers_finite_or_stop_the_plant_with_a_senten
     config = PlantConfig(actuation=actuation, tick_rate=20.0)
     plant = build_plant(robot, config)
     sensors = Sensors(plant, config.sensors, config.control_period)
-    targets = Targets(robot.joint_names, actuation == "effort").of(FAULT_KINDS[kind])
+    targets = FaultTargets(robot.joint_names, actuation == "effort").of(FAULT_KINDS[kind])
     extremes = (
         {FAULT_KINDS[kind].minimum, FAULT_KINDS[kind].maximum} if FAULT_KINDS[kind].value else {""}
     )

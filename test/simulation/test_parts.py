@@ -21,7 +21,7 @@ from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import capture, effort_plant, sensors, status
 from spacerobot_ros.simulation.actuators import build_plant
-from spacerobot_ros.simulation.capture import Approach, CaptureReport, ReleaseReport
+from spacerobot_ros.simulation.capture import CaptureReport, GrappleMotion, ReleaseReport
 from spacerobot_ros.simulation.config import CaptureConfig, PlantConfig, TargetConfig
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
@@ -366,13 +366,13 @@ def test_a_release_says_how_the_target_moves() -> None:
 
 def test_an_approach_may_be_at_its_limits() -> None:
     limits = CaptureConfig(distance=0.5, angle=0.25, speed=0.125, rate=0.0625)
-    assert Approach(0.5, 0.25, 0.125, 0.0625).misses(limits) == []
-    assert Approach(0.75, 0.2, 0.375, math.nan).misses(limits) == [
+    assert GrappleMotion(0.5, 0.25, 0.125, 0.0625).misses(limits) == []
+    assert GrappleMotion(0.75, 0.2, 0.375, math.nan).misses(limits) == [
         "distance is 0.75 m, 0.25 m more than 'capture.distance', 0.5",
         "speed is 0.375 m/s, 0.25 m/s more than 'capture.speed', 0.125",
         "rate is nan rad/s, nan rad/s more than 'capture.rate', 0.0625",
     ]
-    assert Approach(0.0, 0.5, 0.0, 0.125).misses(limits) == [
+    assert GrappleMotion(0.0, 0.5, 0.0, 0.125).misses(limits) == [
         "angle is 0.5 rad, 0.25 rad more than 'capture.angle', 0.25",
         "rate is 0.125 rad/s, 0.0625 rad/s more than 'capture.rate', 0.0625",
     ]

@@ -19,11 +19,11 @@ from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.faults import Targets
+from spacerobot_ros.simulation.faults import FaultTargets
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer import goal_editor, page
 from spacerobot_ros.viewer.page import Page
-from spacerobot_ros.viewer.reachability import Check, Verdict
+from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
 from spacerobot_ros.viewer.server import ViewerConfig
 from spacerobot_ros.viewer.state import Firing, Measured, Momenta, Notice, StackState
 
@@ -65,7 +65,7 @@ def _planned() -> dict[str, Any]:
     names = seen.robot.joint_names
     table = find_thrusters("urdf", seen.robot)
     act.show_thrusters(table)
-    act.faults.offer(Targets(names, wrench=True, nozzles=table.names))
+    act.faults.offer(FaultTargets(names, wrench=True, nozzles=table.names))
     act.note(Notice("A mesh is missing.", 1))
     flying = StackState(
         measured=seen.measured(4.0, 0.0),
@@ -102,7 +102,7 @@ def _planned() -> dict[str, Any]:
     later = replace(flying, measured=seen.measured(5.5, 0.125))
     seen.show(replace(later, momenta=Momenta(np.arange(6.0) / 90, None, 0.5)))
     act.editor.show_check(
-        Check(Verdict.REACHABLE, "In 8 s.", 8.0, np.linspace(0.1, 0.6, len(names)))
+        GoalCheck(Verdict.REACHABLE, "In 8 s.", 8.0, np.linspace(0.1, 0.6, len(names)))
     )
     seen.show(replace(flying, measured=seen.measured(7.0, 0.25)))
     return seen.shown()
@@ -129,7 +129,7 @@ def _controlled() -> dict[str, Any]:
     seen.server.gui.named("Goal for the end-effector").use(seen.server, False)
     seen.server.gui.named("Goal").use(seen.server, "Abort goal")
     seen.server.gui.named("Fly").use(seen.server)
-    seen.page.editor.show_check(Check(Verdict.REFUSED, "Too far."))
+    seen.page.editor.show_check(GoalCheck(Verdict.REFUSED, "Too far."))
     seen.show(replace(flying, measured=seen.measured(4.0, 1.0)))
     seen.server.gui.named("Goal to the robot").use(seen.server)
     seen.server.gui.named("View from").use(seen.server, "Top")

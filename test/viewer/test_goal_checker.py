@@ -19,9 +19,9 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer.reachability import (
-    Check,
+    GoalCheck,
     GoalChecker,
-    Question,
+    GoalQuestion,
     Verdict,
     is_reached,
     make_question,
@@ -69,7 +69,7 @@ def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def question(name: str) -> Any:
-    return Question(name, {}, None, None)  # type: ignore[arg-type]
+    return GoalQuestion(name, {}, None, None)  # type: ignore[arg-type]
 
 
 def said(checker: Checker) -> tuple[Verdict, str] | None:
@@ -78,7 +78,7 @@ def said(checker: Checker) -> tuple[Verdict, str] | None:
     return None if check is None else (check.verdict, check.message)
 
 
-FOUND = Check(Verdict.REACHABLE, "There.", 4.0)
+FOUND = GoalCheck(Verdict.REACHABLE, "There.", 4.0)
 
 
 def test_questions_are_numbered_and_the_last_one_is_answered_once(now: list[float]) -> None:

@@ -22,10 +22,10 @@ from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer import reachability
 from spacerobot_ros.viewer.reachability import (
-    Check,
+    GoalCheck,
     GoalChecker,
+    GoalQuestion,
     Planner,
-    Question,
     Verdict,
     _LastQuestion,
     _uncontrolled_text,
@@ -43,8 +43,8 @@ GOAL = Goal.checked([1.0, 2.0, 3.0], ATTITUDE)
 HAND = Goal.checked([1.5, 2.5, 3.5], ATTITUDE)
 
 
-def asked(number: float) -> Question:
-    return Question("<robot/>", {"number": str(number)}, STATE, GOAL)
+def asked(number: float) -> GoalQuestion:
+    return GoalQuestion("<robot/>", {"number": str(number)}, STATE, GOAL)
 
 
 class Process:
@@ -102,7 +102,7 @@ class Stage:
         return None if check is None else (check.verdict.value, check.message)
 
 
-YES, NO = Check(Verdict.REACHABLE, "yes", 4.0), Check(Verdict.REFUSED, "no")
+YES, NO = GoalCheck(Verdict.REACHABLE, "yes", 4.0), GoalCheck(Verdict.REFUSED, "no")
 
 
 def test_the_time_of_a_plan_and_its_progress_are_told_until_its_answer(
@@ -225,7 +225,7 @@ def test_a_question_has_the_measured_state_and_the_momenta() -> None:
         question = make_question(
             replace(PLANNING, momenta=given), {"base": GOAL}, SERVICER, parameters
         )
-        assert isinstance(question, Question)
+        assert isinstance(question, GoalQuestion)
         start = question.state
         np.testing.assert_array_equal(start.position, PLACE)
         np.testing.assert_array_equal(start.quaternion, ATTITUDE)
@@ -240,13 +240,13 @@ def test_the_question_of_a_controller_is_for_its_end_effector() -> None:
     state = StackState(MEASURED, momenta=Momenta(np.ones(6), None, 0.0))
     goals = {"base": GOAL, "end_effector": HAND}
     question = make_question(state, goals, SERVICER, {})
-    assert isinstance(question, Question)
+    assert isinstance(question, GoalQuestion)
     assert (question.goal, question.tool, question.link) == (GOAL, HAND, SERVICER.end_effector())
     elbow = {"controller": {"end_effector_frame": '"forearm"'}, "planner": {"a": "1"}}
     known = [name for name in SERVICER.frames if name != SERVICER.end_effector()][-1]
     elbow["controller"]["end_effector_frame"] = f'"{known}"'
     other = make_question(state, goals, SERVICER, elbow)
-    assert isinstance(other, Question)
+    assert isinstance(other, GoalQuestion)
     assert (other.link, other.parameters) == (known, {})
     absent = {"controller": {"end_effector_frame": '"nobody"'}}
     answer = make_question(state, goals, SERVICER, absent)
@@ -391,7 +391,7 @@ def test_an_answer_has_the_end_of_the_plan(
     monkeypatch.setattr(reachability, "PlanningWorker", Worker)
     monkeypatch.setattr(reachability, "robot_from_text", lambda urdf, config: urdf)
     planner = Planner()
-    question = Question("one", {"attitude_tolerance": "0.25"}, STATE, UPRIGHT)
+    question = GoalQuestion("one", {"attitude_tolerance": "0.25"}, STATE, UPRIGHT)
     refused = planner.answer(question, Cancellation())
     assert (refused.verdict, refused.message) == (Verdict.REFUSED, "There is no way.")
     assert (refused.shape, refused.base) == (None, None)

@@ -21,7 +21,7 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer.content import COLORS
 from spacerobot_ros.viewer.goal_editor import GoalEditor
-from spacerobot_ros.viewer.reachability import Check, Verdict, planned_goal
+from spacerobot_ros.viewer.reachability import GoalCheck, Verdict, planned_goal
 from spacerobot_ros.viewer.scene import reach_of, xyzw
 from spacerobot_ros.viewer.server import start_server, stop_server
 
@@ -84,14 +84,14 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     assert goal.joint_positions is None, "any"
     page.editor.settled_goals(LATER)
     # The fields begin where the robot is now.
-    page.editor.robot_is_at(POSE, q + 0.02)
+    page.editor.update_robot(POSE, q + 0.02)
     page.set(page.final._enabled, True)
     assert page.final._folder.visible
     shape = page.editor.goals()["base"].joint_positions
     assert shape is not None
     np.testing.assert_allclose(shape, q + 0.02)
     assert page.editor.moving, "another goal is to be checked"
-    page.editor.show_check(Check(Verdict.REACHABLE, shape=q))
+    page.editor.show_check(GoalCheck(Verdict.REACHABLE, shape=q))
     page.editor.settled_goals(LATER)
     at_rest = page.ghost()
     page.set(page.final._fields[2], -0.2)
@@ -102,7 +102,7 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     assert checked is not None
     assert checked["base"].joint_positions is not None
     # The ghost has that shape before it is planned for, whatever the robot does.
-    page.editor.robot_is_at(POSE, np.zeros(3))
+    page.editor.update_robot(POSE, np.zeros(3))
     moved = [float(np.linalg.norm(a - b)) for a, b in zip(page.ghost(), at_rest, strict=True)]
     np.testing.assert_allclose(moved, [0.02, 0.02, 0.35], atol=1e-9)
     # Without a planner nobody takes it.
@@ -119,7 +119,7 @@ def test_the_ghost_is_not_drawn_where_the_robot_is(server: Any) -> None:
     assert ghost is not None
 
     def is_drawn(pose: Array = POSE, q: Array = q) -> bool:
-        page.editor.robot_is_at(pose, q)
+        page.editor.update_robot(pose, q)
         return bool(ghost.base.visible)
 
     assert not is_drawn()
@@ -127,7 +127,7 @@ def test_the_ghost_is_not_drawn_where_the_robot_is(server: Any) -> None:
     assert is_drawn(POSE + np.eye(7)[0] * 0.1)
     half = np.array([0.0, 0.0, 0.05])
     assert is_drawn(np.concatenate([POSE[:3], np.sin(half), [np.cos(0.05)]])), "0.1 rad"
-    page.editor.show_check(Check(Verdict.REACHABLE, shape=np.array([0.0, 0.0, 0.1])))
+    page.editor.show_check(GoalCheck(Verdict.REACHABLE, shape=np.array([0.0, 0.0, 0.1])))
     assert is_drawn()
     assert not is_drawn(q=np.array([0.0, 0.0, 0.1]))
 
@@ -168,7 +168,7 @@ def test_a_goal_of_the_end_effector_that_appears_is_checked(server: Any) -> None
 def test_a_robot_with_other_joints_comes_after_a_goal_was_checked(server: Any) -> None:
     page = Editor(server, "sliding_masses")
     page.editor.place(POSE, None, np.zeros(3), 0.0)
-    reachable = Check(Verdict.REACHABLE, "Reachable in 1 s.", 1.0, shape=np.full(3, 0.1))
+    reachable = GoalCheck(Verdict.REACHABLE, "Reachable in 1 s.", 1.0, shape=np.full(3, 0.1))
     page.editor.show_check(reachable)
     bent = page.ghost()
     # The next plan may end in the same sentence, with another shape.
@@ -180,7 +180,7 @@ def test_a_robot_with_other_joints_comes_after_a_goal_was_checked(server: Any) -
     page.editor.show_robot(other, reach_of(other))
     assert "not checked" in page.editor._verdict.content
     page.editor.place(POSE, None, np.zeros(6), 0.0)
-    page.editor.robot_is_at(POSE, np.full(6, 0.1))
+    page.editor.update_robot(POSE, np.full(6, 0.1))
     assert len(page.ghost()) == 6
 
 
@@ -311,10 +311,10 @@ def test_the_ghost_of_a_free_base_is_where_the_plan_ends(two_hands: Editor) -> N
     choose(page, HANDS[0], "position")
     # Off the robot, so that the ghost's place in the gizmo is not the place in the world.
     page.editor._move_gizmo("/goal", np.array([5.0, 5.0, 5.0, 0.1, 0.7, -0.5, 0.5]))
-    page.editor.show_check(Check(Verdict.PLANNING, "Planning for 2 s."))
+    page.editor.show_check(GoalCheck(Verdict.PLANNING, "Planning for 2 s."))
     assert not ghost.base.visible, "nothing is predicted"
     end = np.array([1.5, -2.25, 0.5, *TURNED[[1, 0, 3, 2]]])
-    page.editor.show_check(Check(Verdict.REACHABLE, shape=q + 0.1, base=end))
+    page.editor.show_check(GoalCheck(Verdict.REACHABLE, shape=q + 0.1, base=end))
     assert ghost.base.visible
     R = matrix_from_quaternion(xyzw(page.editor._gizmos["/goal"].wxyz))
     seen = page.editor._gizmos["/goal"].position + R @ ghost.base.position
@@ -323,10 +323,10 @@ def test_the_ghost_of_a_free_base_is_where_the_plan_ends(two_hands: Editor) -> N
     np.testing.assert_allclose(turned, matrix_from_quaternion(end[3:]), atol=1e-12)
     assert {mark.color for mark in marks.values()} == {COLORS[Verdict.REACHABLE]}
     # Where the robot is then, it is not drawn; and a base with a goal is drawn there.
-    page.editor.robot_is_at(end, q + 0.1)
+    page.editor.update_robot(end, q + 0.1)
     assert not ghost.base.visible
     choose(page, "base", "pose")
-    page.editor.robot_is_at(end, q + 0.1)
+    page.editor.update_robot(end, q + 0.1)
     assert ghost.base.visible
     np.testing.assert_allclose(ghost.base.position, 0.0, atol=1e-12)
 
@@ -447,7 +447,7 @@ def test_the_ghost_stands_where_the_robot_will_end(server: Any) -> None:
     editor.place(POSE, None, np.zeros(3), 0.0)
     page.set(editor._position, (1.0, 0.0, 0.0))
     end = np.array([0.2, 0.1, 0.3, 0.0, 0.0, 0.6, 0.8])
-    editor.show_check(Check(Verdict.PARTLY, shape=np.full(3, 0.1), base=end))
+    editor.show_check(GoalCheck(Verdict.PARTLY, shape=np.full(3, 0.1), base=end))
     assert editor._ghost is not None
     gizmo, ghost = editor._gizmos["/goal"], editor._ghost.base
     # The ghost hangs on the gizmo, which stays at the goal.

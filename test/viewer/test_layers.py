@@ -213,7 +213,7 @@ def test_the_end_of_the_past_is_the_present(server: Server, page: Page) -> None:
 
 
 def test_a_past_of_many_states_is_evenly_thinned() -> None:
-    recent: content.Recent[int] = content.Recent(span_s=300.0, most=600)
+    recent: content.RecentItems[int] = content.RecentItems(span_s=300.0, most=600)
     for k in range(20_000):
         recent.add(0.05 * k, k)
     assert recent.span is not None

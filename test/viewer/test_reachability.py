@@ -24,10 +24,10 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer.reachability import (
-    Check,
+    GoalCheck,
     GoalChecker,
+    GoalQuestion,
     Planner,
-    Question,
     Verdict,
     make_question,
     planned_goal,
@@ -40,12 +40,12 @@ ORIGIN = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
 SPEED = {"method": "lie_bracket", "lie_bracket.t1": 4.0, "lie_bracket.cycles": 0}
 
 
-def question(*position: float, **parameters: object) -> Question:
+def question(*position: float, **parameters: object) -> GoalQuestion:
     """Ask for a position, of a planner with such parameters."""
     values = {**values_of(PlannerConfig()), **SPEED, **parameters, "robot": "elsewhere.urdf"}
     texts = {name: json.dumps(value) for name, value in values.items()}
     goal = Goal.checked(position, [0.0, 0.0, 0.0, 1.0])
-    return Question(URDF, texts, ORIGIN, goal)
+    return GoalQuestion(URDF, texts, ORIGIN, goal)
 
 
 def test_an_answer_is_what_the_planner_would_plan() -> None:
@@ -71,7 +71,7 @@ def test_joint_positions_of_a_goal_are_asked_for_and_a_method_without_them_says_
     assert "'lie_bracket' does not control the final joint positions" in answer.message
 
 
-def arm_question(*position: float) -> Question:
+def arm_question(*position: float) -> GoalQuestion:
     """Ask for a position of an arm, of a planner whose method controls the attitude alone."""
     urdf = load_robot(robot_file("three_joint_arm")).urdf
     return replace(question(*position, method="area_loop"), urdf=urdf)
@@ -140,7 +140,7 @@ def test_goals_of_links_are_planned_for_and_the_base_ends_where_the_plan_has_it(
     texts = {name: json.dumps(value) for name, value in values.items()}
     aim = EndEffectorGoal(link, np.array([1.3, 0.9, 0.8]))
     start = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
-    asked = Question(robot.urdf, texts, start, Goal.of_end_effectors([aim]))
+    asked = GoalQuestion(robot.urdf, texts, start, Goal.of_end_effectors([aim]))
     answer = Planner().answer(asked, Cancellation())
     assert answer.verdict == Verdict.REACHABLE, answer
     assert answer.message == f"Reachable in {answer.duration_s:.4g} s by 'resolved_rate'."
@@ -201,7 +201,7 @@ def test_a_goal_of_a_link_is_not_for_a_controller() -> None:
     assert answer == "No planner is running: a controller flies the base to any pose."
     planning = replace(state, planner=PlannerStatus(PlannerState.IDLE))
     asked = make_question(planning, {"end_effector": hand}, servicer, {"planner": {"a": "1"}})
-    assert isinstance(asked, Question)
+    assert isinstance(asked, GoalQuestion)
     assert (asked.goal.end_effectors, asked.goal.base) == (hand.end_effectors, frozenset())
     assert asked.tool is None
 
@@ -213,9 +213,9 @@ def checker() -> Iterator[GoalChecker]:
     checker.close()
 
 
-def looked(checker: GoalChecker, until: Callable[[Check], bool]) -> list[Check]:
+def looked(checker: GoalChecker, until: Callable[[GoalCheck], bool]) -> list[GoalCheck]:
     """Look until an answer is as wanted; return all that were there."""
-    found: list[Check] = []
+    found: list[GoalCheck] = []
     end = time.monotonic() + 60.0
     while not (found and until(found[-1])):
         assert time.monotonic() < end, found[-3:]
@@ -269,7 +269,7 @@ def test_the_arm_of_a_controlled_robot_reaches_its_goal_or_not() -> None:
         pose = pin.SE3ToXYZQUAT(data.oMf[frame])
         base, tool = (Goal(each[:3], each[3:7]) for each in (full, pose))
         start = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6))
-        near = Question(urdf, {}, start, base, tool, link)
+        near = GoalQuestion(urdf, {}, start, base, tool, link)
         answer = Planner().answer(near, Cancellation())
         assert answer.verdict == Verdict.REACHABLE, answer
         shape = np.array(answer.shape)

@@ -31,12 +31,12 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.clearance import ClearanceStatus
-from spacerobot_ros.simulation.faults import Targets
+from spacerobot_ros.simulation.faults import FaultTargets
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.content import History, Trail
 from spacerobot_ros.viewer.goal_editor import move_along, rpy_from_quaternion
-from spacerobot_ros.viewer.reachability import Check, Verdict
+from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
 from spacerobot_ros.viewer.state import Measured, Momenta, Notice, StackState
 
 HERE = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
@@ -129,7 +129,7 @@ def test_what_nodes_say_is_no_html() -> None:
         content.status_html(state),
         content.faults_html((evil,)),
         content.hint_html(evil),
-        content.check_html(Check(Verdict.REFUSED, evil)),
+        content.check_html(GoalCheck(Verdict.REFUSED, evil)),
         content.log_html([Notice(evil, 2, 1.0, evil)]),
     ]
     robot = load_robot(robot_file("three_joint_arm"))
@@ -345,7 +345,7 @@ def test_without_a_momentum_budget_there_is_no_panel() -> None:
 
 
 def test_faults_are_written_for_the_plant() -> None:
-    targets = Targets(("elbow",), wrench=False)
+    targets = FaultTargets(("elbow",), wrench=False)
     kinds = content.fault_kinds(targets)
     assert kinds["joint_stuck"] == ["elbow"]
     assert "thruster_off" not in kinds

@@ -32,7 +32,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
-from spacerobot_ros.viewer.reachability import Check, Verdict, make_question
+from spacerobot_ros.viewer.reachability import GoalCheck, Verdict, make_question
 from spacerobot_ros.viewer.server import free_port
 from spacerobot_ros.viewer.state import Measured, StackState
 
@@ -381,7 +381,9 @@ def test_a_robot_that_changes_after_a_check_is_shown(
     page, sliders = stack.page, names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
     stack.until(lambda: stack.move(0.1, sliders) or page.editor.placed, "a goal")
-    page.editor.show_check(Check(Verdict.REACHABLE, "Reachable in 1 s.", 1.0, shape=np.zeros(3)))
+    page.editor.show_check(
+        GoalCheck(Verdict.REACHABLE, "Reachable in 1 s.", 1.0, shape=np.zeros(3))
+    )
     # A plan for the robot of before is not to be answered any more.
     cancelled: list[bool] = []
 

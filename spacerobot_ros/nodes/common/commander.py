@@ -45,7 +45,7 @@ from spacerobot_ros.nodes.common.messages import (
 )
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.streams import RawInput, with_information
-from spacerobot_ros.nodes.common.watchdog import Role, Silence
+from spacerobot_ros.nodes.common.watchdog import Role, SilenceReport
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
@@ -173,7 +173,7 @@ class CommanderNode(FlightNode):
         now_ns = self.commander.stamps.now_ns
         return now_ns / SECOND if now_ns else None
 
-    def on_silence(self, silence: Silence) -> None:
+    def on_silence(self, silence: SilenceReport) -> None:
         """Drop all goals if the plant is silent and the parameters request it."""
         super().on_silence(silence)
         if self.config.watchdog_action == "abort" and not silence.over:

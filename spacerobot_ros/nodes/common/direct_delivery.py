@@ -13,7 +13,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
 from spacerobot_ros.nodes.common.node import FlightNode
-from spacerobot_ros.nodes.common.streams import AnnouncedPublisher, RawInput, RawOutput, Take
+from spacerobot_ros.nodes.common.streams import AnnouncedPublisher, RawCallback, RawInput, RawOutput
 
 _CHECK_PERIOD = 0.1
 """Wall time between two checks for other publishers, s; messages under way are checks, too."""
@@ -63,7 +63,7 @@ class DirectDelivery:
     def __init__(self, executor: EventsExecutor, nodes: Sequence[Node], host: Node) -> None:
         self._executor, self._nodes, self._host = executor, nodes, host
         self._links: list[_Link] = []
-        self._queue: deque[tuple[Take, bytes]] = deque()
+        self._queue: deque[tuple[RawCallback, bytes]] = deque()
         self._in_turn = False
         """Whether messages are being delivered, and the turn is not used up."""
         self._published = self._delivered = 0
@@ -148,7 +148,7 @@ class DirectDelivery:
     def _count(self) -> None:
         self._published += 1
 
-    def _deliver(self, readers: Sequence[Take], raw: bytes) -> None:
+    def _deliver(self, readers: Sequence[RawCallback], raw: bytes) -> None:
         """Deliver a message that has been published: after this callback, or by the executor."""
         if self._in_turn and self._delivered == self._published:
             for take in readers:
@@ -157,7 +157,7 @@ class DirectDelivery:
             self._published += 1
             self._executor.create_task(self._deliver_one_turn, readers, raw, self._published)
 
-    def _deliver_one_turn(self, readers: Sequence[Take], raw: bytes, number: int) -> None:
+    def _deliver_one_turn(self, readers: Sequence[RawCallback], raw: bytes, number: int) -> None:
         """Deliver a message, and those that answer it as long as nothing else is under way.
 
         The executor calls this when everything that was published before ``number`` has arrived.

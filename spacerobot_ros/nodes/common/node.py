@@ -35,13 +35,13 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
 from spacerobot_ros.nodes.common.streams import (
     AnnouncedPublisher,
-    Connections,
+    MatchedEndpoints,
+    RawCallback,
     RawInput,
     RawOutput,
     RawStream,
-    Take,
 )
-from spacerobot_ros.nodes.common.watchdog import Liveness, Role, Silence
+from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -178,7 +178,7 @@ class FlightNode(LifecycleNode):
         self,
         kind: type[Any],
         topic: str,
-        callback: Take,
+        callback: RawCallback,
         *,
         qos: QoSProfile = STREAM,
         number: Callable[[int], None] | None = None,
@@ -427,7 +427,7 @@ class FlightNode(LifecycleNode):
     def interrupt(self) -> None:
         """Cancel a long computation; called from another thread when the process must end."""
 
-    def on_silence(self, silence: Silence) -> None:
+    def on_silence(self, silence: SilenceReport) -> None:
         """React to a node that has become silent or is back."""
         kind = EventKind.NODE_BACK if silence.over else EventKind.NODE_SILENT
         level, logger = (0 if silence.over else 2), self.get_logger()
@@ -500,7 +500,7 @@ class FlightNode(LifecycleNode):
 
     def _on_connections(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Return the node's connections; a supervisor starts time once all nodes have met."""
-        response.success, response.message = True, Connections.of(self).to_json()
+        response.success, response.message = True, MatchedEndpoints.of(self).to_json()
         return response
 
     def _run(self, hook: Callable[[], None]) -> TransitionCallbackReturn:

@@ -22,7 +22,7 @@ Matches = tuple[tuple[str, int], ...]
 
 
 @dataclass(frozen=True)
-class Connections:
+class MatchedEndpoints:
     """The endpoints of one node, those of the middleware left out.
 
     Attributes
@@ -35,7 +35,7 @@ class Connections:
     subscriptions: Matches
 
     @classmethod
-    def of(cls, node: Node) -> Connections:
+    def of(cls, node: Node) -> MatchedEndpoints:
         """Return the endpoints of a node of this process."""
         readers = [(each.topic_name, each.get_subscription_count()) for each in node.publishers]
         writers = [(each.topic_name, each.get_publisher_count()) for each in node.subscriptions]
@@ -46,13 +46,13 @@ class Connections:
         return json.dumps([self.publishers, self.subscriptions])
 
     @classmethod
-    def from_json(cls, text: str) -> Connections:
+    def from_json(cls, text: str) -> MatchedEndpoints:
         """Return the endpoints of a text from :meth:`to_json`."""
         publishers, subscriptions = json.loads(text)
         return cls(_without_middleware(publishers), _without_middleware(subscriptions))
 
 
-def topics_without_all_matches(nodes: Iterable[Connections]) -> set[str]:
+def topics_without_all_matches(nodes: Iterable[MatchedEndpoints]) -> set[str]:
     """Return the topics on which endpoints of these nodes are not all matched."""
     nodes = list(nodes)
     writers = Counter(topic for node in nodes for topic, _ in node.publishers)
@@ -73,7 +73,7 @@ def _without_middleware(matches: Iterable[Iterable[object]]) -> Matches:
     )
 
 
-Take = Callable[[bytes], None]
+RawCallback = Callable[[bytes], None]
 
 
 def with_information(callback: Callable[[Any, Any], None]) -> Callable[..., None]:
@@ -88,13 +88,13 @@ def with_information(callback: Callable[[Any, Any], None]) -> Callable[..., None
     return take
 
 
-def raw_publish(publisher: Publisher) -> Take:
+def raw_publish(publisher: Publisher) -> RawCallback:
     """Return the function that publishes serialised messages.
 
     ``publisher.publish`` does the same after taking its handle and looking at the type, which
     costs as much again as the publication; the handle lives as long as the publisher.
     """
-    function: Take = publisher.handle.publish_raw
+    function: RawCallback = publisher.handle.publish_raw
     return function
 
 
@@ -125,15 +125,15 @@ class RawStream:
         Called with each message.
     """
 
-    def __init__(self, topic: str, take: Take) -> None:
+    def __init__(self, topic: str, take: RawCallback) -> None:
         self.topic = topic
         self.take = take
         """Called by the owner with each message; looked up every time."""
-        self._acts: tuple[Take, ...] = (take,)
+        self._acts: tuple[RawCallback, ...] = (take,)
         """Functions that the stream calls with a message, in order."""
-        self._listener: Take | None = None
+        self._listener: RawCallback | None = None
 
-    def add_listener(self, listener: Take) -> None:
+    def add_listener(self, listener: RawCallback) -> None:
         """Call a listener with every message before ``take``; one listener at a time."""
         self._listener = listener
         self._compose()
@@ -149,7 +149,7 @@ class RawStream:
         self.take = _one_after_another(*listeners, *self._acts)
 
 
-def _one_after_another(*acts: Take) -> Take:
+def _one_after_another(*acts: RawCallback) -> RawCallback:
     """Return a function that does one to three things with a message, without further calls."""
     if len(acts) == 1:
         return acts[0]
@@ -199,7 +199,7 @@ class RawOutput(RawStream):
         self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
         """Function that waits for all readers' confirmations; returns whether all came."""
 
-    def add_listener(self, listener: Take) -> None:
+    def add_listener(self, listener: RawCallback) -> None:
         """Call a listener with every message, with the last one of a latched topic at once."""
         super().add_listener(listener)
         if self._last is not None:
@@ -211,7 +211,7 @@ class RawOutput(RawStream):
         self._acts = *before, self._publish
         self._compose()
 
-    def call_after_publication(self, deliver: Take | None) -> None:
+    def call_after_publication(self, deliver: RawCallback | None) -> None:
         """Call a function with each message after its publication; None: no longer."""
         after = () if deliver is None else (deliver,)
         self._acts = self._publish, *after
@@ -238,7 +238,7 @@ class RawInput(RawStream):
     def __init__(
         self,
         topic: str,
-        take: Take,
+        take: RawCallback,
         *,
         create: Callable[[Callable[..., None], QoSProfile], Subscription],
         destroy: Callable[[Subscription], object],
@@ -258,7 +258,7 @@ class RawInput(RawStream):
             except Exception as error:
                 on_error(error)
 
-        self.receive: Take = receive
+        self.receive: RawCallback = receive
         """Callback of the subscription, without the number of the message."""
 
         def receive_numbered(raw: bytes, information: Any) -> None:
@@ -315,7 +315,7 @@ class StreamListeners:
         self.nodes: Sequence[StreamingNode] = ()
         self._tapped: dict[str, list[RawStream]] = {}
 
-    def tap(self, topic: str, listener: Take, publishers: int) -> bool:
+    def tap(self, topic: str, listener: RawCallback, publishers: int) -> bool:
         """Listen to a topic's streams; return whether they carry all publishers' messages."""
         streams = self._streams(topic, publishers)
         if streams:

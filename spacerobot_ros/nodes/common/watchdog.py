@@ -55,7 +55,7 @@ class HeartbeatState(str, Enum):
 
 
 @dataclass(frozen=True)
-class Silence:
+class SilenceReport:
     """A node has become silent, or is back.
 
     Attributes
@@ -104,12 +104,12 @@ class Watchdog:
         """Time of the last heartbeat by silent node, s."""
         self._looked = clock()
 
-    def hear(self, name: str, pulse: str) -> Silence | None:
+    def hear(self, name: str, pulse: str) -> SilenceReport | None:
         """Process a heartbeat; return the end of a silence, None if the node was not silent."""
         now = self._clock()
         back = None
         if name in self.silent:
-            back = Silence(name, now - self.silent.pop(name), over=True)
+            back = SilenceReport(name, now - self.silent.pop(name), over=True)
         self._busy.discard(name)
         if pulse == HeartbeatState.BUSY.value:
             self._busy.add(name)
@@ -119,7 +119,7 @@ class Watchdog:
             self._heard.pop(name, None)
         return back
 
-    def look(self) -> list[Silence]:
+    def look(self) -> list[SilenceReport]:
         """Return the nodes that have become silent since the last call."""
         now = self._clock()
         if now - self._looked > _SUSPENSION_TIME:
@@ -127,7 +127,7 @@ class Watchdog:
                 self._heard[name] = now
         self._looked = now
         lost = [
-            Silence(name, now - heard)
+            SilenceReport(name, now - heard)
             for name, heard in self._heard.items()
             if name not in self.silent and name not in self._busy and now - heard > self._timeout
         ]
@@ -156,7 +156,7 @@ class Liveness:
         node: Node,
         role: Role | None,
         depends_on: Iterable[Role],
-        on_silence: Callable[[Silence], None],
+        on_silence: Callable[[SilenceReport], None],
     ) -> None:
         self._node, self._role, self._on_silence = node, role, on_silence
         self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, _HEARTBEAT_QOS)
@@ -253,7 +253,7 @@ class Liveness:
         if lost or (self._watchdog.silent and time.monotonic() >= self._next_report):
             self._report(lost)
 
-    def _report(self, news: list[Silence]) -> None:
+    def _report(self, news: list[SilenceReport]) -> None:
         """Report changes to the node, and publish diagnostics about silent nodes."""
         for silence in news:
             self._on_silence(silence)

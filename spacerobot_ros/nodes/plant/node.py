@@ -32,7 +32,7 @@ from spacerobot_ros.model.world import obstacles_from_topic, with_obstacles_arou
 from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.watchdog import Role, Silence
+from spacerobot_ros.nodes.common.watchdog import Role, SilenceReport
 from spacerobot_ros.nodes.plant.publisher import (
     ClearancePublisher,
     LinkMarkers,
@@ -498,7 +498,7 @@ class PlantNode(FlightNode):
                     self, self.plant, described, self._clearance
                 )
 
-    def on_silence(self, silence: Silence) -> None:
+    def on_silence(self, silence: SilenceReport) -> None:
         """Bring all joints to rest if a commander is silent and the parameters request it."""
         super().on_silence(silence)
         if self.config.watchdog_action == "latch" and not silence.over:

@@ -67,7 +67,7 @@ _MAX_MOTION_POINTS = 200
 M = TypeVar("M")
 
 
-class Latest(Generic[M]):
+class LatestMessage(Generic[M]):
     """The last message of a topic, deserialized on demand.
 
     Parameters
@@ -129,14 +129,14 @@ class Listener:
     ) -> None:
         self._frame, self._on_status = frame, on_status
         self._silent_after = silent_after or math.inf
-        self._odom = Latest(streams, Odometry, "odom")
-        self._joints = Latest(streams, JointState, "joint_states")
-        self._end_effector = Latest(streams, PoseStamped, "end_effector_pose")
-        self._target = Latest(streams, Odometry, "target/odom")
-        self._momentum = Latest(streams, Float64MultiArray, "momentum")
-        self._expected = Latest(streams, Float64MultiArray, "momentum_expected")
-        self._thrusters = Latest(streams, JointState, "thrusters")
-        self._clearances = Latest(streams, DiagnosticStatus, "clearance")
+        self._odom = LatestMessage(streams, Odometry, "odom")
+        self._joints = LatestMessage(streams, JointState, "joint_states")
+        self._end_effector = LatestMessage(streams, PoseStamped, "end_effector_pose")
+        self._target = LatestMessage(streams, Odometry, "target/odom")
+        self._momentum = LatestMessage(streams, Float64MultiArray, "momentum")
+        self._expected = LatestMessage(streams, Float64MultiArray, "momentum_expected")
+        self._thrusters = LatestMessage(streams, JointState, "thrusters")
+        self._clearances = LatestMessage(streams, DiagnosticStatus, "clearance")
         self._names: Sequence[str] = ()
         self._beats: dict[str, _Heartbeat] = {}
         self._statuses: dict[str, Any] = {}

@@ -38,15 +38,15 @@ from spacerobot_ros.nodes.viewer.listener import Listener
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalIds
 from spacerobot_ros.planning.execution.status import PlannerState
-from spacerobot_ros.simulation.faults import Targets
+from spacerobot_ros.simulation.faults import FaultTargets
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.topics import goal_topic
 from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.page import Page
 from spacerobot_ros.viewer.reachability import (
-    Check,
+    GoalCheck,
     GoalChecker,
-    Question,
+    GoalQuestion,
     Verdict,
     goal_tolerance,
     make_question,
@@ -62,12 +62,12 @@ from spacerobot_ros.viewer.server import (
 )
 from spacerobot_ros.viewer.state import (
     Action,
-    Fly,
-    Inject,
+    FlyAction,
+    InjectAction,
     Notice,
     Part,
     Request,
-    Seek,
+    SeekAction,
     StackState,
 )
 
@@ -252,16 +252,16 @@ class ViewerNode(FlightNode):
         goals = editor.settled_goals(now)
         if goals is not None:
             question = self._question(state, goals)
-            if isinstance(question, Question):
+            if isinstance(question, GoalQuestion):
                 self._checker.ask(question)
             else:
                 self._checker.cancel()
-                editor.show_check(Check(Verdict.UNCHECKED, question))
+                editor.show_check(GoalCheck(Verdict.UNCHECKED, question))
         check = self._checker.latest_answer()
         if check is not None and not editor.moving:
             editor.show_check(check)
 
-    def _question(self, state: StackState, goals: Mapping[Part, Goal]) -> Question | str:
+    def _question(self, state: StackState, goals: Mapping[Part, Goal]) -> GoalQuestion | str:
         """Return the check of goals, or the reason why they are not checked."""
         if not self.config.check_goals:
             return "Parameter 'check_goals' is false."
@@ -385,13 +385,13 @@ class ViewerNode(FlightNode):
         """Update the faults that can be injected, and the thrusters."""
         values = self._remote_values.get("plant")
         if self._robot is None or values is None:
-            self._page.faults.offer(Targets())
+            self._page.faults.offer(FaultTargets())
             return
         effort = json.loads(values.get("actuation", '""')) == "effort"
         table = self._thruster_table(json.loads(values.get("thrusters", '""')))
         nozzles = () if table is None else table.names
         self._page.show_thrusters(table)
-        self._page.faults.offer(Targets(self._robot.joint_names, effort, nozzles))
+        self._page.faults.offer(FaultTargets(self._robot.joint_names, effort, nozzles))
 
     def _thruster_table(self, source: str) -> ThrusterTable | None:
         if not source or self._robot is None:
@@ -409,12 +409,12 @@ class ViewerNode(FlightNode):
 
     def _carry_out(self, action: Action, state: StackState) -> None:
         match action:
-            case Fly(goals):
+            case FlyAction(goals):
                 self._goals_to_send = goals, time.monotonic() + _LONGEST_MATCHING_WAIT
-            case Inject(text):
+            case InjectAction(text):
                 self._fault_topic.publish(String(data=text))
                 self._note(f"Sent to the plant: {text}", source="page")
-            case Seek(seconds):
+            case SeekAction(seconds):
                 self._seek_topic.publish(Float64(data=float(seconds)))
             case Request():
                 self._call_service(action)
@@ -474,7 +474,7 @@ class ViewerNode(FlightNode):
         editor = self._page.editor
         editor.note_sent()
         if self._checker.cancel() and not editor.moving:
-            editor.show_check(Check(Verdict.UNCHECKED, "It was sent before it was checked."))
+            editor.show_check(GoalCheck(Verdict.UNCHECKED, "It was sent before it was checked."))
 
     def _call_service(self, request: Request) -> None:
         """Call the service of a request on every node that has it."""

@@ -240,7 +240,7 @@ class Teleoperation:
 
 
 @dataclass(frozen=True)
-class _Coasting:
+class _PlannedRest:
     """A rest at the start of a plan that is made while the robot drifts.
 
     ``begins_ns`` is the stamp of the state that the ``planned`` task begins from, ``duration`` that
@@ -311,7 +311,7 @@ class Executive:
         """Number of late or refused plans in motion for the new goal."""
         self._pending_plan: PlanJob | ReadyPlan | None = None
         """The requested plan, or the plan that waits for its tick (``TAKING_OVER``)."""
-        self._coasting: _Coasting | None = None
+        self._coasting: _PlannedRest | None = None
         """The rest that the requested plan begins with, because the base drifts meanwhile."""
         self._active_goal: ActiveGoal | None = None
         """The goal that is executed or evaluated."""
@@ -716,7 +716,7 @@ class Executive:
         pose = np.eye(7)[6] if teleoperation.pose is None else teleoperation.pose
         before = self._tracker.setpoint.velocity
         rates, limited = teleoperation.follower.rates(twist, pose, q, before)
-        self._tracker.drive(q, rates)
+        self._tracker.follow_velocity(q, rates)
         if teleoperation.twist is None and not np.any(rates):
             self._end_teleoperation(Event.AT_REST, "No twists come any more: the joints rest.")
             return
@@ -933,7 +933,7 @@ class Executive:
         """Track the ready plan from its first tick on."""
         job, schedule, begins_ns = ready.job, ready.schedule, ready.job.take_over.stamp_ns
         self._pending_plan = None
-        if job.reason.for_new_goal:
+        if job.reason.is_for_new_goal:
             self._accept_goal(ActiveGoal(job.identified, schedule, begins_ns))
         reason = job.reason.value
         self._add_event(
@@ -949,7 +949,7 @@ class Executive:
     def _handle_late_plan(self, job: TakeOverJob) -> None:
         """Continue along the present schedule; plan for a new goal once more."""
         self._drop_plan()
-        self._in_motion_attempts += job.reason.for_new_goal
+        self._in_motion_attempts += job.reason.is_for_new_goal
         self._change_phase(Event.PLAN_LATE, Phase.EXECUTING)
         message = "The plan was not ready when it was to take over."
         self._add_notice(Severity.WARNING, message)
@@ -977,7 +977,10 @@ class Executive:
 
     def _request_plan(self, job: PlanJob, state: RobotState) -> None:
         """Request a plan from a measured state; unless it is to take over, the joints brake."""
-        goal, active = job.identified.goal, None if job.reason.for_new_goal else self._active_goal
+        goal, active = (
+            job.identified.goal,
+            None if job.reason.is_for_new_goal else self._active_goal,
+        )
         if active is not None and len(active.stuck_positions) != len(self._tracker.stuck):
             names = self._robot.joint_names
             active.stuck_positions = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
@@ -1005,7 +1008,7 @@ class Executive:
         self._pending_plan, self._coasting = job, None
         at_rest = braking is None and take_over is None
         if at_rest and self._worker.plans_in_background and self._worker.drifts(state):
-            self._coasting = _Coasting(task, self._stamp_ns, _COASTING_TIME)
+            self._coasting = _PlannedRest(task, self._stamp_ns, _COASTING_TIME)
             task = self._coasting.task(self.config.control_period)
         self._worker.submit(task)
         self._take_plan_result()
@@ -1219,7 +1222,7 @@ class Executive:
         self._worker.cancel()
         plan, self._pending_plan = self._pending_plan, None
         job = plan.job if isinstance(plan, ReadyPlan) else plan
-        if job is not None and job.reason.for_new_goal:
+        if job is not None and job.reason.is_for_new_goal:
             self._new_goal = self._new_goal or job.identified
 
     def _phase_without_plan(self) -> Phase:

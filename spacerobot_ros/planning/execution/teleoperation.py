@@ -27,7 +27,7 @@ from spacerobot_ros.planning.methods.optimal.end_effectors import (
     EndEffectorRows,
     reach_of_end_effector,
 )
-from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
+from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 from spacerobot_ros.planning.methods.resolved_rate import LEAST_PROGRESS, ResolvedRateOptions
 
@@ -154,7 +154,7 @@ class TwistFollower:
         self._clearance = clearance
         self._required: Array | None = None
         """Distances (P,) that pairs of bodies keep from the first shape on, m."""
-        turning = Turning.of(robot)
+        turning = BaseRotations.of(robot)
         axes = turning.axes if turning.loops else np.zeros((0, 3))
         (directions,) = EndEffectorRows(robot, [(link, True)], axes).directions
         self._displacements, self._rotations = directions.displacements, directions.rotations
@@ -234,7 +234,7 @@ class TwistFollower:
         with np.errstate(divide="ignore", invalid="ignore"):
             factor = min(factor, float(np.nanmin(limits.velocity / np.abs(rates))))
             room = np.where(rates > 0, limits.upper - q, q - limits.lower)
-            by_stops = np.where(rates != 0, self._stoppable(room) / np.abs(rates), np.inf)
+            by_stops = np.where(rates != 0, self._rates_that_can_stop(room) / np.abs(rates), np.inf)
         nearest = int(np.argmin(by_stops))
         if by_stops[nearest] < factor:
             factor = float(by_stops[nearest])
@@ -268,7 +268,7 @@ class TwistFollower:
             return np.zeros(len(q)), 0.0
         return self._weights * scaled, float(np.linalg.norm(motion) / np.linalg.norm(scaled))
 
-    def _stoppable(self, room: Array) -> Array:
+    def _rates_that_can_stop(self, room: Array) -> Array:
         """Return the largest rates (n,) from which joints stop within some room (n,)."""
         a, h = self._limits.acceleration, self._period
         free = np.maximum(room - a * h**2 / 8, 0.0)
@@ -282,7 +282,10 @@ class TwistFollower:
             share = float(np.nanmin(np.append(most / np.abs(change), 1.0)))
         # All joints change together, so that the direction of the motion stays; but stops count.
         rates = before + share * change
-        up, down = self._stoppable(limits.upper - q), self._stoppable(q - limits.lower)
+        up, down = (
+            self._rates_that_can_stop(limits.upper - q),
+            self._rates_that_can_stop(q - limits.lower),
+        )
         return np.asarray(np.clip(rates, -down, up))
 
     def _too_near(self, clearance: Clearance, rates: Array, pose: Array, q: Array) -> str:

@@ -345,7 +345,7 @@ class TrajectoryTracker:
             return []
         return self._stuck_watch.find_stuck(q, position, velocity)
 
-    def drive(self, q: Array, velocity: Array) -> None:
+    def follow_velocity(self, q: Array, velocity: Array) -> None:
         """Write a setpoint of velocities (n,) that follow no schedule."""
         setpoint = self.setpoint
         if self._commands_plant or not self._holds_position:

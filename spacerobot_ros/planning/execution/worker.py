@@ -45,7 +45,7 @@ class PlanReason(Enum):
     STUCK_JOINTS = "stuck joints"  # Some joints are stuck; the plan uses the other joints.
 
     @property
-    def for_new_goal(self) -> bool:
+    def is_for_new_goal(self) -> bool:
         """Whether the plan is for a new goal, which is not active yet."""
         return self in (PlanReason.NEW_GOAL, PlanReason.BLEND, PlanReason.IN_MOTION)
 

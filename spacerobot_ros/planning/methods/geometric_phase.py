@@ -172,7 +172,7 @@ class PlanarPhase:
         N_D = ca.vertcat((axis.T @ D_q).T, axis.T @ D @ axis)
         self._N_D = ca.Function("N_D", [psi], [ca.densify(N_D)])
 
-    def leg_turns(self, starts: Array, ends: Array) -> Array:
+    def turns_by_legs(self, starts: Array, ends: Array) -> Array:
         """Return the turns (L,) along straight legs of the shape, starts and ends (L, n)."""
         return _integrate_legs(self._connection_row, starts, ends)
 
@@ -218,7 +218,7 @@ class PhasePlane:
         N_i_j, _, D_j = self._polynomials(left, right @ _HARMONIC_DERIVATIVE)
         return np.asarray((N_i_j * D - N_i * D_j - N_j_i * D + N_j * D_i) / D**2)
 
-    def square_turns(self, centres: Array, sides: Array) -> Array:
+    def turns_by_squares(self, centres: Array, sides: Array) -> Array:
         """Return the turns (R,) of the base by counter-clockwise squares with centres (R, 2)."""
         corners = square_corners(centres, sides)
         ends = np.roll(corners, -1, axis=1)

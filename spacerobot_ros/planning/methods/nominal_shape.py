@@ -158,9 +158,7 @@ class NominalShapeChooser:
         """
         if self._only_choice is not None:
             return self._only_choice
-        return (
-            kept if kept is not None and self._still_applies(kept, q) else self._choose_nominal(q)
-        )
+        return kept if kept is not None and self._can_be_kept(kept, q) else self._choose_nominal(q)
 
     def shapes_with_more_room(self, q: Array, is_clear: ClearanceTest) -> Iterator[NominalShape]:
         """Yield other nominal shapes from shape ``q`` (n,), round which loops have room.
@@ -183,7 +181,7 @@ class NominalShapeChooser:
         turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
         return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
 
-    def _still_applies(self, chosen: NominalShape, q: Array) -> bool:
+    def _can_be_kept(self, chosen: NominalShape, q: Array) -> bool:
         moved = np.abs(np.delete(q - chosen.shape, chosen.joints)).max(initial=0.0)
         return self._given_shape is not None or bool(moved <= _HELD_JOINT_TOLERANCE)
 

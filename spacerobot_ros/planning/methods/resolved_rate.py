@@ -52,7 +52,7 @@ from spacerobot_ros.planning.methods.optimal.end_effectors import (
     EndEffectorRows,
     reach_of_end_effector,
 )
-from spacerobot_ros.planning.methods.optimal.goal_specification import Turning
+from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
 from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 
@@ -136,7 +136,7 @@ class ResolvedRateOptions(MotionOptions):
     )
 
 
-class _Way:
+class _SmoothPath:
     """A smooth way through points (K, 3), m, from the origin: a natural cubic spline by the lengths
     of its chords, which through two points is the straight line.
 
@@ -196,7 +196,7 @@ class _Way:
 
 
 @dataclass(frozen=True)
-class _LinkLine:
+class _LinkPath:
     """The line of a link E, in the base B_0 at the start, seen from the centre of mass.
 
     Attributes
@@ -216,7 +216,7 @@ class _LinkLine:
     rotations: Array
     r_CE: Array
     quaternion: Array
-    way: _Way | RoundedPath
+    way: _SmoothPath | RoundedPath
 
     def miss(self, R: Array, r: Array, progress: float) -> Array:
         """Return the errors (k + l,) of a pose to that after a share ``progress`` of the line."""
@@ -231,7 +231,7 @@ class _LinkLine:
         )
 
 
-class _Lines:
+class _LinkPaths:
     """The lines of all links of a goal, and how the joints move the links along them.
 
     Rows are scaled by the reach of the links, joints by their velocity limits: all are radians of
@@ -247,7 +247,7 @@ class _Lines:
         Shares of the lines at which their curvature jumps.
     """
 
-    def __init__(self, robot: SpaceRobot, lines: Sequence[_LinkLine], limits: MotionLimits) -> None:
+    def __init__(self, robot: SpaceRobot, lines: Sequence[_LinkPath], limits: MotionLimits) -> None:
         self._robot, self._lines = robot, tuple(lines)
         fastest = float(limits.velocity.max())
         ones = np.ones(robot.n)
@@ -367,7 +367,7 @@ class JointPath:
         return JointPath(**parts)
 
 
-def _trace(lines: _Lines, q: Array, cancellation: Cancellation) -> JointPath:
+def _trace(lines: _LinkPaths, q: Array, cancellation: Cancellation) -> JointPath:
     """Follow lines from a shape (n,) to their ends, or to a singularity (Runge-Kutta 4)."""
     n, total = len(q), lines.length
     y = np.concatenate([q, [0.0, 0.0, 0.0, 1.0, 0.0]])
@@ -639,7 +639,7 @@ class ResolvedRateGait(GaitMethod):
         return route.simplified(tolerance) if is_fresh else route
 
     def _follow(
-        self, lines: _Lines, state: RobotState, cancellation: Cancellation
+        self, lines: _LinkPaths, state: RobotState, cancellation: Cancellation
     ) -> tuple[Array, Array, Notes]:
         """Return shapes (N + 1, n) and shares of the lines (N + 1,) at ticks, with notes.
 
@@ -744,7 +744,7 @@ class ResolvedRateGait(GaitMethod):
         tolerance: Tolerance,
         waypoints: Array,
         piece: tuple[PosePath, float, float] | None = None,
-    ) -> _Lines:
+    ) -> _LinkPaths:
         """Return the lines of a goal, along directions in which the joints move the links.
 
         ``piece`` is a part of a given path that the first link follows, the metres before it and
@@ -756,7 +756,7 @@ class ResolvedRateGait(GaitMethod):
             The goal lies off these directions, or has more of them than the joints can follow.
         """
         robot = self.robot
-        turning = Turning.of(robot)
+        turning = BaseRotations.of(robot)
         axes = turning.axes if turning.loops else np.zeros((0, 3))
         goals = list(goal.end_effectors)
         if self.options.keep_attitude:
@@ -780,7 +780,7 @@ class ResolvedRateGait(GaitMethod):
                 turn = rotvec_from_quaternion(between)
             is_base, is_led = each.link == robot.base_link, each is goals[0]
             points = np.vstack([waypoints, each.position] if is_led else [each.position])
-            way: _Way | RoundedPath
+            way: _SmoothPath | RoundedPath
             if is_led and piece is not None:
                 path, before, whole = piece
                 seen = PosePath(
@@ -789,17 +789,17 @@ class ResolvedRateGait(GaitMethod):
                 way = RoundedPath(seen, self.options.corner_tolerance / 2, before, whole)
             else:
                 points = np.vstack([np.zeros(3), (points - state.position) @ R_BW.T - r_BE])
-                way = _Way(points) if is_base else _Way(points, turn)
+                way = _SmoothPath(points) if is_base else _SmoothPath(points, turn)
             # Of the base its attitude alone is kept.
             moved = np.zeros((0, 3)) if is_base else directions.displacements
             lines.append(
-                _LinkLine(each.link, moved, directions.rotations, r_BE - r_BC, quaternion, way)
+                _LinkPath(each.link, moved, directions.rotations, r_BE - r_BC, quaternion, way)
             )
-        found = _Lines(robot, lines, self._limits)
+        found = _LinkPaths(robot, lines, self._limits)
         self._require_freedom(found, goal)
         return found
 
-    def _require_freedom(self, lines: _Lines, goal: Goal) -> None:
+    def _require_freedom(self, lines: _LinkPaths, goal: Goal) -> None:
         X = np.array([0.0, 0.0, 0.0, 1.0])
         matrices = [lines.jacobian(q, X) for q in sample_shapes(self.robot, _SAMPLED_SHAPES)]
         rank = max(int(np.linalg.matrix_rank(J, tol=1e-6)) for J in matrices)
@@ -814,7 +814,7 @@ class ResolvedRateGait(GaitMethod):
                 f"for a position instead of a pose{less}."
             )
 
-    def _find_obstacle(self, lines: _Lines, path: JointPath) -> tuple[int, str] | None:
+    def _find_obstacle(self, lines: _LinkPaths, path: JointPath) -> tuple[int, str] | None:
         """Return the last place of a path before the limits of the joints are left, or before a
         singularity is near, with the reason; None where the way is free.
         """
@@ -847,7 +847,7 @@ class ResolvedRateGait(GaitMethod):
             "line from another shape."
         )
 
-    def _held_commands(self, lines: _Lines, state: RobotState, timed: _TimedPath) -> Array:
+    def _held_commands(self, lines: _LinkPaths, state: RobotState, timed: _TimedPath) -> Array:
         """Return the shapes (N + 1, n) at ticks, with the end-effectors on their lines at each.
 
         Raises
@@ -871,7 +871,7 @@ class ResolvedRateGait(GaitMethod):
         )
 
     def _shapes_on_lines(
-        self, lines: _Lines, state: RobotState, shapes: Array, shares: Array
+        self, lines: _LinkPaths, state: RobotState, shapes: Array, shares: Array
     ) -> Array:
         """Return shapes (N + 1, n) at ticks, corrected for the motion in between."""
         positions = shapes.copy()

@@ -146,7 +146,7 @@ class SquarePathGait(GaitMethod):
         psi_e = self._clear_goal_shape(request)
         if psi_e is None:
             psi_e = np.clip(state.q, self.robot.lower, self.robot.upper)
-        step_1 = float(self._phase.leg_turns(state.q[np.newaxis], psi_e[np.newaxis])[0])
+        step_1 = float(self._phase.turns_by_legs(state.q[np.newaxis], psi_e[np.newaxis])[0])
         # Full turns do not change the attitude, so the shorter way round is taken.
         wanted = math.remainder(turn - step_1, 2 * math.pi)
         loop = None
@@ -403,7 +403,7 @@ class SquareSearch:
         else:
             boxes = [centre_box(at, lower + side / 2, upper - side / 2) for side in sides]
             centres = curvature_peaks(plane, at, np.array(boxes))
-        return _SquareFamily(pair, plane, centres, sides, plane.square_turns(centres, sides))
+        return _SquareFamily(pair, plane, centres, sides, plane.turns_by_squares(centres, sides))
 
     def _solve_for_side(self, candidates: _SquareFamily, wanted: float) -> tuple[int, float]:
         """Return the row of the smallest square that turns the base far enough, and its ``z*``.
@@ -417,7 +417,9 @@ class SquareSearch:
         sign = math.copysign(1.0, candidates.phases[row])
 
         def excess(z: float) -> float:
-            return sign * float(candidates.plane.square_turns(centre, np.array([z]))[0]) - wanted
+            return (
+                sign * float(candidates.plane.turns_by_squares(centre, np.array([z]))[0]) - wanted
+            )
 
         # The last digit of a phase depends on the number of legs in one call of the integration.
         if excess(side) <= 0:

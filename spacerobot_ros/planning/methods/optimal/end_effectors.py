@@ -427,7 +427,7 @@ class EndEffectorSpecification:
             ends: list[PossibleEnd] = [PossibleEnd(shape, turn)]
         else:
             rows.require_enough_freedom(self.attitude)
-            ends = self._possible_ends(state.q, limits, parameters, turn)
+            ends = self._find_possible_ends(state.q, limits, parameters, turn)
         return BoundaryConditions(
             state.q,
             turn,
@@ -491,7 +491,7 @@ class EndEffectorSpecification:
             size = min(1.0, 2 * size) if nearer else size / 2
         return X, float(np.linalg.norm(values))
 
-    def _possible_ends(
+    def _find_possible_ends(
         self, start: Array, limits: MotionLimits, parameters: Array, turn: Array
     ) -> list[PossibleEnd]:
         """Return ends of guesses, those that the joints reach soonest first.

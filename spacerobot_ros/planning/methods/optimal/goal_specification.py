@@ -97,7 +97,7 @@ class GoalSpecification:
     position: bool
     attitude: bool
     same_shape: bool
-    turning: Turning
+    turning: BaseRotations
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> GoalSpecification:
@@ -106,7 +106,10 @@ class GoalSpecification:
         if options.base_position == 0:
             position = slides_anywhere(robot)
         return cls(
-            position, bool(options.base_attitude), bool(options.final_shape), Turning.of(robot)
+            position,
+            bool(options.base_attitude),
+            bool(options.final_shape),
+            BaseRotations.of(robot),
         )
 
     @property
@@ -288,7 +291,7 @@ class GoalSpecification:
 
 
 @dataclass(frozen=True)
-class Turning:
+class BaseRotations:
     """The turns of the base that motions of the joints cause.
 
     Attributes
@@ -308,7 +311,7 @@ class Turning:
     loops: bool
 
     @classmethod
-    def of(cls, robot: SpaceRobot) -> Turning:
+    def of(cls, robot: SpaceRobot) -> BaseRotations:
         """Test a robot at a few shapes in general position."""
         none = np.zeros((0, 3))
         if robot.n == 0:

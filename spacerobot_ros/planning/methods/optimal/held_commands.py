@@ -245,7 +245,7 @@ class CommandHolder:
         """Return commands near to shapes (N + 1, n) that end in the goal attitude and keep all
         limits, where there are some: every shape may change.
         """
-        positions = self._to_final(positions, boundary, final, limits)
+        positions = self._move_to_final(positions, boundary, final, limits)
         for _ in range(_MAX_PROGRAMS_IN_TURN):
             quaternions = self._attitudes(positions, boundary)
             error, *by_end = self._end_error(positions, quaternions, boundary)
@@ -272,7 +272,7 @@ class CommandHolder:
         start = np.array([0.0, 0.0, 0.0, 1.0])
         return self._prediction.attitudes(positions, start, boundary.angular_momentum)
 
-    def _to_final(
+    def _move_to_final(
         self, positions: Array, boundary: BoundaryConditions, final: Array, limits: MotionLimits
     ) -> Array:
         """Return shapes (N + 1, n) that end in the shape ``final`` exactly."""
@@ -310,7 +310,7 @@ class CommandHolder:
         ``moves_end``: the last shape is changed, too. ``clipped``: after every step, shapes beyond
         the joint limits are put on them, and the others make up for the change.
         """
-        positions = self._to_final(positions, boundary, final, limits)
+        positions = self._move_to_final(positions, boundary, final, limits)
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         waves, best = self._build_waves(positions, limits), math.inf
         if moves_end:

@@ -100,7 +100,7 @@ class LimitedEfforts(JointEfforts):
     ) -> Trajectory:
         """Return the trajectory, slowed along its path until its efforts keep the limits."""
         peak = self.peak(trajectory, boundary)
-        return trajectory if peak <= 1 else trajectory.retimed(math.sqrt(peak))
+        return trajectory if peak <= 1 else trajectory.stretched(math.sqrt(peak))
 
     def inequality(self, *, drifting: bool = False) -> PathInequality:
         """Return the limits as a path constraint at both ends of every interval."""

@@ -62,10 +62,10 @@ from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
-    CandidateError,
     MotionLimits,
     OptimalOptions,
     PathConstraints,
+    UnusableCandidateError,
     per_joint,
 )
 from spacerobot_ros.planning.methods.optimal.search import (
@@ -139,7 +139,7 @@ class _PlanResult:
 
 
 @dataclass(frozen=True)
-class _Coast:
+class _CoastingMotion:
     """The motion of a base whose joints rest: shapes (N + 1, n), attitudes (N + 1, 4) and positions
     (N + 1, 3) at ticks.
     """
@@ -394,7 +394,7 @@ class OptimalGait(GaitMethod):
         attitude = state.quaternion[np.newaxis]
         try:
             self._constraints.check(q[np.newaxis], attitude, self.control_period)
-        except CandidateError as reason:
+        except UnusableCandidateError as reason:
             raise PlanningError(f"The start violates a path constraint: {reason}.") from None
         key = None
         if self._cache is not None and not correction and duration is None:
@@ -493,28 +493,28 @@ class OptimalGait(GaitMethod):
         last = min(chosen.longest, _COASTING_TURNS * 2 * math.pi / rate)
         coast = self._coast(request, math.ceil(last / self.control_period))
         step = max(1, round(_COASTING_ANGLE / rate / self.control_period))
-        for end in self._passes(request, boundary, coast, step):
+        for end in self._goal_passing_ticks(request, boundary, coast, step):
             try:
                 return self._plan_for_coasting_time(
                     request, boundary, limits, chosen, cancellation, coast, end
                 )
-            except (PlanningError, CandidateError):
+            except (PlanningError, UnusableCandidateError):
                 cancellation.raise_if_requested()
         return self._begin_now(
             request, boundary, limits, replace(chosen, longest=last), cancellation
         )
 
-    def _coast(self, request: PlanRequest, ticks: int) -> _Coast:
+    def _coast(self, request: PlanRequest, ticks: int) -> _CoastingMotion:
         """Return the motion of the base while the joints rest."""
         state, shapes = request.state, np.tile(request.state.q, (ticks + 1, 1))
         attitudes = self._prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
         times = self.control_period * np.arange(ticks + 1, dtype=np.float64)
-        return _Coast(
+        return _CoastingMotion(
             shapes, attitudes, self._prediction.positions(state, times, shapes, attitudes)
         )
 
     def _later(
-        self, request: PlanRequest, boundary: BoundaryConditions, coast: _Coast, ticks: int
+        self, request: PlanRequest, boundary: BoundaryConditions, coast: _CoastingMotion, ticks: int
     ) -> tuple[PlanRequest, BoundaryConditions]:
         """Return the request and its boundary conditions after some ticks of coasting."""
         state, quaternion = request.state, coast.attitudes[ticks]
@@ -531,8 +531,8 @@ class OptimalGait(GaitMethod):
         L_B = R_BW @ matrix_from_quaternion(state.quaternion) @ boundary.angular_momentum
         return later, replace(aimed, state=after, angular_momentum=L_B)
 
-    def _passes(
-        self, request: PlanRequest, boundary: BoundaryConditions, coast: _Coast, step: int
+    def _goal_passing_ticks(
+        self, request: PlanRequest, boundary: BoundaryConditions, coast: _CoastingMotion, step: int
     ) -> list[int]:
         """Return the ticks at which the coasting base passes the goal, the closest pass first."""
         grid = np.arange(0, len(coast.shapes), step)
@@ -550,7 +550,7 @@ class OptimalGait(GaitMethod):
         limits: MotionLimits,
         chosen: OptimalOptions,
         cancellation: Cancellation,
-        coast: _Coast,
+        coast: _CoastingMotion,
         end: int,
     ) -> _PlanResult:
         """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
@@ -769,7 +769,7 @@ class OptimalGait(GaitMethod):
         try:
             plan = _CachedPlan.from_bytes(kept[1])
             self._require_valid_manoeuvre(plan.positions, request, boundary, limits)
-        except (ValueError, CandidateError) as reason:
+        except (ValueError, UnusableCandidateError) as reason:
             cache.discard(archive_name(key), str(reason))
             return None
         notes: Notes = {**plan.notes, "from_cache": 1.0}
@@ -791,50 +791,52 @@ class OptimalGait(GaitMethod):
         """
         period, state, robot = self.control_period, request.state, self.robot
         if positions.ndim != 2 or positions.shape[1] != robot.n or len(positions) < 2:
-            raise CandidateError(f"it is of shape {positions.shape}, not of {robot.n} joints")
+            raise UnusableCandidateError(
+                f"it is of shape {positions.shape}, not of {robot.n} joints"
+            )
         if not np.all(np.isfinite(positions)):
-            raise CandidateError("it is not finite")
+            raise UnusableCandidateError("it is not finite")
         wanted, duration = self.options.duration, (len(positions) - 1) * period
         if wanted > 0 and abs(duration - wanted) > period:
-            raise CandidateError(f"it takes {duration:g} s, not {wanted:g} s")
+            raise UnusableCandidateError(f"it takes {duration:g} s, not {wanted:g} s")
         if (
             duration
             > _MAX_DURATION_FACTOR * self.options.longest + _LONGEST_ADDITIONAL_TICKS * period
         ):
-            raise CandidateError(f"it takes {duration:g} s")
+            raise UnusableCandidateError(f"it takes {duration:g} s")
         first, last = positions[0], positions[-1]
         if np.abs(first - boundary.start).max() > _MAX_CACHED_END_ERROR:
-            raise CandidateError("it begins in another shape")
+            raise UnusableCandidateError("it begins in another shape")
         if (
             boundary.final is not None
             and np.abs(last - boundary.final).max() > _MAX_CACHED_END_ERROR
         ):
-            raise CandidateError("it ends in another shape")
+            raise UnusableCandidateError("it ends in another shape")
         if boundary.center is not None:
             beside = robot.center_of_mass(last) - boundary.center
             if np.linalg.norm(beside) > _MAX_CACHED_END_ERROR:
-                raise CandidateError("it ends in another position")
+                raise UnusableCandidateError("it ends in another position")
         attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
         factor, overrun = limits.excess(positions, period)
         if self._efforts is not None:
             L_B = _momenta_in_base(state, attitudes)
             factor = max(factor, self._efforts.excess(positions, L_B=L_B))
         if factor > 1 + _LIMIT_ROUNDING or overrun > _LIMIT_ROUNDING:
-            raise CandidateError("it exceeds a limit of the joints")
+            raise UnusableCandidateError("it exceeds a limit of the joints")
         kind = self._kind_of(request.goal)
         aim = quaternion_multiply(state.quaternion, boundary.turn)
         aim = aim if request.goal.end_effectors else request.goal.quaternion
         error = attitude_error(attitudes[-1], aim)
         if np.linalg.norm(kind.specification.axes @ error) > _MAX_CACHED_END_ERROR:
-            raise CandidateError("it ends in another attitude")
+            raise UnusableCandidateError("it ends in another attitude")
         if (rows_at_end := kind.model.end_effectors) is not None:
             turn = quaternion_multiply(quaternion_inverse(state.quaternion), attitudes[-1])
             rows = rows_at_end.evaluate(turn[np.newaxis], last[np.newaxis], boundary.end_effectors)
             if np.abs(rows[0]).max() > _MAX_CACHED_END_ERROR:
-                raise CandidateError("it ends with end-effectors elsewhere")
+                raise UnusableCandidateError("it ends with end-effectors elsewhere")
         self._constraints.check(positions, attitudes, period)
         if too_near := self._too_near(positions, self._base_poses(state, positions, attitudes)):
-            raise CandidateError(too_near)
+            raise UnusableCandidateError(too_near)
 
 
 def _momenta_in_base(state: RobotState, attitudes: Array) -> Array | None:

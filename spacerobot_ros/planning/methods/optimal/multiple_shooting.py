@@ -67,7 +67,7 @@ class StopRule:
     deadline: float = math.inf
     last_call: float = math.inf
 
-    def expired(self, *, found: bool) -> bool:
+    def is_expired(self, *, found: bool) -> bool:
         """Whether the wall time is used up; ``found``: there is a feasible iterate."""
         end = self.deadline if found else self.last_call
         return end < math.inf and time.monotonic() > end
@@ -274,7 +274,7 @@ class _SolverMonitor(ca.Callback):
             # The first iterate is the guess itself.
             self._iterates > self._stop.iterations
             or self._stop.cancellation.requested
-            or self._stop.expired(found=self.best is not None)
+            or self._stop.is_expired(found=self.best is not None)
         )
         np.frombuffer(results[0])[:] = stops
         return 0

@@ -168,7 +168,7 @@ _CONSTRAINT_RESERVE = 0.02
 """Distance of a solution from its path constraints, relative: they are imposed at steps alone."""
 
 
-class CandidateError(PlanningError):
+class UnusableCandidateError(PlanningError):
     """A solution or a state is not usable; the text is a clause that says why."""
 
 
@@ -364,7 +364,7 @@ class Trajectory:
         q, v0, v1 = self.shapes[k], self.velocities[k], self.velocities[k + 1]
         return np.asarray(q + self.step * (v0 * tau + (v1 - v0) * tau**2 / 2))
 
-    def retimed(self, factor: float) -> Trajectory:
+    def stretched(self, factor: float) -> Trajectory:
         """Return the trajectory along the same path in ``factor`` times its duration."""
         return replace(self, step=self.step * factor, velocities=self.velocities / factor)
 
@@ -373,7 +373,7 @@ class Trajectory:
         speed = float((np.abs(self.velocities) / limits.velocity).max())
         change = np.abs(np.diff(self.velocities, axis=0)) / self.step / limits.acceleration
         factor = max(speed, float(np.sqrt(change.max())), shortest / self.duration)
-        return self.retimed(factor)
+        return self.stretched(factor)
 
 
 @dataclass(frozen=True)
@@ -489,7 +489,7 @@ class PathConstraints:
         for box in self.boxes:
             inside = np.all((positions > box[0]) & (positions < box[1]), axis=1)
             if inside.any():
-                raise CandidateError(
+                raise UnusableCandidateError(
                     f"the shape enters a box of keep_out at {np.argmax(inside) * period:.4g} s"
                 )
         if self.axis_B is not None and self.direction_W is not None:
@@ -499,11 +499,13 @@ class PathConstraints:
             ]
             angle = np.arccos(np.clip(np.max(seen), -1.0, 1.0))
             if angle < self.cone - 1e-9:
-                raise CandidateError(f"the axis comes within {angle:.4g} rad of keep_direction")
+                raise UnusableCandidateError(
+                    f"the axis comes within {angle:.4g} rad of keep_direction"
+                )
         if self.base_rate > 0:
             rate = _largest_base_rate(quaternions, period)
             if rate > self.base_rate * (1 + 1e-6):
-                raise CandidateError(f"the base turns at {rate:.4g} rad/s")
+                raise UnusableCandidateError(f"the base turns at {rate:.4g} rad/s")
 
     @property
     def imposed_base_rate(self) -> float:
@@ -521,7 +523,7 @@ class PathConstraints:
         if self.base_rate == 0:
             return guess
         fastest = _largest_base_rate(guess.quaternions, guess.step)
-        return guess.retimed(max(1.0, fastest / self.imposed_base_rate))
+        return guess.stretched(max(1.0, fastest / self.imposed_base_rate))
 
 
 def _unit_direction(name: str, values: Sequence[float]) -> Array | None:

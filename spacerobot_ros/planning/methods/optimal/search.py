@@ -49,10 +49,10 @@ from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
 )
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
-    CandidateError,
     MotionLimits,
     OptimalOptions,
     Trajectory,
+    UnusableCandidateError,
 )
 from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages
 
@@ -234,7 +234,7 @@ class _Progress:
 
     def cut_short(self, *, found: bool) -> bool:
         """Whether the wall time is used up."""
-        return self.stop_rule(found=found).expired(found=found)
+        return self.stop_rule(found=found).is_expired(found=found)
 
     def report(self, step: str, result: str, iterations: int) -> None:
         """Log the result of a guess, and the progress of the search."""
@@ -247,7 +247,7 @@ class _Progress:
             f"{step}: {result} after {seconds:.2f} s, {iterations} steps of the solver",
         )
 
-    def agreed(self, solutions: list[Trajectory]) -> bool:
+    def solutions_agree(self, solutions: list[Trajectory]) -> bool:
         """Whether the best solution was found often enough."""
         costs = np.array([self.cost(each) for each in solutions])
         agreeing = self.options.agreeing
@@ -378,7 +378,7 @@ class ManoeuvreSearch:
             near = replace(progress, kept=kept.copy())
             try:
                 freed.append(self._make_clear(near, each, intervals))
-            except CandidateError as reason:
+            except UnusableCandidateError as reason:
                 progress.rejection = str(reason)
                 assert near.kept is not None
                 kept.include(near.kept)
@@ -414,7 +414,7 @@ class ManoeuvreSearch:
         clear = self._clear_on_grid(progress, manoeuvre, coarser, _COARSE_TOLERANCE)
         try:
             refined = self._clear_on_grid(brief, clear, intervals, TOLERANCE)
-        except CandidateError:
+        except UnusableCandidateError:
             return clear
         refined = self._shorten_with_less_clearance(brief, refined, intervals)
         return min(refined, clear, key=lambda one: one.duration)
@@ -442,7 +442,7 @@ class ManoeuvreSearch:
             near = kept.approaches(made.held.positions, made.held.quaternions)
             if not near:
                 return replace(made, separated_pairs=len(kept.pairs))
-        raise CandidateError(kept.message(near[0], self._period))
+        raise UnusableCandidateError(kept.message(near[0], self._period))
 
     def _shorten_with_less_clearance(
         self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int
@@ -465,7 +465,7 @@ class ManoeuvreSearch:
                 if solution.duration > best.duration - self._period:
                     break
                 manoeuvre = self._make_held_commands(closer, solution)
-            except CandidateError:
+            except UnusableCandidateError:
                 break
             near = kept.approaches(manoeuvre.held.positions, manoeuvre.held.quaternions)
             if not near and manoeuvre.duration < best.duration:
@@ -496,7 +496,7 @@ class ManoeuvreSearch:
         result = _NO_PATH_FOUND if solution is None else f"{solution.duration:.6g} s"
         progress.report(f"{len(kept.pairs)} pair(s) apart", result, solver.iterations)
         if solution is None:
-            raise CandidateError(_NO_PATH_FOUND)
+            raise UnusableCandidateError(_NO_PATH_FOUND)
         return solution
 
     def _get_solver(
@@ -540,7 +540,7 @@ class ManoeuvreSearch:
                 solutions.append(solution)
             # A search may also be cut short within its last start.
             cut_short = progress.cut_short(found=bool(solutions))
-            going_on = len(solutions) < enough and not progress.agreed(solutions)
+            going_on = len(solutions) < enough and not progress.solutions_agree(solutions)
             cut_short = cut_short or not (solutions or progress.starts < progress.max_failed_starts)
             if going_on and number < starts and not cut_short:
                 continue
@@ -565,7 +565,7 @@ class ManoeuvreSearch:
         """
         found: list[Manoeuvre] = []
         costs: list[float] = []
-        agreed = progress.agreed(solutions)
+        solutions_agree = progress.solutions_agree(solutions)
         for solution in sorted(solutions, key=progress.cost):
             cost = progress.cost(solution)
             if found and (
@@ -573,7 +573,7 @@ class ManoeuvreSearch:
             ):
                 break
             least = min((one.solution_time for one in found), default=math.inf)
-            if agreed and solution.duration > (1 - _SAME_COST_TOLERANCE) * least:
+            if solutions_agree and solution.duration > (1 - _SAME_COST_TOLERANCE) * least:
                 break
             if any(abs(cost - other) <= _SAME_COST_TOLERANCE * other for other in costs):
                 continue
@@ -591,7 +591,7 @@ class ManoeuvreSearch:
                 found.append(manoeuvre)
                 costs.append(cost)
                 result = f"{manoeuvre.duration:.6g} s"
-            except CandidateError as reason:
+            except UnusableCandidateError as reason:
                 result = progress.rejection = str(reason)
             progress.report("manoeuvre", result, full.iterations)
         return found
@@ -675,7 +675,7 @@ class ManoeuvreSearch:
                 return solution
             # A solution without convergence is not yet as fast as possible.
             return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest), boundary)
-        guess = guess.retimed(T / guess.duration)
+        guess = guess.stretched(T / guess.duration)
         solution = solver.solve(boundary, limits, guess, stop, DurationBounds(T, T))
         if solution is None or not progress.gentle:
             return solution
@@ -696,7 +696,7 @@ class ManoeuvreSearch:
             There is no solution, or none that commands reach within the constraints.
         """
         if trajectory is None:
-            raise CandidateError(_NO_PATH_FOUND)
+            raise UnusableCandidateError(_NO_PATH_FOUND)
         fixed = progress.options.duration > 0
         if progress.boundary.drifts:
             held = self._hold_in_whole_ticks(progress, trajectory)
@@ -706,10 +706,10 @@ class ManoeuvreSearch:
                 excess = self._constraints.excess_rate(held.quaternions, self._period)
                 if 1 < excess <= _MAX_RATE_EXCESS:
                     # At zero momentum the base turns as much slower as the joints move.
-                    slower = trajectory.retimed(excess * _RATE_RESERVE)
+                    slower = trajectory.stretched(excess * _RATE_RESERVE)
                     held = self._holder.hold(slower, progress.boundary, progress.limits)
         if held is None:
-            raise CandidateError(_NO_HELD_COMMANDS)
+            raise UnusableCandidateError(_NO_HELD_COMMANDS)
         attitudes = quaternion_multiply(progress.quaternion, held.quaternions)
         self._constraints.check(held.positions, attitudes, self._period)
         duration = (len(held.positions) - 1) * self._period
@@ -737,7 +737,7 @@ class ManoeuvreSearch:
         most = 2 if progress.options.duration > 0 else len(_ADDITIONAL_TICKS_OF_DRIFT)
         for more in _ADDITIONAL_TICKS_OF_DRIFT[:most]:
             T = (ticks + more) * self._period
-            guess = guess.retimed(T / guess.duration)
+            guess = guess.stretched(T / guess.duration)
             stop = progress.stop_rule(found=False)
             solution = solver.solve(aim, narrowed, guess, stop, DurationBounds(T, T))
             progress.cancellation.raise_if_requested()
@@ -822,7 +822,7 @@ class MotionSearch:
                 )
                 attitudes = quaternion_multiply(quaternion, held.quaternions)
                 self._constraints.check(held.positions, attitudes, self._period)
-            except CandidateError as reason:
+            except UnusableCandidateError as reason:
                 rejection = str(reason)
                 continue
             finally:
@@ -871,7 +871,7 @@ class MotionSearch:
                 solver, boundary, within, candidate, motion, options, stop
             )
         if near := kept.approaches(held.positions, held.quaternions):
-            raise CandidateError(kept.message(near[0], self._period))
+            raise UnusableCandidateError(kept.message(near[0], self._period))
         return held
 
     def _planned_speed_limit(self, limits: MotionLimits) -> Array:
@@ -961,7 +961,7 @@ class MotionSearch:
                 return held
             if solution is not None and boundary.drifts:
                 aim = self._holder.corrected_end(solution, boundary, ticks + more)
-        raise CandidateError(_NO_HELD_COMMANDS)
+        raise UnusableCandidateError(_NO_HELD_COMMANDS)
 
     def _guesses(
         self,

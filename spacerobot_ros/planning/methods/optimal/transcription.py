@@ -79,7 +79,7 @@ class PathInequality:
 
 
 @dataclass(frozen=True)
-class Block:
+class ConstraintBlock:
     """Rows of the program that depend on few variables z, with their derivatives.
 
     ``values`` is ``(z, p) -> g``, ``jacobian`` ``(z, p) -> g, J`` and ``hessian``
@@ -96,7 +96,7 @@ class Block:
         return int(self.values.size1_out(0))
 
     @classmethod
-    def of(cls, name: str, z: ca.SX, p: ca.SX, g: ca.SX) -> Block:
+    def of(cls, name: str, z: ca.SX, p: ca.SX, g: ca.SX) -> ConstraintBlock:
         """Differentiate ``g`` (SX)."""
         multiplier = ca.SX.sym("lambda", g.shape[0])
         hessian = ca.hessian(ca.dot(multiplier, g), z)[0]
@@ -105,7 +105,7 @@ class Block:
     @classmethod
     def with_derivatives(
         cls, name: str, z: ca.SX, p: ca.SX, multiplier: ca.SX, g: ca.SX, J: ca.SX, H: ca.SX
-    ) -> Block:
+    ) -> ConstraintBlock:
         """Take the expressions of rows, Jacobian and Hessian."""
         g = ca.densify(g)
         return cls(
@@ -135,12 +135,12 @@ class Stages:
     """
 
     joints: int
-    beginning: Block
-    interval: Block
-    end: Block
+    beginning: ConstraintBlock
+    interval: ConstraintBlock
+    end: ConstraintBlock
     path: int
     turn: ca.Function
-    distances: Block | None = None
+    distances: ConstraintBlock | None = None
 
     @property
     def drifting(self) -> bool:
@@ -183,7 +183,7 @@ class Stages:
         X, s, v = ca.SX.sym("X", 4), ca.SX.sym("s", n), ca.SX.sym("v", n)
         h = ca.SX.sym("h")
         start, turn, center = ca.SX.sym("start", n), ca.SX.sym("turn", 4), ca.SX.sym("center", 3)
-        begins = Block.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
+        begins = ConstraintBlock.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
         reached = [ca.DM(axes) @ relative_vector(turn, X)]
         if position:
             center_of_mass = robot.function("center_of_mass", compile=False)
@@ -192,7 +192,7 @@ class Stages:
         if end_effectors is not None:
             p.append(ca.SX.sym("end_effectors", end_effectors.size1_in(2)))
             reached.append(end_effectors(X, s, p[-1]))
-        ends = Block.of("end", ca.vertcat(X, s), ca.vertcat(*p), ca.vertcat(*reached))
+        ends = ConstraintBlock.of("end", ca.vertcat(X, s), ca.vertcat(*p), ca.vertcat(*reached))
         interval = _cached_interval(
             robot, constraints, inequalities, compiling=compiling, drifting=drifting
         )
@@ -204,7 +204,7 @@ class Stages:
         """Return the problem in which pairs of links keep distances, too, at a number of instants
         in each interval.
         """
-        return replace(self, distances=_distances(self.joints, rows, instants))
+        return replace(self, distances=_distance_block(self.joints, rows, instants))
 
 
 def _count_dynamics_rows(joints: int) -> int:
@@ -219,7 +219,7 @@ def _cached_interval(
     *,
     compiling: bool,
     drifting: bool,
-) -> Block:
+) -> ConstraintBlock:
     """Return the block of an interval from the cache, or derive it."""
     q, X, direction = ca.SX.sym("q", robot.n), ca.SX.sym("X", 4), ca.SX.sym("d", 3)
     on_knots = constraints.symbolic(q, X, direction)
@@ -237,23 +237,23 @@ def _cached_interval(
     key = hashlib.sha256("\n".join(facts).encode()).hexdigest()
 
     @cache
-    def derived() -> Block:
-        return _interval(robot, constraints, inequalities, drifting=drifting)
+    def derived() -> ConstraintBlock:
+        return _interval_block(robot, constraints, inequalities, drifting=drifting)
 
-    return Block(
+    return ConstraintBlock(
         cached_function("interval", key, lambda: derived().values, compiling=compiling),
         cached_function("interval_jac", key, lambda: derived().jacobian, compiling=compiling),
         cached_function("interval_hess", key, lambda: derived().hessian, compiling=compiling),
     )
 
 
-def _interval(
+def _interval_block(
     robot: SpaceRobot,
     constraints: PathConstraints,
     inequalities: Sequence[PathInequality],
     *,
     drifting: bool,
-) -> Block:
+) -> ConstraintBlock:
     """Return the dynamics of an interval, then its path constraints."""
     n = robot.n
     X, s, v, a = (ca.SX.sym(name, size) for name, size in zip("Xsva", (4, n, n, n), strict=True))
@@ -297,10 +297,10 @@ def _interval(
         bend = ca.substitute(ca.hessian(ca.dot(weight, point), z)[0], weight, ca.densify(W.T @ mu))
         attitude_hess += P.T @ rotation_hess(point, mu) @ P + bend
 
-    kept = _path(n, constraints, inequalities, z, rates, direction, L_0)
+    kept = _path_constraint_rows(n, constraints, inequalities, z, rates, direction, L_0)
     by_motion, by_path = ca.SX.sym("lambda_v", 2 * n), ca.SX.sym("lambda_g", kept.shape[0])
     plain = ca.dot(by_motion, motion) + ca.dot(by_path, kept)
-    return Block.with_derivatives(
+    return ConstraintBlock.with_derivatives(
         "interval",
         z,
         ca.vertcat(direction, L_0),
@@ -311,7 +311,7 @@ def _interval(
     )
 
 
-def _distances(n: int, pairs: Sequence[DistanceRows], instants: int) -> Block:
+def _distance_block(n: int, pairs: Sequence[DistanceRows], instants: int) -> ConstraintBlock:
     """Return the distances at equally spaced instants of an interval, by the chain rule.
 
     The last instant is the end of the interval. The turn of the base there is about the weighted
@@ -353,7 +353,7 @@ def _distances(n: int, pairs: Sequence[DistanceRows], instants: int) -> Block:
         hessian += ca.triu(_point_derivative_columns(half.T, along, weights, tau, n))
         hessian += ca.vertcat(bend, ca.MX(z.numel() - 1, z.numel()))
     z_p, J = [z, ca.vertcat(least, world)], ca.vertcat(*jacobian)
-    return Block(
+    return ConstraintBlock(
         ca.Function("distances", z_p, [ca.vertcat(*values)]),
         ca.Function("distances_jac", z_p, [ca.vertcat(*values), J]),
         ca.Function("distances_hess", [*z_p, multipliers], [hessian]),
@@ -372,7 +372,7 @@ def _point_derivative_columns(
     return ca.horzcat(by_step, (1 - tau) * X, q, b * q, tau * X, c * q)
 
 
-def _path(
+def _path_constraint_rows(
     n: int,
     constraints: PathConstraints,
     inequalities: Sequence[PathInequality],
@@ -535,7 +535,7 @@ class _PlacedBlock:
         The part of p that it takes.
     """
 
-    block: Block
+    block: ConstraintBlock
     variables: Indices
     rows: Indices
     parameters: ca.MX
