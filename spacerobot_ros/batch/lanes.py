@@ -22,7 +22,7 @@ from spacerobot_ros.batch.flights import (
     HeldCommands,
     SensorErrors,
 )
-from spacerobot_ros.batch.native import CommandProgram, CompiledTick, Job, PendingStep
+from spacerobot_ros.batch.native import CompiledTick, Job, Pending, Program
 from spacerobot_ros.batch.scalar import fly_one_by_one, plant_of, pose_of_link
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.reference import ReferenceProfile
@@ -47,9 +47,9 @@ _CHUNK_TICKS = 2000
 """Number of ticks, with their noise, between two checks for signals."""
 
 _PROGRAMS = {
-    HeldCommands: CommandProgram.HELD,
-    FollowedSchedule: CommandProgram.FOLLOWED,
-    Controlled: CommandProgram.CONTROLLED,
+    HeldCommands: Program.HELD,
+    FollowedSchedule: Program.FOLLOWED,
+    Controlled: Program.CONTROLLED,
 }
 
 Flags = npt.NDArray[np.bool_]
@@ -320,7 +320,7 @@ class LaneBlock:
 
     def begin_stepping(self) -> None:
         """Prepare for :meth:`restart` and :meth:`step`: surplus lanes are idle."""
-        self._job.program = CommandProgram.GIVEN
+        self._job.program = Program.GIVEN
         count = len(self._flown)
         self.idle(np.arange(count, count + self._surplus))
         self._write_rows("h", np.full(len(self._rows_of_lanes), self._flights.control_period))
@@ -411,15 +411,15 @@ class LaneBlock:
     def _step_outside_lanes(self, result: BatchResult, failures: dict[int, str]) -> None:
         """Do the step that lanes wait for: a command, an allocation, or a tick of the plant."""
         rows, alive = self._rows, self._rows.first("alive")
-        steps: dict[PendingStep, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
-            PendingStep.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._step_lane)
+        steps: dict[Pending, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
+            Pending.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._step_lane)
         }
         if self._tick.controller is not None:
-            steps[PendingStep.TICK] = rows.first("exact"), self._command_lane
+            steps[Pending.TICK] = rows.first("exact"), self._command_lane
         if self._modulator is not None:
-            steps[PendingStep.FIRE] = rows.first("unallocated"), self._allocate_lane
+            steps[Pending.FIRE] = rows.first("unallocated"), self._allocate_lane
         for group in np.flatnonzero(self._pending):
-            waiting, step = steps[PendingStep(self._pending[group])]
+            waiting, step = steps[Pending(self._pending[group])]
             lanes = (self._memory[group, waiting] != 0.0) & (self._memory[group, alive] != 0.0)
             for lane in np.flatnonzero(lanes):
                 index = int(group * self._lanes + lane)

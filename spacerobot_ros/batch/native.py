@@ -85,7 +85,7 @@ def vector_unit() -> VectorUnit:
     return next((unit for flag, unit in UNITS.items() if flag in flags), _PORTABLE_UNIT)
 
 
-class CommandProgram(IntEnum):
+class Program(IntEnum):
     """Kind of commands: held, along a schedule, of a controller, or given before each step."""
 
     HELD = 0
@@ -94,7 +94,7 @@ class CommandProgram(IntEnum):
     GIVEN = 3
 
 
-class PendingStep(IntEnum):
+class Pending(IntEnum):
     """Step of a tick that a group of lanes waits for."""
 
     NOTHING = 0
@@ -113,7 +113,7 @@ _JOB_MEMBERS = (
     ("unsigned char *", "pending", "(groups,) Pending"),
     ("double", "period", "s"),
     ("long long", "period_ns", ""),
-    ("long long", "program", "CommandProgram"),
+    ("long long", "program", "Program"),
     ("const double *", "table", "(ticks, COMMANDS); each_table: (groups, ticks, COMMANDS, LANES)"),
     ("long long", "table_ticks", "FOLLOWED: the table has shapes, one more than ticks"),
     ("long long", "each_table", ""),
@@ -421,7 +421,7 @@ def _shared_declarations(
     lines.append("namespace row {")
     lines += [f"constexpr long long {name} = {at.start};" for name, at in rows.slices.items()]
     lines.append("}")
-    for enum in (CommandProgram, PendingStep, Decision):
+    for enum in (Program, Pending, Decision):
         members = ", ".join(f"{each.name} = {each.value}" for each in enum)
         lines.append(f"namespace {enum.__name__.lower()} {{ enum {{ {members} }}; }}")
     lines.append("struct Span { long long from, to, count; };  // rows")

@@ -20,7 +20,7 @@ from spacerobot_ros.batch import (
     SensorErrors,
     lanes,
 )
-from spacerobot_ros.batch.native import Job, PendingStep, RowLayout
+from spacerobot_ros.batch.native import Job, Pending, RowLayout
 from spacerobot_ros.batch.scalar import plant_of
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.outputs import OutputDistance
@@ -304,7 +304,7 @@ def test_a_lane_at_a_stop_is_stepped_by_its_plant(sliders: SpaceRobot) -> None:
 
     def wait() -> None:
         memory, at = block._memory, block._rows
-        block._pending[1], block._at[1] = PendingStep.COMMIT, 5
+        block._pending[1], block._at[1] = Pending.COMMIT, 5
         memory[1, at["command"], 0] = 0.1 * np.arange(1, N + 7)
         memory[1, at.first("limited", 1 + N)] = [1.0, 0.0]
 
@@ -370,7 +370,7 @@ def test_controlled_lanes_begin_decide_and_end_each_for_itself(
     def decide() -> None:
         memory, at = block._memory, block._rows
         for group in range(3):
-            block._pending[group], block._at[group] = PendingStep.TICK, 6 + group
+            block._pending[group], block._at[group] = Pending.TICK, 6 + group
             memory[group, at["measured"]] = 10 * group + np.arange(state)[:, None] + [[0, 0.5]]
             memory[group, at["exact"]] = 1.0
             memory[group, at["decision"]] = [[1.0, 0.0]]
@@ -447,7 +447,7 @@ def test_an_impulse_beyond_the_thrust_is_allocated_by_the_modulator(sliders: Spa
     def wait() -> None:
         memory, at = block._memory, block._rows
         block._modulator = SimpleNamespace(allocation=allocation, table=table)
-        block._pending[2] = PendingStep.FIRE
+        block._pending[2] = Pending.FIRE
         memory[2, at["unallocated"], 0] = 1.0
         memory[2, at["wanted"], 0] = np.arange(1.0, 7.0)
         memory[2, at["pending_impulse"], 0] = np.arange(6.0) / 8

@@ -12,7 +12,7 @@ import casadi as ca
 import pytest
 
 from spacerobot_ros.batch import native
-from spacerobot_ros.batch.native import CommandProgram, Job, PendingStep, RowLayout, VectorUnit
+from spacerobot_ros.batch.native import Job, Pending, Program, RowLayout, VectorUnit
 from spacerobot_ros.model.compilation import NoLibraryError, cxx_compiler
 
 ROWS = RowLayout({"alive": 1, "state": 7, "measured": 3})
@@ -66,7 +66,7 @@ def test_a_compiler_reads_the_declarations_as_python_means_them(tmp_path: Path) 
     assert lines[:7] == ["26 3", "0 1 8", "0 1 2 3", "1 2 3", "1 3", "2 13", "3 3"]
     assert int(lines[7]) == ctypes.sizeof(Job)
     assert [int(line) for line in lines[8:]] == [getattr(Job, name).offset for name in members]
-    assert (list(CommandProgram), list(PendingStep)) == ([0, 1, 2, 3], [0, 1, 2, 3])
+    assert (list(Program), list(Pending)) == ([0, 1, 2, 3], [0, 1, 2, 3])
 
 
 def test_sizes_are_those_of_the_largest_function() -> None:
