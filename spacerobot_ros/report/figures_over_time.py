@@ -718,13 +718,18 @@ def errors_figure(flight: FlightReport) -> ReportFigure | None:
                 signal = Signal(errors.time, errors.values[:, axes])
                 names = ["xyz"[i % 3] for i in axes]
                 colours = [PALETTE[i % 3] for i in axes]
-                groups.append(TraceGroup(signal, names, f"{name} {quantity}", unit, colours))
+                groups.append(TraceGroup(signal, names, f"{name} {quantity} error", unit, colours))
     if not groups:
         return None
     caption = (
         "Goal minus pose, in the world frame, for the components under control; attitude as the "
         "remaining rotation vector"
     )
+    limits: tuple[tuple[Literal["position", "attitude"], str], ...]
+    limits = (("position", "m"), ("attitude", "rad"))
+    known = [(flight.tolerance(part), unit) for part, unit in limits]
+    if within := ", ".join(f"{value:.3g} {unit}" for value, unit in known if value is not None):
+        caption += f"; tolerance of distance and angle: {within}"
     return time_figure(flight, "errors", "Output errors", caption, groups)
 
 
@@ -797,13 +802,13 @@ def sensors_figure(flight: FlightReport) -> ReportFigure | None:
     turn = quaternion_multiply(pose.values[:, 3:], quaternion_inverse(true.values[at, 3:]))
     offset = pose.values[:, :3] - true.values[at, :3]
     errors = Signal(pose.time, np.hstack([offset, rotvecs_from_quaternions(turn)]))
-    groups = axis_groups(errors, (("base position", "m"), ("base attitude", "rad")))
+    groups = axis_groups(errors, (("base position error", "m"), ("base attitude error", "rad")))
     shape, at = _match_times(flight.signal("measured_q"), flight.shape)
     if len(shape):
         off = Signal(shape.time, shape.values - flight.shape.values[at])
         units = {"m": "m", "rad": "rad"}
         groups += joint_groups(
-            flight, off, "joint position", units, lambda joint: [], JOINTS_PER_PANEL
+            flight, off, "joint position error", units, lambda joint: [], JOINTS_PER_PANEL
         )
     groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SENSOR_ROUNDING]
     if not groups:

@@ -257,8 +257,8 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
         assert describe_remaining_error(error, frozenset(controls)) == words  # type: ignore[arg-type]
     hand = PoseError(np.array([0.0, 0.3, -0.4]), np.zeros(3))
     for hands, words in (
-        ((hand,), "end-effectors 0.5 m from the goal"),
-        ((hand, error), "end-effectors 0.5 m and 0.2 rad from the goal"),
+        ((hand,), "end-effector 0.5 m from the goal"),
+        ((hand, error), "end-effectors at most 0.5 m and 0.2 rad from the goal"),
     ):
         of_hands = PoseError(error.position, error.rotvec, end_effectors=hands)
         assert describe_remaining_error(of_hands, frozenset({"end_effectors"})) == words
@@ -271,9 +271,12 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
         told = describe_remaining_error(error, frozenset(controls), within, goal)  # type: ignore[arg-type]
         assert told.endswith(f" from the goal ({words})")
     told = describe_remaining_error(of_hands, frozenset({"end_effectors"}), within)
-    assert told == "end-effectors 0.5 m and 0.2 rad from the goal (tolerance 0.02 m, 0.06 rad)"
+    assert told == "end-effectors at most 0.5 m and 0.2 rad from the goal (tolerance 0.02 m, 0.06 rad)"
     told = describe_remaining_error(of_hands, frozenset({"position", "end_effectors"}), within)
-    assert told.startswith("0.05 m from the goal, end-effectors 0.5 m and 0.2 rad from theirs (")
+    assert told.startswith("0.05 m from the goal, end-effectors at most 0.5 m and 0.2 rad from theirs (")
+    one_hand = PoseError(error.position, error.rotvec, end_effectors=(hand,))
+    told = describe_remaining_error(one_hand, frozenset({"position", "end_effectors"}))
+    assert told == "0.05 m from the goal, end-effector 0.5 m from its goal"
     unshaped = PoseError(error.position, error.rotvec)
     told = describe_remaining_error(unshaped, frozenset({"position", "shape"}), within)
     assert told == "0.05 m from the goal (tolerance 0.02 m)"

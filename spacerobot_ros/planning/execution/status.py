@@ -282,12 +282,15 @@ def describe_remaining_error(
         distance, angle = error.largest_end_effector_distance, error.largest_end_effector_angle
         # Goals of positions alone leave no angle.
         turn = f" and {angle:.3g} rad" if angle > 0 else ""
-        parts["end_effectors"] = f"end-effectors {distance:.3g} m{turn}"
+        parts["end_effectors"] = f"{distance:.3g} m{turn}"
+    several = len(error.end_effectors) > 1
     hand = parts.pop("end_effectors", "") if "end_effectors" in controls else ""
+    if hand:
+        hand = f"end-effectors at most {hand}" if several else f"end-effector {hand}"
     body = " and ".join(text for part, text in parts.items() if part in controls)
     remaining = f"{body or hand} from the goal"
     if body and hand:
-        remaining += f", {hand} from theirs"
+        remaining += f", {hand} from {'theirs' if several else 'its goal'}"
     notes = []
     if tolerance is not None:
         hands = "end_effectors" in controls
