@@ -727,7 +727,7 @@ def errors_figure(flight: FlightReport) -> ReportFigure | None:
     )
     limits: tuple[tuple[Literal["position", "attitude"], str], ...]
     limits = (("position", "m"), ("attitude", "rad"))
-    known = [(flight.tolerance(part), unit) for part, unit in limits]
+    known = [(flight.flight.tolerance(part), unit) for part, unit in limits]
     if within := ", ".join(f"{value:.3g} {unit}" for value, unit in known if value is not None):
         caption += f"; tolerance of distance and angle: {within}"
     return time_figure(flight, "errors", "Output errors", caption, groups)

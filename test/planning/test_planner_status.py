@@ -271,9 +271,10 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
         told = describe_remaining_error(error, frozenset(controls), within, goal)  # type: ignore[arg-type]
         assert told.endswith(f" from the goal ({words})")
     told = describe_remaining_error(of_hands, frozenset({"end_effectors"}), within)
-    assert told == "end-effectors at most 0.5 m and 0.2 rad from the goal (tolerance 0.02 m, 0.06 rad)"
+    hands_words = "end-effectors at most 0.5 m and 0.2 rad from"
+    assert told == f"{hands_words} the goal (tolerance 0.02 m, 0.06 rad)"
     told = describe_remaining_error(of_hands, frozenset({"position", "end_effectors"}), within)
-    assert told.startswith("0.05 m from the goal, end-effectors at most 0.5 m and 0.2 rad from theirs (")
+    assert told.startswith(f"0.05 m from the goal, {hands_words} theirs (")
     one_hand = PoseError(error.position, error.rotvec, end_effectors=(hand,))
     told = describe_remaining_error(one_hand, frozenset({"position", "end_effectors"}))
     assert told == "0.05 m from the goal, end-effector 0.5 m from its goal"
