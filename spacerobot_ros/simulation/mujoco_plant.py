@@ -188,8 +188,8 @@ class MujocoPlant:
         self.hold(self._held)
         self._update()
 
-    def go_on(self, motion: RobotMotion, target: BodyMotion) -> None:
-        """Go on from these motions of robot and target, which are not joined."""
+    def go_on(self, motion: RobotMotion, target: BodyMotion, *, welded: bool) -> None:
+        """Go on from these motions of robot and target, which are welded together or not."""
         data = self._data
         data.qpos[:3], data.qpos[3:7] = motion.pose[:3], np.roll(motion.pose[3:], 1)
         data.qpos[self._q], data.qvel[self._qdot] = motion.q, motion.qdot
@@ -197,6 +197,9 @@ class MujocoPlant:
         self._aim[:] = motion.qdot
         self._place_target(target)
         self._update()
+        if welded:
+            self.weld()
+            self._update()
 
     def hold(self, joints: Flags) -> None:
         """Lock the marked joints (n,) at their positions, and release all other joints."""
@@ -517,12 +520,11 @@ class MujocoCapturePlant(CapturePlant):
     def _resume_dynamics(
         self, robot: SpaceRobot, motion: RobotMotion, momenta: Array, body: BodyMotion
     ) -> None:
-        self._engine.go_on(motion, body)
+        held = self.payload is not None
+        self._engine.go_on(motion, body, welded=held)
+        self._engine.expected_momenta[:] = momenta
+        self._joined = robot if held else None
         self.target.step()
-        if self.payload is None:
-            self._engine.expected_momenta[:] = momenta
-        else:
-            self._continue(robot, motion, momenta)
 
     def _body(self) -> BodyMotion:
         return self._engine.target_motion
