@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
@@ -108,18 +110,32 @@ class EpisodeConfig:
         return cls(**arguments)
 
     def __post_init__(self) -> None:
+        for name in ("task", "scenario", "campaign", "goals", "link"):
+            value = getattr(self, name)
+            if not isinstance(value, str | PathLike):
+                raise ParameterError(f"Argument '{name}' is {value!r}; it must be a text.")
+            object.__setattr__(self, name, fspath(value))
         for name, choices in (("task", tuple(TASKS)), ("goals", ("", *_GOALS))):
             value = getattr(self, name)
             if value not in choices:
                 raise ParameterError(
                     f"Argument '{name}' is '{value}'; it may be {', '.join(filter(None, choices))}."
                 )
-        if self.hold < 1:
-            raise ParameterError(f"Argument 'hold' is {self.hold}; an action is held for a tick.")
+        if not isinstance(self.hold, numbers.Integral) or self.hold < 1:
+            raise ParameterError(
+                f"Argument 'hold' is {self.hold!r}; it is a whole number of ticks, one at least."
+            )
         for name in ("time_limit", "tolerance", "spread", "max_force", "max_torque"):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0.0):
-                raise ParameterError(f"Argument '{name}' is {value}; it must be finite, from 0.")
+            if not (isinstance(value, numbers.Real) and np.isfinite(value) and value >= 0.0):
+                raise ParameterError(f"Argument '{name}' is {value!r}; it must be finite, from 0.")
+        if not self.time_limit:
+            raise ParameterError("Argument 'time_limit' is 0; episodes take longer, in s.")
+        if self.link and self.task != "reach":
+            raise ParameterError(
+                f"Argument 'link' is '{self.link}', and in task '{self.task}' no link reaches: "
+                "leave it out, or take spacerobot/Reach-v0."
+            )
         if self.scenario and self.campaign:
             raise ParameterError(
                 "Arguments 'scenario' and 'campaign' are both given: a campaign names its scenario."
@@ -218,9 +234,6 @@ class Episodes:
         self._source = EpisodeStarts(config)
         scenario, self.robot = self._source.scenario, self._source.robot
         plant = scenario.plant
-        self.task: Task = TASKS[config.task](self.robot)
-        self._tolerance = config.tolerance or self.task.tolerance
-        self._spread = config.spread or self.task.spread
         self._goals_of_scenario = (config.goals or _GOALS[bool(config.campaign)]) == "scenario"
         self._link = self._reaching_link(scenario) if config.task == "reach" else ""
         first = self._source.nominal.starts
@@ -236,6 +249,11 @@ class Episodes:
             in_lanes=in_lanes,
         )
         self.scale, self.taken = self._action_scale(scenario)
+        wrench = self.taken[self.taken >= self.robot.n] - self.robot.n
+        pushed = bool((wrench < 3).any()), bool((wrench >= 3).any())
+        self.task: Task = TASKS[config.task](self.robot, self._link, pushed)
+        self._tolerance = config.tolerance or self.task.tolerance
+        self._spread = config.spread or self.task.spread
         self._goals = np.zeros((count, self.task.goal_size))
         self._goals[:, -1] = 1.0
         self.step_duration = config.hold * plant.control_period

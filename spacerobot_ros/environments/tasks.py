@@ -6,9 +6,11 @@ robot behind ROS topics are observed by the same code.
 
 from __future__ import annotations
 
+import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,7 +26,14 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvecs_from_quaternions,
 )
+from spacerobot_ros.planning.core.controllability import sample_shapes
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
+
+_SAMPLED_SHAPE_COUNT = 12
+"""Number of shapes at which the motions of a link are looked at."""
+
+_MIN_SHARE_OF_MOTION = 1e-7
+"""Singular values below this share of the largest are no motion."""
 
 LARGEST_OBSERVATION = 1e6
 """Bound of observed quantities that have none of their own; observations are clipped to it."""
@@ -84,13 +93,18 @@ class RewardWeights:
         Raises
         ------
         ParameterError
-            There is no such weight.
+            There is no such weight, or it is no finite number.
         """
         known = [each.name for each in fields(cls)]
         for name in changes or {}:
             if name not in known:
                 raise ParameterError(
                     f"There is no weight '{name}' of the reward; there are {', '.join(known)}."
+                )
+        for name, value in (changes or {}).items():
+            if not (isinstance(value, numbers.Real) and np.isfinite(value)):
+                raise ParameterError(
+                    f"The weight '{name}' of the reward is {value!r}: give a finite number."
                 )
         return cls(**(changes or {}))
 
@@ -102,6 +116,10 @@ class Task(ABC):
     ----------
     robot
         The robot.
+    link
+        Link that reaches, where one does.
+    pushed
+        Whether actions push the base by a force, and turn it by a torque.
     """
 
     name: str
@@ -111,8 +129,22 @@ class Task(ABC):
     spread: float
     """Default size of random goals, rad or m."""
 
-    def __init__(self, robot: SpaceRobot) -> None:
-        self.robot = robot
+    def __init__(
+        self, robot: SpaceRobot, link: str = "", pushed: tuple[bool, bool] = (False, False)
+    ) -> None:
+        self.robot, self.link = robot, link
+        self.by_force, self.by_torque = pushed
+
+    @property
+    @abstractmethod
+    def directions(self) -> Array:
+        """Directions (m, 3) in B, orthonormal, in which random goals are drawn.
+
+        Raises
+        ------
+        ParameterError
+            There are none.
+        """
 
     @abstractmethod
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
@@ -151,10 +183,23 @@ class Reorient(Task):
     name, goal_size, tolerance, spread = "reorient", 4, 0.01, 0.15
     largest_error = np.pi
 
+    @cached_property
+    def directions(self) -> Array:
+        """Axes of random turns: one of a planar robot; see :attr:`Task.directions`."""
+        axes = BaseRotations.of(self.robot).axes
+        if len(axes):
+            return axes
+        if not self.by_torque:
+            raise ParameterError(
+                f"The joints of robot '{self.robot.description.name}' do not turn its base to "
+                "attitudes around the start, so there are no random goals: give 'max_torque' under "
+                "efforts, or take the goal of a scenario (goals: scenario)."
+            )
+        return np.eye(3)
+
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
         """Return an attitude within ``spread`` rad of the start; planar robots turn in plane."""
-        axes = BaseRotations.of(self.robot).axes
-        axis = rng.normal(size=3)
+        axes, axis = self.directions, rng.normal(size=3)
         if len(axes) == 1:
             axis = axes[0] * np.copysign(1.0, axis[0])
         turn = spread * rng.uniform() * axis / np.linalg.norm(axis)
@@ -173,10 +218,30 @@ class Reach(Task):
     name, goal_size, tolerance, spread = "reach", 3, 0.02, 0.3
     largest_error = LARGEST_OBSERVATION
 
+    @cached_property
+    def directions(self) -> Array:
+        """Directions in which the link moves, two of a planar robot; :attr:`Task.directions`."""
+        robot = self.robot
+        if self.by_force:
+            return np.eye(3)
+        shapes = sample_shapes(robot, _SAMPLED_SHAPE_COUNT)
+        ways = np.hstack([robot.generalised_jacobian(self.link, q)[:3] for q in shapes])
+        U, sizes, _ = np.linalg.svd(ways, full_matrices=False)
+        found = np.asarray(U[:, sizes > _MIN_SHARE_OF_MOTION * max(1.0, sizes[0])].T)
+        if not len(found):
+            raise ParameterError(
+                f"The joints of robot '{robot.description.name}' do not move link '{self.link}', "
+                "so there are no random goals: give another 'link'."
+            )
+        return np.eye(3) if len(found) == 3 else found
+
     def random_goal(self, start: RobotStates, spread: float, rng: np.random.Generator) -> Array:
-        """Return a position within ``spread`` m of where the link starts."""
-        way = rng.normal(size=3)
-        way *= spread * rng.uniform() ** (1 / 3) / np.linalg.norm(way)
+        """Return a position within ``spread`` m of where the link starts, where it can go."""
+        ways, way = self.directions, rng.normal(size=3)
+        if len(ways) < 3:
+            R = matrices_from_quaternions(start.pose[:1, 3:])[0]
+            way = R @ (ways.T @ way[: len(ways)])
+        way *= spread * rng.uniform() ** (1 / len(ways)) / np.linalg.norm(way)
         return np.asarray(self.link_positions(start)[0] + way)
 
     def remaining(self, states: RobotStates, goals: Array) -> Array:

@@ -247,7 +247,13 @@ def test_goals_of_a_scenario() -> None:
     [
         ({"ticks": 3}, "There is no argument 'ticks' of environments; there are task, scenario, "),
         ({"goals": "far"}, "Argument 'goals' is 'far'; it may be random, scenario"),
-        ({"hold": 0}, "Argument 'hold' is 0; an action is held for a tick"),
+        ({"hold": 0}, "Argument 'hold' is 0; it is a whole number of ticks"),
+        ({"hold": 1.5}, "Argument 'hold' is 1.5; it is a whole number of ticks"),
+        ({"time_limit": 0}, "Argument 'time_limit' is 0; episodes take longer"),
+        ({"time_limit": "x"}, "Argument 'time_limit' is 'x'; it must be finite, from 0"),
+        ({"scenario": 3}, "Argument 'scenario' is 3; it must be a text"),
+        ({"link": "segment_2"}, "Argument 'link' is 'segment_2', and in task 'reorient' no link"),
+        ({"reward": {"time": np.nan}}, "The weight 'time' of the reward is nan: give a finite"),
         ({"spread": -1.0}, "Argument 'spread' is -1.0; it must be finite, from 0"),
         ({"time_limit": np.inf}, "Argument 'time_limit' is inf; it must be finite"),
         ({"scenario": "a", "campaign": "b"}, "both given: a campaign names its scenario"),
@@ -309,7 +315,7 @@ def states(n: int) -> RobotStates:
 
 
 def test_the_way_of_a_link_is_in_the_frame_of_the_base() -> None:
-    task = Reach(SpaceRobot(load_robot(robot_file("planar_chain"))))
+    task = Reach(SpaceRobot(load_robot(robot_file("planar_chain"))), "segment_2", (True, False))
     given = states(2)
     assert given.link_r is not None
     goals = np.random.default_rng(5).normal(size=(3, 3))
@@ -343,6 +349,16 @@ def test_random_attitudes_are_within_their_spread() -> None:
     np.testing.assert_allclose(np.array(turns)[:, :2], 0.0, atol=1e-12)
     assert 0.25 < np.abs(turns).max() <= 0.3
     assert min(turn[2] for turn in turns) < -0.1
+
+
+def test_a_link_of_a_planar_robot_reaches_in_its_plane() -> None:
+    for force, planar in ((0.0, True), (1.0, False)):
+        environment: Any = gymnasium.make(
+            "spacerobot/Reach-v0", scenario="coordinated_control", max_force=force
+        ).unwrapped
+        ways = np.array([environment.reset(seed=seed)[0][:3] for seed in range(20)])
+        assert np.ptp(ways[:, :2], axis=0).min() > 0.3
+        assert bool(np.abs(ways[:, 2]).max() < 1e-12) is planar
 
 
 def test_actions_are_shares_of_limits() -> None:
