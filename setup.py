@@ -72,6 +72,7 @@ setup(
             "py.typed",
             "batch/*.hpp",
             "collision/*.c",
+            "model/*.c",
             "report/*.css",
             "report/*.js",
             "viewer/*.js",

@@ -28,7 +28,7 @@ from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -45,10 +45,6 @@ _COMPILER_FLAGS = ("-O1", *_COMMON_FLAGS)
 
 _SOURCE_FLAGS = ("-O2", *_COMMON_FLAGS)
 """Flags for C that was written by hand: short, with loops."""
-
-_LONG_FUNCTION_FLAGS = ("-O0", *_COMMON_FLAGS)
-"""Flags for functions of ten thousands of operations: a tenth of the time to compile, half
-the speed, still seven times that of the virtual machine."""
 
 _MIN_OPERATIONS_TO_KEEP = 5000
 """Fewest operations of a function for the cache: it takes 0.1 s to derive, 0.01 s to read."""
@@ -68,7 +64,7 @@ _MAX_COMPARED_RESULT = 1e9
 _MAX_FUNCTIONS_IN_MEMORY = 12
 
 _functions_in_memory: dict[tuple[str, ...], ca.Function] = {}
-"""The latest used functions of the cache, by name, key and settings of the compilation."""
+"""The latest used functions of the cache, by name, key and folder of the cache."""
 
 ANNOUNCEMENT_ATTRIBUTE = "announcement"
 """Attribute of log records that announce a long computation."""
@@ -247,14 +243,11 @@ def _warn_of_virtual_machine(reason: _CompilationError) -> None:
     )
 
 
-def cached_function(
-    name: str, key: str, build: Callable[[], ca.Function], *, compiling: bool
-) -> ca.Function:
+def cached_function(name: str, key: str, build: Callable[[], ca.Function]) -> ca.Function:
     """Return an expensive function from the cache, or derive and cache it.
 
     This process has those at hand that it has used last. The same numbers come out whether a
-    function is compiled, read or derived: it is compiled without optimisation, operation by
-    operation.
+    function is read or derived.
 
     Parameters
     ----------
@@ -264,46 +257,24 @@ def cached_function(
         A hash of everything that the function is derived from.
     build
         Derives it.
-    compiling
-        Whether it is evaluated so often that compiling it pays. If not, a compiled one from the
-        cache is used all the same.
-
-    Raises
-    ------
-    ParameterError
-        ``SPACEROBOT_COMPILE_TIMEOUT`` is not a number of seconds.
     """
-    place = (name, key, str(compiling), *compilation_settings())
-    function = _functions_in_memory.pop(place, None) or _load_or_derive(
-        name, key, build, compiling=compiling
-    )
+    place = (name, key, str(cache_directory()))
+    function = _functions_in_memory.pop(place, None) or _load_or_derive(name, key, build)
     _functions_in_memory[place] = function
     if len(_functions_in_memory) > _MAX_FUNCTIONS_IN_MEMORY:
         del _functions_in_memory[next(iter(_functions_in_memory))]
     return function
 
 
-def _load_or_derive(
-    name: str, key: str, build: Callable[[], ca.Function], *, compiling: bool
-) -> ca.Function:
-    cache, compiler = Cache(cache_directory()), c_compiler()
-    compiled_key = ""
-    if compiler is not None:
-        compiled_key = _hash_text(f"{_platform_key(compiler, _LONG_FUNCTION_FLAGS)}\n{name}\n{key}")
-        if found := _load_compiled(cache, name, compiled_key):
-            return found
+def _load_or_derive(name: str, key: str, build: Callable[[], ca.Function]) -> ca.Function:
+    cache = Cache(cache_directory())
     serialised = f"{name}-{key[:32]}.casadi"
-    if (kept := cache.load(serialised, key)) and not (compiling and compiler):
+    if kept := cache.load(serialised, key):
         try:
             return ca.Function.deserialize(kept[1].decode())
         except (RuntimeError, ValueError) as error:
             cache.discard(serialised, str(error))
     function = build()
-    if compiling and compiler is not None:
-        try:
-            return _compile_function(function, compiled_key, _LONG_FUNCTION_FLAGS, compiler)
-        except _CompilationError as reason:
-            _warn_of_virtual_machine(reason)
     if function.n_instructions() >= _MIN_OPERATIONS_TO_KEEP:
         cache.store(serialised, key, function.serialize().encode())
     return function
@@ -315,20 +286,24 @@ def native_library(
     flags: Sequence[str],
     libraries: Sequence[str],
     tried: Sequence[ca.Function],
+    *,
+    language: Literal["c", "cpp"] = "cpp",
 ) -> ctypes.CDLL:
-    """Return the library of a C++ source, compiled, tried and cached like single functions.
+    """Return the library of a C or C++ source, compiled, tried and cached like single functions.
 
     Parameters
     ----------
     name
         For the file in the cache.
     source
-        C++, which has the functions ``tried`` by their names with CasADi's interface.
+        It has the functions ``tried`` by their names with CasADi's interface.
     flags, libraries
         Arguments of the compiler. The flags choose the processor's instructions; they are part of
         the key.
     tried
         Functions of the library that must give the virtual machine's numbers in a process.
+    language
+        That of the source.
 
     Raises
     ------
@@ -337,9 +312,12 @@ def native_library(
     ParameterError
         ``SPACEROBOT_COMPILE_TIMEOUT`` is not a number of seconds.
     """
-    compiler = cxx_compiler()
+    compiler = cxx_compiler() if language == "cpp" else c_compiler()
     if compiler is None:
-        raise NoLibraryError("no C++ compiler (c++, g++, clang++ or $CXX) was found")
+        names = "C++ compiler (c++, g++, clang++ or $CXX)"
+        if language == "c":
+            names = "C compiler (cc, gcc, clang or $CC)"
+        raise NoLibraryError(f"no {names} was found")
     flags = [*flags, *_COMMON_FLAGS]
     key = _hash_text(f"{_platform_key(compiler, flags)} {' '.join(libraries)}\n{source}")
     if kept := Cache(cache_directory()).load(_object_file_name(name, key), key):
@@ -347,7 +325,11 @@ def native_library(
             return ctypes.CDLL(str(kept[0]))
     try:
         return _make_object(
-            name, key, _CompilerCall(source, compiler, flags, libraries, "cpp"), tried, ctypes.CDLL
+            name,
+            key,
+            _CompilerCall(source, compiler, flags, libraries, language),
+            tried,
+            ctypes.CDLL,
         )
     except _CompilationError as reason:
         raise NoLibraryError(str(reason)) from None

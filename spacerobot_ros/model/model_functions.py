@@ -283,7 +283,7 @@ class ModelFunctions:
 
         facts = f"{source_hash(curvature.__module__)} {self.equations_key}"
         key = hashlib.sha256(facts.encode()).hexdigest()
-        return cached_function("curvature", key, derived, compiling=False)
+        return cached_function("curvature", key, derived)
 
     def _momentum(self) -> ca.Function:
         state = self._state_symbols("v_WB_B", quaternion=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spacerobot_ros.model import compilation
-from spacerobot_ros.model.compilation import c_compiler, cached_function
+from spacerobot_ros.model.compilation import cached_function
 
 POINT = np.array([0.3, -1.2, 0.7])
 
@@ -26,9 +26,9 @@ class Derivation:
         rows = ca.vertcat(ca.sin(x) * self.factor, x[0] / x[1] + ca.exp(x[2]) * x[0])
         return ca.Function("bent", [x], [rows, ca.jacobian(rows, x)])
 
-    def kept(self, key: str = "a" * 64, *, compiling: bool) -> list[list[float]]:
+    def kept(self, key: str = "a" * 64) -> list[list[float]]:
         compilation._functions_in_memory.clear()  # As another process.
-        function = cached_function("bent", key, self, compiling=compiling)
+        function = cached_function("bent", key, self)
         return [each.nonzeros() for each in function.call([ca.DM(POINT)])]
 
 
@@ -39,24 +39,19 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("compiling", [False, True])
-def test_what_is_kept_is_not_derived_again_and_gives_the_same_bits(
-    folder: Path, compiling: bool
-) -> None:
+def test_what_is_kept_is_not_derived_again_and_gives_the_same_bits(folder: Path) -> None:
     derivation = Derivation()
     expected = [each.nonzeros() for each in derivation()(ca.DM(POINT))]
-    results = [derivation.kept(compiling=compiling) for _ in range(3)]
+    results = [derivation.kept() for _ in range(3)]
     assert derivation.count == 2
     assert results == [expected] * 3
     (kept,) = folder.iterdir()
-    assert kept.suffix == (".so" if compiling and c_compiler() else ".casadi")
-    # Without a compiler it is derived or read, and a compiled one is not missed.
-    assert Derivation().kept("b" * 64, compiling=False) == expected
+    assert kept.suffix == ".casadi"
 
 
 def test_another_key_is_another_function(folder: Path) -> None:
     first, second = Derivation(1.1), Derivation(1.2)
-    assert first.kept("a" * 64, compiling=False) != second.kept("b" * 64, compiling=False)
+    assert first.kept("a" * 64) != second.kept("b" * 64)
     assert (first.count, second.count) == (1, 1)
 
 
@@ -67,34 +62,33 @@ def test_what_is_damaged_is_derived_again(
     folder: Path, damage: object, caplog: pytest.LogCaptureFixture
 ) -> None:
     derivation = Derivation()
-    expected = derivation.kept(compiling=False)
+    expected = derivation.kept()
     (kept,) = folder.iterdir()
     assert callable(damage)
     kept.write_bytes(damage(kept.read_bytes()))
-    assert derivation.kept(compiling=False) == expected
+    assert derivation.kept() == expected
     assert derivation.count == 2
 
 
 def test_what_others_may_have_written_is_not_read(folder: Path) -> None:
     derivation = Derivation()
-    derivation.kept(compiling=False)
+    derivation.kept()
     (kept,) = folder.iterdir()
     kept.chmod(0o666)
-    derivation.kept(compiling=False)
+    derivation.kept()
     assert derivation.count == 2
 
 
 def test_a_process_reads_and_derives_a_function_once(folder: Path) -> None:
     derivation = Derivation()
-    first = cached_function("bent", "c" * 64, derivation, compiling=False)
+    first = cached_function("bent", "c" * 64, derivation)
     for file in folder.iterdir():
         file.unlink()
-    assert cached_function("bent", "c" * 64, derivation, compiling=False) is first
+    assert cached_function("bent", "c" * 64, derivation) is first
     assert derivation.count == 1
-    # Another function, another way of compiling, and what was used long ago.
-    assert cached_function("bent", "d" * 64, Derivation(2.0), compiling=False) is not first
-    assert cached_function("bent", "c" * 64, derivation, compiling=True) is not first
+    # Another function, and what was used long ago.
+    assert cached_function("bent", "d" * 64, Derivation(2.0)) is not first
     for number in range(compilation._MAX_FUNCTIONS_IN_MEMORY):
-        cached_function("bent", f"{number:064}", derivation, compiling=False)
-    assert cached_function("bent", "c" * 64, derivation, compiling=False) is not first
+        cached_function("bent", f"{number:064}", derivation)
+    assert cached_function("bent", "c" * 64, derivation) is not first
     assert len(compilation._functions_in_memory) == compilation._MAX_FUNCTIONS_IN_MEMORY

@@ -157,9 +157,9 @@ class _Searches:
     in_motion: MotionSearch
 
     @classmethod
-    def of(cls, model: ManoeuvreModel, *, compiling: bool) -> _Searches:
+    def of(cls, model: ManoeuvreModel) -> _Searches:
         """Make both searches for one model."""
-        search = ManoeuvreSearch(model, compiling=compiling)
+        search = ManoeuvreSearch(model)
         return cls(search, MotionSearch(model, search.solver))
 
 
@@ -169,17 +169,16 @@ class _GoalKind:
 
     specification: GoalSpecification | EndEffectorSpecification
     model: ManoeuvreModel
-    compiling: bool
 
     @cached_property
     def without_effort_limits(self) -> _Searches:
         """The searches without effort limits."""
-        return _Searches.of(replace(self.model, efforts=None), compiling=self.compiling)
+        return _Searches.of(replace(self.model, efforts=None))
 
     @cached_property
     def within_efforts(self) -> _Searches:
         """The searches with effort limits: most manoeuvres of most robots do not need them."""
-        return _Searches.of(self.model, compiling=self.compiling)
+        return _Searches.of(self.model)
 
 
 class OptimalGait(GaitMethod):
@@ -221,20 +220,13 @@ class OptimalGait(GaitMethod):
                 else DistanceLibrary(self.clearance, robot, self._prediction)
             ),
         )
-        self._base_goals = self._goal_kind(self._specification, self._model)
+        self._base_goals = _GoalKind(self._specification, self._model)
         self._end_effector_goals: dict[tuple[object, ...], _GoalKind] = {}
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
         self._library_key = library_key(
             robot, self._limits, self._specification.axes, position=self._specification.position
         )
         self._library = load_library(chosen.library, self._library_key)
-
-    def _goal_kind(
-        self,
-        specification: GoalSpecification | EndEffectorSpecification,
-        model: ManoeuvreModel,
-    ) -> _GoalKind:
-        return _GoalKind(specification, model, self.options.answers > 1)
 
     def _kind_of(self, goal: Goal) -> _GoalKind:
         """Return the kind of a goal; that of a goal of end-effectors is made when it is needed.
@@ -250,7 +242,7 @@ class OptimalGait(GaitMethod):
         if key not in self._end_effector_goals:
             of = EndEffectorSpecification.of(self.robot, self._specification, goal)
             model = replace(self._model, axes=of.axes, end_effectors=of.rows_at_end)
-            self._end_effector_goals[key] = self._goal_kind(of, model)
+            self._end_effector_goals[key] = _GoalKind(of, model)
         return self._end_effector_goals[key]
 
     def build_library(self, requests: Iterable[PlanRequest]) -> SolutionLibrary | None:

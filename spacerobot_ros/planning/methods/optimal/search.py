@@ -273,12 +273,9 @@ class ManoeuvreSearch:
     ----------
     model
         Model and constraints of the manoeuvres.
-    compiling
-        Whether searches are long enough for compiled functions to pay.
     """
 
-    def __init__(self, model: ManoeuvreModel, *, compiling: bool = True) -> None:
-        self._compiling = compiling
+    def __init__(self, model: ManoeuvreModel) -> None:
         self._robot, self._period, self._axes = model.robot, model.control_period, model.axes
         self._constraints, self._efforts = model.constraints, model.efforts
         self._end_effectors = model.end_effectors
@@ -637,7 +634,6 @@ class ManoeuvreSearch:
                 position,
                 self._constraints,
                 inequalities,
-                compiling=self._compiling,
                 end_effectors=self._end_effectors and self._end_effectors.function,
                 drifting=drifting,
             )

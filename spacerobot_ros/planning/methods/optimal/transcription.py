@@ -30,7 +30,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
 
@@ -43,6 +43,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cached_function, source_hash
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.lanes import mapped
 from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
 from spacerobot_ros.model.symbolic_rotations import (
     quaternion_from_small_rotvec,
@@ -156,7 +157,6 @@ class Stages:
         constraints: PathConstraints,
         inequalities: Sequence[PathInequality] = (),
         *,
-        compiling: bool = False,
         end_effectors: ca.Function | None = None,
         drifting: bool = False,
     ) -> Stages:
@@ -172,8 +172,6 @@ class Stages:
             Whether the centre of mass is to end at ``center`` in the base.
         constraints, inequalities
             Constraints of the path.
-        compiling
-            Whether they are evaluated so often that compiling them pays.
         end_effectors
             Of SX: ``(turn (4,), shape (n,), parameters)``, rows that vanish at the end.
         drifting
@@ -193,9 +191,7 @@ class Stages:
             p.append(ca.SX.sym("end_effectors", end_effectors.size1_in(2)))
             reached.append(end_effectors(X, s, p[-1]))
         ends = ConstraintBlock.of("end", ca.vertcat(X, s), ca.vertcat(*p), ca.vertcat(*reached))
-        interval = _cached_interval(
-            robot, constraints, inequalities, compiling=compiling, drifting=drifting
-        )
+        interval = _cached_interval(robot, constraints, inequalities, drifting=drifting)
         path = interval.rows - _count_dynamics_rows(n)
         turn = turn_function(robot, drifting=drifting)
         return cls(n, begins, interval, ends, path, turn)
@@ -217,7 +213,6 @@ def _cached_interval(
     constraints: PathConstraints,
     inequalities: Sequence[PathInequality],
     *,
-    compiling: bool,
     drifting: bool,
 ) -> ConstraintBlock:
     """Return the block of an interval from the cache, or derive it."""
@@ -241,9 +236,9 @@ def _cached_interval(
         return _interval_block(robot, constraints, inequalities, drifting=drifting)
 
     return ConstraintBlock(
-        cached_function("interval", key, lambda: derived().values, compiling=compiling),
-        cached_function("interval_jac", key, lambda: derived().jacobian, compiling=compiling),
-        cached_function("interval_hess", key, lambda: derived().hessian, compiling=compiling),
+        cached_function("interval", key, lambda: derived().values),
+        cached_function("interval_jac", key, lambda: derived().jacobian),
+        cached_function("interval_hess", key, lambda: derived().hessian),
     )
 
 
@@ -511,7 +506,10 @@ class Layout:
 
 @dataclass(frozen=True)
 class Program:
-    """Functions of variables x and parameters p, as IPOPT takes them; the bounds are those of g."""
+    """Functions of variables x and parameters p, as IPOPT takes them; the bounds are those of g.
+
+    As long as the program is in use, so are ``called_functions``.
+    """
 
     layout: Layout
     problem: dict[str, ca.MX]
@@ -519,6 +517,7 @@ class Program:
     hess_lag: ca.Function
     lower: Array
     upper: Array
+    called_functions: Sequence[ca.Function]
 
 
 @dataclass(frozen=True)
@@ -533,19 +532,24 @@ class _PlacedBlock:
         Places (count, ...) of its variables in x, and of its rows in g; rows of -1 are left out.
     parameters
         The part of p that it takes.
+    called_functions
+        Those that the program calls: CasADi does not keep them alive.
     """
 
     block: ConstraintBlock
     variables: Indices
     rows: Indices
     parameters: ca.MX
+    called_functions: list[ca.Function] = field(default_factory=list)
 
     def called(self, function: ca.Function, x: ca.MX, *more: ca.MX) -> list[ca.MX]:
         """Return the results at all places, each place's nonzeros after the other's."""
         count = len(self.variables)
         z = ca.reshape(x[self.variables.ravel().tolist()], -1, count)
         p = ca.repmat(self.parameters, 1, count)
-        results = function.map(count)(z, p, *more)
+        at_all = mapped(function, count)
+        self.called_functions.append(at_all)
+        results = at_all(z, p, *more)
         results = results if isinstance(results, (list, tuple)) else [results]
         # A single row of nonzeros becomes a column.
         return [ca.vec(result.nz[:]) for result in results]
@@ -620,6 +624,7 @@ def program(stages: Stages, intervals: int) -> Program:
         ca.Function("hess_lag", [x, parameters, lam_f, lam_g], [hessian]),
         np.zeros(rows),
         np.where(np.arange(rows) < equalities, 0.0, np.inf),
+        [function for each in placed for function in each.called_functions],
     )
 
 

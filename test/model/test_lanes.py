@@ -1,0 +1,60 @@
+"""Functions at many places in vector registers give the numbers of CasADi's virtual machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from spacerobot_ros.model import lanes
+from spacerobot_ros.model.compilation import c_compiler
+from spacerobot_ros.model.lanes import mapped
+
+needs_compiler = pytest.mark.skipif(c_compiler() is None, reason="needs a C compiler")
+
+
+def rows_of(x: ca.SX, p: ca.SX) -> ca.SX:
+    """Return rows with every operation that the models use, and some more."""
+    a, b, c, d = ca.vertsplit(x)
+    rows = [a + b, a - c, b * d, c / d, -a, a**2, 2 * b, 1 / c, ca.sqrt(ca.fabs(d)), ca.sin(a)]
+    rows += [ca.cos(b), ca.tan(c), ca.asin(a / 9), ca.acos(b / 9), ca.atan(c), ca.atan2(a, d)]
+    rows += [ca.exp(a), ca.log(ca.fabs(d)), ca.tanh(a), ca.floor(b), ca.ceil(c), ca.sign(d)]
+    rows += [ca.fmin(a, b), ca.fmax(c, d), ca.if_else(a < b, c, d), ca.if_else(a <= b, p, d)]
+    rows += [ca.if_else(a == b, c, d), ca.if_else(a != b, c, d), ca.copysign(a, b)]
+    rows += [ca.logic_and(a, b), ca.logic_or(a, b), ca.logic_not(c), ca.constpow(d, 2.5) * p]
+    return ca.vertcat(*rows, ca.SX(1, 1), ca.fabs(a) ** b)
+
+
+@needs_compiler
+@pytest.mark.parametrize("count", [2, 7, 8, 9, 20])
+def test_the_numbers_are_those_of_the_virtual_machine(
+    count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
+    x, p = ca.SX.sym("x", 4), ca.SX.sym("p")
+    rows = rows_of(x, p)
+    function = ca.Function("rows", [x, p], [rows, ca.jacobian(rows, x)])
+    rng = np.random.default_rng(29)
+    values = rng.normal(size=(4, count)) * 3
+    values[:, 1] = [0.0, -0.0, np.inf, np.nan]
+    at_all = mapped(function, count)
+    assert isinstance(at_all, lanes._MappedFunction)
+    given = [ca.DM(values), ca.DM(rng.normal(size=(1, count)))]
+    for here, there in zip(at_all.call(given), function.map(count).call(given), strict=True):
+        assert here.sparsity() == there.sparsity()
+        np.testing.assert_array_equal(here.nonzeros(), there.nonzeros())
+
+
+def test_without_a_compiler_the_virtual_machine_takes_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+    x = ca.SX.sym("x")
+    function = ca.Function("square", [x], [x**2])
+    assert mapped(function, 3)(ca.DM([[1.0, 2.0, 3.0]])).nonzeros() == [1.0, 4.0, 9.0]
+
+
+def test_functions_that_have_other_operations_are_run_by_casadi() -> None:
+    x = ca.SX.sym("x")
+    function = ca.Function("hyperbolic", [x], [ca.sinh(x)])
+    assert not isinstance(mapped(function, 2), lanes._MappedFunction)
