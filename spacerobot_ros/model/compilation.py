@@ -46,8 +46,9 @@ _COMPILER_FLAGS = ("-O1", *_COMMON_FLAGS)
 _SOURCE_FLAGS = ("-O2", *_COMMON_FLAGS)
 """Flags for C that was written by hand: short, with loops."""
 
-_MIN_OPERATIONS_TO_KEEP = 5000
-"""Fewest operations of a function for the cache: it takes 0.1 s to derive, 0.01 s to read."""
+_MIN_OPERATIONS_TO_KEEP = 200
+"""Fewest operations of a function for the cache: it takes less to read than to derive, also where
+functions are derived together, of which only some are missing."""
 
 _COMPILE_TIMEOUT = 120.0
 """Time limit for compiling one function, s: ten times that of the largest."""
