@@ -82,6 +82,8 @@ class ExactDistances:
                 made = coal.Box(*shape.size)
             case "cylinder":
                 made = coal.Cylinder(*shape.size)
+            case "capsule":
+                made = coal.Capsule(*shape.size)
             case _:
                 assert solid.vertices is not None
                 points = coal.StdVec_Vec3s()

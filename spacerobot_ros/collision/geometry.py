@@ -135,6 +135,30 @@ class Solid:
         return self.body == _WORLD_BODY
 
 
+@dataclass(frozen=True)
+class UnreadMesh:
+    """A mesh that cannot be read: contacts of its link are not all noticed.
+
+    Attributes
+    ----------
+    link
+        Name of its link.
+    reason
+        A sentence that says why.
+    declared
+        Whether it is that of a ``<collision>``, not only of a ``<visual>``.
+    """
+
+    link: str
+    reason: str
+    declared: bool
+
+    @property
+    def note(self) -> str:
+        """The fact in a sentence."""
+        return f"Contacts of link '{self.link}' are not all noticed: {self.reason}"
+
+
 Poses = tuple[Array, Array]
 """Attitudes ``R_BL`` (N, L, 3, 3) and positions ``r_BL_B`` (N, L, 3) of the links of a robot; among
 obstacles, the world is the last of them."""
@@ -164,6 +188,8 @@ class CollisionGeometry:
         neighbouring ones.
     notes
         Sentences on links whose shape may surprise the user.
+    unread
+        Meshes that are left out.
     """
 
     def __init__(
@@ -175,12 +201,14 @@ class CollisionGeometry:
     ) -> None:
         self.robot = robot
         self._kinematics = ForwardKinematics(robot)
-        self.solids, self.notes = solids_of(robot, mesh_of)
+        self.solids, self.notes, self.unread = _read_solids(robot, mesh_of)
         if robot.world is not None:
-            obstacles, notes = solids_of(robot.world, mesh_of)
+            obstacles, notes, unread = _read_solids(robot.world, mesh_of)
             frames = robot.world.frames
             self.solids += tuple(_in_world(each, frames[each.link][1]) for each in obstacles)
             self.notes += notes
+            self.unread += unread
+        self.notes += tuple(each.note for each in self.unread)
         self.ignored: dict[LinkPair, str] = {}
         links = self._kinematics.links
         self._link_of = np.array(
@@ -406,7 +434,11 @@ def _spins_in_place(solid: Solid, link_pose: Pose, joint: Joint) -> bool:
 
     ``link_pose`` is the pose of its link in the frame of the joint's body.
     """
-    if joint.kind is JointKind.PRISMATIC or solid.shape.kind not in ("cylinder", "sphere"):
+    if joint.kind is JointKind.PRISMATIC or solid.shape.kind not in (
+        "cylinder",
+        "capsule",
+        "sphere",
+    ):
         return False
     placed = link_pose @ solid.shape.pose
     beside = float(np.linalg.norm(np.cross(joint.axis, placed.r)))
@@ -446,8 +478,17 @@ def solids_of(
 
     ``mesh_of`` is that of :class:`CollisionGeometry`.
     """
+    solids, notes, unread = _read_solids(robot, mesh_of)
+    return solids, notes + tuple(each.note for each in unread)
+
+
+def _read_solids(
+    robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh]
+) -> tuple[tuple[Solid, ...], tuple[str, ...], tuple[UnreadMesh, ...]]:
+    """Return solids and notes as :func:`solids_of`, and meshes that cannot be read."""
     solids: list[Solid] = []
     notes: list[str] = []
+    unread: list[UnreadMesh] = []
     drawn = [link.name for link in robot.links if link.shapes and not link.collisions]
     if drawn and any(link.collisions for link in robot.links):
         names = ", ".join(f"'{name}'" for name in drawn[:3]) + ", ..." * (len(drawn) > 3)
@@ -461,7 +502,7 @@ def solids_of(
                 try:
                     vertices = mesh_of(shape).vertices
                 except MeshError as error:
-                    notes.append(f"Contacts of link '{link.name}' are not all noticed: {error}")
+                    unread.append(UnreadMesh(link.name, str(error), bool(link.collisions)))
                     continue
                 hull = _hull(vertices)
                 vertices = vertices if hull is None else vertices[hull.vertices]
@@ -469,7 +510,7 @@ def solids_of(
                 solids.append(Solid(link.name, body, shape, enclosure, vertices))
             elif max(shape.size) > 0:
                 solids.append(Solid(link.name, body, shape, RoundedBox.around(shape)))
-    return tuple(solids), tuple(notes)
+    return tuple(solids), tuple(notes), tuple(unread)
 
 
 def _hull(points: Array) -> Any:

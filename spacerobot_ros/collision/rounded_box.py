@@ -75,6 +75,9 @@ class RoundedBox:
                 capsule = cls(shape.pose, np.array([0.0, 0.0, length / 2]), radius)
                 box = cls(shape.pose, np.array([radius, radius, length / 2]))
                 return min(capsule, box, key=lambda each: each.volume)
+            case "capsule":
+                radius, length = shape.size
+                return cls(shape.pose, np.array([0.0, 0.0, length / 2]), radius)
             case _:
                 assert vertices is not None
                 return _around_points(vertices, shape.pose.R)

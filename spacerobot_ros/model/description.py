@@ -75,8 +75,9 @@ class Inertia:
 class Shape:
     """A visual or collision primitive of a link.
 
-    ``kind`` is ``box`` (sizes x, y, z), ``cylinder`` (radius, length), ``sphere`` (radius) or
-    ``mesh`` (scale x, y, z; ``resource`` is its URI); sizes in m, ``rgba`` in 0..1.
+    ``kind`` is ``box`` (sizes x, y, z), ``cylinder`` (radius, length), ``sphere`` (radius),
+    ``capsule`` (radius, and length of its cylinder) or ``mesh`` (scale x, y, z; ``resource`` is its
+    URI); sizes in m, ``rgba`` in 0..1.
     """
 
     kind: str

@@ -7,6 +7,7 @@ would be singular are refused.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import re
@@ -38,11 +39,13 @@ from spacerobot_ros.model.description import (
     weld_links,
 )
 from spacerobot_ros.model.inertial_parameters import TRIANGLE_SLACK
-from spacerobot_ros.model.meshes import mesh_beside, with_mesh_files
+from spacerobot_ros.model.meshes import mesh_beside, mesh_file, with_mesh_files
 from spacerobot_ros.model.rotations import matrix_from_rpy, rpy_from_matrix
 from spacerobot_ros.model.srdf import disabled_pairs, with_srdf
 from spacerobot_ros.model.wheels import require_reaction_wheels
 from spacerobot_ros.resources import suggestion
+
+_LOG = logging.getLogger(__name__)
 
 _MAX_NUMBER = 1e12
 """Largest number (kg, m, kg m^2): larger ones are typing errors, and their squares overflow."""
@@ -90,9 +93,30 @@ def load_world(path: str | Path) -> RobotDescription:
     Raises
     ------
     RobotDescriptionError
-        The file cannot be read or is not URDF, or :func:`parse_world` refuses it.
+        The file cannot be read or is not URDF, a mesh is not found, or :func:`parse_world` refuses
+        it.
     """
-    return _loaded(Path(path), parse_world)
+    world = _loaded(Path(path), parse_world)
+    require_found_meshes(world)
+    return world
+
+
+def require_found_meshes(world: RobotDescription) -> None:
+    """Check that the meshes of obstacles are found.
+
+    Raises
+    ------
+    RobotDescriptionError
+        One is not; the message names it.
+    """
+    for link in world.links:
+        for shape in link.collisions or link.shapes:
+            if shape.kind == "mesh" and mesh_file(shape.resource) is None:
+                raise RobotDescriptionError(
+                    f"Obstacle '{link.name}' cannot be kept clear of: its mesh '{shape.resource}' "
+                    "was not found. Give a path beside the URDF, or source the workspace of its "
+                    "package."
+                )
 
 
 def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescription:
@@ -377,12 +401,12 @@ def _read_shape(element: Element, colours: dict[str, tuple[float, ...]], where: 
     geometry = element.find("geometry")
     assert geometry is not None
     (form,) = geometry
-    attributes = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}
     if form.tag == "mesh":
         # A negative scale mirrors.
         size = _read_numbers(form, "scale", "1 1 1", f"the scale of a mesh of {where}")
     else:
-        numbers = " ".join(form.get(name, "") for name in attributes[form.tag]).split()
+        names = (attribute.name for attribute in _ATTRIBUTES[form.tag])
+        numbers = " ".join(form.get(name, "") for name in names).split()
         size = _require_finite([float(number) for number in numbers], f"the geometry of {where}")
         if size.min() < 0:
             raise RobotDescriptionError(
@@ -569,7 +593,7 @@ _ELEMENTS_READ = {
 }
 """Tags of the elements to read, by the tag of their parent; other elements are ignored."""
 
-_GEOMETRIES = ("box", "cylinder", "sphere", "mesh")
+_GEOMETRIES = ("box", "cylinder", "sphere", "capsule", "mesh")
 _ACCEPTED_GEOMETRIES = [[name] for name in _GEOMETRIES]
 _GEOMETRY_REMEDY = f"a <geometry> with one of {', '.join(_GEOMETRIES)}"
 
@@ -612,6 +636,7 @@ _ATTRIBUTES = {
     "box": (_Attribute("size", 3, "m"),),
     "cylinder": (_Attribute("radius", 1, "m"), _Attribute("length", 1, "m")),
     "sphere": (_Attribute("radius", 1, "m"),),
+    "capsule": (_Attribute("radius", 1, "m"), _Attribute("length", 1, "m")),
     "mesh": (
         _Attribute("filename", 0, "the file of the mesh"),
         _Attribute("scale", 3, "factors along x, y and z", needed=False),
@@ -652,10 +677,15 @@ def _checked_root(text: str) -> Element:
         _remove_children(element, unused)
     for link in root.findall("link"):
         for collision in link.findall("collision"):
-            # Other programs write forms of their own, such as capsules.
-            if [each.tag for each in collision.iterfind("geometry/*")][
-                0:1
-            ] not in _ACCEPTED_GEOMETRIES:
+            # Other programs write forms of their own, such as planes.
+            form = [each.tag for each in collision.iterfind("geometry/*")][0:1]
+            if form not in _ACCEPTED_GEOMETRIES:
+                _LOG.warning(
+                    "A <collision> of link '%s' is %s, which is not read: give it one of %s.",
+                    link.get("name", ""),
+                    f"a <{form[0]}>" if form else "empty",
+                    ", ".join(f"<{name}>" for name in _GEOMETRIES),
+                )
                 link.remove(collision)
     if not root.get("name"):
         raise _MalformedError("the <robot> has no name", '<robot name="...">')

@@ -152,7 +152,7 @@ def _stand_in_visuals(robot: RobotDescription) -> tuple[Visual, ...]:
 
 
 def solid_mesh(shape: Shape) -> TriangleMesh:
-    """Return the triangles of a box, a cylinder or a sphere in the frame of its link."""
+    """Return the triangles of a box, cylinder, sphere or capsule in the frame of its link."""
     match shape.kind:
         case "box":
             mesh = TriangleMesh(_box_corners() * np.array(shape.size) / 2, np.array(_BOX_FACES))
@@ -165,7 +165,12 @@ def solid_mesh(shape: Shape) -> TriangleMesh:
             polar = np.linspace(-np.pi / 2, np.pi / 2, _FACETS_AROUND // 2 + 1)
             radii = shape.size[0] * np.cos(polar)
             radii[[0, -1]] = 0.0
-            mesh = _surface_of_revolution(radii.tolist(), shape.size[0] * np.sin(polar))
+            heights = shape.size[0] * np.sin(polar)
+            if shape.kind == "capsule":
+                equator, half = len(polar) // 2, shape.size[1] / 2
+                radii = np.concatenate([radii[: equator + 1], radii[equator:]])
+                heights = np.concatenate([heights[: equator + 1] - half, heights[equator:] + half])
+            mesh = _surface_of_revolution(radii.tolist(), heights)
     return mesh.moved(shape.pose)
 
 

@@ -13,7 +13,7 @@ from xml.etree.ElementTree import fromstring, tostring
 
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import RobotDescription
-from spacerobot_ros.model.urdf import parse_world
+from spacerobot_ros.model.urdf import parse_world, require_found_meshes
 
 MAX_OBSTACLES_TEXT = 1_000_000
 """Largest number of characters of obstacles on a topic."""
@@ -52,7 +52,8 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
     Raises
     ------
     RobotDescriptionError
-        It is too long, has obstacles of its own around it, or :func:`.parse_world` refuses it.
+        It is too long, has obstacles of its own around it or a mesh that is not found, or
+        :func:`.parse_world` refuses it.
     """
     if len(text) > MAX_OBSTACLES_TEXT:
         raise RobotDescriptionError(
@@ -65,7 +66,9 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
         raise RobotDescriptionError(
             "Obstacles are not among others: leave the element <world> out of their URDF."
         )
-    return parse_world(text)
+    world = parse_world(text)
+    require_found_meshes(world)
+    return world
 
 
 def links_with_shapes(world: RobotDescription) -> list[str]:

@@ -136,7 +136,7 @@ def solid(path: str, visual: Visual, color: str, opacity: float = 1.0) -> list[C
     if opacity < 1.0:
         look |= {"transparent": True, "opacity": opacity, "depthWrite": False}
         look |= {"polygonOffsetFactor": -1, "polygonOffsetUnits": -1}
-    if shape.kind == "mesh":
+    if shape.kind in ("mesh", "capsule"):
         # Both sides are drawn, because files differ in which one is outside.
         look |= {"flatShading": True, "side": 2}
         return [_set_object(f"{path}/solid", _mesh_geometry(visual.mesh), look, "Mesh")]

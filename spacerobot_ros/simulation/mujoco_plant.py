@@ -636,6 +636,7 @@ def _add_shape(mujoco: Any, spec: Any, solid: Solid, name: str, prefix: str = ""
         "box": (kinds.mjGEOM_BOX, [length / 2 for length in size]),
         "sphere": (kinds.mjGEOM_SPHERE, [size[0], 0.0, 0.0]),
         "cylinder": (kinds.mjGEOM_CYLINDER, [size[0], size[-1] / 2, 0.0]),
+        "capsule": (kinds.mjGEOM_CAPSULE, [size[0], size[-1] / 2, 0.0]),
     }[solid.shape.kind]
     pose = solid.shape.pose
     body.add_geom(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,13 @@ from support.urdf_text import without_collisions
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair
 from spacerobot_ros.collision import distances as distances_module
-from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.errors import PlanningError, RobotDescriptionError
 from spacerobot_ros.model import load_robot, parse_robot
-from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.description import Pose, RobotDescription
 from spacerobot_ros.model.srdf import with_srdf
+from spacerobot_ros.model.visuals import solid_mesh
+from spacerobot_ros.model.world import obstacles_from_topic
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.resources import robot_file
 
 INERTIAL = (
@@ -292,3 +296,44 @@ def test_the_collision_shapes_of_surveyor_are_its_parts_and_leave_the_arm_its_ro
     assert found is not None
     assert hull[0] < 0.0
     assert found[0] == pytest.approx(0.05, abs=1e-4)
+
+
+def test_a_capsule_is_a_cylinder_with_round_ends() -> None:
+    rod = solid("collision", '<capsule radius="0.1" length="0.6"/>')
+    geometry = CollisionGeometry(parse_robot(chain((BALL,), (rod,), (BALL,))))
+    links = [each.link for each in geometry.solids]
+    i, j = links.index("b"), links.index("c")
+    pose = geometry.solids[i].shape.pose
+    # The capsule along z at the origin, the ball beside it or beyond its end.
+    R, r = pose.R.T[np.newaxis], -(pose.R.T @ pose.r)[np.newaxis]
+    for place, nearest in (([0.5, 0.1, 0.7], [0.0, 0.0, 0.3]), ([0.6, 0.0, 0.1], [0.0, 0.0, 0.1])):
+        found = geometry.distance_function(i, R, r, j, R, np.array([place]))
+        expected = np.linalg.norm(np.subtract(place, nearest)) - 0.1 - 0.1
+        assert found == pytest.approx(expected, abs=1e-6)
+    vertices = solid_mesh(replace(geometry.solids[i].shape, pose=Pose())).vertices
+    axis = np.clip(vertices[:, 2], -0.3, 0.3)
+    np.testing.assert_allclose(
+        np.linalg.norm(vertices - np.outer(axis, [0, 0, 1]), axis=1), 0.1, atol=1e-12
+    )
+    assert np.ptp(vertices[:, 2]) == pytest.approx(0.8)
+
+
+def test_plans_are_refused_where_the_mesh_of_a_collision_is_missing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    mesh = '<mesh filename="package://nowhere/arm.stl"/>'
+    declared = parse_robot(chain((BALL,), (solid("collision", mesh),), (BALL,)))
+    start = np.zeros(len(declared.joint_names))
+    with pytest.raises(PlanningError, match=r"Link 'b' .*'package://nowhere/arm.stl' .* SRDF"):
+        Clearance(declared, 0.01).required(start)
+    pairs = [frozenset({"b", link.name}) for link in declared.links if link.name != "b"]
+    disabled = replace(declared, disabled_collisions=frozenset(pairs))
+    Clearance(disabled, 0.01).required(start)
+    caplog.clear()
+    drawn = parse_robot(chain((BALL,), (solid("visual", mesh),), (BALL,)))
+    Clearance(drawn, 0.01).required(start)
+    (warning,) = caplog.messages
+    assert warning.startswith("Contacts of link 'b' are not all noticed: The mesh 'package://nowh")
+    world = f'<robot name="w"><link name="crate">{solid("visual", mesh)}</link></robot>'
+    with pytest.raises(RobotDescriptionError, match=r"Obstacle 'crate' .*'package://nowhere/arm"):
+        obstacles_from_topic(world)

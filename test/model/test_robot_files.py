@@ -344,9 +344,9 @@ BROKEN = {
         r"<mimic> of joint 'wrist' has no 'joint'; write <mimic joint=.*the joint that it follows",
     ),
     # Looks.
-    "a capsule": (
-        seen('<capsule radius="1" length="2"/>'),
-        r"<geometry> of link 'hull' is a <capsule>; write one of <box>, <cylinder>, <sphere>",
+    "a cone": (
+        seen('<cone radius="1" length="2"/>'),
+        r"<geometry> of link 'hull' is a <cone>; write one of <box>, <cylinder>, <sphere>",
     ),
     "no shape": (seen(""), r"<geometry> of link 'hull' has 0 shapes; write one of <box>"),
     "no geometry": (
@@ -392,12 +392,12 @@ def test_other_encodings_are_asked_for_as_utf_8(tmp_path: Path) -> None:
 
 def test_what_other_programs_have_written_is_passed_over(tmp_path: Path) -> None:
     """Collision shapes, transmissions, plugins and safety controllers are nothing to a flight."""
-    collision = "<collision><geometry><capsule radius='1' length='2'/></geometry></collision>"
+    collision = "<collision><geometry><plane radius='1' length='2'/></geometry></collision>"
     text = urdf(visual=collision, limit=LIMIT + '<safety_controller k_velocity="x"/>')
     text = text.replace("</robot>", "<gazebo><a b='c'/></gazebo><transmission/></robot>")
     found = load_robot(file_with(tmp_path, text))
     assert (found.name, found.joint_names, found.total_mass) == ("probe", ("elbow",), 11.0)
-    assert "capsule" in found.urdf
+    assert "plane" in found.urdf
 
 
 def test_what_a_link_is_welded_to_makes_up_for_its_inertia(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_matrix,
     quaternion_multiply,
 )
+from spacerobot_ros.model.visuals import solid_mesh
 from spacerobot_ros.planning import BasePath, Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.times import SECOND, set_stamp
@@ -35,6 +37,7 @@ _MARKER_TYPES = {
     "box": Marker.CUBE,
     "cylinder": Marker.CYLINDER,
     "sphere": Marker.SPHERE,
+    "capsule": Marker.TRIANGLE_LIST,
     "mesh": Marker.MESH_RESOURCE,
 }
 _MAX_KEPT_TRANSFORMS, _MAX_KEPT_STATIC_TRANSFORMS = 200, 100
@@ -110,6 +113,10 @@ def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> Marke
         size = (2 * size[0], 2 * size[0], size[1])
     elif shape.kind == "sphere":
         size = (2 * size[0],) * 3
+    elif shape.kind == "capsule":
+        size, mesh = (1.0, 1.0, 1.0), solid_mesh(replace(shape, pose=Pose()))
+        corners = mesh.vertices[mesh.faces].reshape(-1, 3).tolist()
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in corners]
     marker.scale.x, marker.scale.y, marker.scale.z = (float(x) for x in size)
     marker.color.r, marker.color.g, marker.color.b, marker.color.a = (float(x) for x in shape.rgba)
     marker.mesh_resource = shape.resource

@@ -86,8 +86,11 @@ class Clearance:
 
     @cached_property
     def geometry(self) -> CollisionGeometry:
-        """The solids of the robot."""
-        return CollisionGeometry(self._robot)
+        """The solids of the robot; meshes that cannot be read are named in the log."""
+        geometry = CollisionGeometry(self._robot)
+        for each in geometry.unread:
+            _LOG.warning("%s", each.note)
+        return geometry
 
     @property
     def has_obstacles(self) -> bool:
@@ -121,9 +124,11 @@ class Clearance:
         Raises
         ------
         PlanningError
-            Links are much nearer at the start than the clearance; the message names them.
+            Links are much nearer at the start than the clearance, or the mesh of a ``<collision>``
+            cannot be read; the message names them.
         """
         geometry = self.geometry
+        self._require_declared_meshes()
         required = np.full(len(geometry.pairs), self.distance)
         if not len(required):
             return required
@@ -143,6 +148,20 @@ class Clearance:
             else:
                 required[pair] = min(self.distance, distance)
         return required - _DISTANCE_ERROR
+
+    def _require_declared_meshes(self) -> None:
+        """Refuse a robot with a ``<collision>`` whose mesh cannot be read, unless an SRDF disables
+        all pairs of its link.
+        """
+        robot = self._robot
+        names = {link.name for link in robot.links}
+        for each in self.geometry.unread:
+            pairs = {frozenset({each.link, other}) for other in names - {each.link}}
+            if each.declared and each.link in names and not pairs <= robot.disabled_collisions:
+                raise PlanningError(
+                    f"Link '{each.link}' cannot be kept clear of others: {each.reason} Or have an "
+                    "SRDF disable its pairs (planner.srdf), or set planner.clearance to 0."
+                )
 
     def _warn_of_contact(self, links: LinkPair) -> None:
         if links.subject not in self._warned:
