@@ -419,16 +419,16 @@ def test_the_publisher_of_a_topic_is_asked_for_its_parameters_once(
         get_namespace=lambda: namespace, _parameter_requests={"there": None},
         _taps=SimpleNamespace(nodes=[watched]),
     )  # fmt: skip
-    RecorderNode._ask_for_parameters(node, topic, [owner, None])
+    RecorderNode._request_parameters(node, topic, [owner, None])
     wanted = {} if record is None else {record: "asked /of/owner"}
     assert node._parameter_requests == {"there": None, **wanted}
     if record is not None:
         node._parameter_requests[record] = None
-        RecorderNode._ask_for_parameters(node, topic, [owner])
+        RecorderNode._request_parameters(node, topic, [owner])
         assert node._parameter_requests[record] is None
         del node._parameter_requests[record]
         watched.get_fully_qualified_name = lambda: "/of/owner"
-        RecorderNode._ask_for_parameters(node, topic, [owner])
+        RecorderNode._request_parameters(node, topic, [owner])
         assert record not in node._parameter_requests
 
 
