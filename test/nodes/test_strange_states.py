@@ -5,6 +5,7 @@ from __future__ import annotations
 import array
 import copy
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from spacerobot_ros.messages.builders import path_message
 from spacerobot_ros.messages.readers import JointReader, UnreadableError
 from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.planning import BasePath
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.times import LATEST_NS, first_time_ns, set_stamp, stamp_bytes, stamp_to_ns
 
 LAST = 2**31 - 1
@@ -98,8 +100,11 @@ def test_a_plant_whose_time_no_stamp_carries_says_so(
     harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At a tick in 1000 s that is after two million of them."""
-    start = (None, LAST // 1000)
-    monkeypatch.setattr(PlantNode, "_initial_state_and_tick", lambda self, robot: start)
+    last = SimpleNamespace(time_ns=LAST // 1000 * 1000 * SECOND)
+    monkeypatch.setattr(PlantNode, "_last_state", lambda self, robot: last)
+    monkeypatch.setattr(
+        PlantNode, "_resumed_plant", lambda self, robot, state: build_plant(robot, self.config)
+    )
     plant = harness.make(
         PlantNode,
         {"robot": "sliding_masses", "time_mode": "lockstep", "tick_rate": 0.001},

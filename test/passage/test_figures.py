@@ -115,7 +115,7 @@ def expected(figure: str, group: TraceGroup, messages: Messages) -> Array:
         return vectors([getattr(m.twist.twist, part) for m in odom])
     if figure == "errors":
         axes = ["xyz".index(name) for name in names]
-        return pose_error(messages, group.label)[:, axes]
+        return pose_error(messages, group.label.removesuffix(" error"))[:, axes]
     if figure == "thrusters":
         return thruster_numbers(group, messages)
     assert figure == "momentum"
@@ -137,10 +137,10 @@ UNITS = {
     "attitude": {"rotation vector": "rad"},
     "twist": {"velocity": "m/s", "rate": "rad/s"},
     "errors": {
-        "base position": "m",
-        "base attitude": "rad",
-        "end-effector position": "m",
-        "end-effector attitude": "rad",
+        "base position error": "m",
+        "base attitude error": "rad",
+        "end-effector position error": "m",
+        "end-effector attitude error": "rad",
     },
     "efforts": {"thruster force": "N", "thruster torque": "N m", "joint effort": "N m"},
     "clearance": {"smallest distance": "m"},
