@@ -115,6 +115,7 @@ class Geometry:
         self._distances, self._bounds = distances, bounds or distances
         self.pairs = np.zeros((len(distances), 2))
         self.asked: list[int] = []
+        self.unread: tuple[Any, ...] = ()
 
     def poses(self, shapes: Array, base: object = None) -> tuple[Array, Array]:
         return np.zeros((len(shapes), 1)), np.zeros((len(shapes), 1))
@@ -131,7 +132,8 @@ class Geometry:
 
 
 def clearance(distances: list[float], bounds: list[float] | None = None) -> Any:
-    made: Any = Clearance(None, 0.02)  # type: ignore[arg-type]
+    robot: Any = SimpleNamespace(links=())
+    made: Any = Clearance(robot, 0.02)
     made.__dict__["geometry"] = Geometry(distances, bounds)
     return made
 
