@@ -175,7 +175,8 @@ def _distance_lines(
     for part, error in errors.items():
         of_link = bool(state.goals[part].end_effectors)
         # Once a planner has decided on a goal of the base, its message has the numbers.
-        if planner is not None if of_link else flies or state.controller is not None:
+        by_planner = flies if not of_link else planner is not None
+        if by_planner or (not of_link and state.controller is not None):
             text = error.describe(tolerance, not_controlled(state, part))
             line = _line_html(f"{part} is {text}{'' if of_link else to_go}.", None)
             whose = "planner" if state.controller is None or of_link else "controller"
@@ -498,13 +499,8 @@ def momentum_html(state: StackState) -> str:
         (escape(part), f"{_format_decimals(value, 3)} N m s", "") for part, value in budget.items()
     ]
     for name, share in command.wheels.items():
-        level = (
-            2
-            if abs(share) >= _SATURATED_WHEEL_SHARE
-            else 1
-            if abs(share) >= _WARNING_WHEEL_SHARE
-            else 0
-        )
+        # 0, 1 or 2: how many of the two shares it reaches.
+        level = sum(abs(share) >= each for each in (_WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE))
         title = f'<span title="{escape(name)}">{escape(shortened(name))}</span>'
         bar = _bar_html((1.0 + share) / 2, level)
         rows.append((title, f"{_format_decimals(100 * share, 0)} %", bar))

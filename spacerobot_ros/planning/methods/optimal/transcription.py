@@ -43,13 +43,13 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cached_function, source_hash
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
-from spacerobot_ros.model.lanes import mapped
 from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
 from spacerobot_ros.model.symbolic_rotations import (
     quaternion_from_small_rotvec,
     quaternion_multiply,
     relative_vector,
 )
+from spacerobot_ros.model.vector_machine import mapped
 from spacerobot_ros.planning.methods.optimal.problem import PathConstraints
 
 GAUSS = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)

@@ -1,10 +1,10 @@
 """CasADi functions at many places at once, in vector registers, without compiling each of them.
 
 The derivatives of a robot's motion have ten thousands of operations: a compiler needs seconds for
-them. Here a small C program (``lanes.c``), compiled once for all robots, reads the operations of a
-function one after the other and computes each at eight places, which takes less time than compiled
-code without optimisation. Without a C compiler the functions run in CasADi's virtual machine, with
-the same numbers, bit for bit.
+them. Here a small C program (``vector_machine.c``), compiled once for all robots, reads the
+operations of a function one after the other and computes each at eight places, which takes less
+time than compiled code without optimisation. Without a C compiler the functions run in CasADi's
+virtual machine, with the same numbers, bit for bit.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from spacerobot_ros.model.compilation import (
     native_library,
 )
 
-_SOURCE_FILE = Path(__file__).with_name("lanes.c")
+_SOURCE_FILE = Path(__file__).with_name("vector_machine.c")
 
 _OPERATIONS = {
     name[len("OP_") :]: int(getattr(ca, name)) for name in dir(ca) if name.startswith("OP_")
@@ -39,16 +39,16 @@ _INPUT, _OUTPUT, _CONST = (_OPERATIONS[name] for name in ("INPUT", "OUTPUT", "CO
 
 _FLAGS = ("-O2", "-fno-math-errno", "-fno-trapping-math")
 
-_TRIAL = "lanes_trial"
+_TRIAL = "vector_machine_trial"
 
 
 class _Tape:
-    """The operations of a function of SX, as ``lanes.c`` takes them.
+    """The operations of a function of SX, as ``vector_machine.c`` takes them.
 
     Raises
     ------
     ValueError
-        The function is none of SX, or has an operation that ``lanes.c`` does not know.
+        The function is none of SX, or has an operation that ``vector_machine.c`` does not know.
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -125,12 +125,11 @@ def _tape_of(function: ca.Function) -> _Tape | None:
 
 
 class _MappedFunction(ca.Callback):
-    """A function at several places, run by ``lanes.c``."""
+    """A function at several places, run by ``vector_machine.c``."""
 
     def __init__(self, function: ca.Function, tape: _Tape, run: Any, count: int) -> None:
         ca.Callback.__init__(self)
         self._function, self._tape, self._run, self._count = function, tape, run, count
-        self._given = (ctypes.c_void_p * max(1, function.n_in()))()
         self.construct(f"{function.name()}_at_{count}", {})
 
     def get_n_in(self) -> int:
@@ -184,17 +183,17 @@ def _pointers(memories: Sequence[memoryview | None]) -> Any:
 
 @lru_cache
 def _runner(settings: tuple[str, ...]) -> Any:
-    """Return ``run_lanes`` with a compiler and a cache (``settings``); None without a compiler."""
+    """Return ``run_at_places`` for a compiler and cache (``settings``); None without a compiler."""
     if c_compiler() is None:
         return None
     trial = _trial_function()
     source = _source(trial)
     try:
-        library = native_library("lanes", source, _FLAGS, (), [trial], language="c")
+        library = native_library("vector_machine", source, _FLAGS, (), [trial], language="c")
     except NoLibraryError as reason:
         warn_once(f"Plans are searched for in CasADi's virtual machine, slower: {reason}.")
         return None
-    run = library.run_lanes
+    run = library.run_at_places
     pointer, number = ctypes.c_void_p, ctypes.c_longlong
     run.argtypes = [pointer, number, pointer, number, *[pointer] * 4, number]
     run.restype = ctypes.c_int
@@ -212,7 +211,7 @@ def _trial_function() -> ca.Function:
 
 
 def _source(trial: ca.Function) -> str:
-    """Return C of ``run_lanes``, and of a function with CasADi's interface that runs a trial."""
+    """Return C of ``run_at_places``, and a function with CasADi's interface that runs a trial."""
     tape = _Tape(trial)
     numbers = ", ".join(map(str, tape.steps.ravel().tolist()))
     constants = ", ".join(map(float.hex, [*tape.constants.tolist(), 0.0]))
@@ -226,7 +225,7 @@ def _source(trial: ca.Function) -> str:
             f"  static const double constants[] = {{{constants}}};",
             f"  const long long in = {tape.argument_sizes[0]}, out = {tape.result_sizes[0]};",
             "  (void)iw; (void)w; (void)mem;",
-            f"  return run_lanes((const Step *)steps, {len(tape.steps)}, constants, "
+            f"  return run_at_places((const Step *)steps, {len(tape.steps)}, constants, "
             f"{tape.memory_size}, arg, &in, res, &out, 1);",
             "}",
         ]

@@ -8,9 +8,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from spacerobot_ros.model import lanes
+from spacerobot_ros.model import vector_machine
 from spacerobot_ros.model.compilation import c_compiler
-from spacerobot_ros.model.lanes import mapped
+from spacerobot_ros.model.vector_machine import mapped
 
 needs_compiler = pytest.mark.skipif(c_compiler() is None, reason="needs a C compiler")
 
@@ -40,7 +40,7 @@ def test_the_numbers_are_those_of_the_virtual_machine(
     values = rng.normal(size=(4, count)) * 3
     values[:, 1] = [0.0, -0.0, np.inf, np.nan]
     at_all = mapped(function, count)
-    assert isinstance(at_all, lanes._MappedFunction)
+    assert isinstance(at_all, vector_machine._MappedFunction)
     given = [ca.DM(values), ca.DM(rng.normal(size=(1, count)))]
     for here, there in zip(at_all.call(given), function.map(count).call(given), strict=True):
         assert here.sparsity() == there.sparsity()
@@ -57,4 +57,4 @@ def test_without_a_compiler_the_virtual_machine_takes_over(monkeypatch: pytest.M
 def test_functions_that_have_other_operations_are_run_by_casadi() -> None:
     x = ca.SX.sym("x")
     function = ca.Function("hyperbolic", [x], [ca.sinh(x)])
-    assert not isinstance(mapped(function, 2), lanes._MappedFunction)
+    assert not isinstance(mapped(function, 2), vector_machine._MappedFunction)

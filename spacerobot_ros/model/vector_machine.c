@@ -16,7 +16,7 @@
 #define CLONES
 #endif
 
-typedef double Lanes __attribute__((vector_size(GROUP * sizeof(double))));
+typedef double Vector __attribute__((vector_size(GROUP * sizeof(double))));
 
 /* An operation: its number in CasADi, its result, and its operands: places of the memory, or for
  * inputs and outputs the number of the argument and the place in it. */
@@ -34,16 +34,16 @@ typedef struct {
 
 /* Returns 0, or 1 where memory is short. `sizes` are the nonzeros of the arguments and results at a
  * place; the numbers of a place stand together. Results may be NULL. */
-CLONES int run_lanes(const Step *steps, long long step_count, const double *constants,
+CLONES int run_at_places(const Step *steps, long long step_count, const double *constants,
                      long long memory_size, const double *const *arguments,
                      const long long *argument_sizes, double *const *results,
                      const long long *result_sizes, long long places) {
-  void *block = malloc((size_t)(memory_size + 1) * sizeof(Lanes) + sizeof(Lanes));
-  Lanes *memory;
+  void *block = malloc((size_t)(memory_size + 1) * sizeof(Vector) + sizeof(Vector));
+  Vector *memory;
   long long begin, k;
   int i;
   if (!block) return 1;
-  memory = (Lanes *)(((size_t)block + sizeof(Lanes) - 1) / sizeof(Lanes) * sizeof(Lanes));
+  memory = (Vector *)(((size_t)block + sizeof(Vector) - 1) / sizeof(Vector) * sizeof(Vector));
   for (begin = 0; begin < places; begin += GROUP) {
     const int count = places - begin < GROUP ? (int)(places - begin) : GROUP;
     for (k = 0; k < step_count; ++k) {
@@ -71,8 +71,8 @@ CLONES int run_lanes(const Step *steps, long long step_count, const double *cons
         continue;
       }
       {
-        const Lanes a = memory[s.first], b = memory[s.second];
-        Lanes c = a;
+        const Vector a = memory[s.first], b = memory[s.second];
+        Vector c = a;
         switch (s.operation) {
           case ASSIGN: break;
           case ADD: c = a + b; break;
