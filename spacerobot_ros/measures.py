@@ -79,9 +79,11 @@ class Measures:
     manoeuvre_time
         Duration of the schedules that were flown for the goal, or of the tracking by a controller,
         s; see :func:`flown_time`.
-    error, end_effector_error
-        Error of the last pose of the base and of the end-effector to their goals; None without a
-        goal or a pose.
+    error
+        Error of the last pose of the base to its goal; None without a goal or a pose.
+    end_effector_distance, end_effector_angle
+        Last distance (m) and angle (rad) of the end-effector from its goal, of several the largest;
+        NaN without a goal or a pose, the angle also where the attitude is free or not controlled.
     peak_rate, peak_effort
         (n,) largest absolute rates (m/s or rad/s) and actuator efforts (N or N m) of the joints.
     peak_wrench
@@ -108,13 +110,14 @@ class Measures:
     duration: float
     manoeuvre_time: float
     error: PoseError | None
-    end_effector_error: PoseError | None
     peak_rate: Array
     peak_effort: Array
     peak_wrench: Array
     lowest: Array
     highest: Array
     momentum_drift: Array
+    end_effector_distance: float = math.nan
+    end_effector_angle: float = math.nan
     corrections: int = 0
     propellant: float = math.nan
     plan_time: float = math.nan
@@ -233,9 +236,9 @@ def _capture_metric(name: str, unit: str, description: str, *, yes_or_no: bool =
     return Metric(unit, description, lambda m, _: float(evaluate(m)), yes_or_no=yes_or_no)
 
 
-def _error_metric(error: str, part: str, unit: str, description: str) -> Metric:
-    """Return the metric of a part (``distance`` or ``angle``) of an error of the measures."""
-    return Metric(unit, description, lambda m, _: float(getattr(getattr(m, error), part, math.nan)))
+def _error_metric(part: str, unit: str, description: str) -> Metric:
+    """Return the metric of a part (``distance`` or ``angle``) of the error of the base."""
+    return Metric(unit, description, lambda m, _: float(getattr(m.error, part, math.nan)))
 
 
 def _joint_margin(measures: Measures, robot: RobotDescription) -> Array:
@@ -258,19 +261,20 @@ CLEARANCE = "clearance_m"
 
 METRICS: dict[str, Metric] = {
     "position_error_m": _error_metric(
-        "error", "distance", "m", "distance of the last true position of the base from the goal"
+        "distance", "m", "distance of the last true position of the base from the goal"
     ),
     "attitude_error_rad": _error_metric(
-        "error", "angle", "rad", "angle between the last true attitude of the base and the goal"
+        "angle", "rad", "angle between the last true attitude of the base and the goal"
     ),
-    "end_effector_position_error_m": _error_metric(
-        "end_effector_error",
-        "distance",
+    "end_effector_position_error_m": Metric(
         "m",
-        "last distance of the end-effector from its goal",
+        "last distance of the end-effector from its goal, of several the largest",
+        lambda m, _: m.end_effector_distance,
     ),
-    "end_effector_attitude_error_rad": _error_metric(
-        "end_effector_error", "angle", "rad", "last angle of the end-effector from its goal"
+    "end_effector_attitude_error_rad": Metric(
+        "rad",
+        "last angle of the end-effector from its goal likewise, where its attitude is controlled",
+        lambda m, _: m.end_effector_angle,
     ),
     "duration_s": Metric("s", "simulated time of the flight", lambda m, _: m.duration),
     "manoeuvre_time_s": Metric("s", "time flown for the last goal", lambda m, _: m.manoeuvre_time),

@@ -671,16 +671,25 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
 def different_parameters(scenarios: Sequence[Scenario]) -> list[tuple[str, ...]]:
     """Return node and name of each parameter that is not the same in all scenarios, and its values.
 
-    Values are texts; ``–`` where a scenario does not give the parameter. Texts of robots are left
-    out.
+    Values are texts; ``–`` where a scenario does not give the parameter, which has its default
+    then. Texts of robots are left out.
     """
     given = [{(n, p): v for n in CONFIGS for p, v in s.parameters(n).items()} for s in scenarios]
+    defaults = {(n, each.name): each.default for n in CONFIGS for each in declared(CONFIGS[n])}
     rows = []
     for key in dict.fromkeys(key for each in given for key in each):
-        values = [str(each[key]) if key in each else "–" for each in given]
-        if len(set(values)) > 1 and not key[1].endswith("robot_description"):
-            rows.append((f"{key[0]}.{key[1]}", *values))
+        values = {_comparable(each.get(key, defaults.get(key))) for each in given}
+        if len(values) > 1 and not key[1].endswith("robot_description"):
+            texts = (str(each[key]) if key in each else "–" for each in given)
+            rows.append((f"{key[0]}.{key[1]}", *texts))
     return rows
+
+
+def _comparable(value: Any) -> str:
+    """Return a text that is the same for a list and a tuple, a number and the same integer."""
+    if isinstance(value, list | tuple):
+        return str([_comparable(each) for each in value])
+    return str(float(value)) if isinstance(value, int | float) else str(value)
 
 
 def _sections(content: Mapping[Any, Any], path: Path) -> dict[str, dict[str, Any]]:

@@ -97,7 +97,7 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
             *(f'<p class="missing">{escape(note)}</p>' for note in notes),
             *_parameters_part(first.campaign, second.campaign),
             "<h2>Paired differences</h2>",
-            _difference_table(found, a, b),
+            _difference_table(found, first, second),
             _difference_figure(first, second, flown_a, flown_b, compared[:6]),
         ]
     write_output(path, html_page(f"{a} and {b}", body, FOOTER_TEXT))
@@ -144,10 +144,11 @@ def _notes_on_control(first: Results, second: Results) -> list[str]:
     ]
 
 
-def _difference_table(found: list[PairedDifference], first: str, second: str) -> str:
+def _difference_table(found: list[PairedDifference], first: Results, second: Results) -> str:
+    free = [part for part in first.not_controlled if part in second.not_controlled]
     rows = [
         [
-            metric_label(each.metric),
+            metric_label(each.metric, free),
             str(each.count),
             f"{each.first:.5g}",
             f"{each.second:.5g}",
@@ -157,7 +158,8 @@ def _difference_table(found: list[PairedDifference], first: str, second: str) ->
         ]
         for each in found
     ]
-    head = ["metric", "pairs", f"mean of {first}", f"mean of {second}", "difference"]
+    names = [f"mean of {each.campaign.name}" for each in (first, second)]
+    head = ["metric", "pairs", *names, "difference"]
     return table("paired", [*head, "95 % interval", "interval excludes 0"], rows)
 
 

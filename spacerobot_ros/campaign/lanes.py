@@ -31,8 +31,9 @@ from spacerobot_ros.campaign.draws import Draw, drawn_flight
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, nominal_robots, plant_robot, robots_of
 from spacerobot_ros.campaign.rows import LANES, Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
-from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.controller import build_controller, controlled_outputs
 from spacerobot_ros.control.executive import decided_message
+from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.control.thrusters import find_thrusters
@@ -314,6 +315,7 @@ class _ScheduledLanes:
             message = f"The goal is not reached: {remaining} after 0 correction(s)."
         assert ready.plan is not None
         pose = result.pose[row, end]
+        hand = _end_effector_error(flights.robot, ready.flight, result.q[row, end], pose)
         duration = float(result.time[end] - result.time[0])
         return Measures(
             outcome=outcome,
@@ -321,9 +323,6 @@ class _ScheduledLanes:
             duration=duration,
             manoeuvre_time=duration,
             error=PoseError.between(pose[:3], pose[3:], scenario.goal),
-            end_effector_error=_end_effector_error(
-                flights.robot, ready.flight, result.q[row, end], pose
-            ),
             peak_rate=result.peak_rate[row],
             peak_effort=result.peak_effort[row],
             peak_wrench=np.zeros(2),
@@ -331,6 +330,7 @@ class _ScheduledLanes:
             lowest=schedule.positions.min(axis=0),
             highest=schedule.positions.max(axis=0),
             momentum_drift=momentum_drift(result.momentum[row, : end + 1]),
+            end_effector_distance=math.nan if hand is None else hand.distance,
             corrections=ready.plan.status.corrections,
             plan_time=ready.plan_time,
         )
@@ -430,14 +430,19 @@ class _ControlledLanes:
             return "ended at its first state"
         n, end = flights.robot.n, result.end_state[row]
         q, pose = end[:n], end[2 * n : 2 * n + 7]
+        hand = _end_effector_error(flights.robot, ready.flight, q, pose)
+        distance = angle = math.nan
+        if hand is not None:
+            distance = hand.distance
+            angle = hand.angle if _turns_end_effector(flights) else math.nan
         duration = int(result.end_tick[row]) * period_ns / SECOND
         if decision is Decision.NONE:
             outcome, flown = Outcome.INTERRUPTED, duration
             message = f"Interrupted after {duration:.6g} s of simulated time."
         else:
             outcome, state = _OUTCOME_OF_DECISION[decision]
-            distance = OutputDistance(*result.decided_distance[row].tolist())
-            message = decided_message(state, distance, ready.flight.scenario.controller)
+            left = OutputDistance(*result.decided_distance[row].tolist())
+            message = decided_message(state, left, ready.flight.scenario.controller)
             flown = decided * period_ns / SECOND
         return Measures(
             outcome=outcome,
@@ -445,13 +450,14 @@ class _ControlledLanes:
             duration=duration,
             manoeuvre_time=flown,
             error=PoseError.between(pose[:3], pose[3:], ready.flight.scenario.goal),
-            end_effector_error=_end_effector_error(flights.robot, ready.flight, q, pose),
             peak_rate=np.maximum(result.peak_rate[row], np.abs(flights.starts.qdot[row])),
             peak_effort=result.peak_effort[row],
             peak_wrench=result.peak_wrench[row],
             lowest=np.minimum(result.lowest[row], q),
             highest=np.maximum(result.highest[row], q),
             momentum_drift=result.momentum_drift[row],
+            end_effector_distance=distance,
+            end_effector_angle=angle,
             propellant=math.nan if flights.thrusters is None else float(result.propellant[row]),
             plan_time=0.0,
         )
@@ -496,6 +502,15 @@ def _end_effector_error(
     R_BE, r_BE_B = robot.link_pose(link, q)
     R_WB = matrix_from_quaternion(pose[3:])
     return PoseError.between(pose[:3] + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE), goal)
+
+
+def _turns_end_effector(flights: Flights) -> bool:
+    """Whether the controller of a batch turns the end-effector to an attitude."""
+    program = flights.program
+    assert isinstance(program, Controlled)
+    law_type = LAWS[program.config.law]
+    outputs = controlled_outputs(program.robot or flights.robot, program.config, law_type)
+    return any(axis.startswith("r") for axis in outputs.end_effector)
 
 
 # -- schedules --------------------------------------------------------------------------------

@@ -82,6 +82,9 @@ _MAIN_METRICS = (
 )
 
 
+_PART_OF_METRIC = {"position_error_m": "position", "attitude_error_rad": "attitude"}
+"""Part of the goal of the base whose error a metric is."""
+
 _NOT_CONTROLLED = re.compile(r"[(; ]([a-z]+(?: and [a-z]+)*) not controlled\)")
 """The parts of the goal in the message of a flight that does not control them."""
 
@@ -404,11 +407,15 @@ def _metric(name: str) -> Metric:
     return METRICS[name.partition(".")[0]]
 
 
-def metric_label(metric: str) -> str:
-    """Return the name of a metric with its unit, unless the name has it."""
+def metric_label(metric: str, not_controlled: Sequence[str] = ()) -> str:
+    """Return the name of a metric with its unit, unless the name has it, and whether it is the
+    error of a part of the goal that is not controlled.
+    """
     unit = _metric(metric).unit
     named = metric.endswith(("_m", "_rad", "_s", "_kg", "_N", "_Nm", "_Ns", "_Nms"))
-    return f"{metric}, {unit}" if unit and not named else metric
+    label = f"{metric}, {unit}" if unit and not named else metric
+    free = _PART_OF_METRIC.get(metric) in not_controlled
+    return f"{label} (not controlled)" if free else label
 
 
 # -- parts of the page ------------------------------------------------------------------------
@@ -506,12 +513,12 @@ def _outcomes_section(results: Results) -> str:
 def _percentiles_section(results: Results) -> str:
     if not results.distributed_metrics:
         return '<p class="missing">No flight has any metric.</p>'
-    rows = []
+    rows, free = [], results.not_controlled
     for name in results.distributed_metrics:
         values = results.columns[name]
         there = values[np.isfinite(values)]
         numbers = [there.min(), *percentiles(values), there.max(), there.mean(), there.std()]
-        rows.append([metric_label(name), *(f"{x:.4g}" for x in numbers)])
+        rows.append([metric_label(name, free), *(f"{x:.4g}" for x in numbers)])
     head = ["metric", "minimum", *(f"{p:g} %" for p in PERCENTILES), "maximum", "mean", "std"]
     return table("percentiles", head, rows)
 
@@ -563,14 +570,7 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
             for index in (each.first, each.total):
                 cells.append("" if index is None else f"{index[0]:.3f} ± {index[1]:.3f}")
         rows.append(cells)
-    head = [
-        "drawn",
-        "metric",
-        "rank correlation",
-        "p",
-        "correlation with the distance from the median",
-        "p",
-    ]
+    head = ["drawn", "metric", "rank correlation", "p", "of its distance from the median", "p"]
     head += ["Sobol, first order", "Sobol, total"] if sobol else []
     note = "Spearman's rank correlations, those of passing and then the strongest first; p: "
     note += "probability by chance, corrected for all of them (Benjamini-Hochberg). A metric "

@@ -226,8 +226,8 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
             f"flight {number}."
         )
     draw = draws[number]
-    scenario = drawn_flight(campaign, draw).with_masses_in_urdf().scenario
-    run_scenario(scenario, bag, longest=campaign.longest)
+    flight = drawn_flight(campaign, draw)
+    run_scenario(flight.with_masses_in_urdf().scenario, bag, longest=campaign.longest)
     measures = read_run(bag).measured(clearance=campaign.measures_clearance)
     row = Row.of(campaign, draw, measures, "ros")
     known = stored_flight(dataset, number)
@@ -236,8 +236,13 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     outcome, engine, metrics = known
     deviation, at = largest_deviation(metrics, row.metrics)
     note = ""
-    if engine == LANES and campaign.scenario.plant.thrusters:
+    if campaign.scenario.plant.thrusters and engine == LANES:
         note = "It was flown in lanes: thrusters that are on or off multiply rounding."
+    elif campaign.scenario.plant.thrusters and flight.inertial is not None:
+        note = (
+            "Its masses are drawn: the plants of campaign and stack differ in rounding, which "
+            "thrusters that are on or off multiply."
+        )
     elif outcome == Outcome.INTERRUPTED.value:
         note = "It was interrupted: the stack flies on for up to a fifth of a second of wall time."
     return Rerun(row, deviation, at, outcome, bag, note)

@@ -164,7 +164,19 @@ class ControllerCommander(Commander):
         try:
             self.executive.submit(key, goal)
         except PlanningError as error:
-            self._refuse_goal(str(error), goal.goal_id)
+            if self._leaves_to_planner(key, goal):
+                self.host.log("info", f"The goal is left to the planner. {error}")
+            else:
+                self._refuse_goal(str(error), goal.goal_id)
+
+    def _leaves_to_planner(self, key: str, goal: IdentifiedGoal) -> bool:
+        """Whether a goal that was sent to all commanders is for the planner whose reference the law
+        tracks; the client of an action has asked the controller, and waits for its answer.
+        """
+        assert self.executive is not None
+        controlled = getattr(self.executive.controller.law.outputs.selection, key)
+        of_action = not goal.resumes
+        return not (controlled or of_action) and self.host.has_publisher(JOINT_REFERENCE)
 
     def _refuse_goal(self, message: str, goal_id: str) -> None:
         if self.executive is None:

@@ -449,18 +449,7 @@ def build_controller(
     if robot.description.wheel_names:
         wheels = WheelControl(robot, config.wheels, config.control_period, torque)
         robot = wheels.gyrostat
-    link = robot.description.end_effector(config.end_effector_frame)
-    chosen = OutputSelection(
-        tuple(config.base_outputs.split()),
-        tuple(config.end_effector_outputs.split()),
-        tuple(config.joint_outputs.split()),
-        link,
-    )
-    outputs = chosen
-    if not chosen.labels:
-        outputs = law_type.default_outputs(robot, link)
-        if not thrust:
-            outputs = replace(outputs, base=tuple(x for x in outputs.base if x.startswith("r")))
+    outputs = controlled_outputs(robot, config, law_type)
     if not thrust:
         _require_torque(outputs, robot, wheels)
     return CoordinatedController(
@@ -473,6 +462,29 @@ def build_controller(
         config.estimation_time,
         wheels,
     )
+
+
+def controlled_outputs(
+    robot: SpaceRobot, config: ControllerConfig, law_type: type[ControlLaw]
+) -> OutputSelection:
+    """Return the outputs that a configuration names, or else those of the law.
+
+    The robot is one without wheels, or its gyrostat.
+    """
+    link = robot.description.end_effector(config.end_effector_frame)
+    outputs = OutputSelection(
+        tuple(config.base_outputs.split()),
+        tuple(config.end_effector_outputs.split()),
+        tuple(config.joint_outputs.split()),
+        link,
+    )
+    if outputs.labels:
+        return outputs
+    outputs = law_type.default_outputs(robot, link)
+    if not config.use_thrusters:
+        turns = tuple(axis for axis in outputs.base if axis.startswith("r"))
+        outputs = replace(outputs, base=turns)
+    return outputs
 
 
 def _require_torque(

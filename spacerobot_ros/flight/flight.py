@@ -508,19 +508,21 @@ class Flight:
         ``clearance``: whether the smallest distance between links is measured, which takes a while.
         """
         wrench = self.commands.get("base_wrench")
+        distance, angle = self._largest_end_effector_errors
         return Measures(
             outcome=self.outcome,
             message=self.message,
             duration=self.duration,
             manoeuvre_time=self.manoeuvre_time,
             error=self.error,
-            end_effector_error=self.end_effector_error,
             peak_rate=peak(self.qdot),
             peak_effort=peak(self.effort),
             peak_wrench=np.zeros(2) if wrench is None else peak_wrench(wrench.values),
             lowest=self.q.min(axis=0),
             highest=self.q.max(axis=0),
             momentum_drift=self.momentum_drift,
+            end_effector_distance=distance,
+            end_effector_angle=angle,
             corrections=self.corrections,
             propellant=math.nan if self.propellant is None else self.propellant,
             plan_time=self.plan_time,
@@ -528,6 +530,25 @@ class Flight:
             clearance=self._smallest_distance if clearance else math.nan,
             capture=self.capture_measures,
         )
+
+    @property
+    def _largest_end_effector_errors(self) -> tuple[float, float]:
+        """Distance (m) and angle (rad) as :class:`Measures` has them."""
+        if errors := self.end_effector_errors:
+            angles = [errors[link].angle for link in self._turned_links]
+            return max(each.distance for each in errors.values()), max(angles, default=math.nan)
+        error = self.end_effector_error
+        if error is None:
+            return math.nan, math.nan
+        return error.distance, error.angle if self.turns_end_effector else math.nan
+
+    @property
+    def _turned_links(self) -> list[str]:
+        """Links whose attitude the planner's goal names."""
+        assert self.goal is not None
+        assert self.robot is not None
+        aims = self.goal.for_robot(self.robot).end_effectors
+        return [aim.link for aim in aims if aim.quaternion is not None]
 
     @property
     def _smallest_distance(self) -> float:
@@ -599,25 +620,19 @@ class Flight:
             "succeeded": self.succeeded,
         }
         if errors := self.end_effector_errors:
-            assert self.robot is not None
-            turned = {
-                aim.link
-                for aim in goal.for_robot(self.robot).end_effectors
-                if aim.quaternion is not None
-            }
             summary["end_effectors"] = {
                 link: {
                     "position_error_m": each.distance,
-                    "attitude_error_rad": each.angle if link in turned else None,
+                    "attitude_error_rad": each.angle if link in self._turned_links else None,
                 }
                 for link, each in errors.items()
             }
-        elif measures.end_effector_error is not None:
+        elif math.isfinite(measures.end_effector_distance):
             end = self.signal("end_effector_pose").values[-1, :3]
             summary["end_effector_final_position_m"] = end.tolist()
-            summary["end_effector_position_error_m"] = measures.end_effector_error.distance
+            summary["end_effector_position_error_m"] = measures.end_effector_distance
             if self.turns_end_effector:
-                summary["end_effector_attitude_error_rad"] = measures.end_effector_error.angle
+                summary["end_effector_attitude_error_rad"] = measures.end_effector_angle
         if self.capture:
             summary["capture"] = self.capture
         if self.detumbling:

@@ -143,13 +143,19 @@ def _draw_decades(axes: Axes, flight: FlightReport, group: TraceGroup) -> None:
     axes.set_ylabel(f"{group.label} ({group.unit})")
 
 
+ONE_STATE_TEXT = "The bag holds one state: there are no figures over time."
+
+
 def time_figure(
     flight: FlightReport, name: str, heading: str, caption: str, groups: list[TraceGroup]
-) -> ReportFigure:
-    """Return a figure with a panel for each group, and close-ups of a gait of equal cycles.
+) -> ReportFigure | str:
+    """Return a figure with a panel for each group, and close-ups of a gait of equal cycles; a
+    sentence where nothing was recorded over time.
 
     ``caption`` is its beginning.
     """
+    if all(len(group.signal) < 2 for group in groups):
+        return ONE_STATE_TEXT
     groups = [group.in_unit_of_angles() for group in groups]
     cycles = flight.cycles
     rows, heights = [[1.0]], [2.3]
@@ -413,6 +419,8 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
         return _why_no_joints(flight)
     if not len(flight.rates):
         return "The bag holds no joint velocities."
+    if len(flight.rates) < 2:
+        return ONE_STATE_TEXT
     names, cycles = flight.joint_names, flight.cycles
     height = 1.0 if len(names) <= 4 else 0.75
     widths = [1.0] if cycles is None else [2.2, 1.0]
@@ -469,7 +477,7 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str:
     return ReportFigure("velocities", "Joint velocities", caption, figure, groups, aside)
 
 
-def twist_figure(flight: FlightReport) -> ReportFigure | None:
+def twist_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Velocity and angular velocity of the base link.
 
     None if it rests, and for a gait of many equal cycles, in which it oscillates.
@@ -498,7 +506,7 @@ _EFFORT_ROUNDING = 1e-9
 """Forces and torques up to this one are rounding errors, N or N m."""
 
 
-def efforts_figure(flight: FlightReport) -> ReportFigure | None:
+def efforts_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Commanded thruster wrench and joint efforts."""
 
     def bounds(joint: Joint) -> list[float]:
@@ -541,7 +549,7 @@ def range_without_peaks(signal: Signal) -> tuple[float, float] | None:
     return max(low, inner_low - 0.3 * span), min(high, inner_high + 0.3 * span)
 
 
-def thrusters_figure(flight: FlightReport) -> ReportFigure | None:
+def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Duty cycles of the thrusters, their impulse, and the propellant."""
     names = flight.bag.names("thrusters")
     if not len(flight.signal("thruster_duty")) or not flight.signal("thruster_duty").values.any():
@@ -568,6 +576,8 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     """Change of the total momenta, and the kinetic energy."""
     if not len(flight.momentum):
         return "The bag holds no momentum."
+    if len(flight.momentum) < 2:
+        return ONE_STATE_TEXT
     time, balance = flight.momentum.time, flight.momentum.values
     changes = np.column_stack(
         [np.linalg.norm(balance[:, k : k + 3] - balance[0, k : k + 3], axis=1) for k in (0, 3)]
@@ -659,7 +669,7 @@ _CLEARANCE_STATES = 2000
 """States of a flight whose smallest distances are drawn."""
 
 
-def clearance_figure(flight: FlightReport) -> ReportFigure | None:
+def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Smallest distance between two links; None where no links of the robot could touch."""
     clearance = flight.clearance
     if clearance is None:
@@ -696,12 +706,14 @@ _SENSOR_ROUNDING = 1e-12
 """Sensor errors up to this one are rounding errors, m or rad."""
 
 
-def errors_figure(flight: FlightReport) -> ReportFigure | None:
-    """Goal minus pose of base and end-effector, in the components under control."""
-    if not flight.outputs and not flight.tool_goals:
-        return None
-    groups = []
+def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
+    """Goal minus pose of base and end-effector, in the components under control; of a planner the
+    distance and the angle of the base.
+    """
     base = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
+    if not flight.outputs and not flight.tool_goals:
+        return _base_errors_figure(flight, pose_errors(base, flight.targets))
+    groups = []
     for part, pose, targets in (
         ("base", base, flight.targets),
         ("end_effector", flight.tool, flight.tool_targets),
@@ -734,7 +746,54 @@ def errors_figure(flight: FlightReport) -> ReportFigure | None:
 
 
 _MAX_DECADES = 8
-"""Largest number of powers of ten of an axis of errors of links."""
+"""Largest number of powers of ten of an axis of errors."""
+
+_ERROR_PARTS: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
+    ("position", "distance", "m"),
+    ("attitude", "angle", "rad"),
+)
+"""Parts of a goal, the norms of their errors and the units of those."""
+
+
+def _base_errors_figure(flight: FlightReport, errors: Signal) -> ReportFigure | str | None:
+    """Distance and angle of the base, as far as the method controls it, from errors (N, 6)."""
+    groups = []
+    for k, (part, *_) in enumerate(_ERROR_PARTS):
+        if len(errors) and part not in flight.flight.not_controlled:
+            norms = np.linalg.norm(errors.values[:, 3 * k : 3 * k + 3], axis=1)
+            signal = Signal(errors.time, norms[:, np.newaxis])
+            groups.append(_error_group(flight, signal, part, "base", colour(0)))
+    if not groups:
+        return None
+    caption = (
+        "Distance and angle of the base from its goal, on logarithmic axes; smaller values lie on "
+        "the lower edge; dotted, the tolerance"
+    )
+    if left_out := [part for part, *_ in _ERROR_PARTS if part in flight.flight.not_controlled]:
+        caption += f"; the {' and '.join(left_out)} is not controlled"
+    return time_figure(flight, "errors", "Errors of the base", caption, groups)
+
+
+def _error_group(
+    flight: FlightReport,
+    signal: Signal,
+    part: Literal["position", "attitude"],
+    of: str,
+    line_colour: str,
+) -> TraceGroup:
+    """Return the panel of a distance or an angle (N, 1) with its tolerance."""
+    _, quantity, unit = next(each for each in _ERROR_PARTS if each[0] == part)
+    tolerance = flight.flight.tolerance(part)
+    return TraceGroup(
+        signal,
+        [quantity],
+        f"{quantity} of {of}",
+        unit,
+        [line_colour],
+        limits=[] if not tolerance else [(0, tolerance)],
+        limit_name="tolerance",
+        decades=_error_decades(signal.values, tolerance),
+    )
 
 
 def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
@@ -742,28 +801,11 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     if not flight.link_errors:
         return flight.hidden_links_text or None if flight.link_goals else None
     groups: list[TraceGroup] = []
-    parts: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
-        ("position", "distance", "m"),
-        ("attitude", "angle", "rad"),
-    )
     for number, (link, errors) in enumerate(flight.link_errors.items()):
-        for part, quantity, unit in parts:
+        for part, quantity, _ in _ERROR_PARTS:
             signal: Signal = getattr(errors, quantity)
-            if not len(signal):
-                continue
-            tolerance = flight.flight.tolerance(part)
-            groups.append(
-                TraceGroup(
-                    signal,
-                    [quantity],
-                    f"{quantity} of {short(link)}",
-                    unit,
-                    [colour(number)],
-                    limits=[] if not tolerance else [(0, tolerance)],
-                    limit_name="tolerance",
-                    decades=_error_decades(signal.values, tolerance),
-                )
-            )
+            if len(signal):
+                groups.append(_error_group(flight, signal, part, short(link), colour(number)))
     caption = (
         "Distance of each link from the position of its goal, and angle from its attitude where "
         "that counts, on logarithmic axes; smaller values lie on the lower edge; dotted, the "
@@ -795,7 +837,7 @@ def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:
     return Signal(np.concatenate(times), np.concatenate(values))
 
 
-def sensors_figure(flight: FlightReport) -> ReportFigure | None:
+def sensors_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Measured minus true poses and joint positions; None if sensors have no errors."""
     true = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
     pose, at = _match_times(flight.signal("measured_pose"), true)

@@ -35,6 +35,7 @@ from spacerobot_ros.report.figures_over_time import (
     DASHES,
     NO_JOINTS_TEXT,
     NO_POSES_TEXT,
+    ONE_STATE_TEXT,
     SHOWN_CYCLES,
     power_of_ten,
 )
@@ -194,6 +195,8 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     """The path of the base in three views, with that of the end-effector and of other flights."""
     if not len(flight.position):
         return NO_POSES_TEXT
+    if len(flight.position) < 2 and not beside:
+        return ONE_STATE_TEXT
     goals = []
     if flight.goal is not None and flight.position_counts:
         goals.append(flight.goal.position)
@@ -282,6 +285,8 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
         return "A loop in shape space takes two joints or more."
     if not len(flight.shape):
         return NO_JOINTS_TEXT
+    if len(flight.shape) < 2:
+        return ONE_STATE_TEXT
     pairs = list(itertools.combinations(range(len(names)), 2))
     cycles = flight.cycles
     joint_units = [joint_unit(flight, name) for name in names]

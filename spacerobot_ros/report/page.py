@@ -22,6 +22,7 @@ from spacerobot_ros.report.page_parts import (
     package_file,
     table,
     tiles,
+    unbroken,
 )
 from spacerobot_ros.report.signals import simplified
 from spacerobot_ros.report.tables import (
@@ -72,7 +73,7 @@ def page(
         f"<p>{escape(description)}</p>" if description else "",
         _facts_html(flight),
         _outcome_html(flight),
-        tiles(headline(flight)),
+        tiles([tile for tile in headline(flight) if tile[0] != "Method"]),  # Among the facts.
         "</header>",
         *_runs_html(flight, beside),
         player.markup,
@@ -117,7 +118,7 @@ def _outcome_html(flight: FlightReport) -> str:
     if last.state == "reached" and not verdict.complete:
         tone += " partly"
     state = f"<b>{escape(word)}</b>" if word else ""
-    return f'<p class="outcome {escape(tone)}">{state}{escape(sentence)}</p>'
+    return f'<p class="outcome {escape(tone)}">{state}{unbroken(sentence)}</p>'
 
 
 def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str]:
@@ -125,11 +126,28 @@ def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str
         return []
     flights = [flight, *beside]
     parts = ["<h2>Runs side by side</h2>", _table_html("runs", runs_table(flights))]
-    rows = different_parameters([each.flight.scenario for each in flights])
-    if rows:
-        head = ("Parameter", *(each.file_name for each in flights))
+    files = [each.file_name for each in flights]
+    if goals := _different_goals(flights):
+        parts += ["<h3>Goals that differ</h3>", table("goals", ("Goal", *files), goals)]
+    if rows := different_parameters([each.flight.scenario for each in flights]):
+        head = ("Parameter", *files)
         parts += ["<h3>Parameters that differ</h3>", table("different", head, rows)]
     return parts
+
+
+def _different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
+    """Return the rows of the goals that are not the same in all flights."""
+    goals = [
+        {
+            label.removeprefix("Goal ").removesuffix(" (refused)"): text
+            for label, text, *_ in result_table(each).rows
+            if label.startswith("Goal ")
+        }
+        for each in flights
+    ]
+    labels = dict.fromkeys(label for each in goals for label in each)
+    rows = [(label, *(each.get(label, "–") for each in goals)) for label in labels]
+    return [row for row in rows if len({*row[1:]}) > 1]
 
 
 def _numbers_html(flight: FlightReport) -> list[str]:

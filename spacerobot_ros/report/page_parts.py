@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -17,6 +18,7 @@ from importlib.resources import files
 from typing import Any
 
 _SCROLL_HINT = '<p class="hint">Wider than this screen: scroll sideways →</p>'
+_WITH_EXPONENT = re.compile(r"\d[\d.]*e-\d+")
 _SECURITY_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
@@ -107,6 +109,11 @@ def _licences_html(parts: Sequence[PagePart]) -> str:
     return f'<details id="licences"><summary>Licences of the scripts</summary>{texts}</details>'
 
 
+def unbroken(text: str) -> str:
+    """Return a text as HTML in which no line ends within a number such as ``1.5e-06``."""
+    return _WITH_EXPONENT.sub(r'<span class="unbroken">\g<0></span>', escape(text))
+
+
 def facts(texts: Sequence[str]) -> str:
     """Return short facts in one line; empty if there are none."""
     spans = "".join(f"<span>{escape(fact)}</span>" for fact in texts)
@@ -117,9 +124,9 @@ def tiles(rows: Sequence[tuple[str, str, str]]) -> str:
     """Return the main numbers as tiles, from label, value and note of each."""
     made = []
     for label, value, note in rows:
-        small = f"<small>{escape(note)}</small>" if note else ""
-        # Names of methods may be broken where they have an underscore.
-        shown = escape(value).replace("_", "_<wbr>")
+        small = f"<small>{unbroken(note)}</small>" if note else ""
+        # Names may be broken where they have an underscore.
+        shown = unbroken(value).replace("_", "_<wbr>")
         made.append(f"<div><dt>{escape(label)}</dt><dd>{shown}{small}</dd></div>")
     return f'<dl class="tiles">{"".join(made)}</dl>' if made else ""
 
@@ -140,7 +147,7 @@ def table(
         for column, cell in enumerate(cells):
             name, scope = ("th", ' scope="row"') if tag == "td" and column == 0 else (tag, "")
             kind = ' class="number"' if column in numeric else ""
-            made.append(f"<{name}{scope}{kind}>{escape(cell)}</{name}>")
+            made.append(f"<{name}{scope}{kind}>{unbroken(cell)}</{name}>")
         return f"<tr>{''.join(made)}</tr>\n"
 
     body = "".join(row(cells, "td") for cells in rows)

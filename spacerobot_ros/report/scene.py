@@ -569,6 +569,8 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
     text += "; the ghost is the goal" if ghosts else ""
     text += "; obstacles have the shapes by which distances are measured" * bool(flight.obstacles)
     text += "; the target moves as target/odom says" * (flight.target is not None)
+    if len(flight.position) < 2:
+        return f"{text}.{flight.missing_meshes}"
     text += (
         f". {len(frames.indices)} key frames of {len(flight.position)} recorded states; in between "
         "the motion is interpolated"

@@ -62,7 +62,7 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         rows.append(("Manoeuvre", f"{flight.manoeuvre_time:.6g} s", _time_to_end_text(flight)))
     if flight.method:
         rows.append(("Method", flight.method, ""))
-    if len(flight.momentum):
+    if len(flight.momentum) > 1:
         linear, angular = flight.drift
         values = f"{linear:.1e} kg m/s", f"angular {angular:.1e} kg m²/s"
         rows.append((_momentum_label(flight), *values))
@@ -153,7 +153,7 @@ def result_table(flight: FlightReport) -> Table:
             rows.append(("First schedule to the end", to_end.partition(" from ")[0]))
     if len(flight.position):
         rows.append(("Recorded", _recorded_text(flight)))
-    if len(flight.momentum):
+    if len(flight.momentum) > 1:
         linear, angular = flight.drift
         drifts = f"linear {linear:.3g} kg m/s, angular {angular:.3g} kg m²/s"
         rows.append((_momentum_label(flight), drifts))

@@ -297,7 +297,7 @@ def measures(**given: Any) -> Measures:
     numbers = {"peak_rate": n, "peak_effort": n, "peak_wrench": 2, "lowest": n, "highest": n}
     arrays = {name: np.zeros(size) for name, size in numbers.items()}
     wanted: dict[str, Any] = {"outcome": Outcome.REACHED, "message": "There.", "duration": 2.0}
-    wanted |= {"manoeuvre_time": 1.5, "error": None, "end_effector_error": None}
+    wanted |= {"manoeuvre_time": 1.5, "error": None}
     return Measures(**{**wanted, **arrays, "momentum_drift": np.zeros(2), **given})
 
 
@@ -405,7 +405,8 @@ def test_the_measures_along_a_schedule_are_those_of_its_end() -> None:
     )
     assert (found.duration, found.manoeuvre_time) == (2.5, 2.5)
     assert found.error.distance == pytest.approx(0.03)
-    assert found.end_effector_error is None
+    assert math.isnan(found.end_effector_distance)
+    assert math.isnan(found.end_effector_angle)
     assert (found.corrections, found.plan_time) == (1, 0.375)
     assert math.isnan(found.wall_time)
     np.testing.assert_array_equal(found.peak_rate, [1.0, 2.0, 3.0])
@@ -524,7 +525,8 @@ def test_the_measures_of_control_are_those_of_the_end_of_the_flight() -> None:
     assert found.duration == pytest.approx(0.3)  # At 100 Hz.
     assert found.manoeuvre_time == pytest.approx(0.2)
     assert found.error.distance == pytest.approx(0.5)
-    assert found.end_effector_error is None
+    assert math.isnan(found.end_effector_distance)
+    assert math.isnan(found.end_effector_angle)
     np.testing.assert_array_equal(found.peak_rate, [0.75, 1.0])
     np.testing.assert_array_equal(found.peak_effort, [2.0, 3.0])
     np.testing.assert_array_equal(found.peak_wrench, [4.0, 5.0])

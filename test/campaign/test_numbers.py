@@ -156,6 +156,24 @@ def test_influences_are_rank_correlations_of_finite_values() -> None:
     assert (sides.departure, sides.p_distance_from_median) == (0.0, 1.0)
 
 
+@pytest.mark.parametrize("ties", [False, True])
+def test_the_chance_of_a_correlation_of_few_flights_is_that_of_their_permutations(
+    ties: bool,
+) -> None:
+    rng = np.random.default_rng(8)
+    x, y = rng.normal(size=6), rng.normal(size=6)
+    if ties:
+        y = np.round(y)
+    found = stats.permutation_test(
+        (x,), lambda drawn: stats.spearmanr(drawn, y).statistic, permutation_type="pairings",
+    )  # fmt: skip
+    (each,) = influences({"x": x}, {"m": y})
+    assert (each.correlation, each.p) == pytest.approx((found.statistic, found.pvalue))
+    (perfect,) = influences({"x": np.arange(3.0)}, {"m": np.array([1.0, 2.0, 4.0])})
+    assert (perfect.correlation, perfect.p) == pytest.approx((1.0, 1 / 3))
+    assert not perfect.is_significant
+
+
 def test_indices_need_whole_samples() -> None:
     assert sobol_indices(["a"], np.array([1.0, math.nan, 2.0, 3.0])) == {}
     assert sobol_indices(["a"], np.ones(8)) == {}
@@ -485,13 +503,15 @@ def test_a_rerun_without_dispersions() -> None:
 
 
 @pytest.mark.parametrize(
-    ("engine", "outcome", "thrusters", "note"),
+    ("engine", "outcome", "thrusters", "inertial", "note"),
     [
-        ("lanes", "reached", "urdf", "It was flown in lanes: thrusters that are on or off multip"),
-        ("flights", "reached", "urdf", ""),
-        ("lanes", "reached", "", ""),
+        ("lanes", "reached", "urdf", None, "It was flown in lanes: thrusters that are on or off"),
+        ("flights", "reached", "urdf", None, ""),
+        ("flights", "reached", "urdf", "drawn", "Its masses are drawn: the plants of campaign and"),
+        ("flights", "reached", "", "drawn", ""),
+        ("lanes", "reached", "", None, ""),
         (
-            *("flights", "interrupted", ""),
+            *("flights", "interrupted", "", None),
             "It was interrupted: the stack flies on for up to a fifth of a second of wall time.",
         ),
     ],
@@ -500,6 +520,7 @@ def test_a_flight_is_compared_with_its_row(
     engine: str,
     outcome: str,
     thrusters: str,
+    inertial: str | None,
     note: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -515,7 +536,8 @@ def test_a_flight_is_compared_with_its_row(
         return answer
 
     row = Row(DRAWN, "reached", "There.", {"a_m": 1.5, "b_s": 3.0})
-    flight = SimpleNamespace(with_masses_in_urdf=lambda: SimpleNamespace(scenario="scenario"))
+    in_urdf = SimpleNamespace(scenario="scenario")
+    flight = SimpleNamespace(inertial=inertial, with_masses_in_urdf=lambda: in_urdf)
     dataset = SimpleNamespace(campaign=lambda: made)
     stored: list[Any] = [(outcome, engine, {"a_m": 1.25, "b_s": 3.0})]
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -163,6 +165,31 @@ def controller(arm: SpaceRobot) -> Rig:
     rig.use(arm)
     rig.commander.activate()
     return rig
+
+
+def test_goals_of_the_base_are_left_to_a_planner_whose_reference_a_law_of_joints_tracks(
+    arm: SpaceRobot,
+) -> None:
+    def told(*publishers: str, action: bool = False) -> Rig:
+        rig = Rig(ControllerCommander, config(ControllerConfig, law="computed_torque"), arm.n)
+        rig.use(arm)
+        rig.host.publishers |= {*publishers}
+        rig.commander.activate()
+        if action:
+            request = SimpleNamespace(goal=GOAL, tolerance_or=lambda one: one, tolerance=None)
+            rig.commander._fly_to = MagicMock()
+            rig.commander.receive_fly_to("one", lambda: request, MagicMock())
+        else:
+            rig.goal()
+        return rig
+
+    left = told(JOINT_REFERENCE)
+    assert left.host.states == []
+    assert left.host.events == []
+    assert left.host.lines[-1][1].startswith("The goal is left to the planner. The law 'computed_")
+    for refused in (told(), told(JOINT_REFERENCE, action=True)):
+        assert refused.host.states == ["refused"]
+        assert_one_sentence(refused.host.statuses[0].message)
 
 
 # -- states -----------------------------------------------------------------------------------

@@ -395,6 +395,7 @@ def test_goals_are_submitted_resumed_and_aborted() -> None:
         raise PlanningError("It is too far.")
 
     made.executive = SimpleNamespace(submit=refuse)
+    made._leaves_to_planner = lambda *words: False
     ControllerCommander._submit_goal(made, "base", goal)
     assert made.done[1:] == [("refuse", "It is too far.", "7.5")]
     for executive in (True, False):

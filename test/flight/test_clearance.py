@@ -18,6 +18,7 @@ from spacerobot_ros.measures import metrics_of
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.report.figures import ReportFigure
 from spacerobot_ros.report.figures_over_time import clearance_figure
 from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.tables import result_table
@@ -130,7 +131,7 @@ def test_its_bag_and_its_report_show_the_contacts(through: Flight, tmp_path: Pat
         f"contact: {pair}" for pair in ("mass_2, mass_3", "mass_1, mass_2", "mass_1, mass_3")
     ]
     figure = clearance_figure(report)
-    assert figure is not None
+    assert isinstance(figure, ReportFigure)
     assert "Links 'mass_1' and 'mass_2' touch, 0.186 m deep at " in figure.caption
     (group,) = figure.groups
     assert group.limits == [(0, 0.0)]

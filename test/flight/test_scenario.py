@@ -244,3 +244,6 @@ def test_parameters_that_differ_between_scenarios() -> None:
         ("planner.max_corrections", "3", "7", "7"),
     ]
     assert different_parameters([first, first]) == []
+    # What one alone gives, as its default, is no difference.
+    usual = first.with_overrides("plant", {"orbit.altitude": 0, "sensors.position_bias": [0, 0, 0]})
+    assert different_parameters([first, usual]) == []

@@ -45,6 +45,7 @@ FIGURES = [
     "shape",
     "velocities",
     "loops",
+    "errors",
     "momentum",
     "path",
 ]
@@ -209,7 +210,8 @@ def test_dense_traces_become_bands_and_say_so(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("blank")
 def test_a_robot_without_joints(tmp_path: Path) -> None:
     page = report_of(tmp_path, Story(np.empty((50, 0)), goals=[(0.0, *GOAL)]))
-    assert list(page.figures) == ["configurations", "position", "attitude", "momentum", "path"]
+    wanted = ["configurations", "position", "attitude", "errors", "momentum", "path"]
+    assert list(page.figures) == wanted
     assert "The robot has no joints." in page.text
     assert "joints" not in page.tables
 
@@ -261,7 +263,7 @@ def test_any_number_of_joints(tmp_path: Path, n: int) -> None:
 @pytest.mark.usefixtures("blank")
 def test_without_goal_and_planner_and_in_a_namespace(tmp_path: Path) -> None:
     page = report_of(tmp_path, Story(still(), prefix="/free_flyer"))
-    assert list(page.figures) == FIGURES
+    assert list(page.figures) == [name for name in FIGURES if name != "errors"]
     assert "The bag holds no goal pose." in page.text
     assert "no status of a planner" in page.text
     assert "Position error" not in dict(page.tables["numbers"])
@@ -325,7 +327,11 @@ def test_the_goal_of_a_status_is_found_by_its_id(tmp_path: Path) -> None:
 def test_cut_short_right_after_the_start(tmp_path: Path) -> None:
     statuses = [(0.0, "Flying a gait.", EXECUTING | goal_value())]
     page = report_of(tmp_path, Story(still(count=1), statuses, goals=[(0.0, *GOAL)]))
-    assert list(page.figures) == FIGURES
+    assert list(page.figures) == ["configurations"]
+    assert "The bag holds one state: there are no figures over time." in page.text
+    assert "Momentum drift" not in page.text
+    assert "Drag across a chart" not in page.text
+    assert "key frames" not in page.text
     assert "Flying a gait. The recording ends before the outcome is known." in page.text
 
 
@@ -348,7 +354,7 @@ def test_a_robot_without_shapes_and_with_odd_names(tmp_path: Path) -> None:
     bare = re.sub(r"<visual>.*?</visual>", "", urdf_of(2), flags=re.DOTALL)
     story = Story(still(2), urdf=bare.replace("joint_", "a$^_b$" * 8), name="a$^_b$" * 8)
     page = report_of(tmp_path, story)
-    assert list(page.figures) == FIGURES
+    assert list(page.figures) == [name for name in FIGURES if name != "errors"]
     assert page.tables["joints"][1][0] == "a$^_b$" * 8 + "0"
 
 
@@ -356,7 +362,9 @@ def test_a_robot_without_shapes_and_with_odd_names(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("blank")
 def test_runs_stand_side_by_side(folder: Path, flown: Page, tmp_path: Path) -> None:
     assert flown.figures
-    other = tell(tmp_path / "other.mcap", Story(still(count=3), goals=[(0.0, *GOAL)]))
+    farther = [(0.0, [0.5, *GOAL[0][1:]], GOAL[1])]
+    metadata = {"parameters/planner": {"position_tolerance": "0.03"}}
+    other = tell(tmp_path / "other.mcap", Story(still(count=3), goals=farther, metadata=metadata))
     write_report(folder / "flight.mcap", tmp_path / "both.html", beside=[other])
     page = Page((tmp_path / "both.html").read_text(encoding="utf-8"))
     head, *rows = page.tables["runs"]
@@ -364,6 +372,13 @@ def test_runs_stand_side_by_side(folder: Path, flown: Page, tmp_path: Path) -> N
     ticks = [row[head.index("Recorded")] for row in rows]
     assert ticks == [f"{len(cyclic_shapes()) - 1} ticks", "2 ticks"]
     assert rows[1][head.index("Method")] == "–"
+    # The second bag does not give the method, which is not the default in the first.
+    parameters = [["planner.position_tolerance", "0.02", "0.03"]]
+    parameters += [["planner.method", "lie_bracket", "–"]]
+    assert page.tables["different"][1:] == parameters
+    ((name, here, there),) = page.tables["goals"][1:]
+    assert name == "position"
+    assert (numbers_in(here)[0], numbers_in(there)[0]) == (GOAL[0][0], 0.5)
 
 
 def test_picture(tmp_path: Path, folder: Path, flown: Page) -> None:

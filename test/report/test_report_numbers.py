@@ -456,7 +456,7 @@ def test_where_sensors_err_the_numbers_are_true_and_the_measured_ones_beside_the
     assert top["Attitude error"][1].endswith("; measured: 0.3 rad")
     assert rows_of(found)["Errors as measured"] == "0.5 m, 0.3 rad"
     figure = sensors_figure(found)
-    assert figure is not None
+    assert isinstance(figure, ReportFigure)
     position, attitude, turn = figure.groups
     np.testing.assert_allclose(position.signal.values, [[-0.25, 0, 0]] * 3, atol=1e-15)
     np.testing.assert_allclose(position.signal.time, [0.5, 1.0, 1.5])
@@ -631,7 +631,7 @@ def test_propellant_is_what_the_plant_counted() -> None:
     on = bag["thrusters"].field("position")
     assert found.impulse.values[-1, 0] == pytest.approx(10.0 * float((on[-1] - on[0]).sum()))
     figure = thrusters_figure(found)
-    assert figure is not None
+    assert isinstance(figure, ReportFigure)
     assert [len(group.names) for group in figure.groups] == [6, 1, 1]
     assert "18 of 24 thrusters were never on" in figure.caption
 

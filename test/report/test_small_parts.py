@@ -309,6 +309,7 @@ def test_duty_cycles_have_rows() -> None:
         group = TraceGroup(signal, ["a", "b"], "thrusters", "share", ["#0000ff", "#ff0000"])
         with drawing():
             found = time_figure(flight, "name", "Heading", "Caption", [replace(group, rows=True)])
+        assert isinstance(found, figures.ReportFigure)
         (axes,) = found.figure.axes
         assert ("Where a trace has more samples" in found.caption) is dense
         assert axes.get_ylim() == (-0.2, 2)

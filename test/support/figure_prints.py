@@ -100,7 +100,9 @@ def _charts(flight: FlightReport) -> dict[str, Any]:
     """Return the charts of two figures; the numbers of their samples as fingerprints."""
     with drawing():
         figures = [draw(flight) for draw in (momentum_figure, thrusters_figure, shape_figure)]
-    content = charts_of(flight, figures).data["charts"]
+    content = charts_of(flight, figures).data.get("charts")
+    if content is None:
+        return {}
     for chart in content["charts"]:
         for name, kind in (("time", "<f8"), ("values", "<f4")):
             texts = chart[name] if isinstance(chart[name], list) else [chart[name]]

@@ -71,7 +71,7 @@ class Page(HTMLParser):
         if {"style", "script"} & set(self.open):
             return
         self.text += data
-        if self.open and self.open[-1] in ("td", "th"):
+        if {"td", "th"} & set(self.open[-2:]):
             self.tables[self._table][-1][-1] += data
 
     def number(self, label: str) -> str:
