@@ -15,13 +15,34 @@ from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 """Type of a parameter's value."""
 
 C = TypeVar("C")
+
+
+def as_numbers(
+    given: Any, name: str, error: type[SpaceRobotError] = ParameterError
+) -> npt.NDArray[np.float64]:
+    """Return given numbers as an array, of any shape.
+
+    Raises
+    ------
+    SpaceRobotError
+        They are no real numbers; of the type ``error``, whose subject is ``name``.
+    """
+    try:
+        numbers = np.asarray(given)
+        if numbers.dtype.kind == "c":
+            raise TypeError
+        return numbers.astype(float)
+    except (TypeError, ValueError, OverflowError):
+        raise error(f"{name} {given!r} is not a list of numbers.") from None
+
 
 _PARAMETER, _GROUP, _REGISTERED = "parameter", "group", "registered"
 """Metadata keys of dataclass fields: one for each function that makes a field."""

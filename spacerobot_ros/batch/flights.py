@@ -301,11 +301,6 @@ class Flights:
         count, robot = len(self), self.robot
         if self.actuation not in PLANTS:
             raise ParameterError(f"The actuation is '{self.actuation}', not velocity or effort.")
-        if self.actuation == "effort" and robot.description.wheel_names:
-            raise ParameterError(
-                f"Robot '{robot.description.name}' has reaction wheels, whose motors lanes do not "
-                "model: fly it by engine 'flights'."
-            )
         if self.ticks < 1:
             raise ParameterError(f"A flight of {self.ticks} ticks is too short; it needs one.")
         if not self.instants:
@@ -347,6 +342,11 @@ class Flights:
                 _require_rows("joints", joints, count, n)
                 _require_rows("wrench", wrench, count, 6)
             case Controlled(config=config, gains=gains):
+                if self.robot.description.wheel_names:
+                    raise ParameterError(
+                        f"Robot '{self.robot.description.name}' has reaction wheels, which the "
+                        "controller of lanes does not turn: fly it by engine 'flights'."
+                    )
                 if self.actuation != "effort":
                     raise ParameterError("A controller needs effort actuation.")
                 if round(config.control_period * SECOND) != round(self.control_period * SECOND):

@@ -36,8 +36,8 @@ from spacerobot_ros.simulation import effort_plant, velocity_plant
 
 _SOURCE_FOLDER = Path(__file__).resolve().parent
 
-_CASADI_SELECTION = re.compile(r"\((\w+)\?(\w+):0\)")
-"""CasADi's text for a number that is zero unless a condition holds."""
+_CASADI_SELECTION = re.compile(r"\((\w+|\(\*\w+\+\+\))\?(\w+(?:\[i\])?):0\)")
+"""CasADi's texts for a number, alone or in a loop, that is zero unless a condition holds."""
 
 
 @dataclass(frozen=True)

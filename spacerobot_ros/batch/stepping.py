@@ -176,14 +176,25 @@ class SteppedFlights:
         of_others = self._flights.starts, self._flights.inertial
         assert of_others[1] is not None
         # Checked as rows of their own: a refusal changes no flight.
-        masses = of_others[1][chosen] if inertial is None else inertial
-        self._require_regular(replace(self._flights, starts=starts, inertial=masses))
+        self.require_startable(starts, of_others[1][chosen] if inertial is None else inertial)
         for each in fields(starts):
             getattr(of_others[0], each.name)[chosen] = getattr(starts, each.name)
         if inertial is not None:
             for part in fields(inertial):
                 getattr(of_others[1], part.name)[chosen] = getattr(inertial, part.name)
         self._begin(chosen)
+
+    def require_startable(self, starts: InitialStates, inertial: InertialParameters) -> None:
+        """Refuse starts (K rows) with their masses as :meth:`reset` does, and reset nothing.
+
+        Raises
+        ------
+        ParameterError
+            The plant refuses a start.
+        RobotDescriptionError
+            A mass or an inertia is not physical.
+        """
+        self._require_regular(replace(self._flights, starts=starts, inertial=inertial))
 
     def end(self, rows: npt.ArrayLike) -> None:
         """End some flights: they are not stepped until they are reset."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numbers
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from os import PathLike, fspath
@@ -25,16 +24,21 @@ from spacerobot_ros.environments.tasks import (
     action_scale,
     command_of,
 )
-from spacerobot_ros.errors import CommandError, ParameterError
+from spacerobot_ros.errors import CommandError, ParameterError, RobotDescriptionError
+from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
+from spacerobot_ros.parameters import as_numbers
 from spacerobot_ros.scenario import Scenario, scenario_or_robot
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 from spacerobot_ros.simulation.plant import InitialState
 
 _MAX_DRAWS = 10_000
 """Largest number of draws of a campaign that episodes start from."""
+
+_MAX_REFUSED_DRAWS = 100
+"""Number of draws in succession that may be refused, before a campaign is."""
 
 _DEFAULT_SCENARIOS = {"reorient": "arm_attitude", "reach": "reach"}
 
@@ -121,14 +125,22 @@ class EpisodeConfig:
                 raise ParameterError(
                     f"Argument '{name}' is '{value}'; it may be {', '.join(filter(None, choices))}."
                 )
-        if not isinstance(self.hold, numbers.Integral) or self.hold < 1:
+        if not isinstance(self.hold, int | np.integer) or self.hold < 1:
             raise ParameterError(
                 f"Argument 'hold' is {self.hold!r}; it is a whole number of ticks, one at least."
             )
         for name in ("time_limit", "tolerance", "spread", "max_force", "max_torque"):
             value = getattr(self, name)
-            if not (isinstance(value, numbers.Real) and np.isfinite(value) and value >= 0.0):
+            if not (
+                isinstance(value, int | float | np.integer | np.floating)
+                and np.isfinite(value)
+                and value >= 0.0
+            ):
                 raise ParameterError(f"Argument '{name}' is {value!r}; it must be finite, from 0.")
+        if not isinstance(self.reward, Mapping | None):
+            raise ParameterError(
+                f"Argument 'reward' is {self.reward!r}; it must be a dictionary of weights."
+            )
         if not self.time_limit:
             raise ParameterError("Argument 'time_limit' is 0; episodes take longer, in s.")
         if self.link and self.task != "reach":
@@ -154,6 +166,8 @@ class _Start:
 class EpisodeStarts:
     """Starts of episodes: of a scenario, or of the draws of a campaign.
 
+    Draws that are no robot or no start are left out, with a warning.
+
     Raises
     ------
     ParameterError
@@ -172,23 +186,51 @@ class EpisodeStarts:
         self.robot = SpaceRobot(description_of(self.scenario))
         _require_steppable(self.scenario, self.robot)
         self.nominal = _Start(self._row(self.scenario), None, self.scenario)
-        self._made: dict[int, _Start] = {}
+        self._made: dict[int, _Start | str] = {}
+        """Starts of the draws by their numbers; texts are the reasons of refusals."""
 
     def _row(self, scenario: Scenario) -> InitialStates:
         return InitialStates.of(self.robot, [InitialState.of(scenario.plant)])
 
-    def draw(self, rng: np.random.Generator) -> _Start:
-        """Return a start; that of a campaign is one of its draws at random."""
+    def draw(self, rng: np.random.Generator, flights: SteppedFlights) -> _Start:
+        """Return a start of one of the flights; of a campaign, one of its draws at random.
+
+        Raises
+        ------
+        ParameterError
+            A draw has a part that environments do not have, or too many are refused.
+        """
         if self._campaign is None:
             return self.nominal
-        number = int(rng.integers(len(self._draws)))
-        if number not in self._made:
-            common = DrawnFlight.of(self.scenario)
-            flight = drawn_flight(self._campaign, self._draws[number], common)
-            _require_steppable(flight.scenario, self.robot)
+        start: _Start | str = ""
+        for _ in range(_MAX_REFUSED_DRAWS):
+            number = int(rng.integers(len(self._draws)))
+            if number not in self._made:
+                self._made[number] = self._drawn(self._campaign, number, flights)
+            start = self._made[number]
+            if isinstance(start, _Start):
+                return start
+        raise ParameterError(
+            f"{_MAX_REFUSED_DRAWS} draws of the campaign in succession are refused, the last "
+            f"because: {start} Disperse within what the robot can have."
+        )
+
+    def _drawn(self, campaign: Campaign, number: int, flights: SteppedFlights) -> _Start | str:
+        """Return the start of a draw, or the reason why there is none."""
+        try:
+            flight = drawn_flight(campaign, self._draws[number], DrawnFlight.of(self.scenario))
+            start = self._row(flight.scenario)
             masses = flight.inertial or self.robot.inertial
-            self._made[number] = _Start(self._row(flight.scenario), masses, flight.scenario)
-        return self._made[number]
+            flights.require_startable(start, InertialParameters.stacked([masses]))
+        except (ParameterError, RobotDescriptionError) as refusal:
+            if not any(isinstance(each, str) for each in self._made.values()):
+                warn_once(
+                    f"Draw {number} of the campaign is left out, as are others that are refused: "
+                    f"{refusal}"
+                )
+            return str(refusal)
+        _require_steppable(flight.scenario, self.robot)
+        return _Start(start, masses, flight.scenario)
 
 
 def _require_steppable(scenario: Scenario, robot: SpaceRobot) -> None:
@@ -228,8 +270,8 @@ class Episodes:
     """
 
     def __init__(self, config: EpisodeConfig, count: int, *, in_lanes: bool) -> None:
-        if count < 1:
-            raise ParameterError(f"There are {count} environments to make; take at least one.")
+        if not isinstance(count, int | np.integer) or count < 1:
+            raise ParameterError(f"There are {count!r} environments to make; take at least one.")
         self._config, self._weights = config, RewardWeights.of(config.reward)
         self._source = EpisodeStarts(config)
         scenario, self.robot = self._source.scenario, self._source.robot
@@ -280,12 +322,17 @@ class Episodes:
         if "coordinated_control" in scenario.commanders:
             force = force or scenario.controller.max_force
             torque = torque or scenario.controller.max_torque
-        if len(config.action_scale):
-            scale = np.array(config.action_scale, dtype=float)
+        scale = as_numbers(config.action_scale, "Argument 'action_scale'")
+        if scale.shape != (0,):
             if scale.shape != (size,) or not np.isfinite(scale).all():
                 raise ParameterError(
-                    f"Argument 'action_scale' has {scale.size} numbers; robot "
-                    f"'{self.robot.description.name}' takes {size} finite ones."
+                    f"Argument 'action_scale' is {config.action_scale!r}; robot "
+                    f"'{self.robot.description.name}' takes a list of {size} finite numbers."
+                )
+            if not scale.any():
+                raise ParameterError(
+                    "Argument 'action_scale' has zeros alone, so that no action moves the robot: "
+                    "give some larger ones."
                 )
         else:
             scale = action_scale(self.robot, actuation, force, torque)
@@ -329,7 +376,7 @@ class Episodes:
         """
         chosen = np.asarray(rows, dtype=np.int64)
         given = None if goal is None else self._checked_goals(goal)
-        drawn = [self._source.draw(generators[row]) for row in chosen.tolist()]
+        drawn = [self._source.draw(generators[row], self._flights) for row in chosen.tolist()]
         starts = InitialStates(
             *(
                 np.concatenate([getattr(each.starts, part.name) for each in drawn])
@@ -352,7 +399,7 @@ class Episodes:
 
     def _checked_goals(self, goal: Any) -> Array:
         """Return the given goals (N, goal_size) of all rows."""
-        values, count, size = np.asarray(goal, dtype=float), len(self._goals), self.task.goal_size
+        values, count, size = as_numbers(goal, "The goal"), len(self._goals), self.task.goal_size
         if values.shape not in ((size,), (count, size)) or not np.isfinite(values).all():
             raise ParameterError(
                 f"The goal is {values.shape}; task '{self.task.name}' takes {size} finite numbers, "
@@ -390,13 +437,13 @@ class Episodes:
         Raises
         ------
         CommandError
-            The shape is wrong, or an action is not finite.
+            The shape is wrong, or an action is no finite number.
         """
         count, size = len(self._flights), self.action_size
-        if np.shape(actions) != (count, size):
-            raise CommandError(f"The actions are {np.shape(actions)}, not ({count}, {size}).")
+        shares = as_numbers(actions, "The array of actions", CommandError)
+        if shares.shape != (count, size):
+            raise CommandError(f"The actions are {shares.shape}, not ({count}, {size}).")
         under_way, before = self._flights.alive.copy(), self.errors
-        shares = np.asarray(actions, dtype=float)
         self._flights.step(command_of(shares, self.scale, self.taken), self._config.hold)
         self._observe()
         weights, seconds = self._weights, self.step_duration

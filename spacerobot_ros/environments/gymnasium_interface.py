@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from spacerobot_ros.environments import import_gymnasium
 from spacerobot_ros.environments.episodes import EpisodeConfig, Episodes
+from spacerobot_ros.errors import ParameterError
 
 import_gymnasium()  # Says how to install it where it is missing.
 
 import gymnasium  # noqa: E402
-from gymnasium.error import ResetNeeded  # noqa: E402
+from gymnasium.error import Error, ResetNeeded  # noqa: E402
 from gymnasium.spaces import Box  # noqa: E402
 from gymnasium.utils import EzPickle  # noqa: E402
 from gymnasium.utils.seeding import np_random  # noqa: E402
@@ -36,8 +38,37 @@ def _require_no_rendering(render_mode: str | None) -> None:
         )
 
 
-def _goal_in(options: dict[str, Any] | None) -> Any:
-    return None if options is None else options.get("goal")
+def _goal_in(options: Mapping[str, Any] | None) -> Any:
+    """Return the goal of options of a reset, which are refused if there are others."""
+    if options is None:
+        return None
+    if not isinstance(options, Mapping):
+        raise ParameterError(f"The options of a reset are {options!r}: give a dictionary.")
+    for name in options:
+        if name not in ("goal", "reset_mask"):
+            raise ParameterError(
+                f"There is no option '{name}' of a reset; there are goal, and of vectors "
+                "reset_mask."
+            )
+    return options.get("goal")
+
+
+def _seeds_of(seed: Any, count: int) -> list[int | None]:
+    """Return a seed for each environment: those of a list, or s + i of a number s."""
+    try:
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds = [None if seed is None else int(seed) + i for i in range(count)]
+        else:
+            seeds = [None if each is None else operator.index(each) for each in seed]
+    except TypeError:
+        raise Error(
+            f"The seed is {seed!r}: give a whole number, or a list of {count} of them or None."
+        ) from None
+    if len(seeds) != count:
+        raise ValueError(f"There are {len(seeds)} seeds of {count} environments.")
+    if any(each is not None and each < 0 for each in seeds):
+        raise Error(f"The seed is {seed!r}: seeds are whole numbers from 0.")
+    return seeds
 
 
 class SpaceRobotEnv(gymnasium.Env, EzPickle):
@@ -126,6 +157,8 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         seeded = [np_random(None) for _ in range(num_envs)]
         self._generators = [generator for generator, _ in seeded]
         self._seeds = [seed for _, seed in seeded]
+        self._begun = np.zeros(num_envs, dtype=np.bool_)
+        """Whether each robot was ever reset."""
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         """Episodes that have ended and not begun anew."""
 
@@ -149,30 +182,29 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
 
         ``options["goal"]``, one for all or one for each robot, replaces the goals that are drawn.
         """
-        mask = np.ones(self.num_envs, dtype=np.bool_)
+        mask, goal = np.ones(self.num_envs, dtype=np.bool_), _goal_in(options)
         if options is not None and "reset_mask" in options:
             mask = np.asarray(options["reset_mask"])
             if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
                 raise ValueError(
                     f"options['reset_mask'] must be {self.num_envs} booleans, at least one true."
                 )
-        seeds = (
-            [None if seed is None else seed + i for i in range(self.num_envs)]
-            if (seed is None or isinstance(seed, int | np.integer))
-            else list(seed)
-        )
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"There are {len(seeds)} seeds of {self.num_envs} environments.")
-        rows = np.flatnonzero(mask)
+        seeds, rows = _seeds_of(seed, self.num_envs), np.flatnonzero(mask)
         for row in rows.tolist():
             if (own := seeds[row]) is not None:
-                self._generators[row], self._seeds[row] = np_random(int(own))
-        self._begin(rows, _goal_in(options))
+                self._generators[row], self._seeds[row] = np_random(own)
+        self._begin(rows, goal)
+        self._begun |= mask
         return self.episodes.observations.copy(), self._info(mask)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all episodes; those that have ended begin anew by the autoreset mode."""
         episodes, mode = self.episodes, self.autoreset_mode
+        if not self._begun.all():
+            raise ResetNeeded(
+                f"{int((~self._begun).sum())} robots have no episode yet: reset them before the "
+                "first step."
+            )
         if mode is AutoresetMode.DISABLED and self._ended.any():
             raise ResetNeeded(
                 f"{int(self._ended.sum())} episodes have ended: reset them by options['reset_mask']"

@@ -173,6 +173,30 @@ def test_three_hundred_steps_of_arm_and_servicer_are_those_of_the_plant(
     assert at_stops > 3
 
 
+@needs_compiler
+@pytest.mark.slow
+def test_reaction_wheels_in_lanes_are_those_of_the_plant() -> None:
+    robot, rng = SpaceRobot(load_robot(robot_file("tender"))), np.random.default_rng(4)
+    wheels = np.array([name in robot.description.wheel_names for name in robot.joint_names])
+    starts, masses = InitialStates.repeated(robot, InitialState(), 5), drawn_masses(robot, 5, rng)
+    starts.q[:, ~wheels] = [0.9, -0.9, 1.6]
+    starts.qdot[:, wheels] = 0.999 * robot.velocity_limit[wheels] * rng.choice([-1, 1], (5, 4))
+    flights = SteppedFlights(robot, "effort", 0.02, starts, masses, link="base_link")
+    assert "lanes" in flights.engine
+    reference = OnePlant(flights, "effort", "")
+    reference.plants = [reference.make(starts, masses, row) for row in range(5)]
+    scale, at_limit = np.append(robot.effort_limit, np.ones(6)), 0
+    for step in range(300):
+        commands = scale * np.where(np.append(wheels, [False] * 6), 1.0, 0.01)
+        commands = commands * rng.uniform(-1.0, 1.0, (5, 13)) * (1.0 if step % 50 < 25 else 0.1)
+        commands[:, : robot.n][:, wheels] += 0.2 if step % 60 < 30 else -0.2
+        flights.step(commands)
+        reference.step(commands, 1)
+        reference.compare(flights)
+        at_limit += int((np.abs(flights.qdot) >= robot.velocity_limit)[:, wheels].sum())
+    assert at_limit > 100
+
+
 @pytest.fixture(params=[pytest.param(True, marks=needs_compiler), False], ids=["lanes", "plants"])
 def three(request: pytest.FixtureRequest, sliders: SpaceRobot) -> SteppedFlights:
     starts = drawn_starts(sliders, 3, np.random.default_rng(5))

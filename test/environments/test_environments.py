@@ -13,9 +13,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
+from gymnasium.error import Error, ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+from gymnasium.wrappers.vector import NormalizeObservation as GymnasiumsOwn
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from scipy.spatial.transform import Rotation
 
 import spacerobot_ros.environments
@@ -29,6 +30,7 @@ from spacerobot_ros.environments.tasks import (
     action_scale,
     command_of,
 )
+from spacerobot_ros.environments.wrappers import NormalizeObservation
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.compilation import cxx_compiler
@@ -140,12 +142,52 @@ def test_environments_in_lanes_are_as_many_single_ones(name: str, mode: str) -> 
 
 
 @pytest.mark.usefixtures("strict")
-def test_observations_can_be_normalised() -> None:
-    vector = NormalizeObservation(gymnasium.make_vec(ARM, num_envs=3, **SHORT))
-    vector.reset(seed=1)
-    for _ in range(8):
-        observations, *_ = vector.step(vector.action_space.sample())
-        assert np.isfinite(observations).all()
+@pytest.mark.parametrize("statistics_outside", [True, False])
+@pytest.mark.parametrize("mode", MODES)
+def test_observations_are_normalised_in_every_mode(mode: str, statistics_outside: bool) -> None:
+    def wrapped(normalize: Any, mode: str) -> Any:
+        vector = gymnasium.make_vec(ARM, num_envs=3, autoreset_mode=mode, **SHORT)
+        if statistics_outside:
+            return RecordEpisodeStatistics(normalize(vector))
+        return normalize(RecordEpisodeStatistics(vector))
+
+    here, plain = (
+        wrapped(each, mode) for each in (NormalizeObservation, lambda environment: environment)
+    )
+    own = wrapped(GymnasiumsOwn, mode) if mode == "NextStep" else None
+    rng, seen, ends = np.random.default_rng(2), [], 0
+    found, given = here.reset(seed=1)[0], plain.reset(seed=1)[0]
+    seen.extend(given)
+    if own is not None:
+        np.testing.assert_allclose(found, own.reset(seed=1)[0], atol=1e-6)
+
+    statistics = (here.env if statistics_outside else here).obs_rms
+
+    def normalized(observation: Any) -> Any:
+        return (observation - statistics.mean) / np.sqrt(statistics.var + 1e-8)
+
+    for _ in range(14):
+        actions = rng.uniform(-1.0, 1.0, (3, 2))
+        (found, *_, infos), (given, _, *flags, others) = here.step(actions), plain.step(actions)
+        ended = flags[0] | flags[1]
+        ends += int(ended.sum())
+        for row in np.flatnonzero(others.get("_final_obs", [])):
+            seen.append(others["final_obs"][row])
+            np.testing.assert_allclose(infos["final_obs"][row], normalized(seen[-1]), rtol=1e-5)
+        seen.extend(given)
+        np.testing.assert_allclose(found, normalized(given), rtol=1e-5, atol=1e-6)
+        assert found.dtype == here.single_observation_space.dtype == np.float32
+        if own is not None:
+            np.testing.assert_allclose(found, own.step(actions)[0], rtol=1e-5, atol=1e-5)
+        if ended.any():
+            assert infos["episode"]["l"][ended].all()
+        if mode == "Disabled" and ended.any():
+            here.reset(options={"reset_mask": ended.copy()})
+            seen.extend(plain.reset(options={"reset_mask": ended.copy()})[0][ended])
+    assert ends > 4
+    assert statistics.count == pytest.approx(len(seen), abs=1e-3)
+    np.testing.assert_allclose(statistics.mean, np.mean(seen, axis=0), atol=1e-4)
+    np.testing.assert_allclose(statistics.var, np.var(seen, axis=0), atol=1e-4)
 
 
 def test_a_step_is_that_of_the_plant_of_the_scenario() -> None:
@@ -234,6 +276,62 @@ def test_draws_of_a_campaign_are_starts_masses_and_goals(tmp_path: Path) -> None
     np.testing.assert_array_equal(first, episodes.goals)
 
 
+SLIDING = """
+campaign: {{scenario: sliding_masses, flights: 40, disperse: {{{}}}}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("changed", "refusal"),
+    [
+        ("initial.joints.slider_1: {uniform: [-5.0, 10.0]}", "slider_1.*outside its limits"),
+        ("mass.*: {uniform: [-0.5, 1.5]}", "mass"),
+    ],
+)
+def test_draws_that_are_refused_are_left_out_with_one_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, changed: str, refusal: str
+) -> None:
+    file = tmp_path / "draws.yaml"
+    file.write_text(SLIDING.format(changed))
+    vector: Any = gymnasium.make_vec(ARM, num_envs=4, campaign=str(file))
+    single: Any = gymnasium.make(ARM, campaign=str(file))
+    caplog.clear()
+    for seed in range(12):
+        observations, _ = vector.reset(seed=seed)
+        np.testing.assert_array_equal(observations[0], single.reset(seed=seed)[0])
+    (record,) = [each for each in caplog.records if "is left out" in each.message]
+    assert re.search(
+        f"Draw .* of the campaign is left out, as are others .*{refusal}", record.message
+    )
+    made = vector.episodes._source._made.values()
+    assert sum(isinstance(each, str) for each in made) > 3
+    assert sum(not isinstance(each, str) for each in made) > 3
+
+
+def test_a_campaign_whose_draws_are_all_refused_says_so(tmp_path: Path) -> None:
+    file = tmp_path / "draws.yaml"
+    file.write_text(SLIDING.format("initial.joints.slider_1: {uniform: [3.0, 1.0]}"))
+    environment = gymnasium.make(ARM, campaign=str(file))
+    with pytest.raises(ParameterError, match="100 draws of the campaign in succession are refused"):
+        environment.reset(seed=1)
+
+
+def test_wheels_turn_the_base() -> None:
+    environment: Any = gymnasium.make(ARM, scenario="wheels").unwrapped
+    robot = environment.episodes.robot
+    environment.reset(seed=1, options={"goal": quaternion_from_rotvec([0.0, 0.0, 0.5])})
+    before = environment.episodes.flights.momentum[0, 3:6].copy()
+    action = np.zeros(environment.action_space.shape)
+    wheels = [name in robot.description.wheel_names for name in robot.joint_names]
+    action[: robot.n][wheels] = -1.0
+    for _ in range(5):
+        observation, *_ = environment.step(action)
+    # The wheels' axes have a common direction: the base turns against it, without momentum.
+    momentum = environment.episodes.flights.momentum[0, 3:6]
+    np.testing.assert_allclose(momentum, before, atol=1e-12)
+    assert np.abs(observation[-3:]).max() > 1e-3
+
+
 def test_goals_of_a_scenario() -> None:
     config = EpisodeConfig("reorient", scenario="planar_chain", goals="scenario")
     episodes = Episodes(config, 2, in_lanes=False)
@@ -261,7 +359,11 @@ def test_goals_of_a_scenario() -> None:
         ({"scenario": "faults/stuck_slider"}, "has faults, which environments do not have"),
         ({"scenario": "faults/noisy_sensors"}, "has errors of sensors, which environments do not"),
         ({"scenario": "capture"}, "has a target, which environments do not have"),
-        ({"action_scale": [1.0]}, "'action_scale' has 1 numbers; robot .* takes 8 finite ones"),
+        ({"action_scale": [1.0]}, r"'action_scale' is \[1.0\]; robot .* takes a list of 8 finite"),
+        ({"action_scale": 1.0}, "'action_scale' is 1.0; robot .* takes a list of 8 finite numbers"),
+        ({"action_scale": "fast"}, "'action_scale' 'fast' is not a list of numbers"),
+        ({"action_scale": np.zeros(8)}, "'action_scale' has zeros alone, so that no action moves"),
+        ({"reward": 3}, "Argument 'reward' is 3; it must be a dictionary of weights"),
     ],
 )
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
@@ -288,14 +390,27 @@ def test_bad_actions_goals_and_masks_are_refused() -> None:
     for actions, message in (
         (np.zeros((2, 3)), r"The actions are \(2, 3\), not \(2, 2\)"),
         (np.full((2, 2), np.nan), "not finite"),
+        (np.full((2, 2), "right"), "is not a list of numbers"),
+        (np.full((2, 2), 1j), "is not a list of numbers"),
+        ([[1, 2], [3]], "is not a list of numbers"),
     ):
         with pytest.raises(CommandError, match=message):
             vector.step(actions)
     for goal in ([0, 0, 0], np.ones((3, 4)), [0, 0, 0, np.nan]):
         with pytest.raises(ParameterError, match=r"The goal is .*; task 'reorient' takes 4 finite"):
             vector.reset(options={"goal": goal})
-    with pytest.raises(ParameterError, match="There are 0 environments to make"):
-        gymnasium.make_vec(ARM, num_envs=0, scenario="planar_chain")
+    for given in ("up", {"x": 1.0}, [[0, 0, 0, 1], [1]]):
+        with pytest.raises(ParameterError, match=r"The goal .* is not a list of numbers\."):
+            vector.reset(options={"goal": given})
+    for options, message in (
+        ({"gaol": [0, 0, 0, 1]}, "There is no option 'gaol' of a reset; there are goal, and of"),
+        ("goal", "The options of a reset are 'goal': give a dictionary"),
+    ):
+        with pytest.raises(ParameterError, match=message):
+            vector.reset(options=options)
+    for count in (0, 1.5, "2"):
+        with pytest.raises(ParameterError, match=f"There are {count!r} environments to make"):
+            gymnasium.make_vec(ARM, num_envs=count, scenario="planar_chain")
     with pytest.raises(ParameterError, match="a quaternion of zeros"):
         vector.reset(options={"goal": [0, 0, 0, 0]})
     for mask in (np.zeros(2, dtype=bool), np.ones(3, dtype=bool), np.ones(2)):
@@ -303,6 +418,23 @@ def test_bad_actions_goals_and_masks_are_refused() -> None:
             vector.reset(options={"reset_mask": mask})
     with pytest.raises(ValueError, match="There are 3 seeds of 2 environments"):
         vector.reset(seed=[1, 2, 3])
+    for seed in (1.5, "x", [1, "x"], [1.5, 2]):
+        with pytest.raises(Error, match="give a whole number, or a list of 2 of them or None"):
+            vector.reset(seed=seed)
+    with pytest.raises(Error, match="seeds are whole numbers from 0"):
+        vector.reset(seed=[4, -1])
+    assert vector.np_random_seed == (3, 4)
+
+
+def test_robots_are_reset_before_they_are_stepped() -> None:
+    vector: Any = gymnasium.make_vec(ARM, num_envs=3, scenario="planar_chain")
+    with pytest.raises(ResetNeeded, match="3 robots have no episode yet: reset them before"):
+        vector.step(np.zeros((3, 2)))
+    vector.reset(options={"reset_mask": np.array([True, False, True])})
+    with pytest.raises(ResetNeeded, match="1 robots have no episode yet"):
+        vector.step(np.zeros((3, 2)))
+    vector.reset(seed=1)
+    vector.step(np.zeros((3, 2)))
 
 
 def states(n: int) -> RobotStates:

@@ -80,6 +80,29 @@ def test_violated_tolerances_are_corrected(flight: DrivenFlight) -> None:
     assert max(flight.error_to(TURNED)) <= 1e-3
 
 
+@pytest.mark.parametrize("finishes_at", [0.0, 1.0])
+def test_a_server_that_says_done_early_is_corrected(
+    flight: DrivenFlight, finishes_at: float
+) -> None:
+    flight.server.lag, flight.server.finishes_at = 0.0, finishes_at
+    flight.send(TURNED)
+    flight.harness.spin_until(lambda: flight.server.ends == ["succeeded"], "the early end")
+    flight.server.finishes_at = None
+    status = flight.wait("reached", "failed")
+    assert (status.level, values_of(status)["corrections"]) == (status.OK, "1"), status.message
+    assert flight.server.ends == ["succeeded"] * 2
+    assert max(flight.error_to(TURNED)) <= 1e-3
+
+
+def test_a_server_that_always_says_done_fails_the_goal(flight: DrivenFlight) -> None:
+    flight.server.lag, flight.server.finishes_at = 0.0, 0.0
+    state, corrections, message = flight.ended(TURNED)
+    assert (state, int(corrections)) == ("failed", flight.planner.commander.config.max_corrections)
+    assert flight.server.ends == ["succeeded"] * (int(corrections) + 1)
+    assert f"after {corrections} correction(s)" in message
+    assert flight.plant.time_ns < 60e9
+
+
 def test_refused_trajectories_fail_their_goals(flight: DrivenFlight) -> None:
     flight.server.rejects = True
     state, corrections, message = flight.ended(NEAR)

@@ -46,6 +46,8 @@ class TrajectoryServer:
         self.path_tolerance, self.goal_tolerance, self.goal_time = 0.2, 1e-5, 3.0
         self.freezes_at: float | None = None
         """Time of a trajectory from which on the first joint does not move, once, s."""
+        self.finishes_at: float | None = None
+        """Time of a trajectory at which it is said to be followed to its end, s."""
         self.falls_short = 0.0
         """Error of the last point, as long as it is not zero, m."""
         self.rejects, self.answer, self.text = False, 0, "told so"
@@ -132,6 +134,9 @@ class TrajectoryServer:
         if np.abs(at(since) - q).max() > self.path_tolerance and since < times[-1]:
             self.freezes_at = None
             self._end("aborted", -4, f"{state.name[0]} is off.")
+            return [0.0] * len(q)
+        if self.finishes_at is not None and since >= self.finishes_at:
+            self._end("succeeded")
             return [0.0] * len(q)
         if since >= times[-1] and not self.loses_results:
             if np.abs(goal - q).max() <= self.goal_tolerance:

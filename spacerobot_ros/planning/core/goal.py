@@ -21,6 +21,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_rotvec,
     unit_quaternion,
 )
+from spacerobot_ros.parameters import as_numbers
 
 Controlled = Literal["position", "attitude", "shape", "end_effectors"]
 """A part of a goal: the position and the attitude of the base, the joint positions, and the poses
@@ -76,7 +77,7 @@ class EndEffectorGoal:
         GoalError
             They are not 3 or 7 finite numbers, or the quaternion is zero.
         """
-        values = _convert_numbers(pose, f"of '{link}'")
+        values = as_numbers(pose, f"The goal of '{link}'", GoalError)
         if values.shape not in ((3,), (7,)):
             raise GoalError(
                 f"The goal of '{link}' is {values.size} number(s); it takes 3, a position, or 7, "
@@ -96,7 +97,10 @@ class EndEffectorGoal:
         GoalError
             There are no poses or too many of them, or one is none.
         """
-        values, name = _convert_numbers(poses, f"path of '{link}'"), f"The path of '{link}'"
+        values, name = (
+            as_numbers(poses, f"The goal path of '{link}'", GoalError),
+            f"The path of '{link}'",
+        )
         if not values.size:
             raise GoalError(f"{name} has no poses.")
         if values.ndim != 2 or values.shape[1] not in (3, 7):
@@ -240,8 +244,8 @@ class Goal:
             A list has the wrong length, or numbers that are not finite or too large, or the
             quaternion is zero.
         """
-        r = _convert_numbers(position, "position")
-        q = _convert_numbers(quaternion, "orientation")
+        r = as_numbers(position, "The goal position", GoalError)
+        q = as_numbers(quaternion, "The goal orientation", GoalError)
         if r.shape != (3,) or q.shape != (4,):
             raise GoalError("A goal has three numbers of position and four of orientation.")
         if not np.all(np.isfinite(r)):
@@ -252,7 +256,11 @@ class Goal:
             )
         if not np.all(np.isfinite(q)):
             raise GoalError(f"The goal orientation {q.tolist()} is not finite.")
-        shape = None if joint_positions is None else _convert_numbers(joint_positions, "shape")
+        shape = (
+            None
+            if joint_positions is None
+            else as_numbers(joint_positions, "The goal shape", GoalError)
+        )
         if shape is not None and not (
             shape.ndim == 1
             and np.all(np.isfinite(shape))
@@ -279,7 +287,7 @@ class Goal:
         GoalError
             It is no goal, or the rotation vector is not three numbers of at most a million turns.
         """
-        vector = _convert_numbers(rotvec, "rotation vector")
+        vector = as_numbers(rotvec, "The goal rotation vector", GoalError)
         if vector.shape != (3,) or not np.all(np.abs(vector) <= _MAX_ANGLE):
             raise GoalError(
                 f"The rotation vector {rotvec!r} is not three finite numbers of at most "
@@ -296,7 +304,7 @@ class Goal:
         GoalError
             It is no goal, or the angles are not three finite numbers.
         """
-        angles = _convert_numbers(rpy_deg, "roll, pitch and yaw")
+        angles = as_numbers(rpy_deg, "The goal roll, pitch and yaw", GoalError)
         if angles.shape != (3,) or not np.all(np.abs(angles) <= np.degrees(_MAX_ANGLE)):
             raise GoalError(f"The angles {rpy_deg!r} are not three finite numbers of degrees.")
         return cls.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
@@ -380,13 +388,6 @@ def _require_one_goal_each(goals: Iterable[EndEffectorGoal]) -> None:
         if count > 1:
             name = f"'{link}'" if link else "that has no name"
             raise GoalError(f"The end-effector {name} has {count} goals; it can have one.")
-
-
-def _convert_numbers(given: npt.ArrayLike, name: str) -> Array:
-    try:
-        return np.asarray(given, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        raise GoalError(f"The goal {name} {given!r} is not a list of numbers.") from None
 
 
 @dataclass(frozen=True)
