@@ -97,6 +97,7 @@ def test_control_in_lanes_is_that_of_the_controller() -> None:
     flights = controlled(
         *("planar_manipulator", SHAPE),
         ticks=220,
+        count=5,
         law="transposed_jacobian",
         position_tolerance=0.01,
         attitude_tolerance=0.02,

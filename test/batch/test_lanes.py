@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.slow import some_fast
 
 from spacerobot_ros.batch import (
     BatchResult,
@@ -115,7 +116,9 @@ def effort_flights(robot: SpaceRobot, count: int) -> Flights:
 
 
 @needs_compiler
-@pytest.mark.parametrize(("each", "deadband"), [(False, 0.0), (True, 0.003)])
+@pytest.mark.parametrize(
+    ("each", "deadband"), some_fast([(False, 0.0), (True, 0.003)], (True, 0.003))
+)
 def test_velocity_flights_in_lanes_are_those_of_the_plant(
     robots: dict[str, SpaceRobot], each: bool, deadband: float
 ) -> None:

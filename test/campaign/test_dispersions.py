@@ -167,7 +167,7 @@ KINDS: list[Any] = [
 FAULT_SLOWLY = pytest.param(*KINDS[-1].values, id="fault", marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize(("disperse", "settings", "check"), KINDS)
+@pytest.mark.parametrize(("disperse", "settings", "check"), [*KINDS[:-1], FAULT_SLOWLY])
 def test_what_is_drawn_is_what_is_flown(
     disperse: dict[str, Any], settings: dict[str, Any], check: Check
 ) -> None:

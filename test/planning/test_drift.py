@@ -179,6 +179,7 @@ def test_a_base_that_coasts_is_at_its_goal_when_the_plan_ends() -> None:
     assert angle_between(quaternion, NO_TURN) < END_ERROR
 
 
+@pytest.mark.slow
 def test_joints_rest_until_the_drift_leads_past_the_goal(
     arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
+from support.slow import some_fast
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.measures import Outcome
@@ -153,7 +154,9 @@ FLIGHTS: dict[str, tuple[Callable[[], Scenario], Acts]] = {
 }
 
 
-@pytest.mark.parametrize("name", FLIGHTS)
+@pytest.mark.parametrize(
+    "name", some_fast(tuple(FLIGHTS), *(name for name in FLIGHTS if "noise" not in name))
+)
 def test_the_bag_is_that_of_the_middleware(
     name: str, ros_context: rclpy.Context, tmp_path: Path
 ) -> None:

@@ -62,7 +62,12 @@ def test_mujoco_flies_reference_bags_to_the_same_states(name: str) -> None:
     assert found.engine.startswith("MuJoCo ")
 
 
-@pytest.mark.parametrize(("name", "link"), [("coordinated_control", "link_1"), ("reach", "link_2")])
+@pytest.mark.parametrize(
+    ("name", "link"),
+    some_fast(
+        [("coordinated_control", "link_1"), ("reach", "link_2")], ("coordinated_control", "link_1")
+    ),
+)
 def test_a_thousandth_of_a_mass_is_noticed(
     name: str, link: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -126,11 +131,13 @@ def test_external_loads_are_flown(tmp_path: Path, plant: dict[str, Any]) -> None
 
 @pytest.mark.parametrize(
     "surroundings",
-    [
-        Surroundings(mean_motion=0.7, quaternion_WO=(0.0, 0.6, 0.0, 0.8)),
-        Surroundings(gravity_W=(0.3, -0.1, 0.2), friction=0.4),
-    ],
-    ids=["gradient", "table"],
+    some_fast(
+        {
+            "gradient": Surroundings(mean_motion=0.7, quaternion_WO=(0.0, 0.6, 0.0, 0.8)),
+            "table": Surroundings(gravity_W=(0.3, -0.1, 0.2), friction=0.4),
+        },
+        "table",
+    ),
 )
 def test_external_loads_are_flown_under_velocities(surroundings: Surroundings) -> None:
     """Where joint rates are given, loads change the momenta."""
