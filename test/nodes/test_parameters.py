@@ -8,7 +8,9 @@ from types import MappingProxyType
 from typing import Any
 
 import pytest
+import yaml
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import (
     DescribeParameters,
@@ -19,6 +21,7 @@ from rcl_interfaces.srv import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import JointState
 from support.ros_harness import Harness, construction
 
@@ -72,6 +75,53 @@ def test_all_parameters_are_answered_at_once(harness: Harness, name: str) -> Non
     assert len(declared) >= 8
     for each, value in declared.items():
         assert values[each] == (list(value) if isinstance(value, tuple) else value)
+
+
+STARTED: dict[str, dict[str, Any]] = {
+    "plant": LOCKSTEP,
+    "planner": {"robot": "sliding_masses"},
+    "coordinated_control": {"robot": "servicer"},
+    "recorder": {"bag": "mine.mcap"},
+    "viewer": {"port": 0},
+    "replay": {"bag": str(Path(__file__).resolve().parents[2] / "bags" / "planar_chain.mcap")},
+}
+"""Parameters with which nodes may be started."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(each, marks=() if each == "plant" else pytest.mark.slow) for each in KINDS],
+)
+def test_a_dump_is_loaded_again_without_a_word(
+    harness: Harness, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    node = harness.make(KINDS[name], STARTED[name], autostart=False)
+    node.start()
+    assert node.is_active
+    remote = Remote(harness, node)
+    values = remote.values(remote.names())
+    # As the ros2 command writes it: lists for arrays, and groups within each other.
+    tree: dict[str, Any] = {}
+    for each, value in values.items():
+        *groups, last = each.split(".")
+        place = tree
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[last] = value.tolist() if hasattr(value, "tolist") else value
+    dump = tmp_path / "dump.yaml"
+    dump.write_text(yaml.dump({node.get_fully_qualified_name(): {"ros__parameters": tree}}))
+    probe = harness.probe({"/rosout": Log})
+    loader = AsyncParameterClient(probe, node.get_fully_qualified_name())
+    harness.spin_until(loader.services_are_ready, "the services")
+    loaded = loader.load_parameter_file(str(dump))
+    harness.spin_until(loaded.done, "the answer")
+    results = loaded.result().results
+    assert [each.reason for each in results if not each.successful] == []
+    assert len(results) == len(values) >= 8
+    assert str(remote.values(list(values))) == str(values)
+    harness.settle(probe)
+    assert [log.msg for log in probe.messages["/rosout"] if log.level >= log.WARN] == []
 
 
 def test_empty_lists_keep_their_type_through_the_services(harness: Harness) -> None:
