@@ -148,6 +148,21 @@ class Campaign:
         return tuple(dispersion.name for dispersion in self.dispersions)
 
     @property
+    def lines(self) -> list[str]:
+        """Lines for the terminal: the range of the drawn numbers, those of one range together."""
+        together: dict[str, list[str]] = {}
+        for each in self.dispersions:
+            if not each.distribution.choices:
+                low, high = each.distribution.quantiles(np.array([0.01, 0.99]))
+                unit = "" if each.target.unit in ("", "1") else f" {each.target.unit}"
+                text = f"{low:.4g} to {high:.4g}{unit} in 98 % of the flights"
+                together.setdefault(text, []).append(each.name)
+        return [
+            f"drawn       {names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)}: {text}"
+            for text, names in together.items()
+        ]
+
+    @property
     def measures_clearance(self) -> bool:
         """Whether a criterion names the smallest distance between links."""
         return any(criterion.metric == CLEARANCE for criterion in self.criteria)

@@ -70,7 +70,12 @@ def _parse_length(context: click.Context, option: click.Parameter, text: str) ->
 @click.command("figures")
 @bag_argument
 @click.option(
-    "--only", metavar="NAME,NAME", default="", help="Draw only these figures, such as pose,joints."
+    "--only",
+    metavar="NAME,NAME",
+    default="",
+    help="Draw only these figures, such as pose,joints. There are robot, pose, position, attitude, "
+    "cycles, joints, velocities, loops, errors, link_errors, sensors, efforts, thrusters, twist, "
+    "clearance, momentum, momentum_budget and path.",
 )
 @format_option(
     ("pdf", "svg", "png"), "Format of the files; text in PDF and SVG can be searched and edited."

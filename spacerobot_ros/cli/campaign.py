@@ -80,6 +80,22 @@ def fly(
 ) -> None:
     """Fly the campaign of FILE and write its dataset and report.
 
+    Such a FILE, of 20 flights whose masses and goals differ:
+
+    \b
+      campaign:
+        scenario: sliding_masses
+        flights: 20
+        seed: 1
+        disperse:
+          mass.*: {norm: {loc: 1.0, scale: 0.05}}
+          goal.position.x: {uniform: {loc: -0.01, scale: 0.02}}
+        criteria:
+          position_error_m: {max: 0.02}
+
+    A second file with another `method: lie_bracket` beside the scenario is the second design of
+    --compare. More are in examples/campaigns.
+
     A campaign that was interrupted is continued. Exit code 0: all flights were flown; 2: bad input;
     130: Ctrl-C, the flights so far are kept.
     """
@@ -138,6 +154,8 @@ def _fly_campaign(
     if name:
         campaign = replace(campaign, name=name)
     folder = out or Path("out") / campaign.name
+    for line in campaign.lines:
+        click.echo(line)
     with ended_on_request() as stopped, _progress_bar(campaign.name) as show:
         progress = run_campaign(
             campaign, folder, engine=engine, cluster=cluster, show=show, stopped=stopped

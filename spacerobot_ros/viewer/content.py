@@ -89,7 +89,8 @@ def time_to_go(state: StackState) -> float | None:
     if measured is None:
         return None
     if planner is not None and "planner" not in state.absent:
-        ends = planner.ends_at_s if planner.state is PlannerState.EXECUTING else 0.0
+        flies = planner.state is PlannerState.EXECUTING and planner.ends_at_s
+        ends = planner.ends_at_s + planner.remaining_s if flies else 0.0
     elif controller is not None and "controller" not in state.absent:
         ends = controller.ends_at_s
     else:
@@ -97,12 +98,22 @@ def time_to_go(state: StackState) -> float | None:
     return max(0.0, ends - measured.time_s) if ends else None
 
 
+def _to_go_text(left: float | None) -> str:
+    """Return the end of a line about the time to go, s; None: nothing is flown to.
+
+    Once its reference has ended, the robot is to come to rest on the goal.
+    """
+    if left is None:
+        return ""
+    return f", {left:.1f} s to go" if left > 0.0 else ", settling"
+
+
 def progress(state: StackState) -> float | None:
     """Return the flown share of the planned manoeuvre, 0 to 1; None if none is flown."""
     left, planner = time_to_go(state), state.planner
     if left is None or planner is None or planner.manoeuvre_time_s <= 0.0:
         return None
-    return min(1.0, max(0.0, 1.0 - left / planner.manoeuvre_time_s))
+    return min(1.0, max(0.0, 1.0 - left / (planner.manoeuvre_time_s + planner.remaining_s)))
 
 
 def status_html(
@@ -133,7 +144,7 @@ def status_html(
     if state.measured is not None:
         left = time_to_go(state)
         text = f"t = {state.measured.time_s:.2f} s"
-        lines.append(_line_html(text if left is None else f"{text}, {left:.1f} s to go", None))
+        lines.append(_line_html(text + _to_go_text(left), None))
     if state.replay is not None:
         replay = state.replay
         word = "ended" if replay.ended else "paused" if replay.paused else "playing"
@@ -168,8 +179,7 @@ def _distance_lines(
 ) -> list[str]:
     """Return a line on each part with a goal: how far it is from it, and the time to go."""
     left = time_to_go(state) if state.planner is None else None
-    to_go = "" if left is None else f", {left:.1f} s to go"
-    planner = state.planner
+    to_go, planner = _to_go_text(left), state.planner
     flies = planner is not None and planner.state is PlannerState.EXECUTING
     lines = []
     for part, error in errors.items():

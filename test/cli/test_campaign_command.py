@@ -15,6 +15,7 @@ from support.command_line import CliRunner, Result
 import spacerobot_ros.campaign.comparing as comparing
 import spacerobot_ros.campaign.report as report
 import spacerobot_ros.campaign.running as running
+from spacerobot_ros.campaign.config import load_campaign
 from spacerobot_ros.campaign.workers import Cluster
 from spacerobot_ros.cli.main import main
 
@@ -68,6 +69,18 @@ def test_without_options(campaigns: Campaigns) -> None:
     assert campaigns.reported == [(Path("out/first"), Path("out/first/report.html"))]
     assert "first: 4 of 11 flights, 2.5 a second; out/first" in result.output
     assert "success 75 %" in result.output
+    # The range of the numbers: of scipy's `uniform: [a, b]` the end is a + b.
+    drawn = [line for line in result.output.splitlines() if line.startswith("drawn ")]
+    assert drawn == call["campaign"].lines
+
+
+def test_the_range_of_what_is_drawn_is_said(tmp_path: Path) -> None:
+    file = tmp_path / "c.yaml"
+    disperse = {"mass.*": {"uniform": [0.95, 1.05]}, "goal.position.x": {"uniform": [-0.01, 0.02]}}
+    file.write_text(yaml.safe_dump({"campaign": section(**{**GIVEN, "disperse": disperse})}))
+    lines = sorted(load_campaign(file).lines, reverse=True)
+    assert lines[0].endswith(" more: 0.9605 to 1.99 in 98 % of the flights")
+    assert lines[1:] == ["drawn       goal.position.x: -0.0098 to 0.0098 m in 98 % of the flights"]
 
 
 def test_every_option_reaches_the_campaign(campaigns: Campaigns) -> None:

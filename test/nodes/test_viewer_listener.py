@@ -288,6 +288,37 @@ def test_goals_of_anyone_are_shown_until_one_is_refused(viewed: Viewed) -> None:
     assert list(viewed.look().goals) == ["end_effector"]
 
 
+@pytest.mark.parametrize("planned_meanwhile", [False, True])
+@pytest.mark.parametrize("who", ["planner", "controller"])
+def test_a_goal_that_is_refused_in_flight_leaves_the_one_that_is_pursued(
+    who: str, planned_meanwhile: bool, viewed: Viewed
+) -> None:
+    kind: Any = PlannerStatus if who == "planner" else ControllerStatus
+    states: Any = PlannerState if who == "planner" else ControllerState
+    flies = states.EXECUTING if who == "planner" else states.TRACKING
+    given = {"ends_at_s": 9.0}
+
+    def send(x: float, goal_id: str, state: Any, words: str) -> None:
+        message = PoseStamped(pose=pose_of(x, 0.0, 0.0))
+        message.header.frame_id = "world"
+        viewed.heard["goal_pose"](message)
+        viewed.report(f"{who}/status", kind(state, words, goal_id, **given), "/it")
+
+    send(0.5, "1.0", flies, "Flying.")
+    for x, goal_id in ((9.0, "2.0"), (8.0, "3.0")):
+        if planned_meanwhile and who == "planner":
+            viewed.report("planner/status", kind(states.PLANNING, "Planning.", goal_id), "/it")
+        send(x, goal_id, states.REFUSED, f"{x} m is too far.")
+        shown = getattr(viewed.look(), who)
+        assert (shown.state, shown.goal_id, shown.ends_at_s) == (flies, "1.0", 9.0)
+        assert shown.message == f"Flying. A later goal is refused: {x} m is too far."
+        assert viewed.look().goals["base"].position[0] == 0.5
+    viewed.report(f"{who}/status", kind(states.REACHED, "There.", "1.0"), "/it")
+    send(7.0, "4.0", states.REFUSED, "Too far.")
+    shown = getattr(viewed.look(), who)
+    assert (shown.state, shown.message) == (states.REFUSED, "Too far.")
+
+
 def test_goals_of_links_are_those_of_the_planner(viewed: Viewed) -> None:
     pose, place = (0.5, 0.25, 0.125, *TURNED), (4.0, -2.0, 1.0)
 

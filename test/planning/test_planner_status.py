@@ -72,6 +72,7 @@ def test_a_status_survives_its_message(
         attitude_error_rad=attitude,
         manoeuvre_time_s=time,
         ends_at_s=time,
+        remaining_s=2 * time,
         method="optimal",
         duration_s=time,
         notes=notes,

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -211,6 +212,101 @@ def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
         page.press("Stop all")
         page.wait_for_text("Plant latched", "stopped on request")
         looked.keep("stopped")
+
+
+def test_goals_in_flight_that_are_refused_dragged_or_seen_by_a_page_that_is_loaded_again(
+    tmp_path: Path, ros_domain: int
+) -> None:
+    with flying(tmp_path, ros_domain, "sliding_masses", "--rate", "0.2") as (up, looked):
+        page = looked.page
+        page.wait_for_text("Goal reachable")
+        page.type("Goal (m)", [0.3, -0.25, 0.1])
+        page.wait_for_text("Goal reachable", without="being moved")
+        page.press("Fly")
+        page.wait_for_text("executing", "s to go", "(tolerance 0.02 m, 0.06 rad)")
+        # A goal that is refused leaves the first one as it is.
+        up.goal("9", "0", "0", "0", "0", "0", "1")
+        page.wait_for_text("A later goal is refused: The goal position", "executing", "s to go")
+        assert page.numbers("Goal (m)") == [0.3, -0.25, 0.1]
+        looked.keep("refused-in-flight")
+        # The goal is dragged by one of its arrows while the robot flies to the last one.
+        before = page.numbers("Goal (m)")
+        for shift in _drags(looked):
+            page.drag(*shift)
+            if page.numbers("Goal (m)") != before:
+                break
+        assert page.numbers("Goal (m)") != before
+        page.wait_for_text("executing")
+        looked.keep("dragged-in-flight")
+        page.type("Goal (m)", [0.1, 0.0, 0.05])
+        page.wait_for_text("Goal reachable", without="being moved")
+        page.press("Fly")
+        looked.window.wait_for("document.body.innerText.includes('executing')")
+        page.wait_for_text("executing", "s to go")
+        # A page that is loaded again, or by somebody else, shows the flight as it is.
+        again = Looked(looked.window, up.url)
+        again.page.wait_for_text("executing", "s to go", "base is ", "(tolerance 0.02 m, 0.06 rad)")
+        assert again.page.numbers("Goal (m)") == [0.1, 0.0, 0.05]
+        assert np.linalg.norm(again.at("/goal/ghost") - again.at("/goal")) < 0.02
+        again.keep("loaded-again")
+
+
+def _drags(looked: Looked) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """Return drags of the mouse from where the arrows of a goal may be seen, outwards."""
+    x, y, _ = looked.window.evaluate(f"{_UNDER}({looked.at('/goal').tolist()})")
+    turns = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    ways = [np.array([np.cos(turn), np.sin(turn)]) for turn in turns]
+    centre = np.array([x, y])
+    return [
+        (tuple((centre + r * way).tolist()), tuple((centre + (r + 60.0) * way).tolist()))
+        for r in (60.0, 90.0, 40.0, 120.0)
+        for way in ways
+    ]
+
+
+@pytest.mark.parametrize("scenario", ["planar_chain", "coordinated_control"])
+def test_a_planar_robot(scenario: str, tmp_path: Path, ros_domain: int) -> None:
+    with flying(tmp_path, ros_domain, scenario) as (_, looked):
+        page = looked.page
+        page.wait_for_text("Goal reachable")
+        page.type("Roll, pitch, yaw (deg)", [0, 0, 25])
+        page.wait_for_text("reachable", without="being moved")
+        page.press("Fly")
+        if scenario == "planar_chain":
+            page.wait_for_text("executing", "Not controlled: position.", "s to go")
+        else:
+            page.wait_for_text("s to go.", "from the reference", "(tolerance 0.001 m, 0.001 rad)")
+        assert "refused" not in page.text()
+        looked.keep(f"planar-{scenario}")
+
+
+def test_a_slow_phone(tmp_path: Path, ros_domain: int) -> None:
+    """A processor four times slower behind 1.6 Mbit/s with 150 ms: the page is usable."""
+    up = Up(tmp_path, ros_domain, "sliding_masses", *RATE)
+    try:
+        with browser(tmp_path / "profile") as window:
+            window.call("Emulation.setCPUThrottlingRate", rate=4)
+            window.call(
+                "Network.emulateNetworkConditions",
+                offline=False, latency=150, downloadThroughput=2e5, uploadThroughput=9e4,
+            )  # fmt: skip
+            began = time.monotonic()
+            page = Page(window, up.url, *SIZES["phone"])
+            page.wait_for_text("Goal reachable")
+            window.wait_for("!!window.__viserMutable?.nodeRefFromName?.['/robot']")
+            print(f"slow phone: robot and status after {time.monotonic() - began:.1f} s")
+            window.evaluate("document.querySelector('.mantine-Notification-root button')?.click()")
+            page.type("Goal (m)", [0.3, -0.25, 0.1])
+            page.wait_for_text("Goal reachable", without="being moved")
+            page.press("Fly")
+            page.wait_for_text("executing", "s to go", "base is ")
+            page.press("Look at the robot")
+            window.wait_for(f"({_UNDER}({_NODE}('/robot')))[2] === 'CANVAS'")
+            assert window.evaluate("document.documentElement.scrollWidth") <= SIZES["phone"][0]
+            keep_picture(window, "slow-phone")
+            assert window.complaints == []
+    finally:
+        up.close()
 
 
 def test_nodes_that_die_and_the_end_of_the_stack(tmp_path: Path, ros_domain: int) -> None:

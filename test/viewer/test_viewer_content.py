@@ -103,6 +103,10 @@ def test_time_to_go_is_of_the_schedule_that_is_flown() -> None:
     assert content.time_to_go(flying) == pytest.approx(6.0)
     assert content.progress(flying) == pytest.approx(0.25)
     assert "6.0 s to go" in content.status_html(flying)
+    # Of a manoeuvre in pieces, that of all pieces.
+    piece = replace(flying, planner=replace(executing, remaining_s=24.0))
+    assert content.time_to_go(piece) == pytest.approx(30.0)
+    assert content.progress(piece) == pytest.approx(1 - 30 / 32)
     assert content.time_to_go(STATE) is None
     assert content.progress(STATE) is None
     reached = replace(STATE, planner=replace(executing, state=PlannerState.REACHED))
@@ -114,6 +118,7 @@ def test_time_to_go_is_of_the_schedule_that_is_flown() -> None:
     late = replace(STATE, planner=replace(executing, ends_at_s=3.0))
     assert content.time_to_go(late) == 0.0
     assert content.progress(late) == 1.0
+    assert ", settling" in content.status_html(late)
 
 
 def test_what_nodes_say_is_no_html() -> None:

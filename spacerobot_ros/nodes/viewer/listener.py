@@ -27,7 +27,7 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from spacerobot_ros.bag.playback import ReplayStatus
-from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -37,7 +37,7 @@ from spacerobot_ros.nodes.common.watchdog import HeartbeatState, Role
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
-from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.simulation.clearance import ClearanceStatus
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND, stamp_to_ns
@@ -57,6 +57,9 @@ _JITTER_NS = 200_000
 
 _LONGEST_EXPECTED_DELAY_NS = SECOND
 """Wall time after which a plant counts as one that publishes no expected momenta, ns."""
+
+_REFUSED = " A later goal is refused: "
+"""Between the message about the goal that is pursued and the reason of a refusal."""
 
 _MAX_PATH_POINTS = 1000
 """Largest number of points of a planned path."""
@@ -152,6 +155,10 @@ class Listener:
         self._schedule: _Schedule | None = None
         self._motion: Array | None = None
         self._goals: dict[Part, Goal] = {}
+        self._earlier_goals: dict[Part, Goal] = {}
+        """Goals before the last one was sent."""
+        self._pursued: dict[str, Any] = {}
+        """The last status of a goal that is pursued, by kind of status."""
         self.forget_state()
         for topic, key, read in (
             ("plant/status", "plant", PlantStatus.from_values),
@@ -331,6 +338,7 @@ class Listener:
                 status = read(dict(message.values), message.message)
             except SpaceRobotError:
                 return  # The status is of another kind of node.
+            status = self._after_refusal(key, status)
             self._statuses[key] = status
             self._reporters[key] = message.name
             self._hidden.pop(message.name, None)
@@ -340,6 +348,29 @@ class Listener:
             self._on_status(key, message.name)
 
         return take
+
+    def _after_refusal(self, key: str, status: Any) -> Any:
+        """Return the status to show: where a goal is refused while another is pursued, that of the
+        pursued one with the reason of the refusal; the pursued goal is shown again, too.
+        """
+        pursued = self._pursued.get(key)
+        match status:
+            case (
+                PlannerStatus(state=PlannerState.EXECUTING)
+                | ControllerStatus(state=ControllerState.TRACKING)
+            ):
+                self._pursued[key] = status
+            case (
+                PlannerStatus(state=PlannerState.REFUSED)
+                | ControllerStatus(state=ControllerState.REFUSED)
+            ) if pursued is not None and pursued.goal_id != status.goal_id:
+                self._goals = dict(self._earlier_goals)
+                return replace(pursued, message=f"{pursued.message}{_REFUSED}{status.message}")
+            case PlannerStatus(state=PlannerState.PLANNING):
+                pass  # It flies on meanwhile.
+            case _:
+                self._pursued.pop(key, None)
+        return status
 
     def _take_planned_goal(self, status: PlannerStatus) -> None:
         """Take the goal of a planner in place of the one before, if the status reports one."""
@@ -399,6 +430,7 @@ class Listener:
             self._motion = motion if np.all(np.isfinite(motion)) else None
 
     def _on_goal(self, part: Part, message: PoseStamped) -> None:
+        self._earlier_goals = dict(self._goals)
         try:
             self._goals[part] = goal_of(message, self._frame)
         except SpaceRobotError:

@@ -408,13 +408,14 @@ class Executive:
         return frozenset(goal.goal_id for goal in goals if goal is not None)
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the work that is done for a goal, and the time until its schedule ends, s.
+        """Return the work that is done for a goal, and the expected time until its end, s.
 
         None: no schedule leads to the goal yet.
         """
         active, planned = self._active_goal, self._planned_goal()
         if active is not None and active.identified.goal_id == goal_id:
-            return self.phase.value, max(0.0, active.ends_at - self._stamp_ns / 1e9)
+            left = max(0.0, active.ends_at - self._stamp_ns / 1e9)
+            return self.phase.value, left + active.schedule.remaining
         if planned is not None and planned.goal_id == goal_id:
             return Phase.PLANNING.value, None
         return Phase.MEASURING.value, None
@@ -1323,6 +1324,7 @@ class Executive:
         if active is not None:
             values["corrections"] = active.corrections
             values |= {"manoeuvre_time_s": active.manoeuvre_time, "ends_at_s": active.ends_at}
+            values["remaining_s"] = active.schedule.remaining
             controls = active.schedule.controls
             values["not_controlled"] = uncontrolled_parts(identified.goal, controls)
         aim = identified.goal

@@ -32,6 +32,7 @@ _PARTS: tuple[Controlled, ...] = ("position", "attitude", "shape")
 _NUMBER_KEYS = (
     *_END_EFFECTOR_ERRORS,
     *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "ends_at_s", "duration_s"),
+    "remaining_s",
 )
 """Keys of status values that are single numbers."""
 
@@ -94,6 +95,8 @@ class PlannerStatus:
         0: none.
     ends_at_s
         Simulated time at which the latest schedule ends; 0: none.
+    remaining_s
+        Expected duration of the schedules after it until the goal is reached; 0: it reaches it.
     method
         Gait method of the schedule that begins; empty: none begins.
     duration_s
@@ -117,6 +120,7 @@ class PlannerStatus:
     end_effector_attitude_error_rad: float | None = None
     manoeuvre_time_s: float = 0.0
     ends_at_s: float = 0.0
+    remaining_s: float = 0.0
     method: str = ""
     duration_s: float = 0.0
     notes: Notes = field(default_factory=dict)
@@ -146,6 +150,8 @@ class PlannerStatus:
         if self.ends_at_s:
             values["manoeuvre_time_s"] = _format_note(self.manoeuvre_time_s)
             values["ends_at_s"] = _format_note(self.ends_at_s)
+        if self.remaining_s:
+            values["remaining_s"] = _format_note(self.remaining_s)
         if self.method:
             values["method"] = self.method
             values["duration_s"] = _format_note(self.duration_s)
