@@ -53,7 +53,7 @@ VIEWER = ["viser>=1.1"]
 CAMPAIGN = ["dask", "distributed", "pandas>=2.1", "pyarrow", "SALib"]
 
 # Learning environments.
-RL = ["gymnasium>=1.1"]
+RL = ["gymnasium>=1.4"]
 
 setup(
     name=NAME,
