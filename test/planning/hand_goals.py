@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections import Counter
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,7 +33,7 @@ PERIOD = 0.05
 
 def measure(name: str, count: int, seed: int) -> str:
     """Return a line about goals of one robot: a quarter each is a position or a pose, the base free
-    or its attitude given.
+    or its attitude given. Proofs are listed at its end.
     """
     urdf, links = robot_file(name).read_text("utf-8"), ROBOTS[name]
     robot = SpaceRobot.from_file(robot_file(name))
@@ -40,7 +41,8 @@ def measure(name: str, count: int, seed: int) -> str:
     method = build_method("optimal", robot, PERIOD, 0.01, options)
     rng = np.random.default_rng(seed)
     lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    planned, proved, not_found, refused = 0, 0, 0, 0
+    planned, not_found, refused = 0, 0, 0
+    proofs = Counter[str]()
     errors, durations, cpu = [0.0], [], []
     for k in range(count):
         q, end = (lower + (upper - lower) * rng.uniform(a, 1 - a, robot.n) for a in (0.3, 0.1))
@@ -59,8 +61,8 @@ def measure(name: str, count: int, seed: int) -> str:
         began = time.process_time()
         try:
             schedule = method.plan(PlanRequest(state, goal, Tolerance(1e-6, 1e-6)))
-        except UnreachableError:
-            proved += 1
+        except UnreachableError as refusal:
+            proofs[refusal.proof.value] += 1
         except NotFoundError:
             not_found += 1
         except PlanningError:
@@ -79,10 +81,10 @@ def measure(name: str, count: int, seed: int) -> str:
                     errors.append(float(turn.magnitude()))
         cpu.append(time.process_time() - began)
     return (
-        f"{name:<18}{count:>6}{planned:>9}{proved:>8}{not_found:>11}{refused:>9}"
+        f"{name:<18}{count:>6}{planned:>9}{proofs.total():>8}{not_found:>11}{refused:>9}"
         f"{np.median(durations or [np.nan]):>9.3g}{np.median(cpu):>9.3g}{max(cpu):>9.3g}"
-        f"{max(errors):>10.1e}"
-    )
+        f"{max(errors):>10.1e}  {', '.join(f'{n} by {proof}' for proof, n in proofs.items())}"
+    ).rstrip()
 
 
 def main() -> None:

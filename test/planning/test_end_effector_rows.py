@@ -234,15 +234,15 @@ def test_the_parts_of_a_goal_are_what_is_controlled(arm: SpaceRobot) -> None:
 
 def test_more_than_the_joints_bring_about_is_counted(arm: SpaceRobot) -> None:
     rows = EndEffectorRows(arm, [(HAND, True), ("base_link", False)], np.eye(3))
-    with pytest.raises(PlanningError) as refusal:
+    with pytest.raises(NotFoundError) as refusal:
         rows.require_enough_freedom(fixed_attitude=True)
     assert str(refusal.value) == (
         "The goal of 'end_effector' and 'base_link' asks for 9 independent coordinates, and the "
-        "joints of robot 'three_joint_arm' move no more than 3: ask for a position instead of a "
-        "pose, or for less of the base."
+        "joints of robot 'three_joint_arm' move no more than 3, so no manoeuvre is looked for: ask "
+        "for a position instead of a pose, or for less of the base."
     )
     # Loops turn the base about its own axis of the first joint, which moves neither of the two.
-    with pytest.raises(PlanningError, match=r"9 independent .* no more than 5: "):
+    with pytest.raises(PlanningError, match=r"9 independent .* no more than 5, "):
         rows.require_enough_freedom(fixed_attitude=False)
     rows = EndEffectorRows(arm, [(HAND, False)], np.eye(3))
     rows.require_enough_freedom(fixed_attitude=True)

@@ -213,9 +213,11 @@ class EndEffectorRows:
     def require_enough_freedom(self, fixed_attitude: bool) -> None:
         """Refuse goals with more independent numbers than the joints can bring about.
 
+        Such goals are reached by chance at most, which proves nothing about one of them.
+
         Raises
         ------
-        PlanningError
+        NotFoundError
             The goal has more independent numbers.
         """
         ranks, rows = [], 0
@@ -230,10 +232,11 @@ class EndEffectorRows:
             ranks.append(int(np.linalg.matrix_rank(J, tol=1e-6)))
         if max(ranks) < rows:
             names = " and ".join(f"'{each.link}'" for each in self.directions)
-            raise PlanningError(
+            raise NotFoundError(
                 f"The goal of {names} asks for {rows} independent coordinates, and the joints of "
-                f"robot '{self.robot.description.name}' move no more than {max(ranks)}: ask for "
-                "a position instead of a pose, or for less of the base."
+                f"robot '{self.robot.description.name}' move no more than {max(ranks)}, so no "
+                "manoeuvre is looked for: ask for a position instead of a pose, or for less of "
+                "the base."
             )
 
     def require_directions(

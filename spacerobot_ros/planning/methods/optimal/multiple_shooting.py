@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -45,6 +47,19 @@ _IPOPT_OPTIONS = {
 
 _WARM_OPTIONS = {"ipopt.mu_init": 1e-3, "ipopt.bound_push": 1e-4, "ipopt.bound_frac": 1e-4}
 """With distances: the guess is a solution without some of them, which is not to be left far."""
+
+_CONTINUED_OPTIONS = {
+    "ipopt.mu_init": 1e-6,
+    "ipopt.warm_start_init_point": "yes",
+    **{
+        f"ipopt.warm_start_{of}": 1e-9
+        for of in (
+            *("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac"),
+            "mult_bound_push",
+        )
+    },
+}
+"""With other distances than those of the solution that it begins at, with its multipliers."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +101,14 @@ class DurationBounds:
         return self.shortest == self.longest
 
 
+@dataclass(frozen=True)
+class _Solution:
+    """A solution, and the variables and multipliers from which a solver continues."""
+
+    trajectory: Trajectory
+    variables: Mapping[str, ca.DM]
+
+
 class MultipleShooting:
     """Solves the problem of one robot for many boundary conditions.
 
@@ -109,19 +132,29 @@ class MultipleShooting:
         self._monitor = _SolverMonitor(
             self._program.problem, self._program.lower, self._program.upper
         )
-        self._solver = ca.nlpsol(
+        self._has_distances = stages.distances is not None
+        self._tolerance = tolerance
+        self._solver = self._build_solver(_WARM_OPTIONS if self._has_distances else {})
+        self._last: _Solution | None = None
+
+    def _build_solver(self, options: Mapping[str, object]) -> ca.Function:
+        return ca.nlpsol(
             "manoeuvre",
             "ipopt",
             self._program.problem,
             {
                 **_IPOPT_OPTIONS,
-                **(_WARM_OPTIONS if stages.distances is not None else {}),
-                "ipopt.tol": tolerance,
+                **options,
+                "ipopt.tol": self._tolerance,
                 "jac_g": self._program.jac_g,
                 "hess_lag": self._program.hess_lag,
                 "iteration_callback": self._monitor,
             },
         )
+
+    @cached_property
+    def _continuing_solver(self) -> ca.Function:
+        return self._build_solver(_CONTINUED_OPTIONS)
 
     def solve(
         self,
@@ -132,6 +165,9 @@ class MultipleShooting:
         duration: DurationBounds,
     ) -> Trajectory | None:
         """Return the fastest trajectory near ``guess``; None if none.
+
+        With distances, the solver continues at its own last solution, where that is the guess:
+        then it takes a few steps. Where that fails, it begins there as at any guess.
 
         In a fixed time it is the one of least effort: of the least mean square of the
         accelerations, over the joints' speeds.
@@ -162,8 +198,12 @@ class MultipleShooting:
             for i in (0, 1)
         )
         self._monitor.begin(stop)
-        result = self._solver(
-            x0=self._initial_variables(guess),
+        solver, begin = self._solver, {"x0": self._initial_variables(guess)}
+        if self._last is not None and guess is self._last.trajectory:
+            solver, begin = self._continuing_solver, self._last.variables
+        self._last = None
+        result = solver(
+            **begin,
             lbx=least,
             ubx=most,
             lbg=self._program.lower,
@@ -172,16 +212,22 @@ class MultipleShooting:
                 boundary, limits, guess if duration.fixed else None, drifting=self._drifting
             ),
         )
-        stats = self._solver.stats()
+        stats = solver.stats()
         self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
         x = result["x"].full().ravel()
+        if not self.converged and solver is not self._solver:
+            return self.solve(boundary, limits, guess, stop, duration)
         if not self.converged:
             # Where the goal drifts away, no time makes up for what each interval violates.
             infeasible = self._drifting and stats["return_status"] == _INFEASIBLE
             if self._monitor.best is None or infeasible:
                 return None
             x = self._monitor.best
-        return self._unpack_trajectory(x)
+        trajectory = self._unpack_trajectory(x)
+        if self._has_distances and self.converged:
+            begin = {"x0": result["x"], "lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
+            self._last = _Solution(trajectory, begin)
+        return trajectory
 
     def _initial_variables(self, guess: Trajectory) -> Array:
         """Return the initial values of the program's variables by a guess."""

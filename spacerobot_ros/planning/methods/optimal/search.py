@@ -487,7 +487,10 @@ class ManoeuvreSearch:
         assert kept is not None
         within = replace(progress, limits=kept.within(progress.limits))
         solver = self._get_solver(within, intervals, tolerance)
-        guess = _build_guesses(self._robot, solver, progress.boundary).resample(trajectory)
+        guess = trajectory
+        if len(trajectory.shapes) != intervals + 1:
+            guess = _build_guesses(self._robot, solver, progress.boundary).resample(trajectory)
+        # On the same grid, a solver continues at its own last solution.
         solution = self._solve_from_guess(within, solver, guess, progress.stop_rule(found=False))
         progress.cancellation.raise_if_requested()
         result = _NO_PATH_FOUND if solution is None else f"{solution.duration:.6g} s"
