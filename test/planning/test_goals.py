@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import GoalError, PlanningError
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.planning import METHODS, Goal, PoseError, Tolerance
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 
 
 def test_methods_say_what_they_control() -> None:
@@ -80,3 +81,12 @@ def test_what_is_no_pose_is_refused(
 def test_what_is_no_shape_is_refused(shape: npt.ArrayLike) -> None:
     with pytest.raises(PlanningError, match="goal shape"):
         Goal.checked([0, 0, 0], [0, 0, 0, 1], shape)
+
+
+def test_a_goal_of_the_end_effector_without_a_name_is_refused_by_that() -> None:
+    with pytest.raises(
+        GoalError, match=r"^The goal of the end-effector is 2 number\(s\); it takes 3"
+    ):
+        EndEffectorGoal.checked("", [1.0, 0.0])
+    with pytest.raises(GoalError, match=r"^The end-effector has 2 goals; it can have one\.$"):
+        Goal.of_end_effectors([EndEffectorGoal.checked("", np.ones(3))] * 2)

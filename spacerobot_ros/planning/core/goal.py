@@ -77,10 +77,11 @@ class EndEffectorGoal:
         GoalError
             They are not 3 or 7 finite numbers, or the quaternion is zero.
         """
-        values = as_numbers(pose, f"The goal of '{link}'", GoalError)
+        name = f"'{link}'" if link else "the end-effector"
+        values = as_numbers(pose, f"The goal of {name}", GoalError)
         if values.shape not in ((3,), (7,)):
             raise GoalError(
-                f"The goal of '{link}' is {values.size} number(s); it takes 3, a position, or 7, "
+                f"The goal of {name} is {values.size} number(s); it takes 3, a position, or 7, "
                 "a position and a quaternion."
             )
         given = Goal.checked(values[:3], values[3:] if len(values) == 7 else [0, 0, 0, 1])
@@ -386,8 +387,8 @@ class Goal:
 def _require_one_goal_each(goals: Iterable[EndEffectorGoal]) -> None:
     for link, count in Counter(each.link for each in goals).items():
         if count > 1:
-            name = f"'{link}'" if link else "that has no name"
-            raise GoalError(f"The end-effector {name} has {count} goals; it can have one.")
+            name = f" '{link}'" if link else ""
+            raise GoalError(f"The end-effector{name} has {count} goals; it can have one.")
 
 
 @dataclass(frozen=True)

@@ -198,7 +198,8 @@ class MultipleShooting:
             for i in (0, 1)
         )
         self._monitor.begin(stop)
-        solver, begin = self._solver, {"x0": self._initial_variables(guess)}
+        solver = self._solver
+        begin: Mapping[str, Array | ca.DM] = {"x0": self._initial_variables(guess)}
         if self._last is not None and guess is self._last.trajectory:
             solver, begin = self._continuing_solver, self._last.variables
         self._last = None
