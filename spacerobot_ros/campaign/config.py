@@ -268,6 +268,17 @@ def _read_scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
         raise ParameterError("'scenario' must be the name or the file of a scenario.")
     beside = folder / given
     scenario = scenario_or_robot(str(beside) if beside.is_file() else given)
+    return scenario_of_section(scenario, section)
+
+
+def scenario_of_section(scenario: Scenario, section: Mapping[str, Any]) -> Scenario:
+    """Return a scenario with the parameters under ``set`` and the ``method`` of a section.
+
+    Raises
+    ------
+    ParameterError
+        It has no goal, a parameter is refused, or campaigns do not fly it.
+    """
     scenario.require_goal()
     for key, value in _read_mapping(section, "set").items():
         node, _, parameter = str(key).partition(".")

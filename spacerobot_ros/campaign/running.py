@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from spacerobot_ros.campaign.config import Campaign, parse_campaign
+from spacerobot_ros.campaign.config import Campaign, parse_campaign, scenario_of_section
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
@@ -34,6 +34,7 @@ from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.api import EndEffectorValues, end_effector_goals
 from spacerobot_ros.scenario import Scenario
 
 
@@ -287,7 +288,11 @@ def sweep(
     *,
     position: npt.ArrayLike | None = None,
     rotvec: npt.ArrayLike | None = None,
+    end_effector_position: EndEffectorValues | None = None,
+    end_effector_pose: EndEffectorValues | None = None,
+    end_effector: str = "",
     method: str | None = None,
+    parameters: Mapping[str, Any] | None = None,
     seed: int = 0,
     flights: int = 100,
     folder: Path | None = None,
@@ -299,8 +304,10 @@ def sweep(
 
     Parameters
     ----------
-    what, goal, position, rotvec, method
+    what, goal, position, rotvec, method, parameters
         As for :func:`~spacerobot_ros.flight.api.fly`.
+    end_effector_position, end_effector_pose, end_effector
+        Likewise.
     disperse
         Distributions by the name of the quantity, as in a file of a campaign.
     seed, flights
@@ -308,7 +315,8 @@ def sweep(
     folder
         Where the dataset is kept, which a later call goes on with; None: nowhere.
     section
-        Other keys of a file of a campaign: ``sampler``, ``criteria``, ``engine``, ``longest``.
+        Other keys of a file of a campaign: ``sampler``, ``criteria``, ``engine``, ``longest``;
+        ``set`` means the same as ``parameters``.
 
     Returns
     -------
@@ -319,10 +327,13 @@ def sweep(
     SpaceRobotError
         A key or value is refused, or pyarrow or scipy is not installed.
     """
-    scenario = scenario_to_fly(what, goal, position, rotvec)
-    scenario.require_goal()
+    hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
+    scenario = scenario_to_fly(what, goal, position, rotvec, hands)
     if method is not None:
-        scenario = scenario.with_method(method)
+        section["method"] = method
+    if parameters is not None:
+        section["set"] = {**parameters, **section.get("set", {})}
+    scenario = scenario_of_section(scenario, section)
     given = {**section, "disperse": dict(disperse), "flights": flights, "seed": seed}
     campaign = parse_campaign(scenario.name, given, scenario=scenario)
     with TemporaryDirectory() as left_nowhere:

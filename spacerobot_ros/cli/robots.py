@@ -31,6 +31,9 @@ _MAX_LISTED_JOINTS = 12
 _MAX_PLAUSIBLE_RADIANS = 20.0
 """Limit of a joint beyond which it is likely to be in degrees."""
 
+_MAX_PLAUSIBLE_SPEED = 25.0
+"""Speed of a joint, rad/s, beyond which it is likely to be in degrees; that of fast legs is 21."""
+
 _MAX_LISTED_DISTANCES = 3
 """Pairs of links whose distances are listed, nearest first."""
 
@@ -243,23 +246,41 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
 
 
 def _degree_warnings(robot: RobotDescription) -> list[str]:
-    """Return a warning about limits that look as if they were in degrees."""
-    suspects = [
+    """Return warnings about limits and speeds that look as if they were in degrees."""
+    turning = [each for each in robot.movable_joints if each.unit == "rad"]
+    wide = [
         joint.name
-        for joint in robot.movable_joints
-        if joint.unit == "rad"
-        and any(
-            math.isfinite(limit) and abs(limit) > _MAX_PLAUSIBLE_RADIANS
-            for limit in (joint.limits.lower, joint.limits.upper)
+        for joint in turning
+        if _is_beyond(_MAX_PLAUSIBLE_RADIANS, joint.limits.lower, joint.limits.upper)
+    ]
+    fast = [
+        joint.name
+        for joint in turning
+        if joint.name not in robot.wheel_names
+        and _is_beyond(_MAX_PLAUSIBLE_SPEED, joint.limits.velocity)
+    ]
+    warnings = []
+    if wide:
+        warnings.append(
+            f"warning: the limits of {_listed(wide)} are beyond {_MAX_PLAUSIBLE_RADIANS:g} rad, "
+            "several turns. Those of a URDF are in radians: if these are degrees, divide them by "
+            "57.2958."
         )
-    ]
-    if not suspects:
-        return []
-    names = ", ".join(f"'{name}'" for name in suspects[:_MAX_LISTED_JOINTS])
-    return [
-        f"warning: the limits of {names} are beyond {_MAX_PLAUSIBLE_RADIANS:g} rad, several turns. "
-        "Those of a URDF are in radians: if these are degrees, divide them by 57.2958."
-    ]
+    if fast:
+        warnings.append(
+            f"warning: the speed of {_listed(fast)} is beyond {_MAX_PLAUSIBLE_SPEED:g} rad/s, some "
+            "four turns a second. That of a URDF is in rad/s: if it is in deg/s, divide it by "
+            "57.2958."
+        )
+    return warnings
+
+
+def _is_beyond(most: float, *limits: float) -> bool:
+    return any(math.isfinite(limit) and abs(limit) > most for limit in limits)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names[:_MAX_LISTED_JOINTS])
 
 
 def _rotation_lines(found: Analysis) -> list[str]:

@@ -39,6 +39,7 @@ def test_a_sweep_is_a_campaign(run: list[tuple[Any, Path]], tmp_path: Path) -> N
         NOISE,
         position=at,
         method="lie_bracket",
+        parameters={"planner.position_tolerance": 0.0125},
         seed=5,
         flights=7,
         folder=tmp_path / "kept",
@@ -53,7 +54,20 @@ def test_a_sweep_is_a_campaign(run: list[tuple[Any, Path]], tmp_path: Path) -> N
     assert campaign.names[0] == "plant.sensors.position_noise"
     assert campaign.scenario.planner.method == "lie_bracket"
     np.testing.assert_allclose(campaign.scenario.goal.position, at)
+    assert campaign.scenario.planner.position_tolerance == 0.0125
     assert [each.metric for each in campaign.criteria] == ["position_error_m"]
+
+
+def test_a_sweep_takes_goals_of_end_effectors_and_refuses_unknown_parameters(
+    run: list[tuple[Any, Path]],
+) -> None:
+    place = (1.0, 0.6, 0.7)
+    sweep("reach", NOISE, end_effector_position=place, end_effector="link_7")
+    (aim,) = run[0][0].scenario.goal.end_effectors
+    assert aim.link == "link_7"
+    np.testing.assert_allclose(aim.position, place)
+    with pytest.raises(ParameterError, match="position_toleranse"):
+        sweep("sliding_masses", NOISE, parameters={"planner.position_toleranse": 0.1})
 
 
 def test_a_sweep_without_a_folder_leaves_nothing(run: list[tuple[Any, Path]]) -> None:

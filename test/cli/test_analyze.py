@@ -128,6 +128,14 @@ def test_limits_that_look_like_degrees_are_pointed_out() -> None:
         "warning: the limits of 'joint_0', 'joint_2' are beyond 20 rad, several turns. Those of a "
         "URDF are in radians: if these are degrees, divide them by 57.2958."
     ]
+    fast = jointed(
+        'lower="-1" upper="1" velocity="30" effort="3"',
+        'lower="-1" upper="1" velocity="24" effort="3"',
+    )
+    (warning,) = _degree_warnings(fast.description)
+    assert warning.startswith("warning: the speed of 'joint_0' is beyond 25 rad/s, some four turns")
+    # Reaction wheels turn faster.
+    assert _degree_warnings(SpaceRobot.from_file(robot_file("tender")).description) == []
 
 
 def test_masses_and_limits_are_those_of_the_urdf() -> None:

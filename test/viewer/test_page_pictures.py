@@ -217,7 +217,7 @@ def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
 def test_goals_in_flight_that_are_refused_dragged_or_seen_by_a_page_that_is_loaded_again(
     tmp_path: Path, ros_domain: int
 ) -> None:
-    with flying(tmp_path, ros_domain, "sliding_masses", "--rate", "0.2") as (up, looked):
+    with flying(tmp_path, ros_domain, "sliding_masses", "--rate", "0.1") as (up, looked):
         page = looked.page
         page.wait_for_text("Goal reachable")
         page.type("Goal (m)", [0.3, -0.25, 0.1])
@@ -237,7 +237,7 @@ def test_goals_in_flight_that_are_refused_dragged_or_seen_by_a_page_that_is_load
                 break
         assert page.numbers("Goal (m)") != before
         page.wait_for_text("executing")
-        looked.keep("dragged-in-flight")
+        keep_picture(looked.window, "dragged-in-flight-light-desktop")
         page.type("Goal (m)", [0.1, 0.0, 0.05])
         page.wait_for_text("Goal reachable", without="being moved")
         page.press("Fly")
