@@ -60,7 +60,8 @@ class Proof(Enum):
     """No joint positions within the joint limits put the robot at the goal."""
 
     MOMENTUM = "momentum"
-    """The goal needs the centre of mass to move, which it cannot do at zero momentum."""
+    """The goal needs the centre of mass to move, which it cannot do at zero momentum, or reaction
+    wheels to hold more angular momentum than they can."""
 
     COLLISION = "collision"
     """Links are in contact, or nearer than the clearance, in the shape of the goal."""

@@ -22,11 +22,14 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.errors import Proof, RobotDescriptionError, UnreachableError
 from spacerobot_ros.model.description import Array, Body, JointKind, RobotDescription
 
 _MAX_OFFSET = 1e-4
 """Largest distance of a wheel's centre of mass from its axis, m."""
+
+_MOMENTUM_ROUNDING, _LEAST_MOMENTUM = 1e-9, 1e-12
+"""Angular momentum that wheels may leave to the base, relative to all of it, and kg m^2/s."""
 
 _MAX_ASYMMETRY = 1e-3
 """Largest difference of a wheel's inertia from that of a body of revolution, relative."""
@@ -87,6 +90,61 @@ class ReactionWheels:
     def spins(self, omega_WB_B: Array, rates: Array) -> Array:
         """Return the momenta h (k,) about the axes, kg m^2/s, at relative rates (k,), rad/s."""
         return np.asarray(self.inertia * (self.axes_B.T @ omega_WB_B + rates))
+
+    def rates_for(
+        self, L_B: Array, near: Array | None = None, largest: Array | None = None
+    ) -> Array:
+        """Return rates (k,), rad/s, at which the wheels hold all of an angular momentum while base
+        and arm rest: of redundant wheels the nearest ones, or the smallest ones within the limits.
+
+        Parameters
+        ----------
+        L_B
+            (3,) in the base, kg m^2/s.
+        near
+            (k,) rates that redundant wheels stay near to, rad/s; None: zero.
+        largest
+            (k,) largest rates, rad/s; None: those of the wheels.
+
+        Raises
+        ------
+        UnreachableError
+            No rates within the limits do; the message is a clause that says why.
+        """
+        rate = self.rate if largest is None else largest
+        near = np.zeros(len(self)) if near is None else near
+        stored = self.axes_B * self.inertia
+        scaled = stored * rate
+        nearest = near + rate * (np.linalg.pinv(scaled) @ (L_B - stored @ near))
+        left = float(np.linalg.norm(stored @ nearest - L_B))
+        if left > _MOMENTUM_ROUNDING * float(np.linalg.norm(L_B)) + _LEAST_MOMENTUM:
+            raise UnreachableError(
+                f"their axes leave out a direction in which it has {left:.3g} kg m^2/s",
+                Proof.MOMENTUM,
+            )
+        if np.all(np.abs(nearest) <= rate):
+            return np.asarray(nearest)
+        from scipy.optimize import linprog  # Slow to import, and few robots have wheels.
+
+        # The shares x of the limits whose largest one, t, is the least: |x| <= t.
+        k = len(self)
+        U, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
+        rows = U.T[sizes > _MOMENTUM_ROUNDING * sizes[0]]
+        found = linprog(
+            np.append(np.zeros(k), 1.0),
+            A_ub=np.block([[np.eye(k), -np.ones((k, 1))], [-np.eye(k), -np.ones((k, 1))]]),
+            b_ub=np.zeros(2 * k),
+            A_eq=np.hstack([rows @ scaled, np.zeros((len(rows), 1))]),
+            b_eq=rows @ L_B,
+            bounds=(None, None),
+        )
+        if found.fun > 1:
+            raise UnreachableError(
+                f"it is {found.fun:.4g} times the largest that they hold in its direction",
+                Proof.MOMENTUM,
+            )
+        shares = found.x[:k]
+        return np.asarray(rate * (shares + np.linalg.pinv(scaled) @ (L_B - scaled @ shares)))
 
     @cached_property
     def gyrostat(self) -> RobotDescription:

@@ -156,6 +156,9 @@ class CommandSource:
         Quantity of its commands.
     limits
         (size,) largest magnitude of each value.
+    kept
+        Indices of the values that stay in force where a command is revoked: the rates of reaction
+        wheels, because stopping them would turn the base.
     command
         (size,) command in force: of the joints (m/s, rad/s, N or N m), or force (N) over torque
         (N m) at the origin of the base link, base components.
@@ -176,9 +179,15 @@ class CommandSource:
     """
 
     def __init__(
-        self, topic: str, quantity: Quantity, limits: Array, senders: PublisherTracker | None = None
+        self,
+        topic: str,
+        quantity: Quantity,
+        limits: Array,
+        senders: PublisherTracker | None = None,
+        kept: npt.NDArray[np.int64] | None = None,
     ) -> None:
         self.topic, self.quantity, self.limits = topic, quantity, limits
+        self.kept = np.zeros(0, dtype=np.int64) if kept is None else kept
         self.senders = senders or PublisherTracker(SECOND)
         self.sender: int | None = None
         self.command: Array = np.zeros(len(limits))
@@ -189,7 +198,9 @@ class CommandSource:
 
     def rest(self) -> None:
         """Revoke the command in force."""
+        kept = self.command[self.kept]
         self.command[:] = 0.0
+        self.command[self.kept] = kept
         self.stamp_ns = NO_STAMP
         self.resting = True
 
@@ -222,7 +233,8 @@ class CommandValidator:
         robot = plant.robot
         silence_ns = round((config.command_timeout or _START_TIME) * SECOND)
         joints = partial(CommandSource, "joint_commands", senders=PublisherTracker(silence_ns))
-        self.sources = [joints("velocity", robot.velocity_limit)]
+        kept = ReactionWheels.of(robot.description).index
+        self.sources = [joints("velocity", robot.velocity_limit, kept=kept)]
         """Sources in the order of the arguments of a step: the joints' first."""
         self._brakes: _JointBrakes | None = None
         if config.actuation == "effort":
@@ -336,6 +348,12 @@ class CommandValidator:
         """Revoke all commands, and accept only answers to states stamped ``now_ns`` or later."""
         self.rest()
         self._earliest = now_ns
+
+    def reset(self, now_ns: int) -> None:
+        """Begin again (:meth:`begin`) with a plant in its initial state, whose wheels rest, too."""
+        for source in self.sources:
+            source.command[:] = 0.0
+        self.begin(now_ns)
 
     def rest(self) -> None:
         """Revoke all commands."""

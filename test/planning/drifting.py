@@ -15,6 +15,20 @@ END_ERROR = 1e-6
 _LONGEST_STEP = 0.0125
 
 
+def turn_rate_in_pinocchio(
+    name: str, q: Array, quaternion: Array, qdot: Array, L_W: Array, names: tuple[str, ...]
+) -> Array:
+    """Return the angular velocity (3,) of the base in W at rates of the joints and a momentum about
+    the centre of mass, which rests.
+    """
+    urdf = name if name.startswith("<") else robot_file(name).read_text()
+    oracle = PinocchioOracle(urdf, names)
+    oracle.place(q, quaternion, np.zeros(3))
+    A = oracle.momentum_matrix_W()
+    momenta = np.concatenate([np.zeros(3), L_W])
+    return np.asarray(np.linalg.solve(A[:, :6], momenta - A @ oracle.joint_velocities(qdot))[3:])
+
+
 def angle_between(first: Array, second: Array) -> float:
     """Return the angle between two attitudes (4,), rad."""
     # |a - b| is twice the sine of a quarter of the angle.
@@ -26,8 +40,10 @@ def flown_by_pinocchio(name: str, schedule: GaitSchedule, state: RobotState) -> 
     """Return position (3,) and attitude (4,) of the base after a schedule.
 
     The momenta of the state stay; the twist of the base follows from them and the joint rates.
+    ``name`` is that of a robot, or its URDF.
     """
-    oracle = PinocchioOracle(robot_file(name).read_text(), schedule.joint_names)
+    urdf = name if name.startswith("<") else robot_file(name).read_text()
+    oracle = PinocchioOracle(urdf, schedule.joint_names)
     momenta = np.concatenate([state.linear_momentum, state.angular_momentum])
 
     def rate(x: Array, q: Array, qdot: Array) -> Array:

@@ -24,6 +24,11 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 Array = npt.NDArray[np.float64]
 
 
+_WITHOUT_WHEELS = SimpleNamespace(
+    wheel_names=(), joint_names=("a", "b"), limits=lambda _: np.zeros(2)
+)
+
+
 @pytest.mark.parametrize(
     ("velocity", "acceleration", "sentence"),
     [
@@ -38,7 +43,7 @@ def test_a_joint_needs_a_speed_and_a_finite_acceleration(
 ) -> None:
     robot: Any = SimpleNamespace(
         velocity_limit=np.array([1.0, velocity]), joint_names=("a", "b"), n=2,
-        lower=np.array([-1.0, -2.0]), upper=np.array([1.0, 2.0]),
+        lower=np.array([-1.0, -2.0]), upper=np.array([1.0, 2.0]), description=_WITHOUT_WHEELS,
     )  # fmt: skip
     options = MotionOptions(max_acceleration=(1.0, acceleration))
     if not sentence:
@@ -53,7 +58,7 @@ def test_a_joint_needs_a_speed_and_a_finite_acceleration(
 def test_a_joint_without_a_velocity_limit_is_refused_with_the_remedies() -> None:
     robot: Any = SimpleNamespace(
         velocity_limit=np.array([1.0, np.inf]), joint_names=("a", "b"), n=2,
-        lower=np.array([-1.0, -2.0]), upper=np.array([1.0, 2.0]),
+        lower=np.array([-1.0, -2.0]), upper=np.array([1.0, 2.0]), description=_WITHOUT_WHEELS,
     )  # fmt: skip
     with pytest.raises(ParameterError) as refusal:
         MotionLimits.of(robot, MotionOptions(), "m")

@@ -235,7 +235,7 @@ class Built:
     def _kind_of(self, goal: Goal) -> Any:
         return SimpleNamespace(specification=SimpleNamespace(controls=self.controls))
 
-    def _list_active_limits(self, positions: Array, velocity: Any, L_B: Any) -> str:
+    def _list_active_limits(self, positions: Array, velocity: Any, L_B: Any, after: Any) -> str:
         self.momenta.append(L_B)
         return f"limits at {velocity}"
 

@@ -240,7 +240,7 @@ def test_shapes_beyond_the_ends_of_joints_are_clipped_once_more(model: Manoeuvre
 
 def test_efforts_stretch_a_path_too(model: ManoeuvreModel) -> None:
     class Efforts:
-        def excess(self, positions: Array, before: object, L_B: object) -> float:
+        def excess(self, positions: Array, before: object, L_B: object, after: object) -> float:
             return 46.0 / (len(positions) - 1)
 
     limited: Any = replace(model, efforts=Efforts())  # type: ignore[arg-type]

@@ -174,7 +174,8 @@ def planned(velocity: list[float], previous: object = None, **options: Any) -> A
     limits = SimpleNamespace(velocity=np.array([0.5, 1.0, 2.0]))
     never: Any = None
     plan_in_motion: Any = OptimalGait._plan_in_motion
-    schedule = plan_in_motion(made, request, motion, never, limits, never)
+    boundary = SimpleNamespace(final_velocity=0.0)
+    schedule = plan_in_motion(made, request, motion, boundary, limits, never)
     assert schedule[3] == {"starts": 4.0, "durations": [5.0, 6.0]}
     ((_, _, quaternion, intervals, budget, given, _),) = asked
     assert quaternion is STATE.quaternion

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from support.wheels import wheeled_robot
 
 from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.model import SpaceRobot
@@ -515,3 +516,18 @@ def test_names_and_lengths() -> None:
     require_frame("base", "base")
     with pytest.raises(CommandError, match="in frame 'world'"):
         require_frame("world", "base")
+
+
+def test_wheels_keep_their_rates_where_commands_end_until_a_reset() -> None:
+    robot = wheeled_robot()
+    rig = Rig(robot, time_mode="realtime", command_timeout=0.5, tick_rate=20.0)
+    spin = [30.0, -20.0, 0.3, 10.0]
+    assert rig.offer(0, 0, np.array(spin)) is None
+    rig.plant.step(*rig.commands.begin_step())
+    assert rig.commands.drop_old(SECOND)
+    rig.plant.step(*rig.commands.begin_step())
+    np.testing.assert_allclose(rig.plant.qdot, [30.0, -20.0, 0.0, 10.0], err_msg="the elbow rests")
+    rig.commands.latch("abort", "somebody aborted", SECOND)
+    assert rig.in_force() == [30.0, -20.0, 0.0, 10.0]
+    rig.commands.reset(SECOND)
+    assert rig.in_force() == [0.0] * 4

@@ -510,7 +510,7 @@ class PlantNode(FlightNode):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.plant.reset()
-        self._commands.begin(self.time_ns)
+        self._commands.reset(self.time_ns)
         assert self._monitor is not None
         self._monitor.resets += 1
         response.success = True

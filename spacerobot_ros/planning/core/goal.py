@@ -403,6 +403,9 @@ class RobotState:
         (n,) joint positions, m or rad.
     linear_momentum, angular_momentum
         (3,) each in W, the second about the centre of mass of the system; kg m/s and kg m^2/s.
+    qdot
+        (n,) joint velocities, m/s or rad/s; None: zero. Plans from rest read those of reaction
+        wheels, which spin while the other joints rest.
     """
 
     position: Array
@@ -410,6 +413,7 @@ class RobotState:
     q: Array
     linear_momentum: Array = field(default_factory=lambda: np.zeros(3))
     angular_momentum: Array = field(default_factory=lambda: np.zeros(3))
+    qdot: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -45,35 +45,48 @@ class JointEfforts:
         self._robot = robot
 
     def shares(
-        self, positions: Array, velocity: Array | float = 0.0, L_B: Array | None = None
+        self,
+        positions: Array,
+        velocity: Array | float = 0.0,
+        L_B: Array | None = None,
+        after: Array | float = 0.0,
     ) -> Array:
         """Return the efforts of held commands over their limits (N + 1, n), at the ticks.
 
-        ``positions`` (N + 1, n) are the shapes at the ticks, at rest after; ``velocity`` (n,) is
-        held before. ``L_B`` (N + 1, 3) is the angular momentum about the centre of mass in the
-        base, kg m^2/s; None: zero.
+        ``positions`` (N + 1, n) are the shapes at the ticks; the velocities ``velocity`` and
+        ``after`` (n,) are held before and after. ``L_B`` (N + 1, 3) is the angular momentum about
+        the centre of mass in the base, kg m^2/s; None: zero.
         """
-        return self._effort_shares(positions, *self._rates(positions, velocity), L_B)
+        return self._effort_shares(positions, *self._rates(positions, velocity, after), L_B)
 
     def excess(
-        self, positions: Array, velocity: Array | float = 0.0, L_B: Array | None = None
+        self,
+        positions: Array,
+        velocity: Array | float = 0.0,
+        L_B: Array | None = None,
+        after: Array | float = 0.0,
     ) -> float:
         """Return the factor by which held commands must be slower; at most 1: they need not be.
 
         Arguments are those of :meth:`shares`. Of a robot that drifts it is an estimate, as its
         efforts are not quadratic in the speed.
         """
-        return math.sqrt(float(np.abs(self.shares(positions, velocity, L_B)).max(initial=0.0)))
+        shares = self.shares(positions, velocity, L_B, after)
+        return math.sqrt(float(np.abs(shares).max(initial=0.0)))
 
     def beyond_limits(
-        self, positions: Array, velocity: Array | float = 0.0, L_B: Array | None = None
+        self,
+        positions: Array,
+        velocity: Array | float = 0.0,
+        L_B: Array | None = None,
+        after: Array | float = 0.0,
     ) -> str:
         """Return the clause that says which joints take more than their limits; empty: none.
 
         Arguments are those of :meth:`shares`. Of many ticks, those are compared at which the joints
         accelerate most, and some in between.
         """
-        rates, changes = self._rates(positions, velocity)
+        rates, changes = self._rates(positions, velocity, after)
         if len(positions) > _MAX_CHECKED_TICKS:
             scale = np.maximum(np.abs(changes).max(axis=0), np.finfo(float).tiny)
             most = np.argsort(-np.abs(changes / scale).max(axis=1))[: _MAX_CHECKED_TICKS // 2]
@@ -92,12 +105,14 @@ class JointEfforts:
                 )
         return ", ".join(clauses)
 
-    def _rates(self, positions: Array, velocity: Array | float) -> tuple[Array, Array]:
+    def _rates(
+        self, positions: Array, velocity: Array | float, after: Array | float
+    ) -> tuple[Array, Array]:
         """Return the joint rates and their changes a second (N + 1, n) at the ticks."""
         rates = np.diff(positions, axis=0) / self._period
-        before = np.vstack([np.broadcast_to(velocity, (1, positions.shape[1])), rates])
-        after = np.vstack([rates, np.zeros((1, positions.shape[1]))])
-        return (before + after) / 2, (after - before) / self._period
+        first, last = (np.broadcast_to(x, (1, positions.shape[1])) for x in (velocity, after))
+        held, next_held = np.vstack([first, rates]), np.vstack([rates, last])
+        return (held + next_held) / 2, (next_held - held) / self._period
 
     def _effort_shares(
         self,

@@ -14,6 +14,7 @@ from spacerobot_ros.errors import GoalError, PlanningError, Proof, UnreachableEr
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, RobotState, Tolerance
@@ -23,6 +24,9 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 
 _REST_MOMENTUM = 1e-9
 """Momenta per mass below this count as zero, m/s and m^2/s."""
+
+_REST_SHARE = 1e-9
+"""Share of the largest rates of wheels below which they rest."""
 
 END_EFFECTOR_METHOD = "optimal"
 """Name of the method that plans for goals of end-effectors."""
@@ -217,11 +221,13 @@ class GaitMethod(ABC):
         is_clear: bool = False,
         velocity: Array | float = 0.0,
         L_B: Array | None = None,
+        end_velocities: Array | None = None,
     ) -> GaitSchedule:
         """Return shapes (N + 1, n) at the ticks as a schedule of this method.
 
-        ``velocity`` (n,) is held before. Of efforts beyond the limits of the URDF there is a note;
-        ``L_B`` (N + 1, 3) is the angular momentum in the base for them (:class:`JointEfforts`).
+        ``velocity`` and ``end_velocities`` (n,) are held before and after. Of efforts beyond the
+        limits of the URDF there is a note; ``L_B`` (N + 1, 3) is the angular momentum in the base
+        for them (:class:`JointEfforts`).
 
         Raises
         ------
@@ -236,7 +242,8 @@ class GaitMethod(ABC):
             start = RobotState(path.position[0], path.quaternion[0], positions[0])
             self._require_clear(positions, self._base_poses(start, positions))
         if self._joint_efforts is not None:
-            beyond = self._joint_efforts.beyond_limits(positions, velocity, L_B)
+            after = 0.0 if end_velocities is None else end_velocities
+            beyond = self._joint_efforts.beyond_limits(positions, velocity, L_B, after)
             notes = {**notes, BEYOND_EFFORT_LIMITS: beyond} if beyond else notes
         return GaitSchedule(
             method=self.name,
@@ -250,6 +257,7 @@ class GaitMethod(ABC):
             remaining=remaining,
             controls=self.controls,
             progress=progress,
+            end_velocities=end_velocities,
         )
 
     def _goal_shape(self, goal: Goal) -> Array | None:
@@ -369,6 +377,14 @@ class GaitMethod(ABC):
                 "The robot drifts: its total momentum is not zero "
                 f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), and {self.name} plans for zero momentum; "
                 "shape changes cannot remove it, and optimal plans for robots that drift."
+            )
+        wheels = ReactionWheels.of(self.robot.description)
+        if state.qdot is not None and np.any(
+            np.abs(state.qdot[wheels.index]) > _REST_SHARE * wheels.rate
+        ):
+            raise PlanningError(
+                f"Reaction wheels spin, and {self.name} begins with all joints at rest; optimal "
+                "plans from spinning wheels."
             )
 
     def significant(self, momentum: Array) -> Array:

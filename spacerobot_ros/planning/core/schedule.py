@@ -52,6 +52,9 @@ class GaitSchedule:
         s.
     positions
         (N + 1, n) shape at the ticks 0..N, m or rad.
+    end_velocities
+        (n,) joint velocities that are held from the end on, m/s or rad/s: reaction wheels that
+        have taken up momentum spin on. None: all joints rest.
     path
         Predicted base path at instants of the method's choice, the first and the last included.
     goal
@@ -81,6 +84,7 @@ class GaitSchedule:
     remaining: float = 0.0
     controls: frozenset[Controlled] = POSE
     progress: object = None
+    end_velocities: Array | None = None
 
     def __repr__(self) -> str:
         error = PoseError.between(self.path.position[-1], self.path.quaternion[-1], self.goal)

@@ -603,6 +603,7 @@ class Executive:
             self._end_teleoperation(Event.PLANT_RESET, "The plant was reset: the joints rest.")
         # The held shape and the schedule belong to the time before the reset.
         self._tracker.stop()
+        self._tracker.forget_wheels()
         if self._active_goal is not None:
             self._active_goal.next_plan = PlanReason.REPLAN
         if self.phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
@@ -659,7 +660,9 @@ class Executive:
         if self._teleoperation is not None:
             self._follow_twist(self._teleoperation, measured)
         elif not tracker.is_active:
-            tracker.hold(q, obeyed=not self.plant_rests)
+            base = measured.base() if tracker.needs_wheel_rates else None
+            qdot = None if base is None else base.qdot
+            tracker.hold(q, qdot, obeyed=not self.plant_rests)
         self._command_count += 1
         return tracker.setpoint
 

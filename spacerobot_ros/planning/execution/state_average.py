@@ -14,6 +14,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_rotvec,
     quaternion_multiply,
 )
+from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.goal import RobotState
 
 _REST_RATE = 1e-9
@@ -64,6 +65,8 @@ class StateAverage:
 
     def __init__(self, robot: SpaceRobot, count: int = 1, rest_tolerance: float = 0.0) -> None:
         self._robot, self._full_count, self._tolerance = robot, count, rest_tolerance
+        wheels = ReactionWheels.of(robot.description)
+        self._wheels, self._braked = wheels.index, wheels.other
         self._poses: list[Array] = []
         self._rates: list[Array] = []
         self._shapes: list[Array] = []
@@ -116,12 +119,14 @@ class StateAverage:
             quaternion = quaternion_multiply(first, quaternion_from_rotvec(turn))
         twist, qdot = rates[:6], rates[6:]
         momenta = self._momenta
-        at_rest = np.abs(qdot).max(initial=0.0) <= max(_REST_RATE, self._tolerance)
+        # Wheels spin on at rest.
+        at_rest = np.abs(qdot[self._braked]).max(initial=0.0) <= max(_REST_RATE, self._tolerance)
         if at_rest or momenta is None:
-            if at_rest and self._tolerance and np.abs(twist).max() <= self._tolerance:
+            noise = np.abs(np.concatenate([twist, qdot[self._wheels]])).max() <= self._tolerance
+            if at_rest and self._tolerance and noise:
                 momenta = np.zeros(3), np.zeros(3)
             else:
                 momenta = self._robot.momentum(quaternion, q, twist[:3], twist[3:], qdot)[:2]
         if at_rest:
             self._momenta = momenta
-        return RobotState(poses[:, :3].mean(axis=0), quaternion, q, *momenta)
+        return RobotState(poses[:, :3].mean(axis=0), quaternion, q, *momenta, qdot)

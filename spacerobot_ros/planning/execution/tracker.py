@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -86,9 +87,13 @@ class ScheduleFollower:
         self._end_ns = start_ns + self._last_tick * self._period_ns
         self._gain = min(shape_gain, 1.0 / schedule.control_period)
         self._positions = schedule.positions
-        # The joints rest after the last tick. The part of the feedback known beforehand is added
-        # here: qdot = qdot_k + gain (q_k - q), and q alone is measured.
-        velocities = np.vstack([schedule.velocities, np.zeros(len(schedule.joint_names))])
+        # The joints rest after the last tick, and wheels keep their rates. The part of the
+        # feedback known beforehand is added here: qdot = qdot_k + gain (q_k - q), and q alone is
+        # measured.
+        self._after = np.zeros(len(schedule.joint_names))
+        if schedule.end_velocities is not None:
+            self._after = schedule.end_velocities
+        velocities = np.vstack([schedule.velocities, self._after])
         self._feedforward = velocities + self._gain * self._positions
         self._velocities, self._deadband = velocities, deadband
 
@@ -97,7 +102,8 @@ class ScheduleFollower:
         late = stamp_ns - self._end_ns
         if late < 0:
             return False
-        far = np.abs(self._positions[-1] - q).max(initial=0.0) > max(_END_TOLERANCE, self._deadband)
+        last = self._positions[-1] + late / SECOND * self._after
+        far = np.abs(last - q).max(initial=0.0) > max(_END_TOLERANCE, self._deadband)
         return not far or late > _MAX_SETTLING_TIME * SECOND
 
     def is_overdue(self, stamp_ns: int) -> bool:
@@ -128,6 +134,9 @@ class ScheduleFollower:
         k = (stamp_ns - self._start_ns) // self._period_ns
         k = 0 if k < 0 else min(k, self._last_tick)
         position[:] = self._positions[k]
+        late = stamp_ns - self._end_ns
+        if late > 0:
+            position += late / SECOND * self._after
         if self._deadband:
             error = position - q
             error -= np.clip(error, -self._deadband, self._deadband)
@@ -135,6 +144,8 @@ class ScheduleFollower:
             return
         np.multiply(q, -self._gain, out=velocity)
         velocity += self._feedforward[k]
+        if late > 0:
+            velocity += self._gain * (late / SECOND) * self._after
 
 
 class BrakingFollower:
@@ -227,6 +238,9 @@ class TrajectoryTracker:
         self._follower: ScheduleFollower | BrakingFollower | None = None
         self._holds_position = False
         """Whether the position of the setpoint is the shape to hold."""
+        self._wheels = ReactionWheels.of(robot.description).index
+        self._spins = False
+        """Whether the velocities of wheels in the setpoint are those to keep."""
         self.use_robot(robot)
         band = 2 * config.shape_deadband
         self._stuck_watch = StuckJointWatch(
@@ -317,6 +331,8 @@ class TrajectoryTracker:
         """Stop tracking; hold the schedule's last shape, or the next measured shape."""
         if at_last_shape and isinstance(self._follower, ScheduleFollower):
             self.setpoint.position[:] = self._follower.schedule.positions[-1]
+            if self._follower.schedule.end_velocities is not None:
+                self.setpoint.velocity[:] = self._follower.schedule.end_velocities
             self._holds_position = True
         else:
             self._holds_position = False
@@ -338,6 +354,7 @@ class TrajectoryTracker:
         if not math.isfinite(velocity.dot(velocity)):
             velocity[:] = 0.0
             return []
+        self._spins = True
         if self.stuck:
             velocity[self.stuck] = 0.0
         if not obeyed:
@@ -356,14 +373,31 @@ class TrajectoryTracker:
         setpoint.velocity[:] = velocity
         self._holds_position = True
 
-    def hold(self, q: Array, *, obeyed: bool = True) -> None:
-        """Write the setpoint that keeps the shape without a schedule."""
+    @property
+    def needs_wheel_rates(self) -> bool:
+        """Whether :meth:`hold` needs measured rates: there are wheels, and none were commanded."""
+        return bool(len(self._wheels)) and not self._spins
+
+    def forget_wheels(self) -> None:
+        """Keep the measured rates of wheels next, and not those that were commanded."""
+        self._spins = False
+
+    def hold(self, q: Array, qdot: Array | None = None, *, obeyed: bool = True) -> None:
+        """Write the setpoint that keeps the shape without a schedule.
+
+        Reaction wheels keep their last commanded rates, or at first the measured ones, of ``qdot``
+        (n,): braking them would turn the base.
+        """
         # The reference of a controller must not follow the measured shape; for a plant, rest is any
         # shape. Motions while no command is in force are not undone afterwards.
         if self._commands_plant or not self._holds_position or not obeyed:
             if math.isfinite(q.dot(q)):
                 self.setpoint.position[:] = q
+            kept = self.setpoint.velocity[self._wheels]
+            if not self._spins and qdot is not None and np.all(np.isfinite(qdot)):
+                kept, self._spins = qdot[self._wheels], True
             self.setpoint.velocity[:] = 0.0
+            self.setpoint.velocity[self._wheels] = kept
             self._holds_position = True
 
 

@@ -105,7 +105,9 @@ class RemainingJointsGait(GaitMethod):
         names, previous = self._methods_to_try(request.previous)
         inner = replace(
             request,
-            state=replace(state, q=state.q[moving]),
+            state=replace(
+                state, q=state.q[moving], qdot=None if state.qdot is None else state.qdot[moving]
+            ),
             goal=replace(request.goal, joint_positions=None if shape is None else shape[moving]),
             previous=previous,
         )
@@ -127,8 +129,13 @@ class RemainingJointsGait(GaitMethod):
                 self._require_stuck_at(state, shape, request.tolerance.shape)
             positions = np.tile(state.q, (len(schedule.positions), 1))
             positions[:, moving] = schedule.positions
+            end = None
+            if schedule.end_velocities is not None:
+                end = np.zeros(self.robot.n)
+                end[moving] = schedule.end_velocities
             return replace(
                 schedule,
+                end_velocities=end,
                 joint_names=self.robot.joint_names,
                 positions=positions,
                 goal=request.goal,

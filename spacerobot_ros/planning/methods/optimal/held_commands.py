@@ -157,22 +157,24 @@ class CommandHolder:
         limits: MotionLimits,
         *,
         fixed: bool = False,
-        before: Array | float = 0.0,
+        before: Array | float | None = None,
     ) -> HeldCommands | None:
         """Return the commands of a trajectory that end in the shape and attitude of the goal.
 
         They take the trajectory's time, rounded up to ticks, or as much longer as it takes to keep
         the limits (``fixed``: not longer); None where that is not found. Where the boundary
         conditions leave the last shape free, it is the trajectory's, or one near to it. ``before``
-        are the velocities (n,) that are held until then.
+        are the velocities (n,) that are held until then; None: those of the boundary conditions.
         """
-        final = boundary.final
-        if final is None:
-            final = np.clip(trajectory.shapes[-1], limits.lower, limits.upper)
+        before = boundary.velocity if before is None else before
+        final = np.clip(trajectory.shapes[-1], limits.lower, limits.upper)
+        if boundary.final is not None:
+            final = np.where(np.isfinite(boundary.final), boundary.final, final)
         if boundary.center is not None:
-            final = nearest_shape_for_center(self._robot, limits, final, boundary.center)
-        if final is None:
-            return None
+            nearest = nearest_shape_for_center(self._robot, limits, final, boundary.center)
+            if nearest is None:
+                return None
+            final = nearest
         ticks = max(1, math.ceil(trajectory.duration / self._period - _TICK_ROUNDING))
         most = (
             ticks if fixed else max(_MIN_SMOOTH_TICKS, math.ceil(_MAX_STRETCH_FACTOR * ticks) + 4)
@@ -188,14 +190,15 @@ class CommandHolder:
                 held = self._adjust_to_goal(positions, boundary, final, limits, moves_end=moves_end)
                 if held is None:
                     continue
-                needed, overrun = limits.excess(held.positions, self._period, before)
+                after = boundary.final_velocity
+                needed, overrun = limits.excess(held.positions, self._period, before, after)
                 if overrun > _LIMIT_ROUNDING:
                     held = self._adjust_to_goal(
                         positions, boundary, final, limits, moves_end=moves_end, clipped=True
                     )
                     if held is None:
                         continue
-                    needed, overrun = limits.excess(held.positions, self._period, before)
+                    needed, overrun = limits.excess(held.positions, self._period, before, after)
                 too_fast = needed > 1 + _LIMIT_ROUNDING
                 needed = max(needed, self._effort_excess(held, boundary, before))
                 if overrun <= _LIMIT_ROUNDING:
@@ -230,7 +233,7 @@ class CommandHolder:
         if self._efforts is None:
             return 0.0
         L_B = boundary.momenta_in_base(held.quaternions)
-        return self._efforts.excess(held.positions, before, L_B)
+        return self._efforts.excess(held.positions, before, L_B, boundary.final_velocity)
 
     def _fit_to_limits(
         self,
@@ -251,7 +254,14 @@ class CommandHolder:
             error, *by_end = self._end_error(positions, quaternions, boundary)
             rows = self._end_rows(positions, quaternions, boundary, *by_end)
             change = least_change(
-                positions, rows, error, limits, self._period, before, moves_end=moves_end
+                positions,
+                rows,
+                error,
+                limits,
+                self._period,
+                before,
+                boundary.final_velocity,
+                moves_end=moves_end,
             )
             if change is None:
                 return None
@@ -263,7 +273,8 @@ class CommandHolder:
         held = self._adjust_to_goal(positions, boundary, positions[-1], limits, moves_end=moves_end)
         if held is None:
             return None
-        needed, overrun = limits.excess(held.positions, self._period, before)
+        after = boundary.final_velocity
+        needed, overrun = limits.excess(held.positions, self._period, before, after)
         needed = max(needed, self._effort_excess(held, boundary, before))
         return held if max(needed - 1, overrun) <= _LIMIT_ROUNDING else None
 
@@ -502,6 +513,7 @@ def least_change(
     limits: MotionLimits,
     period: float,
     before: Array | float,
+    after: Array | float = 0.0,
     *,
     moves_end: bool,
 ) -> Array | None:
@@ -517,8 +529,8 @@ def least_change(
         Limits of the joints.
     period
         Between ticks, s.
-    before
-        (n,) velocities that are held until the start; after the end, the joints rest.
+    before, after
+        (n,) velocities that are held until the start, and from the end on.
     moves_end
         Whether the last shape may change.
 
@@ -553,7 +565,7 @@ def least_change(
     )
     rates = np.diff(positions, axis=0) / period
     ends = np.zeros((2, n))
-    ends[0] = before
+    ends[0], ends[1] = before, after
     changes = np.diff(np.vstack([ends[:1], rates, ends[1:]]), axis=0) / period
     shares = np.concatenate(
         [(rates / limits.velocity).ravel(), (changes / limits.acceleration).ravel()]

@@ -31,9 +31,13 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     attitude_error,
     matrices_from_quaternions,
+    matrix_from_quaternion,
+    quaternion_inverse,
     quaternion_multiply,
     quaternions_from_rotvecs,
+    rotvecs_from_quaternions,
 )
+from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -53,6 +57,12 @@ _MAX_RANGE_SHARE = 0.85
 
 _MAX_COASTING_SHARE = 0.6
 """Largest share of a guess in which the joints rest first while the base drifts."""
+
+_LEAST_TURN_TIME, _TURN_STRETCHES = 0.5, tuple(1.15**k for k in range(16))
+"""Shortest guess with reaction wheels, s, and the factors by which others are longer."""
+
+_TURNED_GUESSES = 3
+"""Number of guesses with reaction wheels along one path of the other joints."""
 
 _BRAKING_TIME_FACTOR = 4.0
 """A joint that moves at the start is back on the way of its guess after this many times the time
@@ -117,6 +127,113 @@ class InitialGuesses:
             # The cosine of half the remaining angle.
             near = np.abs([each.quaternions[-1] @ turn for each in candidates])
             yield candidates[int(near.argmax())]
+
+    def generate_with_wheels(
+        self,
+        wheels: ReactionWheels,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        robot: SpaceRobot,
+    ) -> Iterator[Trajectory]:
+        """Yield guesses in which reaction wheels turn the base to its goal.
+
+        The base turns about a fixed axis, one way or the other, from its present rate to rest; the
+        other joints go to their last shape, later with loops on the way; and the wheels have the
+        rates that momentum asks for.
+        """
+        direct = self._direct_path(boundary.start, boundary.likely)
+        loops = self.generate(boundary, limits, boundary.likely)
+        for number in itertools.count():
+            shapes = next(loops).shapes if number else direct
+            found = self._turned_by_wheels(wheels, boundary, limits, robot, shapes)
+            yield from (trajectory for _, trajectory in found[:_TURNED_GUESSES])
+
+    def _turned_by_wheels(
+        self,
+        wheels: ReactionWheels,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        robot: SpaceRobot,
+        shapes: Array,
+    ) -> list[tuple[float, Trajectory]]:
+        """Return guesses along shapes (N + 1, n) in which wheels turn the base, with their largest
+        shares of limits, at least one: the least share, then the shortest first.
+
+        Were the wheels to change their rates steadily, the base would be stopped, but at another
+        attitude. So it turns from where that leads forwards to where it leads backwards from the
+        goal, one way or the other, and wheels have the rates that this asks for. Durations are
+        tried one after the other: in a longer one, a base that turns only turns farther.
+        """
+        s = self._instants[:, np.newaxis]
+        index, other = wheels.index, wheels.other
+        ends = boundary.velocity, boundary.final_velocity
+        first, last = (np.broadcast_to(each, robot.n)[index] for each in ends)
+        D, D_q = (
+            each.full().reshape(3, len(shapes), -1).transpose(1, 0, 2)
+            for each in robot.function("locked_inertia", compile=False)(shapes.T)
+        )
+        by_instant = np.gradient(shapes[:, other], self._instants, axis=0, edge_order=2)
+        by_instant[0] = by_instant[-1] = 0.0
+        steady = np.zeros_like(shapes)
+        steady[:, index] = first + s * (last - first)
+        to_wheels = np.linalg.pinv(wheels.axes_B * wheels.inertia).T
+        fastest = np.abs(last - first) / limits.acceleration[index] / _MAX_RANGE_SHARE
+        found = []
+        for factor, turns in itertools.product(_TURN_STRETCHES, (0, -1, 1)):
+            step = factor * max(float(fastest.max()), _LEAST_TURN_TIME) / (len(s) - 1)
+            velocities = steady.copy()
+            velocities[:, other] = by_instant / (step * (len(s) - 1))
+            quaternions = self._blended_attitudes(boundary, shapes, velocities, step, turns)
+            w = _rates_between(quaternions, step)
+            L_B = boundary.angular_momentum @ matrices_from_quaternions(quaternions)
+            left = L_B - np.einsum("kij,kj->ki", D, w) - np.einsum("kij,kj->ki", D_q, velocities)
+            velocities[1:-1, index] += (left @ to_wheels)[1:-1]
+            speed = np.abs(velocities / limits.velocity).max()
+            change = np.abs(np.diff(velocities, axis=0) / step / limits.acceleration).max()
+            means = (velocities[1:, index] + velocities[:-1, index]) / 2
+            guess = shapes.copy()
+            guess[1:, index] = guess[0, index] + step * np.cumsum(means, axis=0)
+            share = max(1.0, float(speed), float(change))
+            found.append((share, Trajectory(step, guess, velocities, quaternions)))
+        return sorted(found, key=lambda each: (each[0], each[1].step))
+
+    def _blended_attitudes(
+        self,
+        boundary: BoundaryConditions,
+        shapes: Array,
+        velocities: Array,
+        step: float,
+        turns: int,
+    ) -> Array:
+        """Return attitudes (N + 1, 4) between those to which a motion leads forwards from the
+        start, and backwards from the goal.
+        """
+        forwards = np.tile([0.0, 0.0, 0.0, 1.0], (len(shapes), 1))
+        backwards = forwards.copy()
+        if self._angular_momentum is not None:
+            u, L_0 = step * velocities, self._angular_momentum
+            parts = shapes[:-1], u[:-1], u[1:]
+            forwards = self._integrate_drift(*parts, np.asarray(step), L_0)
+            L_f = L_0 @ matrix_from_quaternion(boundary.turn)
+            parts = shapes[:0:-1], -u[:0:-1], -u[-2::-1]
+            backwards = self._integrate_drift(*parts, np.asarray(step), -L_f)[::-1]
+        backwards = quaternion_multiply(boundary.turn, backwards)
+        between = rotvecs_from_quaternions(
+            quaternion_multiply(quaternion_inverse(forwards), backwards)
+        )
+        # Without jumps by a whole turn.
+        for k in range(1, len(between)):
+            angle = float(np.linalg.norm(between[k]))
+            if angle > 0:
+                axis = between[k] / angle
+                whole = round(float(axis @ (between[k - 1] - between[k])) / (2 * math.pi))
+                between[k] += 2 * math.pi * whole * axis
+        angles = np.linalg.norm(between, axis=1, keepdims=True)
+        axes = np.where(angles > 0, between / np.maximum(angles, 1e-300), [0.0, 0.0, 1.0])
+        s = self._instants[:, np.newaxis]
+        late = s**3 * (10 - 15 * s + 6 * s**2)
+        added = late * (between + 2 * math.pi * turns * axes)
+        return np.asarray(quaternion_multiply(forwards, quaternions_from_rotvecs(added)))
 
     def _loops_after_coasting(self, shapes: Array, rng: np.random.Generator) -> Array:
         """Return paths (K, N + 1, n) that begin later: meanwhile the base drifts on."""
@@ -247,6 +364,17 @@ class InitialGuesses:
         shapes = np.clip(shapes, limits.lower, limits.upper)
         quaternions = self._integrate_attitudes(shapes, guess.step * velocities, guess.step)
         return Trajectory(guess.step, shapes, velocities, quaternions)
+
+
+def _rates_between(quaternions: Array, step: float) -> Array:
+    """Return the angular velocity (N + 1, 3), base components, at attitudes (N + 1, 4) that are a
+    step, s, apart.
+    """
+    turns = rotvecs_from_quaternions(
+        quaternion_multiply(quaternion_inverse(quaternions[:-1]), quaternions[1:])
+    )
+    rates = np.vstack([turns[:1], (turns[:-1] + turns[1:]) / 2, turns[-1:]]) / step
+    return np.asarray(rates)
 
 
 def _interpolate(instants: Array, known: Array, values: Array) -> Array:

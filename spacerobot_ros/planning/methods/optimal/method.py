@@ -21,7 +21,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import NotFoundError, PlanningError
+from spacerobot_ros.errors import NotFoundError, PlanningError, UnreachableError
 from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
@@ -33,9 +33,11 @@ from spacerobot_ros.model.rotations import (
     quaternion_inverse,
     quaternion_multiply,
 )
+from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import (
+    Controlled,
     Goal,
     PoseError,
     RobotState,
@@ -79,6 +81,9 @@ _MAX_CORRECTION_INTERVALS = 40
 
 _MAX_STARTS_IN_MOTION = 12
 """Largest number of guesses for a manoeuvre from moving joints: the robot flies on meanwhile."""
+
+_ZERO_RATE_SHARE = 1e-9
+"""Share of the largest rates of wheels below which all of them rest."""
 
 _ZERO_ERROR = 1e-10
 """Largest error that counts as zero: the robot is at the goal; rad, m and joint coordinates."""
@@ -207,6 +212,7 @@ class OptimalGait(GaitMethod):
             self._margin = per_joint(robot, "joint_margin", chosen.joint_margin, np.zeros(robot.n))
         self._constraints = PathConstraints.of(robot, chosen)
         self._efforts = LimitedEfforts.of(robot, chosen, self.control_period)
+        self._wheels = ReactionWheels.of(robot.description)
         self._model = ManoeuvreModel(
             robot,
             self._prediction,
@@ -282,19 +288,97 @@ class OptimalGait(GaitMethod):
         # Measured shapes may be a little beyond the joint limits.
         q = np.clip(request.state.q, self.robot.lower, self.robot.upper)
         goal = request.goal.for_robot(self.robot.description)
+        if goal.joint_positions is not None and len(goal.joint_positions) == self.robot.n:
+            # The angle of a wheel is no part of the shape.
+            shape = goal.joint_positions.copy()
+            shape[self._wheels.index] = q[self._wheels.index]
+            goal = replace(goal, joint_positions=shape)
         self._require_no_path(goal)
         state = replace(
             request.state,
             q=q,
             linear_momentum=self.significant(request.state.linear_momentum),
             angular_momentum=self.significant(request.state.angular_momentum),
+            qdot=self._wheel_rates(request.state.qdot),
         )
+        turns_on = len(self._wheels) > 0 and bool(state.angular_momentum.any())
+        if turns_on and goal.end_effectors and "attitude" not in goal.base:
+            # The rates of the wheels at the end depend on the attitude: a free one is the present.
+            base: frozenset[Controlled] = goal.base | {"attitude"}
+            goal = replace(goal, quaternion=state.quaternion, base=base)
         request = replace(request, state=state, goal=goal)
         if not state.linear_momentum.any():
             return self._plan_about_center(request, cancellation)
         schedule = self._plan_while_coasting(request, cancellation)
-        velocity = 0.0 if request.motion is None else request.motion.velocity
-        return self._build_schedule(state, goal, schedule.positions, {**schedule.notes}, velocity)
+        velocity: Array | float = self._wheel_rates(state.qdot)
+        if request.motion is not None:
+            velocity = request.motion.velocity
+        end = 0.0 if schedule.end_velocities is None else schedule.end_velocities
+        return self._build_schedule(
+            state, goal, schedule.positions, {**schedule.notes}, velocity, end
+        )
+
+    def _wheel_rates(self, qdot: Array | None) -> Array:
+        """Return velocities (n,) of the joints with those of wheels alone; none where they rest."""
+        rates, index = np.zeros(self.robot.n), self._wheels.index
+        if qdot is not None and np.any(np.abs(qdot[index]) > _ZERO_RATE_SHARE * self._wheels.rate):
+            rates[index] = qdot[index]
+        return rates
+
+    def _with_wheels(
+        self, boundary: BoundaryConditions, request: PlanRequest
+    ) -> BoundaryConditions:
+        """Return boundary conditions with the rates of reaction wheels at both ends.
+
+        The angle of a wheel is free at the end; its rate there is such that the wheels hold all of
+        the momentum, and the base rests.
+
+        Raises
+        ------
+        UnreachableError
+            The wheels cannot hold it.
+        PlanningError
+            The goal leaves the attitude open, on which the rates depend, or wheels are too fast.
+        """
+        wheels, n, state = self._wheels, self.robot.n, request.state
+        if not len(wheels):
+            return boundary
+        end, near = np.zeros(n), None
+        begin = self._wheel_rates(state.qdot)
+        if request.motion is None:
+            near = begin[wheels.index]
+        elif request.previous is not None and request.previous.end_velocities is not None:
+            near = request.previous.end_velocities[wheels.index]
+        limit = self._limits.velocity
+        fast = np.abs(begin) > limit * (1 + _LIMIT_ROUNDING)
+        if fast.any():
+            names = ", ".join(np.array(self.robot.joint_names)[fast])
+            raise PlanningError(f"Wheels turn faster than the velocity limits of optimal: {names}.")
+        begin = np.clip(begin, -limit, limit)
+        L_B = boundary.angular_momentum
+        if boundary.drifts:
+            axes = self._kind_of(request.goal).specification.axes
+            if not len(axes):
+                raise PlanningError(
+                    f"The robot has an angular momentum of {np.linalg.norm(L_B):.3g} kg m^2/s, "
+                    "which its wheels take up as its attitude at the end asks for: give the goal "
+                    "an attitude of the base (with optimal.base_attitude 1)."
+                )
+            L_B = matrix_from_quaternion(boundary.turn).T @ L_B
+        try:
+            end[wheels.index] = wheels.rates_for(L_B, near, limit[wheels.index])
+        except UnreachableError as clause:
+            raise UnreachableError(
+                f"The wheels cannot hold the angular momentum of {np.linalg.norm(L_B):.4g} kg "
+                f"m^2/s that the robot has at the attitude of the goal: {clause}. Without thrust "
+                "the momentum stays: dump it to thrusters, or choose another attitude.",
+                clause.proof,
+            ) from None
+        final = boundary.final
+        if final is not None:
+            final = final.copy()
+            final[wheels.index] = np.nan
+        return replace(boundary, velocity=begin, final_velocity=end, final=final)
 
     def _plan_while_coasting(
         self, request: PlanRequest, cancellation: Cancellation
@@ -375,14 +459,16 @@ class OptimalGait(GaitMethod):
         )
         L_0 = matrix_from_quaternion(state.quaternion).T @ state.angular_momentum
         boundary = replace(boundary, state=state, angular_momentum=L_0)
+        boundary = self._with_wheels(boundary, request)
         # A manoeuvre ends within the margin if its goal does.
         limits = self._limits.within(margin, q, boundary.likely)
         if request.motion is not None:
             return self._plan_in_motion(
                 request, request.motion, boundary, limits, cancellation, duration
             )
-        if self._is_reached(state, goal):
-            return self._build_schedule(state, goal, q[np.newaxis], {"starts": 0.0})
+        end = boundary.final_velocity
+        if self._is_reached(state, goal) and np.allclose(end, boundary.velocity, rtol=_ZERO_ERROR):
+            return self._build_schedule(state, goal, q[np.newaxis], {"starts": 0.0}, 0.0, end)
         attitude = state.quaternion[np.newaxis]
         try:
             self._constraints.check(q[np.newaxis], attitude, self.control_period)
@@ -398,17 +484,20 @@ class OptimalGait(GaitMethod):
             chosen = replace(chosen, duration=duration)
         searched = request, boundary, limits, chosen, cancellation
         # The clearance of a base that coasts on among obstacles is not checked.
-        if boundary.drifts and chosen.duration == 0 and not self._has_obstacles:
+        coasts = boundary.drifts and not len(self._wheels)
+        if coasts and chosen.duration == 0 and not self._has_obstacles:
             found = self._begin_now_or_coast(*searched)
         else:
             found = self._begin_now(*searched)
-        schedule = self._build_schedule(state, goal, found.positions, found.notes)
+        schedule = self._build_schedule(
+            state, goal, found.positions, found.notes, boundary.velocity, end
+        )
         # A result of a busy machine is not cached, as an idle machine finds a better one.
         if (
             self._cache is not None
             and key is not None
             and not found.manoeuvre.cut_short
-            and self._is_within_efforts(found.manoeuvre, boundary=boundary)
+            and self._is_within_efforts(found.manoeuvre, boundary.velocity, boundary)
         ):
             kept_plan = _CachedPlan(schedule.positions, found.notes)
             self._cache.store(archive_name(key), key, kept_plan.to_bytes())
@@ -442,10 +531,11 @@ class OptimalGait(GaitMethod):
                 cancellation,
                 library=guess or library,
                 # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
-                gentle=correction and not boundary.drifts,
+                gentle=correction and not boundary.is_timed,
                 max_failed_starts=max_failed_starts,
             ),
-            boundary=boundary,
+            boundary.velocity,
+            boundary,
         )
         notes: Notes = {
             "starts": float(found.starts),
@@ -616,7 +706,12 @@ class OptimalGait(GaitMethod):
         )
         notes: Notes = {"starts": float(found.starts), "durations": list(found.solutions)}
         return self._build_schedule(
-            request.state, request.goal, found.held.positions, notes, motion.velocity
+            request.state,
+            request.goal,
+            found.held.positions,
+            notes,
+            motion.velocity,
+            boundary.final_velocity,
         )
 
     def _within_efforts(
@@ -649,8 +744,12 @@ class OptimalGait(GaitMethod):
     ) -> bool:
         if self._efforts is None:
             return True
-        L_B = None if boundary is None else boundary.momenta_in_base(found.held.quaternions)
-        return self._efforts.excess(found.held.positions, velocity, L_B) <= 1 + _LIMIT_ROUNDING
+        L_B, after = None, np.zeros(self.robot.n)
+        if boundary is not None:
+            L_B = boundary.momenta_in_base(found.held.quaternions)
+            after[:] = boundary.final_velocity
+        excess = self._efforts.excess(found.held.positions, velocity, L_B, after)
+        return excess <= 1 + _LIMIT_ROUNDING
 
     def _count_intervals(self, correction: bool) -> int:
         intervals = self.options.intervals
@@ -668,7 +767,11 @@ class OptimalGait(GaitMethod):
         positions: Array,
         notes: Notes,
         velocity: Array | float = 0.0,
+        after: Array | float = 0.0,
     ) -> GaitSchedule:
+        """Return shapes (N + 1, n) at the ticks as a schedule; the velocities ``velocity`` and
+        ``after`` (n,) are held before and after.
+        """
         attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
         path = self._prediction.path(state, positions, attitudes)
         L_B = _momenta_in_base(state, attitudes)
@@ -691,25 +794,41 @@ class OptimalGait(GaitMethod):
             notes["predicted_end_effector_position_error"] = left.largest_end_effector_distance
             notes["predicted_end_effector_attitude_error"] = left.largest_end_effector_angle
         if L_B is not None:
-            momenta, rest = (state.linear_momentum, state.angular_momentum), np.zeros(self.robot.n)
-            _, omega = self.robot.base_twist(attitudes[-1], positions[-1], rest, *momenta)
+            momenta = state.linear_momentum, state.angular_momentum
+            kept = np.broadcast_to(after, self.robot.n).copy()
+            _, omega = self.robot.base_twist(attitudes[-1], positions[-1], kept, *momenta)
             notes["final_base_rate"] = omega.tolist()
-        notes["limited_by"] = self._list_active_limits(positions, velocity, L_B)
+        end_velocities = None
+        if np.any(after):
+            end_velocities = np.broadcast_to(after, self.robot.n).copy()
+            notes["final_wheel_rates"] = end_velocities[self._wheels.index].tolist()
+        notes["limited_by"] = self._list_active_limits(positions, velocity, L_B, after)
         schedule = self._schedule_of(
-            goal, positions, path, notes, is_clear=True, velocity=velocity, L_B=L_B
+            goal,
+            positions,
+            path,
+            notes,
+            is_clear=True,
+            velocity=velocity,
+            L_B=L_B,
+            end_velocities=end_velocities,
         )
         return replace(schedule, controls=controls)
 
     def _list_active_limits(
-        self, positions: Array, velocity: Array | float, L_B: Array | None = None
+        self,
+        positions: Array,
+        velocity: Array | float,
+        L_B: Array | None = None,
+        after: Array | float = 0.0,
     ) -> str:
         """Return the active limits of held commands, with the joints at each limit."""
         if len(positions) < 2:
             return "nothing"
-        speed, change = self._limits.shares(positions, self.control_period, velocity)
+        speed, change = self._limits.shares(positions, self.control_period, velocity, after)
         shares = {"velocity": speed, "acceleration": change}
         if self._efforts is not None:
-            shares["effort"] = np.abs(self._efforts.shares(positions, velocity, L_B))
+            shares["effort"] = np.abs(self._efforts.shares(positions, velocity, L_B, after))
         names = np.array(self.robot.joint_names)
         active = {
             limit: names[share.max(axis=0) > _ACTIVE_LIMIT_SHARE].tolist()
@@ -737,6 +856,8 @@ class OptimalGait(GaitMethod):
         momenta = np.concatenate([state.linear_momentum, state.angular_momentum])
         if momenta.any():
             numbers["momenta"] = momenta
+        if state.qdot is not None and np.any(state.qdot):
+            numbers["velocities"] = state.qdot
         if self._efforts is not None:
             numbers["effort"] = self._efforts.limit
         if self.clearance is not None:
@@ -765,7 +886,8 @@ class OptimalGait(GaitMethod):
             cache.discard(archive_name(key), str(reason))
             return None
         notes: Notes = {**plan.notes, "from_cache": 1.0}
-        return self._build_schedule(request.state, request.goal, plan.positions, notes)
+        ends = boundary.velocity, boundary.final_velocity
+        return self._build_schedule(request.state, request.goal, plan.positions, notes, *ends)
 
     def _require_valid_manoeuvre(
         self,
@@ -801,7 +923,7 @@ class OptimalGait(GaitMethod):
             raise UnusableCandidateError("it begins in another shape")
         if (
             boundary.final is not None
-            and np.abs(last - boundary.final).max() > _MAX_CACHED_END_ERROR
+            and np.nanmax(np.abs(last - boundary.final), initial=0.0) > _MAX_CACHED_END_ERROR
         ):
             raise UnusableCandidateError("it ends in another shape")
         if boundary.center is not None:
@@ -809,10 +931,11 @@ class OptimalGait(GaitMethod):
             if np.linalg.norm(beside) > _MAX_CACHED_END_ERROR:
                 raise UnusableCandidateError("it ends in another position")
         attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
-        factor, overrun = limits.excess(positions, period)
+        ends = boundary.velocity, boundary.final_velocity
+        factor, overrun = limits.excess(positions, period, *ends)
         if self._efforts is not None:
             L_B = _momenta_in_base(state, attitudes)
-            factor = max(factor, self._efforts.excess(positions, L_B=L_B))
+            factor = max(factor, self._efforts.excess(positions, ends[0], L_B, ends[1]))
         if factor > 1 + _LIMIT_ROUNDING or overrun > _LIMIT_ROUNDING:
             raise UnusableCandidateError("it exceeds a limit of the joints")
         kind = self._kind_of(request.goal)

@@ -184,9 +184,10 @@ class MultipleShooting:
         N, layout = self.intervals, self._program.layout
         vertices = np.array([np.tile(x, (N + 1, 1)) for x in (limits.lower, limits.upper)])
         if boundary.final is not None:
-            vertices[:, N] = boundary.final
+            given = np.isfinite(boundary.final)
+            vertices[:, N, given] = boundary.final[given]
         velocities = np.multiply.outer([-1.0, 1.0], np.tile(limits.velocity, (N + 1, 1)))
-        velocities[:, 0], velocities[:, N] = boundary.velocity, 0.0
+        velocities[:, 0], velocities[:, N] = boundary.velocity, boundary.final_velocity
         attitudes = np.multiply.outer([-1.0, 1.0], np.full((N + 1, 4), 1.1))
         attitudes[:, 0] = [0.0, 0.0, 0.0, 1.0]
         accelerations = np.multiply.outer([-1.0, 1.0], np.tile(limits.acceleration, (N, 1)))

@@ -13,6 +13,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot, symbolic_rotations
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_from_quaternion
+from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.resources import suggestion
@@ -182,7 +183,7 @@ class PossibleEnd:
 
 @dataclass(frozen=True)
 class BoundaryConditions:
-    """Both ends of a motion that ends at rest, seen from the attitude that it starts at.
+    """Both ends of a motion, seen from the attitude that it starts at.
 
     Attributes
     ----------
@@ -193,13 +194,15 @@ class BoundaryConditions:
     likely
         (n,) last shape for all that is known before the search.
     final
-        (n,) last shape; None: any.
+        (n,) last shape; None: any. That of a reaction wheel is not a number: any.
     center
         (3,) centre of mass of the system in the base at the end, m; None: anywhere.
     direction
         (3,) kept direction of the path constraints, in the starting base.
     velocity
         (n,) first velocities of the joints, m/s or rad/s; a number is that of all.
+    final_velocity
+        (n,) velocities that the joints keep from the end on, likewise.
     end_effectors
         (7 k,) goals of k links (:meth:`.EndEffectorRows.pack`).
     ends
@@ -217,6 +220,7 @@ class BoundaryConditions:
     center: Array | None = None
     direction: Array = field(default_factory=lambda: np.zeros(3))
     velocity: Array | float = 0.0
+    final_velocity: Array | float = 0.0
     end_effectors: Array = field(default_factory=lambda: np.zeros(0))
     ends: tuple[PossibleEnd, ...] = ()
     state: RobotState | None = None
@@ -226,6 +230,13 @@ class BoundaryConditions:
     def drifts(self) -> bool:
         """Whether the angular momentum is not zero."""
         return bool(self.angular_momentum.any())
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether the motion leads elsewhere where it takes longer: the robot drifts, or joints
+        move at an end.
+        """
+        return self.drifts or bool(np.any(self.velocity) or np.any(self.final_velocity))
 
     def momenta_in_base(self, quaternions: Array) -> Array | None:
         """Return the angular momentum (..., 3) in the base at turns (..., 4) since the start; None:
@@ -256,6 +267,9 @@ class MotionLimits:
     def of(cls, robot: SpaceRobot, options: MotionOptions, method: str = "optimal") -> MotionLimits:
         """Return the robot's own limits, narrowed by the options of a method.
 
+        Without ``max_acceleration``, reaction wheels accelerate as the torque of their motors has
+        them do while the base rests.
+
         Raises
         ------
         ParameterError
@@ -267,6 +281,8 @@ class MotionLimits:
             fastest = per_joint(robot, "max_velocity", options.max_velocity, velocity, method)
             velocity = np.minimum(velocity, fastest)
         acceleration = velocity / options.ramp_time
+        wheels = ReactionWheels.of(robot.description)
+        acceleration[wheels.index] = wheels.torque / wheels.inertia
         if options.max_acceleration:
             given = options.max_acceleration
             acceleration = per_joint(robot, "max_acceleration", given, acceleration, method)
@@ -309,29 +325,37 @@ class MotionLimits:
         return middle, np.minimum((upper - lower) / 2, _UNLIMITED_HALF_RANGE)
 
     def excess(
-        self, positions: Array, period: float, velocity: Array | float = 0.0
+        self,
+        positions: Array,
+        period: float,
+        velocity: Array | float = 0.0,
+        after: Array | float = 0.0,
     ) -> tuple[float, float]:
         """Return the factor by which held commands must be slower, and the largest overrun.
 
-        ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds, at rest after;
-        before, ``velocity`` (n,) is held. The factor is at most 1 where velocities and
-        accelerations keep their limits; the overrun is the farthest that a joint is beyond its
-        limits, m or rad.
+        ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds; the velocities
+        ``velocity`` and ``after`` (n,) are held before and after. The factor is at most 1 where
+        velocities and accelerations keep their limits; the overrun is the farthest that a joint is
+        beyond its limits, m or rad.
         """
-        speed, change = self.shares(positions, period, velocity)
+        speed, change = self.shares(positions, period, velocity, after)
         beyond = np.maximum(self.lower - positions, positions - self.upper)
         factor = max(float(speed.max(initial=0.0)), float(np.sqrt(change.max(initial=0.0))))
         return factor, float(beyond.max(initial=0.0))
 
     def shares(
-        self, positions: Array, period: float, velocity: Array | float = 0.0
+        self,
+        positions: Array,
+        period: float,
+        velocity: Array | float = 0.0,
+        after: Array | float = 0.0,
     ) -> tuple[Array, Array]:
         """Return velocities (N + 2, n) and accelerations (N + 1, n) as shares of their limits.
 
         Arguments are those of :meth:`excess`.
         """
         ends = np.zeros((2, positions.shape[1]))
-        ends[0] = velocity
+        ends[0], ends[1] = velocity, after
         rates = np.vstack([ends[:1], np.diff(positions, axis=0) / period, ends[1:]])
         change = np.abs(np.diff(rates, axis=0)) / period
         return np.abs(rates) / self.velocity, change / self.acceleration

@@ -27,6 +27,7 @@ from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
+from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.progress import SearchProgress, log_progress
@@ -114,6 +115,9 @@ solver leave as much between them."""
 _AGREEING_SOLUTIONS_WITH_LIBRARY = 2
 """Number of agreeing solutions that end a search with first guesses from a library."""
 
+_MAX_ITERATIONS_OF_STOPS = 120
+"""Steps of the solver from a guess in which wheels stop the base: most take twenty."""
+
 _MAX_FULL_GRID_STARTS = 3
 """Number of guesses on the full grid after a coarse grid without solutions."""
 
@@ -151,6 +155,10 @@ _ADDITIONAL_TICKS = (0, 1, 3, 7)
 
 _ADDITIONAL_TICKS_OF_DRIFT = (0, 0, 1, 3, 7)
 """Additional control periods where the robot drifts; the second time, the end is corrected."""
+
+
+_ADDITIONAL_SHARES_OF_STOPS = (0.03, 0.08)
+"""And shares of its duration where wheels stop the base: they use their torque all the time."""
 
 
 @dataclass(frozen=True)
@@ -281,6 +289,7 @@ class ManoeuvreSearch:
         self._end_effectors = model.end_effectors
         self._distances = model.distances
         self._begin = model.begin
+        self._wheels = ReactionWheels.of(model.robot.description)
         self._holder = CommandHolder(model)
         self._stages: dict[tuple[bool, bool, bool], Stages] = {}
         self._solvers: dict[tuple[int, bool, float, tuple[int, ...], bool], MultipleShooting] = {}
@@ -345,7 +354,13 @@ class ManoeuvreSearch:
         options = progress.options
         full = self._get_solver(progress, intervals)
         coarser = intervals // _COARSE_GRID_RATIO
-        # A single answer costs less without a coarse grid.
+        # A single answer costs less without a coarse grid, on which the attitude of a base that is
+        # to be stopped is too far off; guesses with wheels are near to solutions.
+        if len(self._wheels) and progress.boundary.is_timed:
+            iterations = min(options.iterations, _MAX_ITERATIONS_OF_STOPS)
+            brief = replace(options, answers=1, iterations=iterations)
+            progress.options = brief
+            return self._search_from_guesses(progress, full, full, options.starts)
         if options.answers > 1 and coarser >= _MIN_COARSE_INTERVALS:
             coarse = self._get_solver(progress, coarser, _COARSE_TOLERANCE)
             found = self._search_from_guesses(progress, coarse, full, options.starts)
@@ -518,6 +533,8 @@ class ManoeuvreSearch:
         guesses = _build_guesses(self._robot, grid, progress.boundary)
         boundary, limits = progress.boundary, progress.limits
         of_boundary = guesses.generate(boundary, limits, boundary.likely)
+        if len(self._wheels) and len(self._axes):
+            of_boundary = guesses.generate_with_wheels(self._wheels, boundary, limits, self._robot)
         if progress.library is not None:
             near = progress.library.nearest(boundary, limits)
             of_boundary = itertools.chain(
@@ -697,7 +714,7 @@ class ManoeuvreSearch:
         if trajectory is None:
             raise UnusableCandidateError(_NO_PATH_FOUND)
         fixed = progress.options.duration > 0
-        if progress.boundary.drifts:
+        if progress.boundary.is_timed:
             held = self._hold_in_whole_ticks(progress, trajectory)
         else:
             held = self._holder.hold(trajectory, progress.boundary, progress.limits, fixed=fixed)
@@ -717,9 +734,10 @@ class ManoeuvreSearch:
     def _hold_in_whole_ticks(
         self, progress: _Progress, trajectory: Trajectory
     ) -> HeldCommands | None:
-        """Return a solution of a robot that drifts as held commands; None where that fails.
+        """Return a solution whose duration matters as held commands; None where that fails.
 
-        Were it stretched to whole control periods, the base would turn on meanwhile. So the
+        Were it stretched to whole control periods, the base would turn on meanwhile, or the wheels
+        begin at other rates. So the
         trajectory of least effort in as many control periods, or a few more, is solved for.
         """
         boundary, limits, kept = progress.boundary, progress.limits, progress.kept
@@ -733,8 +751,11 @@ class ManoeuvreSearch:
         ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
         guess, aim = trajectory, boundary
         # In a given time there is no other than the first.
-        most = 2 if progress.options.duration > 0 else len(_ADDITIONAL_TICKS_OF_DRIFT)
-        for more in _ADDITIONAL_TICKS_OF_DRIFT[:most]:
+        additional = list(_ADDITIONAL_TICKS_OF_DRIFT)
+        if len(self._wheels):
+            additional += [math.ceil(share * ticks) for share in _ADDITIONAL_SHARES_OF_STOPS]
+        most = 2 if progress.options.duration > 0 else len(additional)
+        for more in additional[:most]:
             T = (ticks + more) * self._period
             guess = guess.stretched(T / guess.duration)
             stop = progress.stop_rule(found=False)

@@ -1,0 +1,191 @@
+"""Plans with reaction wheels: momentum stays in them, their bound refuses, they spin on after."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+from planning.drifting import END_ERROR, angle_between, flown_by_pinocchio, turn_rate_in_pinocchio
+from support.wheels import ARM, ELBOW, HULL, WHEELS, text, wheel, wheeled_robot
+
+from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import (
+    matrix_from_quaternion,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+    rotvec_from_quaternion,
+)
+from spacerobot_ros.model.wheels import ReactionWheels
+from spacerobot_ros.planning import Goal, RobotState, plan
+from spacerobot_ros.planning.core.goal import Tolerance
+from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.methods.registry import build_method
+
+THREE = text(HULL, *WHEELS[:2], ARM, ELBOW, WHEELS[2])
+SKEWED = text(HULL, *WHEELS, wheel("spin_d", '<origin rpy="-0.7 0.5 0.2"/>'), ARM, ELBOW)
+TWO = text(HULL, WHEELS[1], ARM, ELBOW, WHEELS[2])
+
+BASE_RATE = 1e-8
+"""Largest turn of a base that has come to rest, rad/s."""
+
+
+def wheels_of(urdf: str) -> ReactionWheels:
+    return ReactionWheels.of(SpaceRobot.from_urdf(urdf).description)
+
+
+def capacity(wheels: ReactionWheels, direction: Array) -> float:
+    """Return the largest angular momentum along a unit vector: the facets of the zonotope of all
+    momenta are spanned by pairs of axes.
+    """
+    spins = wheels.axes_B * wheels.inertia * wheels.rate
+    least = np.inf
+    for i, j in combinations(range(len(wheels)), 2):
+        normal = np.cross(spins[:, i], spins[:, j])
+        along = abs(float(normal @ direction))
+        if along > 0:
+            least = min(least, float(np.abs(normal @ spins).sum()) / along)
+    return least
+
+
+def case(urdf: str, seed: int, share: float) -> tuple[SpaceRobot, RobotState, Array, Array]:
+    """Return a robot, its state with a share of the momentum that wheels hold at the goal, the
+    goal attitude, and that share of the momentum in W.
+    """
+    robot, rng = SpaceRobot.from_urdf(urdf), np.random.default_rng(seed)
+    wheels = ReactionWheels.of(robot.description)
+    q = np.zeros(robot.n)
+    q[wheels.other] = rng.uniform(-0.5, 0.5, len(wheels.other))
+    begins, turn = rng.normal(size=(2, 3)) * [[1.0], [0.3]]
+    quaternion = quaternion_from_rotvec(begins)
+    goal = quaternion_multiply(quaternion, quaternion_from_rotvec(turn))
+    # Of two wheels, in the plane of their axes.
+    stored = wheels.axes_B * wheels.inertia
+    direction = stored @ rng.normal(size=len(wheels)) if len(wheels) < 3 else rng.normal(size=3)
+    direction = direction / np.linalg.norm(direction)
+    if len(wheels) < 3:
+        shares = np.linalg.lstsq(stored * wheels.rate, direction, rcond=None)[0]
+        L_B = share / np.abs(shares).max() * direction
+    else:
+        L_B = share * capacity(wheels, direction) * direction
+    L_W = matrix_from_quaternion(goal) @ L_B
+    return robot, RobotState(np.zeros(3), quaternion, q, np.zeros(3), L_W), goal, L_W
+
+
+def planned(urdf: str, seed: int, share: float, **options: Any) -> None:
+    robot, state, goal, L_W = case(urdf, seed, share)
+    schedule = plan(
+        robot, rotvec=rotvec_from_quaternion(goal), start=state, cache=0, base_position=2, **options
+    )
+    wheels, end = ReactionWheels.of(robot.description), schedule.end_velocities
+    assert end is not None
+    assert not end[wheels.other].any()
+    assert np.all(np.abs(schedule.velocities) <= robot.velocity_limit * (1 + 1e-8))
+    assert np.all(np.abs(end) <= robot.velocity_limit)
+    rates = np.vstack([np.zeros(robot.n), schedule.velocities, end])
+    torque = np.abs(np.diff(rates, axis=0))[:, wheels.index] / schedule.control_period
+    assert np.all(torque * wheels.inertia <= wheels.torque * (1 + 1e-6))
+    _, reached = flown_by_pinocchio(urdf, schedule, state)
+    assert angle_between(reached, goal) < END_ERROR
+    turn = turn_rate_in_pinocchio(
+        urdf, schedule.positions[-1], reached, end, L_W, schedule.joint_names
+    )
+    assert np.linalg.norm(turn) < BASE_RATE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(16))
+def test_wheels_stop_a_base_that_turns(seed: int) -> None:
+    planned((THREE, SKEWED)[seed % 2], seed, np.random.default_rng(seed).uniform(0.05, 0.8))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_the_bound_of_the_rates_refuses_what_is_not_planned(share: float) -> None:
+    if share < 1:
+        planned(THREE, 5, share)
+        return
+    robot, state, goal, _ = case(THREE, 5, share)
+    with pytest.raises(UnreachableError, match=r"1\.01 times the largest") as refusal:
+        plan(robot, rotvec=rotvec_from_quaternion(goal), start=state, cache=0, base_position=2)
+    assert refusal.value.proof is Proof.MOMENTUM
+
+
+@pytest.mark.parametrize("urdf", [THREE, SKEWED], ids=["three", "skewed"])
+def test_wheels_hold_all_that_the_zonotope_of_their_momenta_has(urdf: str) -> None:
+    wheels, rng = wheels_of(urdf), np.random.default_rng(3)
+    stored = wheels.axes_B * wheels.inertia
+    for _ in range(5):
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        most = capacity(wheels, direction)
+        rates = wheels.rates_for((1 - 1e-6) * most * direction)
+        assert np.all(np.abs(rates) <= wheels.rate * (1 + 1e-9))
+        np.testing.assert_allclose(stored @ rates, (1 - 1e-6) * most * direction, atol=1e-9)
+        with pytest.raises(UnreachableError, match="1 times the largest"):
+            wheels.rates_for((1 + 1e-6) * most * direction)
+
+
+def test_redundant_wheels_keep_the_motion_that_has_no_momentum() -> None:
+    wheels = wheels_of(SKEWED)
+    stored = wheels.axes_B * wheels.inertia
+    null = np.linalg.svd(stored)[2][-1]
+    rates = wheels.rates_for(np.zeros(3), 40.0 * null)
+    np.testing.assert_allclose(rates, 40.0 * null, atol=1e-9)
+
+
+def test_a_direction_that_wheels_leave_out_is_refused() -> None:
+    wheels = wheels_of(TWO)
+    across = np.cross(*(wheels.axes_B.T))
+    with pytest.raises(UnreachableError, match="leave out a direction") as refusal:
+        wheels.rates_for(0.1 * across)
+    assert refusal.value.proof is Proof.MOMENTUM
+
+
+@pytest.mark.slow
+def test_a_plan_begins_with_spinning_wheels() -> None:
+    robot, state, goal, L_W = case(THREE, 2, 0.3)
+    wheels = ReactionWheels.of(robot.description)
+    qdot = np.zeros(robot.n)
+    held = matrix_from_quaternion(state.quaternion).T @ L_W
+    qdot[wheels.index] = np.linalg.solve(wheels.axes_B * wheels.inertia, held)
+    schedule = plan(
+        robot,
+        rotvec=rotvec_from_quaternion(goal),
+        joint_positions=state.q + np.where(robot.effort_limit > 1, 0.3, -7.0),
+        start=replace(state, qdot=qdot),
+        cache=0,
+        base_position=2,
+    )
+    _, reached = flown_by_pinocchio(THREE, schedule, state)
+    assert angle_between(reached, goal) < END_ERROR
+    np.testing.assert_allclose(schedule.velocities[0], qdot, atol=1.0)
+    # The goal shape is that of the arm: wheels are where they are.
+    other = wheels.other
+    np.testing.assert_allclose(schedule.positions[-1, other], state.q[other] + 0.3, atol=1e-9)
+
+
+def test_other_methods_do_not_begin_with_spinning_wheels() -> None:
+    robot = wheeled_robot()
+    qdot = np.where(robot.velocity_limit > 1, 30.0, 0.0)
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(robot.n), qdot=qdot)
+    goal = Goal.from_rotvec([0, 0, 0], [0.1, 0, 0])
+    method = build_method("area_loop", robot, 0.05, 0.0125, {})
+    with pytest.raises(PlanningError, match="Reaction wheels spin"):
+        method.plan(PlanRequest(state, goal, Tolerance(1e-3, 1e-3, 1e-3)))
+
+
+def test_without_an_attitude_the_rates_of_wheels_are_not_known() -> None:
+    robot, state, goal, _ = case(THREE, 1, 0.1)
+    with pytest.raises(PlanningError, match="give the goal an attitude"):
+        plan(
+            robot,
+            rotvec=rotvec_from_quaternion(goal),
+            start=state,
+            base_position=2,
+            base_attitude=0,
+        )
