@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from planning.drifting import END_ERROR, angle_between, flown_by_pinocchio, turn_rate_in_pinocchio
+from support.planner_loop import Loop, robot_of
 from support.wheels import ARM, ELBOW, HULL, WHEELS, text, wheel, wheeled_robot
 
 from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
@@ -24,7 +26,10 @@ from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning import Goal, RobotState, plan
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.execution.executive import Executive
+from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.registry import build_method
+from spacerobot_ros.simulation.plant import InitialState
 
 THREE = text(HULL, *WHEELS[:2], ARM, ELBOW, WHEELS[2])
 SKEWED = text(HULL, *WHEELS, wheel("spin_d", '<origin rpy="-0.7 0.5 0.2"/>'), ARM, ELBOW)
@@ -189,3 +194,31 @@ def test_without_an_attitude_the_rates_of_wheels_are_not_known() -> None:
             base_position=2,
             base_attitude=0,
         )
+
+
+@pytest.mark.slow
+def test_wheels_spin_on_after_goals_at_restarts_and_after_an_abort(tmp_path: Path) -> None:
+    file = tmp_path / "gyro.urdf"
+    file.write_text(THREE)
+    options = {"method": "optimal", "optimal.base_position": 2, "optimal.cache": 0}
+    initial = InitialState(angular_momentum=np.array([0.5, -0.8, 0.3]))
+    loop = Loop(options, robot=str(file), initial=initial)
+    decided = loop.decide(([0.0, 0.0, 0.0], [0.2, 0.3, -0.1]))
+    assert decided.state is PlannerState.REACHED
+    loop.tick(100)
+    held, kept = loop.poses[-1], loop.commands[-1]
+    assert np.abs(kept[[0, 1, 3]]).max() > 10.0
+    assert angle_between(loop.poses[-100][3:], held[3:]) < 1e-9
+    # A planner that is started again has commanded nothing, and keeps what it measures.
+    loop.executive = Executive(robot_of(str(file)), loop.config)
+    loop.tick(100)
+    np.testing.assert_allclose(loop.commands[-1], kept, atol=1e-9)
+    assert angle_between(loop.poses[-1][3:], held[3:]) < 1e-8
+    loop.propose_goal(([0.0, 0.0, 0.0], [0.3, 0.25, -0.1]))
+    loop.tick(20)
+    loop.abort()
+    loop.tick(100)
+    # Near to the goal, at which its rates would have stopped the base.
+    apart = angle_between(loop.poses[-1][3:], loop.poses[-51][3:])
+    assert apart < 0.25 * 50 * 0.05 * float(np.linalg.norm(initial.angular_momentum)) / 4.0
+    assert loop.decide(([0.0, 0.0, 0.0], [0.2, 0.3, -0.1])).state is PlannerState.REACHED

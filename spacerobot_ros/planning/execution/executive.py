@@ -253,8 +253,11 @@ class _PlannedRest:
 
     def task(self, period: float) -> PlanningTask:
         """Return the task of a plan that begins with the rest, in control periods, s."""
-        ticks = math.ceil(self.duration / period - 1e-9)
-        return replace(self.planned, braking=np.tile(self.planned.request.state.q, (ticks + 1, 1)))
+        ticks, state = math.ceil(self.duration / period - 1e-9), self.planned.request.state
+        shapes = np.tile(state.q, (ticks + 1, 1))
+        if self.planned.rates is not None:
+            shapes += period * np.arange(ticks + 1)[:, np.newaxis] * self.planned.rates
+        return replace(self.planned, braking=shapes)
 
 
 class Executive:
@@ -988,12 +991,14 @@ class Executive:
         if active is not None and len(active.stuck_positions) != len(self._tracker.stuck):
             names = self._robot.joint_names
             active.stuck_positions = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
-        braking, take_over = None, None
+        braking, take_over, rates = None, None, self._tracker.wheel_rates(state)
         if isinstance(job, TakeOverJob):
             goal, take_over = job.aim, job.take_over
             self._change_phase(Event.PLAN_REQUESTED, Phase.REPLANNING)
         else:
             braking = self._tracker.braking_shapes(self._stamp_ns)
+            if braking is not None:
+                rates = self._tracker.rates_after_braking()
             self._commanded_from_ns = self._stamp_ns
             self._change_phase(Event.PLAN_REQUESTED, Phase.PLANNING)
         request = PlanRequest(
@@ -1006,7 +1011,7 @@ class Executive:
         reason = job.reason.value
         message = f"A plan is made: {reason}."
         self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
-        task = PlanningTask(request, braking=braking, take_over=take_over)
+        task = PlanningTask(request, braking=braking, rates=rates, take_over=take_over)
         if active is not None:
             task = replace(task, stuck=active.stuck_positions, required=active.required)
         self._pending_plan, self._coasting = job, None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ import numpy.typing as npt
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.wheels import ReactionWheels
+from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -152,7 +154,8 @@ class BrakingFollower:
     """Continues along a schedule ever more slowly, to rest on its path.
 
     The gait's time runs at the rate ``1 - t/T``: the shape stays on the gait's path, and so does
-    the base, which at zero momentum follows the path of the shape and not its speed.
+    the base, which at zero momentum follows the path of the shape and not its speed. Wheels that
+    spin on after the schedule go over to their rates after it, which stop the base at its goal.
 
     Parameters
     ----------
@@ -211,7 +214,24 @@ class BrakingFollower:
         positions = self.schedule.positions
         k = min(max(int(ticks), 0), len(positions) - 1)
         ahead = positions[min(k + 1, len(positions) - 1)] - positions[k]
-        return np.asarray(positions[k] + (ticks - k) * ahead)
+        shape = np.asarray(positions[k] + (ticks - k) * ahead)
+        end = self.schedule.end_velocities
+        if end is not None:
+            # From the rate at the beginning to that of the end, steadily.
+            T, t = self._duration, min(since, self._duration)
+            first, begin = self._at_begin
+            turned = begin + t * first + t**2 / (2 * T) * (end - first) + (since - t) * end
+            shape = np.where(end != 0, turned, shape)
+        return shape
+
+    @cached_property
+    def _at_begin(self) -> tuple[Array, Array]:
+        """Velocities (n,) and shape (n,) at the beginning of the braking."""
+        ticks = self._begin_s / self.schedule.control_period
+        positions = self.schedule.positions
+        k = min(max(int(ticks), 0), len(positions) - 2)
+        velocity = self.schedule.velocities[k]
+        return velocity, positions[k] + (ticks - k) * self.schedule.control_period * velocity
 
 
 class TrajectoryTracker:
@@ -294,6 +314,18 @@ class TrajectoryTracker:
         follower = self._begin_braking(stamp_ns)
         return None if follower is None else follower.shapes(stamp_ns)
 
+    def rates_after_braking(self) -> Array | None:
+        """Return the velocities (n,) that are held after a braking; None: zero."""
+        return None if self._follower is None else self._follower.schedule.end_velocities
+
+    def wheel_rates(self, state: RobotState) -> Array | None:
+        """Return the velocities (n,) of wheels in a measured state; None without wheels."""
+        if not len(self._wheels) or state.qdot is None:
+            return None
+        rates = np.zeros(len(state.q))
+        rates[self._wheels] = state.qdot[self._wheels]
+        return rates
+
     def _begin_braking(self, stamp_ns: int) -> BrakingFollower | None:
         if isinstance(self._follower, ScheduleFollower):
             return self._follower.braking_follower(stamp_ns, self._config.abort_time)
@@ -331,11 +363,11 @@ class TrajectoryTracker:
         """Stop tracking; hold the schedule's last shape, or the next measured shape."""
         if at_last_shape and isinstance(self._follower, ScheduleFollower):
             self.setpoint.position[:] = self._follower.schedule.positions[-1]
-            if self._follower.schedule.end_velocities is not None:
-                self.setpoint.velocity[:] = self._follower.schedule.end_velocities
             self._holds_position = True
         else:
             self._holds_position = False
+        if self._follower is not None and self._follower.schedule.end_velocities is not None:
+            self.setpoint.velocity[:] = self._follower.schedule.end_velocities
         self._follower = None
 
     def is_check_due(self, stamp_ns: int) -> bool:

@@ -103,6 +103,9 @@ class PlanningTask:
     braking
         (K + 1, n) shapes at the ticks, m or rad, in which the joints brake before the gait, or rest
         while the base drifts; None: the gait begins at once.
+    rates
+        (n,) velocities that are held from there on, m/s or rad/s: those of reaction wheels; None:
+        zero.
     take_over
         When the plan takes over from a schedule that is tracked until then; None: it begins at
         rest, or with the braking. The state of the request is that of now.
@@ -112,6 +115,7 @@ class PlanningTask:
     stuck: Mapping[str, float] = field(default_factory=dict)
     required: frozenset[Controlled] = frozenset()
     braking: Array | None = None
+    rates: Array | None = None
     take_over: TakeOver | None = None
 
 
@@ -251,7 +255,7 @@ class PlanningWorker:
             return method.plan(replace(task.request, state=state, motion=motion), cancellation)
         if task.braking is None:
             return method.plan(task.request, cancellation)
-        return self._plan_with_braking(task.braking, task.request, method, cancellation)
+        return self._plan_with_braking(task.braking, task.request, method, cancellation, task.rates)
 
     def _choose_method(self, task: PlanningTask) -> GaitMethod:
         if not task.stuck:
@@ -280,8 +284,10 @@ class PlanningWorker:
         request: PlanRequest,
         method: GaitMethod,
         cancellation: Cancellation,
+        rates: Array | None = None,
     ) -> GaitSchedule:
-        """Return one schedule: braking in ``shapes`` (K + 1, n), then a gait from rest.
+        """Return one schedule: braking in ``shapes`` (K + 1, n), then a gait from rest, at which
+        wheels have ``rates`` (n,).
 
         No joint velocity jumps. The pose of the base at rest is predicted.
         """
@@ -289,6 +295,7 @@ class PlanningWorker:
         shapes[0] = state.q
         at_rest, positions, attitudes = self._predict_motion(state, shapes)
         times: Array = period * np.arange(len(shapes), dtype=float)
+        at_rest = replace(at_rest, qdot=rates)
         gait = method.plan(replace(request, state=at_rest), cancellation)
         path = BasePath(
             np.append(times[:-1], times[-1] + gait.path.time),
