@@ -51,9 +51,21 @@ HELD_BY_TESTS = [
     ),
     (
         "docs/theory/square_path.md",
-        "The paper's laws also start from joint rates that are not zero (its property 3); "
-        "`square_path` begins at rest.",
-        "planning/test_executive_decisions.py::test_a_goal_is_planned_from_rest_or_blended_into",
+        "The paper's laws also start from joint rates that are not zero (its property 3), and so "
+        "do these",
+        "flight/test_from_joint_rates.py::test_the_chain_is_turned_from_moving_joints",
+    ),
+    (
+        "docs/theory/wheels.md",
+        "A robot with wheels ends with the base at rest",
+        "planning/test_wheels_in_plans.py::test_wheels_stop_a_base_that_turns",
+    ),
+    (
+        "docs/theory/wheels.md",
+        "one wheel is announced at 4.6 s with 6 s left, and at 8.4 s all are dumped, which takes "
+        "23 s",
+        "session/test_wheels.py::"
+        "test_the_base_is_held_while_saturation_is_announced_and_momentum_dumped",
     ),
     (
         "docs/theory/coordinated_control.md",
