@@ -222,3 +222,10 @@ def test_wheels_spin_on_after_goals_at_restarts_and_after_an_abort(tmp_path: Pat
     apart = angle_between(loop.poses[-1][3:], loop.poses[-51][3:])
     assert apart < 0.25 * 50 * 0.05 * float(np.linalg.norm(initial.angular_momentum)) / 4.0
     assert loop.decide(([0.0, 0.0, 0.0], [0.2, 0.3, -0.1])).state is PlannerState.REACHED
+
+
+def test_rates_that_are_not_finite_are_refused() -> None:
+    robot, state, goal, _ = case(THREE, 1, 0.1)
+    unknown = replace(state, qdot=np.full(robot.n, np.nan))
+    with pytest.raises(PlanningError, match="wheels at the start are not finite"):
+        plan(robot, rotvec=rotvec_from_quaternion(goal), start=unknown, base_position=2)

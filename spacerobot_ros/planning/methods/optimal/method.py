@@ -321,6 +321,8 @@ class OptimalGait(GaitMethod):
     def _wheel_rates(self, qdot: Array | None) -> Array:
         """Return velocities (n,) of the joints with those of wheels alone; none where they rest."""
         rates, index = np.zeros(self.robot.n), self._wheels.index
+        if qdot is not None and not np.all(np.isfinite(qdot[index])):
+            raise PlanningError("The velocities of the wheels at the start are not finite.")
         if qdot is not None and np.any(np.abs(qdot[index]) > _ZERO_RATE_SHARE * self._wheels.rate):
             rates[index] = qdot[index]
         return rates
