@@ -508,6 +508,9 @@ def _resimulate(
     if flight.config.actuation == "velocity":
         # The efforts of servos follow from the change of the velocities.
         plant.qdot[:] = rates
+        # Wheels keep their rates where no command came since.
+        joints = commands.sources[0]
+        joints.command[joints.kept] = rates[joints.kept]
     recorded = [flight.commands(source) for source in commands.sources]
     states: dict[str, Floats] = {}
     done = _Resimulation(first, last, states, frozenset(recorded[0]))
