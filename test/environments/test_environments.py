@@ -277,7 +277,11 @@ def test_draws_of_a_campaign_are_starts_masses_and_goals(tmp_path: Path) -> None
 
 
 SLIDING = """
-campaign: {{scenario: sliding_masses, flights: 40, disperse: {{{}}}}}
+campaign:
+  scenario: sliding_masses
+  flights: 40
+  disperse:
+    {}
 """
 
 
@@ -285,7 +289,8 @@ campaign: {{scenario: sliding_masses, flights: 40, disperse: {{{}}}}}
     ("changed", "refusal"),
     [
         ("initial.joints.slider_1: {uniform: [-5.0, 10.0]}", "slider_1.*outside its limits"),
-        ("mass.*: {uniform: [-0.5, 1.5]}", "mass"),
+        pytest.param("mass.*: {uniform: [-0.5, 1.5]}", "mass", marks=pytest.mark.slow),
+        ("plant.initial_joint_velocities[0]: {choice: [0.0, 0.1]}", "must start at rest"),
     ],
 )
 def test_draws_that_are_refused_are_left_out_with_one_warning(
@@ -316,6 +321,7 @@ def test_a_campaign_whose_draws_are_all_refused_says_so(tmp_path: Path) -> None:
         environment.reset(seed=1)
 
 
+@pytest.mark.slow
 def test_wheels_turn_the_base() -> None:
     environment: Any = gymnasium.make(ARM, scenario="wheels").unwrapped
     robot = environment.episodes.robot
