@@ -142,7 +142,7 @@ def test_environments_in_lanes_are_as_many_single_ones(name: str, mode: str) -> 
 
 
 @pytest.mark.usefixtures("strict")
-@pytest.mark.parametrize("statistics_outside", [True, False])
+@pytest.mark.parametrize("statistics_outside", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize("mode", MODES)
 def test_observations_are_normalised_in_every_mode(mode: str, statistics_outside: bool) -> None:
     def wrapped(normalize: Any, mode: str) -> Any:
