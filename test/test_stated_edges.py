@@ -154,7 +154,7 @@ def test_twists_without_a_robot_are_told(lost: str) -> None:
     told: list[Any] = []
     made: Any = SimpleNamespace(
         active=True,
-        plant=SimpleNamespace(blocked=""),
+        plant=SimpleNamespace(refusal_of_goals=""),
         executive="executive",
         robot="robot",
         _log_fault=lambda *words: told.append(words),

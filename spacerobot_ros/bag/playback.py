@@ -111,7 +111,7 @@ class Timeline:
         """Whether the time of the bag advances."""
         return self._running
 
-    def run(self, clock_ns: int) -> None:
+    def start(self, clock_ns: int) -> None:
         """Let time advance; ``clock_ns`` is the present time of the clock."""
         if not self._running:
             self._clock_ns, self._running = clock_ns, True
@@ -154,7 +154,7 @@ class SubscriberWait:
         self._readers = 0
         self._waited = self._quiet = 0.0
 
-    def check(self, matched: Sequence[int], known: Sequence[int]) -> bool:
+    def may_begin(self, matched: Sequence[int], known: Sequence[int]) -> bool:
         """Return whether to begin, given the counts of matched and known readers by topic."""
         readers = sum(matched)
         self._waited += self._period
@@ -273,7 +273,7 @@ class Playback:
 
     def run(self, clock_ns: int) -> None:
         """Let time advance; ``clock_ns`` is the present time of the clock."""
-        self._timeline.run(clock_ns)
+        self._timeline.start(clock_ns)
 
     def pause(self, clock_ns: int) -> None:
         """Stop time."""

@@ -68,7 +68,7 @@ _BATCH_SIZE = 1000
 class Derived(NamedTuple):
     """A message that is computed from those before it, and recorded after one of them."""
 
-    after: int
+    source_index: int
     """Index of that message."""
     channel: int
     message: bytes
@@ -265,10 +265,10 @@ class Recording:
         published = np.where(times == 0, logged, times)
         if self.derive is not None:
             derived = self.derive(channels, messages, times)
-            after = np.array([each.after for each in derived], np.intp)
+            after = np.array([each.source_index for each in derived], np.intp)
             for each in reversed(derived):
-                numbers.insert(each.after + 1, each.channel)
-                messages.insert(each.after + 1, each.message)
+                numbers.insert(each.source_index + 1, each.channel)
+                messages.insert(each.source_index + 1, each.message)
             published = np.insert(published, after + 1, [each.published_ns for each in derived])
             logged = np.insert(logged, after + 1, logged[after])
         try:

@@ -220,7 +220,7 @@ class BatchController:
         results = dict(zip(names, values, strict=True))
         omega, q, qdot = measured[10:13], measured[13 : 13 + n], measured[13 + n :]
         actuation, lowered = self.controller.limits_expression(omega, q, qdot, results["actuation"])
-        exact = ca.logic_or(lowered, ca.logic_not(law.defined(results)))
+        exact = ca.logic_or(lowered, ca.logic_not(law.is_complete(results)))
         largest = dict.fromkeys(("position", "attitude", "joints"), ca.SX(0))
         for kind, places in law.outputs.selection.distances:
             largest[kind] = ca.fmax(largest[kind], ca.norm_2(results["error"][list(places)]))

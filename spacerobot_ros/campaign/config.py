@@ -369,7 +369,7 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
         if not isinstance(arguments, list) or not arguments:
             raise ParameterError(f"'{name}' must have a list of values to choose from.")
         return Distribution("choice", {}, tuple(_read_choice(target, each) for each in arguments))
-    if target.text:
+    if target.is_text:
         raise ParameterError(f"'{name}' is a text: it must have a 'choice' of texts.")
     distribution = _load_scipy_distribution(str(kind))
     shapes = (distribution.shapes or "").replace(" ", "").split(",")
@@ -407,7 +407,7 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
 
 def _read_choice(target: DispersionTarget, value: Any) -> Any:
     """Return a value to choose from, a text or a finite number as its target takes it."""
-    if target.text:
+    if target.is_text:
         if not isinstance(value, str):
             raise ParameterError(f"'{target.name}' is a text; the choice has {value!r}.")
         return value

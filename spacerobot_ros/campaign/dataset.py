@@ -317,7 +317,7 @@ def _row_schema(campaign: Campaign) -> Any:
     fields = [("flight", arrow.int64()), ("seed", arrow.int64()), ("passed", arrow.bool_())]
     fields += [("outcome", text), ("reason", text)]
     for each in campaign.dispersions:
-        fields.append((f"{DRAW_PREFIX}{each.name}", text if each.target.text else real))
+        fields.append((f"{DRAW_PREFIX}{each.name}", text if each.target.is_text else real))
     fields += [(name, real) for name in metric_names(description_of(campaign.scenario).joint_names)]
     fields += [("wall_time_s", real), ("plan_time_s", real), ("engine", text)]
     fields += [("fallback", text), ("versions", text)]

@@ -152,7 +152,7 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
     flight = flight.with_overrides("plant", {"sensors.seed": draw.seed})
     for dispersion in campaign.dispersions:
         value = draw.values[dispersion.name]
-        if not dispersion.target.text and not math.isfinite(value):
+        if not dispersion.target.is_text and not math.isfinite(value):
             raise ParameterError(f"The value drawn for '{dispersion.name}' is {value}.")
         flight = dispersion.target.apply(flight, value)
     flight.require_physical()

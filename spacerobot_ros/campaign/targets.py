@@ -75,7 +75,7 @@ class DispersionTarget:
     name: str
     apply: Callable[[DrawnFlight, Any], DrawnFlight]
     unit: str
-    text: bool
+    is_text: bool
     sets: frozenset[str]
 
 

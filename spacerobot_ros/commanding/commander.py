@@ -83,7 +83,7 @@ class CommanderHost(Protocol):
     def report_event(self, event: Event) -> None:
         """Publish an event."""
 
-    def announce(self, start: ScheduleStart) -> None:
+    def publish_start(self, start: ScheduleStart) -> None:
         """Publish a schedule that begins; only planners have schedules."""
 
     def log(self, level: LogLevel, message: str) -> None:
@@ -107,13 +107,13 @@ class StateDecoder(Protocol):
     qdot: Array
     """Rates (n,) of the latest accepted joints, m/s or rad/s."""
 
-    def require(self, joints: Any) -> None:
+    def check_robot(self, joints: Any) -> None:
         """Refuse joint states of another robot: CommandError."""
 
-    def accept(self, joints: Any) -> int:
+    def decode_joints(self, joints: Any) -> int:
         """Read joints into ``q`` and ``qdot``; return their stamp, ns, or raise CommandError."""
 
-    def base(self, odom: Any) -> tuple[Array, Array]:
+    def decode_base(self, odom: Any) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an odom or base reference, or raise CommandError."""
 
     def target(self, odom: Any) -> tuple[Array, Array]:
@@ -146,21 +146,21 @@ class ArrayDecoder:
     q: Array
     qdot: Array
 
-    def require(self, joints: StateArrays) -> None:
+    def check_robot(self, joints: StateArrays) -> None:
         """Accept any joints."""
 
-    def accept(self, joints: StateArrays) -> int:
+    def decode_joints(self, joints: StateArrays) -> int:
         """Store the joints unchanged."""
         self.q, self.qdot = joints.q, joints.qdot
         return joints.stamp_ns
 
-    def base(self, odom: StateArrays) -> tuple[Array, Array]:
+    def decode_base(self, odom: StateArrays) -> tuple[Array, Array]:
         """Return pose and twist."""
         assert odom.pose is not None
         assert odom.twist is not None
         return odom.pose, odom.twist
 
-    target = base
+    target = decode_base
 
     def joint_reference(self, message: StateArrays) -> tuple[Array, Array]:
         """Return positions and rates."""
@@ -270,7 +270,7 @@ class Commander(ABC):
         if self.activity is not CommanderActivity.INACTIVE and self.executive is not None:
             self._stop_executive()
         self.activity, self._waiting_goals = CommanderActivity.INACTIVE, {}
-        self._fly_to.settle((), "Aborted: this node was deactivated.")
+        self._fly_to.end_dropped_goals((), "Aborted: this node was deactivated.")
 
     # -- goals --------------------------------------------------------------------------------
 
@@ -357,8 +357,8 @@ class Commander(ABC):
         """Raise PlanningError where no goal is taken now."""
         if not self.active:
             raise PlanningError(f"The goal is refused: this node is {self.activity.value}.")
-        if self.plant.blocked:
-            raise PlanningError(self.plant.blocked)
+        if self.plant.refusal_of_goals:
+            raise PlanningError(self.plant.refusal_of_goals)
 
     def _accept_goal(self, key: str, goal: IdentifiedGoal) -> None:
         self._fly_to.accepted(goal.goal_id)
@@ -368,7 +368,7 @@ class Commander(ABC):
         else:
             self._submit_goal(key, goal)
         if self._fly_to:
-            self._fly_to.settle(self._active_goal_ids())
+            self._fly_to.end_dropped_goals(self._active_goal_ids())
 
     def _refuse_goal(self, message: str, goal_id: str) -> None:
         self._publish_decision(self._make_status("refused", message, goal_id))
@@ -390,9 +390,9 @@ class Commander(ABC):
     def _publish_status(self, status: Status) -> None:
         # A replaced goal ends before its successor begins: the last status is of the present goal.
         if self._fly_to:
-            self._fly_to.settle(self._active_goal_ids() | {status.goal_id})
+            self._fly_to.end_dropped_goals(self._active_goal_ids() | {status.goal_id})
         self.host.publish_status(status)
-        self._fly_to.take(status)
+        self._fly_to.update(status)
         if status.state.decided and self.config.stop_when_decided and self.active:
             self.activity = CommanderActivity.DECIDED
 
@@ -402,14 +402,14 @@ class Commander(ABC):
         """Return the ids of the goals that are pursued, or wait to be."""
         pursued = {goal.goal_id for goal in self._waiting_goals.values()}
         if self.active and self.executive is not None:
-            pursued |= self.executive.pursued
+            pursued |= self.executive.unfinished_goals
         return pursued
 
     def _watch_fly_to(self) -> None:
         """Send feedback to the clients of actions after a state."""
         self._fly_to.advance(self.stamps.now_ns, self._progress)
         self._abort_fly_to()
-        self._fly_to.settle(self._active_goal_ids())
+        self._fly_to.end_dropped_goals(self._active_goal_ids())
 
     def _abort_fly_to(self) -> None:
         """Give up all goals where the client of one, or its time limit, asks for it."""
@@ -451,7 +451,7 @@ class Commander(ABC):
         if odom is None or decoder is None or self.states.joints is None:
             return None
         try:
-            return decoder.base(odom)[0].copy()
+            return decoder.decode_base(odom)[0].copy()
         except CommandError:
             return None
 
@@ -473,7 +473,7 @@ class Commander(ABC):
         """Take received joints: those of another time are set aside, and late ones skipped."""
         if self._clock() - self._answer_time > _PROCESS_DELAY_TIME:
             self._answer_last_state(Stamped(stamp_ns, joints))
-        elif self._is_of_robot(joints) and self.stamps.admits(stamp_ns, joints):
+        elif self._is_of_robot(joints) and self.stamps.accepts_joints(stamp_ns, joints):
             self.take_joints(stamp_ns, joints)
         if self._fly_to:
             self._watch_fly_to()
@@ -537,7 +537,7 @@ class Commander(ABC):
             else:
                 skipped.append(newer)
         for each in (joints, *skipped):
-            if self._is_of_robot(each.message) and self.stamps.admits(*each):
+            if self._is_of_robot(each.message) and self.stamps.accepts_joints(*each):
                 for odom in odoms:
                     if odom.stamp_ns >= self.stamps.now_ns:
                         self.receive_odom(*odom)
@@ -548,7 +548,7 @@ class Commander(ABC):
         # Joint states of another robot neither set the time nor replace this robot's.
         try:
             if self._decoder is not None:
-                self._decoder.require(joints)
+                self._decoder.check_robot(joints)
         except CommandError as error:
             self._log_fault("joints", f"joint_states: {error}.")
             return False
@@ -565,7 +565,7 @@ class Commander(ABC):
 
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status of the named plant."""
-        for change in self.plant.take(status, name):
+        for change in self.plant.update(status, name):
             if isinstance(change, PlantStopped):
                 self._give_up_goals(change)
                 continue
@@ -599,11 +599,11 @@ class Commander(ABC):
     def _give_up_goals(self, stopped: PlantStopped) -> None:
         if self.executive is not None:
             self.executive.plant_stopped(
-                stopped.why, stopped.commanded_until_ns, stopped.rests_since_ns
+                stopped.reason, stopped.commanded_until_ns, stopped.rests_since_ns
             )
             self._forward_outputs()
         elif self._waiting_goals and stopped.commanded_until_ns is None:
-            self._abort_waiting(f"Aborted by the plant: {stopped.why}")
+            self._abort_waiting(f"Aborted by the plant: {stopped.reason}")
 
     # -- differences --------------------------------------------------------------------------
 

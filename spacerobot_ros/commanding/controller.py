@@ -91,8 +91,8 @@ class ControllerCommander(Commander):
         """Do a task without a goal after it; return whether it is accepted, and a sentence."""
         if self.executive is None or not self.active:
             return False, "The controller is not active, or has no robot yet."
-        if self.plant.blocked:
-            return False, self.plant.blocked
+        if self.plant.refusal_of_goals:
+            return False, self.plant.refusal_of_goals
         self.executive.request(task)
         return True, f"The task '{task.value}' begins; controller/status tells its course."
 
@@ -120,7 +120,7 @@ class ControllerCommander(Commander):
         """Take joints of the present time, after answering a state whose odom never came."""
         overdue = None
         if self.active and self.executive is not None and not self._waits_for_first_pose():
-            overdue = self.states.overdue()
+            overdue = self.states.take_overdue()
         if overdue is not None:
             # An answer to a state whose pose was lost would come a tick late, so the state only
             # advances the estimate.
@@ -199,7 +199,7 @@ class ControllerCommander(Commander):
 
     def _forward_plant_state(self) -> None:
         if self.executive is not None:
-            self.executive.plant_blocked = bool(self.plant.blocked)
+            self.executive.plant_blocked = bool(self.plant.refusal_of_goals)
 
     def _waits_for_first_pose(self) -> bool:
         """Whether the last state came before odom was connected: its pose is not lost."""
@@ -211,7 +211,7 @@ class ControllerCommander(Commander):
     def answer(self) -> None:
         """Answer a state once, as soon as all its messages are there."""
         if self.executive is not None and self.activity is _ACTIVE:
-            pairing = self.states.ready()
+            pairing = self.states.take_ready()
             if pairing is not None:
                 self._answer_state(pairing)
 
@@ -222,15 +222,15 @@ class ControllerCommander(Commander):
         assert decoder is not None
         self._pose_has_come = self._pose_has_come or pairing is _WHOLE
         try:
-            stamp = decoder.accept(states.joints)
+            stamp = decoder.decode_joints(states.joints)
         except CommandError as error:
-            self.stamps.withdraw()
+            self.stamps.undo_last()
             self._log_fault("state", f"The state is refused: {error}")
             return
         try:
             q, qdot, measured = decoder.q, decoder.qdot, None
             if pairing is _WHOLE:
-                pose, twist = decoder.base(states.odom)
+                pose, twist = decoder.decode_base(states.odom)
                 measured = ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
             now = stamp / SECOND
             self._read_target(decoder)
@@ -257,7 +257,7 @@ class ControllerCommander(Commander):
             return None
         base_reference, joint_reference = None, None
         if base is not None:
-            pose, twist = decoder.base(base)
+            pose, twist = decoder.decode_base(base)
             base_reference = PoseReference.with_body_twist(pose[:3], pose[3:], twist[:3], twist[3:])
         if joints is not None:
             joint_reference = self._held_velocities.at_command(*decoder.joint_reference(joints))

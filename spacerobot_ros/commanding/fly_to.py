@@ -43,7 +43,7 @@ class FlyTo:
     time_limit: float = 0.0
 
     @classmethod
-    def checked(cls, goal: Goal, tolerance: Tolerance, time_limit: float) -> FlyTo:
+    def from_numbers(cls, goal: Goal, tolerance: Tolerance, time_limit: float) -> FlyTo:
         """Return the goal of an action with numbers that were received.
 
         Raises
@@ -282,14 +282,14 @@ class FlyToGoals:
                     progress(goal_id, served.request.goal, served.first_state_ns)
                 )
 
-    def take(self, status: Status) -> None:
+    def update(self, status: Status) -> None:
         """End the goal that a status decides, if a client waits for it."""
         if status.state.value == "refused" and status.goal_id in self._accepted:
             self._accepted.remove(status.goal_id)
         if status.state.decided:
             self._end(status.goal_id, status)
 
-    def settle(self, pursued: Collection[str], why: str = "") -> None:
+    def end_dropped_goals(self, pursued: Collection[str], why: str = "") -> None:
         """End the goals that are pursued no more, and which no status has decided.
 
         Parameters

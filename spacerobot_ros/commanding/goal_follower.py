@@ -36,15 +36,15 @@ class GoalFollower:
         self.decision: Status | None = None
         """The status that decided the goal; None: it is still pursued."""
 
-    def concerns(self, status: Status) -> bool:
+    def is_about_goal(self, status: Status) -> bool:
         """Whether a status is about the goal."""
         if self.goal_id is None:
             return False
         return status.goal_id == self.goal_id or (self._unnamed and not status.goal_id)
 
-    def take(self, status: Status) -> bool:
+    def update(self, status: Status) -> bool:
         """Take the next status; return whether it decides the goal."""
-        if self.decision is not None or not self.concerns(status):
+        if self.decision is not None or not self.is_about_goal(status):
             return False
         if self.gait is None and status.state is PlannerState.EXECUTING:
             assert isinstance(status, PlannerStatus)

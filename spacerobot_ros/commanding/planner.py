@@ -75,7 +75,7 @@ class _MeasuredState:
         if self.odom is None:
             return None
         try:
-            return BaseMeasurement(*self.decoder.base(self.odom), self.decoder.qdot)
+            return BaseMeasurement(*self.decoder.decode_base(self.odom), self.decoder.qdot)
         except CommandError as error:
             self.base_error = error
             return None
@@ -243,8 +243,8 @@ class PlannerCommander(Commander):
         try:
             if not self.active:
                 raise PlanningError(f"This node is {self.activity.value}.")
-            if self.plant.blocked:
-                raise PlanningError(self.plant.blocked)
+            if self.plant.refusal_of_goals:
+                raise PlanningError(self.plant.refusal_of_goals)
             if self.executive is None or self.robot is None:
                 raise PlanningError("There is no robot on robot_description yet.")
             world = self.config.world_frame
@@ -306,7 +306,7 @@ class PlannerCommander(Commander):
 
     def _forward_plant_state(self) -> None:
         if self.executive is not None:
-            self.executive.plant_rests = self.plant.rests
+            self.executive.plant_rests = self.plant.has_no_command
 
     def _awaits_odom(self) -> bool:
         # A goal to plan for or to evaluate needs every pose, even after its joints.
@@ -318,15 +318,15 @@ class PlannerCommander(Commander):
         if executive is None or self.activity is not _ACTIVE:
             return
         states = self.states
-        pairing = states.ready()
+        pairing = states.take_ready()
         if pairing is None:
             return
         measured = self._measured
         measured.odom = None if pairing is _WITHOUT_POSE else states.odom
         try:
-            measured.stamp_ns = measured.decoder.accept(states.joints)
+            measured.stamp_ns = measured.decoder.decode_joints(states.joints)
         except CommandError as error:
-            self.stamps.withdraw()
+            self.stamps.undo_last()
             self._log_fault("state", f"joint_states: {error}.")
             return
         if pairing is _LATE_POSE:
@@ -334,7 +334,7 @@ class PlannerCommander(Commander):
             executive.add_base_measurement(measured)
         else:
             if self.trajectories is not None:
-                self.trajectories.watch(measured.stamp_ns)
+                self.trajectories.check_server(measured.stamp_ns)
             executive.update(measured)
             if executive.outputs:
                 self._forward_outputs()
@@ -354,7 +354,7 @@ class PlannerCommander(Commander):
                     self._status = status
                     self._publish_decision(status)
                 case ScheduleStart() as start:
-                    host.announce(start)
+                    host.publish_start(start)
                     if self.trajectories is not None:
                         self.trajectories.start(start)
                     self._warn_of_disturbances(self._disturbances)

@@ -101,7 +101,7 @@ class StampFilter:
         self.last_ignored = ""
         """Message for the user about the latest ignored state."""
 
-    def admits(self, stamp_ns: int, joints: Any) -> bool:
+    def accepts_joints(self, stamp_ns: int, joints: Any) -> bool:
         """Return whether joints are of the present time; set other joints aside."""
         if not 0 <= stamp_ns - self.now_ns <= self._max_step_ns and not self._is_explained_by_loss(
             stamp_ns
@@ -132,7 +132,7 @@ class StampFilter:
         self._jump_odom = Stamped(stamp_ns, odom)
         return False
 
-    def withdraw(self) -> None:
+    def undo_last(self) -> None:
         """Undo the last admission: the state is not one of the robot."""
         if self._previous_ns == _NO_STAMP:
             self._max_step_ns, self.now_ns = -1, 0
@@ -308,7 +308,7 @@ class StateSynchroniser:
         """Return the latest message of a required topic; None before its first message."""
         return self._required.get(topic, _NO_MESSAGE).message
 
-    def ready(self) -> Pairing | None:
+    def take_ready(self) -> Pairing | None:
         """Hand over a ready state once; None without a new ready state."""
         stamp = self._joints_ns
         together = stamp == self._odom_ns
@@ -328,7 +328,7 @@ class StateSynchroniser:
             return _WITHOUT_POSE if self._without_pose else _WHOLE
         return None
 
-    def overdue(self) -> Pairing | None:
+    def take_overdue(self) -> Pairing | None:
         """Hand over a state that was never ready; call this before the next joints are put.
 
         :attr:`Pairing.WITHOUT_POSE`: its odom is missing, and states are ready without from now
@@ -358,7 +358,7 @@ class PlantStopped:
         Time since which it rests then, as far as is known.
     """
 
-    why: str
+    reason: str
     commanded_until_ns: int | None = None
     rests_since_ns: int = 0
 
@@ -380,7 +380,7 @@ class PlantListener:
         self._name = "plant"
 
     @property
-    def blocked(self) -> str:
+    def refusal_of_goals(self) -> str:
         """Message on why goals are refused at present; empty: goals are accepted."""
         status = self._status
         if status is None:
@@ -392,10 +392,12 @@ class PlantListener:
         return ""
 
     @property
-    def rests(self) -> bool:
+    def has_no_command(self) -> bool:
         """Whether no command is in force: none has come, or none is obeyed."""
         status = self._status
-        return status is not None and (status.state is PlantState.RESTING or bool(self.blocked))
+        return status is not None and (
+            status.state is PlantState.RESTING or bool(self.refusal_of_goals)
+        )
 
     @property
     def payload(self) -> str:
@@ -407,15 +409,15 @@ class PlantListener:
         """Whether the plant's time stands still."""
         return self._status is not None and self._status.state is PlantState.PAUSED
 
-    def take(self, status: PlantStatus, name: str = "plant") -> list[PlantStopped | PlantChange]:
+    def update(self, status: PlantStatus, name: str = "plant") -> list[PlantStopped | PlantChange]:
         """Take the next status of the named plant; return the changes to react to.
 
         Statuses may be missed: the counters of a plant tell the changes in between.
         """
-        before, was_blocked = self._status, bool(self.blocked)
+        before, was_blocked = self._status, bool(self.refusal_of_goals)
         self._status, self._name = status, name
         changes: list[PlantStopped | PlantChange] = []
-        if self.blocked:
+        if self.refusal_of_goals:
             if before is None or not was_blocked or status.latched_fault != before.latched_fault:
                 changes.append(PlantStopped(status.message))
             return changes

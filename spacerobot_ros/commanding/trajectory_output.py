@@ -65,7 +65,7 @@ class TrajectoryEnd:
 class TrajectoryServer(Protocol):
     """The connection with the action server."""
 
-    def ready(self) -> bool:
+    def is_available(self) -> bool:
         """Whether the server is there."""
 
     def send(self, number: int, start: ScheduleStart) -> None:
@@ -105,7 +105,7 @@ class TrajectoryOutput:
         """Stamp of the last check for the server, ns."""
 
     @property
-    def waits(self) -> bool:
+    def awaits_result(self) -> bool:
         """Whether a schedule has no result yet."""
         return self._sent is not None
 
@@ -114,12 +114,12 @@ class TrajectoryOutput:
         self._number += 1
         self._replaced, self._sent, self._accepted = self._sent, self._number, False
         self._watched_ns = None
-        if not self._server.ready():
+        if not self._server.is_available():
             self._end(TrajectoryEnd(f"no server of the action '{self._name}' is there", final=True))
             return
         self._server.send(self._number, start)
 
-    def watch(self, now_ns: int) -> None:
+    def check_server(self, now_ns: int) -> None:
         """End a schedule whose server does not answer, or is gone, at a state of a stamp."""
         if self._sent is None:
             return
@@ -129,7 +129,7 @@ class TrajectoryOutput:
             self._give_up(f"the action '{self._name}' has not answered")
         elif now_ns - self._looked_ns >= _SERVER_CHECK_PERIOD_NS:
             self._looked_ns = now_ns
-            if not self._server.ready():
+            if not self._server.is_available():
                 self._give_up(f"the server of the action '{self._name}' is gone")
 
     def _give_up(self, why: str) -> None:

@@ -87,7 +87,7 @@ class CoordinatedController:
         wheels: WheelControl | None = None,
     ) -> None:
         self.wheels = wheels
-        self.law, self._kinds = law, law.outputs.selection.kinds
+        self.law, self._kinds = law, law.outputs.selection.error_kinds
         self._distances = law.outputs.selection.distances
         self._limits, self.joint_rate_limits = limits, rates
         self._profile_type, self._motion = profile, motion

@@ -86,7 +86,7 @@ class GraspLoad:
         """Return the load of the grasp of a robot, whose model has the body."""
         return cls(payload, BufferedFunction(_grasp_wrench(robot, payload)))
 
-    def at(self, state: ControlState, z: Array, zdot: Array) -> Array:
+    def wrench(self, state: ControlState, z: Array, zdot: Array) -> Array:
         """Return force over torque (6,) at the end-effector, base components.
 
         Parameters
@@ -190,8 +190,8 @@ class Detumbling:
 
         share = 1.0
         if self._grasp is not None:
-            free = self._grasp.at(state, z, accelerations(0.0))[3:].copy()
-            change = self._grasp.at(state, z, accelerations(1.0))[3:] - free
+            free = self._grasp.wrench(state, z, accelerations(0.0))[3:].copy()
+            change = self._grasp.wrench(state, z, accelerations(1.0))[3:] - free
             share = largest_share(free, change, self._limit) if self._limit < math.inf else 1.0
             loaded = float(np.linalg.norm(free + share * change))
             self.largest_grasp_torque = max(self.largest_grasp_torque, loaded)

@@ -143,7 +143,7 @@ class ControlExecutive:
     # -- goals --------------------------------------------------------------------------------
 
     @property
-    def pursued(self) -> frozenset[str]:
+    def unfinished_goals(self) -> frozenset[str]:
         """Ids of the goals that are pursued or wait, also those whose abort is not reported yet."""
         present = self._abort_requested or self._goal_state is ControllerState.TRACKING
         waiting = frozenset(goal.goal_id for goal in self._pending.values())
@@ -393,7 +393,7 @@ class ControlExecutive:
         result = self.controller.command(time, measured, q, qdot)
         if wheels is None:
             return result
-        loss = Actuation(result.loss.wrench_B, wheels.shape(result.loss.tau))
+        loss = Actuation(result.excess.wrench_B, wheels.shape(result.excess.tau))
         return Saturated(wheels.actuation(result.realised), loss)
 
     def dump_momentum(self) -> tuple[bool, str]:
@@ -684,7 +684,7 @@ _STATE_AND_EVENT_OF_DECISION = {
 
 
 def _command_report(controller: CoordinatedController, result: Saturated) -> CommandReport:
-    status, loss, wheels = controller.law.status, result.loss, controller.wheels
+    status, loss, wheels = controller.law.status, result.excess, controller.wheels
     state = controller.law.state
     return CommandReport(
         law=controller.law.name,

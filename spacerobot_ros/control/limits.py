@@ -105,7 +105,7 @@ class Saturated:
     """
 
     realised: Actuation
-    loss: Actuation
+    excess: Actuation
 
     @classmethod
     def of(cls, commanded: Actuation, realised: Actuation) -> Saturated:
@@ -116,7 +116,7 @@ class Saturated:
     @property
     def limited(self) -> bool:
         """Whether any limit has changed the command."""
-        return bool(self.loss.wrench_B.any() or self.loss.tau.any())
+        return bool(self.excess.wrench_B.any() or self.excess.tau.any())
 
 
 @dataclass(frozen=True)

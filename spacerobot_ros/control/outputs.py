@@ -58,7 +58,7 @@ class OutputSelection:
     end_effector_link: str = ""
 
     @property
-    def kinds(self) -> tuple[str, ...]:
+    def error_kinds(self) -> tuple[str, ...]:
         """The kind of each output's error: ``position``, ``attitude`` or ``joints``."""
         axes = (*self.base, *self.end_effector)
         poses = ("attitude" if axis.startswith("r") else "position" for axis in axes)

@@ -222,7 +222,7 @@ def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate,
     if robot is None or not held:
         return ()
     loaded = any(event.kind is EventKind.DISTURBANCE for event in flight.events)
-    if loaded or plant.disturbances or Surroundings.of(plant.orbit, plant.table).act:
+    if loaded or plant.disturbances or Surroundings.of(plant.orbit, plant.table).has_loads:
         raise SpaceRobotError(
             "The held body is not estimated: loads from outside (disturbances, an orbit or a "
             "table) acted on the robot, and their impulse is not known to it; estimate it from a "

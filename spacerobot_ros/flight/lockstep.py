@@ -220,7 +220,7 @@ class _Host:
     def report_event(self, event: Event) -> None:
         self.flight.take_event(event)
 
-    def announce(self, start: ScheduleStart) -> None:
+    def publish_start(self, start: ScheduleStart) -> None:
         self.flight.log.schedules.append((start.stamp_ns, start.schedule))
 
     def log(self, level: str, message: str) -> None:
@@ -280,7 +280,7 @@ class _LockstepFlight:
         """Fly to the decision about the goal."""
         began, interrupted = time.perf_counter(), ""
         reported_at = began
-        self._commands.begin(0)
+        self._commands.revoke_before(0)
         for source in self._commands.sources:
             wrench = source.quantity == "wrench"
             source.commanders = int(self._controller is not None) if wrench else 1
@@ -404,7 +404,7 @@ class _LockstepFlight:
         self.log.add_command(source.topic, self._tick, values)
         if self._decided is _DecisionState.BEFORE_COMMAND:
             return
-        refusal = self._commands.offer(source, now, values, now)
+        refusal = self._commands.accept_or_refuse(source, now, values, now)
         if refusal is not None:
             self.log.refusals.append((self._time, source.topic, refusal))
             if refusal.latches:
@@ -451,7 +451,7 @@ class _LockstepFlight:
         if self._decided is not None:
             return
         self._status = status
-        if self._follower.take(status):
+        if self._follower.update(status):
             self._decided = self._moment
 
     def take_event(self, event: Event) -> None:

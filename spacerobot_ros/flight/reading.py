@@ -428,7 +428,7 @@ def read_flight(bag: FlightBag) -> Flight:
     sent = goals or next(filter(None, map(bag.goals, topics)), ())
     follower, status = GoalFollower(sent[-1].goal_id if sent else "", unnamed=True), None
     for status in reports:
-        if follower.take(status):
+        if follower.update(status):
             break
     decision = follower.decision
     flight = Flight(

@@ -541,7 +541,7 @@ def _resimulate(
         now = tick * flight.config.period_ns
         for source, commanded in zip(commands.sources, recorded, strict=True):
             if tick in commanded:
-                refusal = commands.offer(source, now, commanded[tick], now)
+                refusal = commands.accept_or_refuse(source, now, commanded[tick], now)
                 if refusal is not None:
                     done.refusals.setdefault(tick, (source.topic, refusal))
             elif not state.sensors.dropout:  # A state without a pose needs no answer.

@@ -390,9 +390,9 @@ class MessageDecoder:
             TemplateReader(ODOMETRY, {_POSE_PATH: 7, _TWIST_PATH: 6}) for _ in range(2)
         )
         self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
-        self.require, self.accept = self._joints.require, self._joints.accept
+        self.check_robot, self.decode_joints = self._joints.require, self._joints.accept
 
-    def base(self, odom: bytes) -> tuple[Array, Array]:
+    def decode_base(self, odom: bytes) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an Odometry."""
         self._odom.accept(odom)
         return self._odom.floats(_POSE_PATH), self._odom.floats(_TWIST_PATH)
@@ -437,7 +437,7 @@ class CommandReader:
             stamp_ns, command = self.read(raw)
         except UnreadableError as error:
             return commands.unreadable(self.source, error, now_ns)
-        return commands.offer(self.source, stamp_ns, command, now_ns)
+        return commands.accept_or_refuse(self.source, stamp_ns, command, now_ns)
 
     def read(self, raw: bytes) -> tuple[int, Array | CommandError]:
         """Return the stamp of a message, ns, and its values, or the reason why they are malformed.

@@ -138,7 +138,7 @@ class CoordinatedControlNode(CommanderNode):
         if status.state.level:
             self.get_logger().warning(status.message, throttle_duration_sec=5.0)
 
-    def announce(self, start: ScheduleStart) -> None:
+    def publish_start(self, start: ScheduleStart) -> None:
         """Ignore schedules, which a controller does not have."""
 
 

@@ -240,7 +240,7 @@ class PlannerNode(CommanderNode):
         super().publish_status(status)
         self.log_about_goals("warning" if status.state.level else "info", status.message)
 
-    def announce(self, start: ScheduleStart) -> None:
+    def publish_start(self, start: ScheduleStart) -> None:
         """Publish a schedule, its path and its goal, in a thread if planning runs in a thread."""
         if not self.config.plan_in_background:
             self._publish_schedule(start)
@@ -333,7 +333,7 @@ class _Connection:
         self._cancelled: set[int] = set()
         """Schedules that are cancelled as soon as they are accepted."""
 
-    def ready(self) -> bool:
+    def is_available(self) -> bool:
         """Whether the server is there."""
         return bool(self._client.server_is_ready())
 

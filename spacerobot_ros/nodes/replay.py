@@ -202,7 +202,7 @@ class ReplayNode(FlightNode):
     def _on_reader_check(self) -> None:
         matched = [p.get_subscription_count() for p in self._outputs]
         known = [self.count_subscribers(p.topic_name) for p in self._outputs]
-        if self._wait.check(matched, known):
+        if self._wait.may_begin(matched, known):
             self._begin()
 
     # -- time ---------------------------------------------------------------------------------

@@ -251,5 +251,5 @@ class MissionClient:
     def _on_status(self, received: DiagnosticStatus) -> None:
         message = read_status(received)
         self.status = self._read(dict(message.values), message.message)
-        if self._follower.take(self.status):
+        if self._follower.update(self.status):
             self._end(Outcome(self.status.state.value))

@@ -276,7 +276,7 @@ class FaultyPlant(WrappedPlant):
         """External loads; None: there never were any."""
         self._disturbances = disturbance_timeline(disturbances, self.robot.link_names)
         self._surroundings = surroundings or Surroundings()
-        if self._disturbances.entries or self._surroundings.act:
+        if self._disturbances.entries or self._surroundings.has_loads:
             self._begin_loads()
         self.apply_active_faults()
         self._apply_active_disturbances()

@@ -154,7 +154,7 @@ class Target:
             It would not stay on the table.
         """
         loads.surroundings.require_flat(self.description.name, self.motion, self.inertia)
-        if loads.surroundings.act:
+        if loads.surroundings.has_loads:
             self.loads, self._clock = PlantLoads(self._model, loads.surroundings), loads
             self._plant.load(self.loads)
 

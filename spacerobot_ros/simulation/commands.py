@@ -280,7 +280,7 @@ class CommandValidator:
         """Whether a command of any source is in force."""
         return any(source.stamp_ns != NO_STAMP for source in self.sources)
 
-    def offer(
+    def accept_or_refuse(
         self, source: CommandSource, stamp_ns: int, values: Array | CommandError, now_ns: int
     ) -> Refusal | None:
         """Accept or refuse a command.
@@ -344,16 +344,16 @@ class CommandValidator:
             self._commands[0][:] = self._brakes.efforts()
         return self._commands
 
-    def begin(self, now_ns: int) -> None:
+    def revoke_before(self, now_ns: int) -> None:
         """Revoke all commands, and accept only answers to states stamped ``now_ns`` or later."""
         self.rest()
         self._earliest = now_ns
 
     def reset(self, now_ns: int) -> None:
-        """Begin again (:meth:`begin`) with a plant in its initial state, whose wheels rest, too."""
+        """Begin again (:meth:`revoke_before`) with a plant in its initial state, whose wheels rest, too."""
         for source in self.sources:
             source.command[:] = 0.0
-        self.begin(now_ns)
+        self.revoke_before(now_ns)
 
     def rest(self) -> None:
         """Revoke all commands."""

@@ -82,7 +82,7 @@ class Surroundings:
         return bool(any(self.gravity_W) or self.friction)
 
     @property
-    def act(self) -> bool:
+    def has_loads(self) -> bool:
         """Whether there is any load."""
         return bool(self.mean_motion or self.on_table)
 
@@ -188,7 +188,7 @@ class PlantLoads:
         self.vector[layout.friction] = given.friction
 
     @property
-    def act(self) -> bool:
+    def has_loads(self) -> bool:
         """Whether any load acts now."""
         return bool(any(part.any() for part in self._acting))
 

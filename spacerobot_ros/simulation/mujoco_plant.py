@@ -229,7 +229,7 @@ class MujocoPlant:
         pushed = np.broadcast_to(np.asarray(wrench, dtype=float), (6,))
         if not (np.all(np.isfinite(wanted)) and np.all(np.isfinite(pushed))):
             raise CommandError(f"A command is not finite: {[*wanted.tolist(), *pushed.tolist()]}.")
-        loaded = self._loads is not None and self._loads.act
+        loaded = self._loads is not None and self._loads.has_loads
         if not loaded:
             self._data.xfrc_applied[:] = 0.0
         self._data.ctrl[:6] = self.wrench[:] = pushed

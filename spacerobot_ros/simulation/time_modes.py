@@ -108,7 +108,7 @@ class RealTime:
         """Start from a tick whose state is due now."""
         self._origin = now_ns - tick * self._pace
 
-    def due(self, now_ns: int, tick: int) -> int:
+    def due_ticks(self, now_ns: int, tick: int) -> int:
         """Return the number of ticks to take now, after ``tick``; lost ticks are dropped."""
         behind = int((now_ns - self._origin) / self._pace) - tick
         if behind > _MAX_LATE_TICKS:

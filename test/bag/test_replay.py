@@ -249,7 +249,7 @@ def test_time_goes_on_by_the_rate_and_stands_in_pauses(
     running_ns = 0
     clock = CLOCK
     for runs, passed in moves:
-        (timeline.run if runs else timeline.stop)(clock)
+        (timeline.start if runs else timeline.stop)(clock)
         clock += passed
         running_ns += passed if runs else 0
     # Floats near the time of the bag are 256 ns apart: whole numbers and fractions are not.
@@ -267,16 +267,16 @@ def test_time_goes_on_by_the_rate_and_stands_in_pauses(
 
 def test_a_replay_waits_for_readers_to_be_matched_and_to_be_all() -> None:
     wait = SubscriberWait(period=0.1, longest=60.0, settled=0.25)
-    assert not wait.check([0, 0], [0, 0]), "nobody is there"
-    assert not wait.check([1, 0], [1, 1]), "one is known and not matched"
-    assert not any(wait.check([1, 0], [1, 1]) for _ in range(9))
-    assert not wait.check([1, 1], [1, 1]), "one has just come"
-    assert [wait.check([1, 1], [1, 1]) for _ in range(3)] == [False, False, True]
+    assert not wait.may_begin([0, 0], [0, 0]), "nobody is there"
+    assert not wait.may_begin([1, 0], [1, 1]), "one is known and not matched"
+    assert not any(wait.may_begin([1, 0], [1, 1]) for _ in range(9))
+    assert not wait.may_begin([1, 1], [1, 1]), "one has just come"
+    assert [wait.may_begin([1, 1], [1, 1]) for _ in range(3)] == [False, False, True]
 
 
 def test_a_replay_without_readers_begins_after_the_longest_wait() -> None:
     wait = SubscriberWait(period=0.25, longest=1.0)
-    assert [wait.check([0], [0]) for _ in range(4)] == [False, False, False, True]
+    assert [wait.may_begin([0], [0]) for _ in range(4)] == [False, False, False, True]
 
 
 def test_topics_get_new_names() -> None:

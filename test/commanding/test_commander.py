@@ -63,7 +63,7 @@ class Host:
     def report_event(self, event: Event) -> None:
         self.events.append(event)
 
-    def announce(self, start: Any) -> None:
+    def publish_start(self, start: Any) -> None:
         pass
 
     def log(self, level: str, message: str) -> None:
@@ -89,14 +89,14 @@ class OneRobotDecoder(ArrayDecoder):
     def __init__(self, n: int) -> None:
         self._n = n
 
-    def require(self, joints: StateArrays) -> None:
+    def check_robot(self, joints: StateArrays) -> None:
         if len(joints.q) != self._n:
             raise CommandError("joint 'wing' is unknown")
 
-    def base(self, odom: StateArrays) -> tuple[Any, Any]:
+    def decode_base(self, odom: StateArrays) -> tuple[Any, Any]:
         if odom.pose is None:
             raise CommandError("its bytes are no Odometry")
-        return super().base(odom)
+        return super().decode_base(odom)
 
 
 @pytest.fixture(scope="module")
@@ -405,7 +405,7 @@ class SilentServer:
     def __init__(self) -> None:
         self.present, self.sent, self.cancelled = True, 0, list[int]()
 
-    def ready(self) -> bool:
+    def is_available(self) -> bool:
         return self.present
 
     def send(self, number: int, start: Any) -> None:

@@ -35,7 +35,7 @@ class Filter:
 
     def joints(self, wall: float, stamp: float) -> bool:
         self.wall = wall
-        return self.made.admits(round(stamp * UNIT), f"joints {stamp:g}")
+        return self.made.accepts_joints(round(stamp * UNIT), f"joints {stamp:g}")
 
     def odom(self, wall: float, stamp: float) -> bool:
         self.wall = wall
@@ -142,11 +142,11 @@ def test_ignored_messages_are_counted_and_named() -> None:
 def test_a_state_that_is_withdrawn_has_not_been() -> None:
     some = Filter()
     some.joints(0, 0)
-    some.made.withdraw()
+    some.made.undo_last()
     assert some.made.now_ns == 0
     assert some.joints(1, 7000), "it is the first again"
     some.joints(5, 7004)
-    some.made.withdraw()
+    some.made.undo_last()
     assert some.made.now_ns == 7000 * UNIT
     assert some.joints(6, 7006)
     assert not some.joints(6, 7000)
@@ -158,20 +158,20 @@ def test_a_state_that_is_withdrawn_has_not_been() -> None:
 @pytest.mark.parametrize("pose_required", [False, True])
 def test_pairs_are_handed_over_once(pose_required: bool) -> None:
     states = StateSynchroniser(pose_required=pose_required)
-    assert states.ready() is None
+    assert states.take_ready() is None
     states.put_odom(5, "o5")
-    assert states.ready() is None
+    assert states.take_ready() is None
     states.put_joints(5, "j5")
-    assert [states.ready(), states.ready()] == [Pairing.WHOLE, None]
+    assert [states.take_ready(), states.take_ready()] == [Pairing.WHOLE, None]
     states.put_joints(6, "j6")
-    early = states.ready()
+    early = states.take_ready()
     assert early is (None if pose_required else Pairing.WITHOUT_POSE)
     assert not states.put_odom(6, "o6")
     late = Pairing.WHOLE if pose_required else Pairing.LATE_POSE
-    assert [states.ready(), states.ready()] == [late, None]
+    assert [states.take_ready(), states.take_ready()] == [late, None]
     assert states.put_odom(6, "another")
     states.put_joints(6, "j6 again")
-    assert states.ready() is Pairing.WITHOUT_POSE
+    assert states.take_ready() is Pairing.WITHOUT_POSE
 
 
 @pytest.mark.parametrize("pose_required", [False, True])
@@ -179,11 +179,11 @@ def test_a_state_of_the_same_time_after_a_reset_is_new(pose_required: bool) -> N
     states = StateSynchroniser(pose_required=pose_required)
     states.put_odom(5, "o5")
     states.put_joints(5, "j5")
-    states.ready()
+    states.take_ready()
     states.forget_pose()
     assert (states.odom, states.joints) == (None, None)
     assert not states.put_odom(5, "another")
-    assert states.ready() is None
+    assert states.take_ready() is None
     states.put_joints(5, "j5 anew")
     states.forget_pose()
     assert states.joints == "j5 anew", "it was not handed over yet"
@@ -196,15 +196,15 @@ def test_references_are_waited_for_where_they_are_published() -> None:
     for stamp, put in ((5, True), (6, False)):
         states.put_odom(stamp, f"o{stamp}")
         states.put_joints(stamp, f"j{stamp}")
-        assert states.ready() is None
+        assert states.take_ready() is None
         if put:
             states.put_required("a", stamp, "message")
             states.require("a")
             assert states.latest("a") == "message", "it is not forgotten"
-            assert states.ready() is Pairing.WHOLE
+            assert states.take_ready() is Pairing.WHOLE
     states.require("a", required=False)
     assert states.latest("a") is None
-    assert states.ready() is Pairing.WHOLE
+    assert states.take_ready() is Pairing.WHOLE
 
 
 # -- controller ---------------------------------------------------------------------------------
@@ -233,8 +233,8 @@ def commander(**changes: Any) -> Any:
             send_command=lambda stamp: done.append(("send", stamp)),
             log=lambda *words: done.append(words),
         ),
-        plant=SimpleNamespace(blocked=""),
-        stamps=SimpleNamespace(withdraw=lambda: done.append("withdraw")),
+        plant=SimpleNamespace(refusal_of_goals=""),
+        stamps=SimpleNamespace(undo_last=lambda: done.append("withdraw")),
         _pose_has_come=False,
         _odom_was_connected=False,
         effort=np.zeros(2),
@@ -268,7 +268,7 @@ def test_changes_of_the_plant_are_told_to_the_executive(change: PlantChange, cal
 
 @pytest.mark.parametrize("blocked", ["", "aborted"])
 def test_a_blocked_plant_blocks_the_executive(blocked: str) -> None:
-    made = commander(plant=SimpleNamespace(blocked=blocked))
+    made = commander(plant=SimpleNamespace(refusal_of_goals=blocked))
     ControllerCommander._forward_plant_state(made)
     assert made.executive.plant_blocked is bool(blocked)
     made.executive = None
@@ -295,7 +295,7 @@ def test_a_state_without_its_odom_is_answered_when_the_next_comes(
 ) -> None:
     made = commander(
         active=active,
-        states=SimpleNamespace(overdue=lambda: overdue),
+        states=SimpleNamespace(take_overdue=lambda: overdue),
         _waits_for_first_pose=lambda: waits,
     )
     made._answer_state = lambda pairing, send: made.done.append((pairing, send))
@@ -322,14 +322,14 @@ def answering(pairing: Pairing, *, send: bool = True, fails: Exception | None = 
         command=command, evaluate=lambda now, result: made.done.append(("evaluate", now))
     )
 
-    def accept(joints: str) -> int:
+    def decode_joints(joints: str) -> int:
         if isinstance(fails, CommandError):
             raise fails
         return 3 * SECOND // 2
 
     made._decoder = SimpleNamespace(
-        accept=accept, q="q", qdot="qdot",
-        base=lambda odom: (np.arange(7.0), np.arange(10.0, 16.0)),
+        decode_joints=decode_joints, q="q", qdot="qdot",
+        decode_base=lambda odom: (np.arange(7.0), np.arange(10.0, 16.0)),
     )  # fmt: skip
     made._reference = lambda decoder: "reference"
     ControllerCommander._answer_state(made, pairing, send=send)
@@ -375,7 +375,7 @@ def test_a_state_that_is_refused_is_not_answered(error: Exception) -> None:
 def test_only_an_active_controller_with_a_robot_answers(
     executive: bool, activity: CommanderActivity, pairing: Pairing | None
 ) -> None:
-    made = commander(activity=activity, states=SimpleNamespace(ready=lambda: pairing))
+    made = commander(activity=activity, states=SimpleNamespace(take_ready=lambda: pairing))
     made._answer_state = made.done.append
     if not executive:
         made.executive = None
@@ -426,7 +426,7 @@ def test_references_of_others_have_a_base_or_joints(
     made = commander(states=SimpleNamespace(latest=given.get))
     made._held_velocities = SimpleNamespace(at_command=lambda q, qdot: f"{q} and {qdot}")
     decoder: Any = SimpleNamespace(
-        base=lambda message: (np.arange(7.0), np.arange(10.0, 16.0)),
+        decode_base=lambda message: (np.arange(7.0), np.arange(10.0, 16.0)),
         joint_reference=lambda message: (message, "rates"),
     )
     monkeypatch.setattr(

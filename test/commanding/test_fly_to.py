@@ -95,17 +95,17 @@ def status(state: str, goal_id: str, message: str = "So it is.", **about: Any) -
 )
 def test_tolerances_are_finite_numbers(change: dict[str, float], words: str) -> None:
     tolerance = Tolerance(0.0, 0.2, 0.3)
-    assert FlyTo.checked(POSE, tolerance, 7.5) == FlyTo(POSE, tolerance, 7.5)
+    assert FlyTo.from_numbers(POSE, tolerance, 7.5) == FlyTo(POSE, tolerance, 7.5)
     with pytest.raises(PlanningError) as refused:
-        FlyTo.checked(POSE, replace(tolerance, **change), 7.5)
+        FlyTo.from_numbers(POSE, replace(tolerance, **change), 7.5)
     assert_one_sentence(str(refused.value), words, "finite number above 0")
 
 
 def test_a_time_limit_is_a_finite_number() -> None:
-    assert FlyTo.checked(POSE, Tolerance(0.0, 0.0, 0.0), 0.0).time_limit == 0.0
+    assert FlyTo.from_numbers(POSE, Tolerance(0.0, 0.0, 0.0), 0.0).time_limit == 0.0
     for limit in (-1.0, math.inf):
         with pytest.raises(PlanningError, match="time limit of the goal is"):
-            FlyTo.checked(POSE, Tolerance(0.0, 0.0, 0.0), limit)
+            FlyTo.from_numbers(POSE, Tolerance(0.0, 0.0, 0.0), limit)
 
 
 def test_tolerances_that_a_goal_leaves_open_are_the_parameters() -> None:
@@ -206,16 +206,16 @@ def test_errors_of_a_status_count_where_the_goal_has_them() -> None:
 def test_the_status_that_decides_a_goal_is_its_result(state: str) -> None:
     rig = Rig()
     first, second = rig.send("a"), rig.send("b")
-    rig.goals.take(status("executing", "b"))
-    rig.goals.take(status(state, "b", "It is over.", position_error_m=0.02))
+    rig.goals.update(status("executing", "b"))
+    rig.goals.update(status(state, "b", "It is over.", position_error_m=0.02))
     assert second.end_of == (state, "It is over.")
     assert second.results[0].errors.position == 0.02
     assert second.results[0].errors.attitude == 0.5
-    rig.goals.take(status(state, "b", "Once more."))
+    rig.goals.update(status(state, "b", "Once more."))
     assert len(second.results) == 1
     assert not first.results
     assert rig.goals
-    rig.goals.take(status(state, "a"))
+    rig.goals.update(status(state, "a"))
     assert not rig.goals
     assert rig.aborted == []
 
@@ -224,7 +224,7 @@ def test_a_goal_that_is_refused_at_once_has_no_errors() -> None:
     rig, client = Rig(), Client()
     rig.goals.begin("a", client, None)
     rig.advance(5)
-    rig.goals.take(status("refused", "a", "It is in frame 'moon'."))
+    rig.goals.update(status("refused", "a", "It is in frame 'moon'."))
     assert client.end_of == ("refused", "It is in frame 'moon'.")
     assert math.isnan(client.results[0].errors.position)
     assert client.told == []
@@ -233,13 +233,13 @@ def test_a_goal_that_is_refused_at_once_has_no_errors() -> None:
 def test_goals_that_are_pursued_no_more_are_aborted_by_the_later_one() -> None:
     rig = Rig()
     first, second = rig.send("a"), rig.send("b")
-    rig.goals.settle({"a", "b"})
+    rig.goals.end_dropped_goals({"a", "b"})
     assert not first.results
     rig.goals.accepted("12.5")
-    rig.goals.settle({"b", "12.5"})
+    rig.goals.end_dropped_goals({"b", "12.5"})
     assert first.end_of == ("aborted", "Aborted: replaced by goal 12.5.")
     assert rig.aborted == [("a", "Aborted: replaced by goal 12.5.")]
-    rig.goals.settle((), "Aborted: this node was deactivated.")
+    rig.goals.end_dropped_goals((), "Aborted: this node was deactivated.")
     assert second.end_of == ("aborted", "Aborted: this node was deactivated.")
     assert len(first.results) == 1
 
@@ -248,8 +248,8 @@ def test_a_goal_that_was_refused_has_replaced_none() -> None:
     rig = Rig()
     first = rig.send("a")
     rig.goals.accepted("later")
-    rig.goals.take(status("refused", "later"))
-    rig.goals.settle(())
+    rig.goals.update(status("refused", "later"))
+    rig.goals.end_dropped_goals(())
     assert first.end_of == ("aborted", "The goal is not pursued any more.")
 
 

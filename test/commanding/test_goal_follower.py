@@ -21,7 +21,7 @@ def test_the_first_schedule_and_the_first_decision_of_the_goal_count() -> None:
     first, second = (planner(PlannerState.EXECUTING, message=text) for text in ("one", "two"))
     reached, later = planner(PlannerState.REACHED), planner(PlannerState.ABORTED)
     told: list[Status] = [planner(PlannerState.PLANNING), first, second, reached, later]
-    assert [follower.take(status) for status in told] == [False, False, False, True, False]
+    assert [follower.update(status) for status in told] == [False, False, False, True, False]
     assert (follower.gait, follower.decision) == (first, reached)
 
 
@@ -29,24 +29,24 @@ def test_the_first_schedule_and_the_first_decision_of_the_goal_count() -> None:
 def test_statuses_of_other_goals_tell_nothing(state: PlannerState) -> None:
     for follower, others in ((GoalFollower(ID), (OTHER, "")), (GoalFollower(), (ID, OTHER, ""))):
         for other in others:
-            assert not follower.concerns(planner(state, other))
-            assert not follower.take(planner(state, other))
+            assert not follower.is_about_goal(planner(state, other))
+            assert not follower.update(planner(state, other))
         assert follower.gait is None
         assert follower.decision is None
 
 
 def test_statuses_without_an_id_are_those_of_the_goal_in_old_bags() -> None:
     follower = GoalFollower(ID, unnamed=True)
-    assert not follower.take(planner(PlannerState.FAILED, OTHER))
-    assert not follower.take(planner(PlannerState.EXECUTING, ""))
-    assert follower.take(planner(PlannerState.FAILED, ""))
+    assert not follower.update(planner(PlannerState.FAILED, OTHER))
+    assert not follower.update(planner(PlannerState.EXECUTING, ""))
+    assert follower.update(planner(PlannerState.FAILED, ""))
     assert follower.gait is not None
 
 
 def test_a_controller_that_tracks_begins_no_schedule() -> None:
     follower = GoalFollower(ID)
-    assert not follower.take(ControllerStatus(ControllerState.TRACKING, goal_id=ID))
-    assert follower.take(ControllerStatus(ControllerState.REACHED, goal_id=ID))
+    assert not follower.update(ControllerStatus(ControllerState.TRACKING, goal_id=ID))
+    assert follower.update(ControllerStatus(ControllerState.REACHED, goal_id=ID))
     assert follower.gait is None
 
 

@@ -35,7 +35,7 @@ class Listener:
         return self.times.accepts_odom(*message("odom", seconds))
 
     def joints(self, seconds: float) -> bool:
-        admitted = self.times.admits(*message("joint_states", seconds))
+        admitted = self.times.accepts_joints(*message("joint_states", seconds))
         if admitted:
             self.believed.append(seconds)
         return admitted
@@ -167,10 +167,10 @@ def test_the_first_state_is_believed_whatever_its_stamp() -> None:
 def test_a_state_of_another_robot_tells_nothing_about_the_time() -> None:
     listener = Listener()
     assert listener.joints(1e6)
-    listener.times.withdraw()
+    listener.times.undo_last()
     listener.states(10)
     assert listener.joints(listener.time + PERIOD)
-    listener.times.withdraw()
+    listener.times.undo_last()
     listener.states(10)
     assert listener.times.ignored == 0
 
@@ -185,7 +185,7 @@ class Exact:
         self.times = StampFilter(self.PERIOD, clock=lambda: self.wall)
         for tick in range(1, 17):
             self.wall += self.PERIOD / pace
-            assert self.times.admits(round(tick * self.PERIOD * SECOND), "joints")
+            assert self.times.accepts_joints(round(tick * self.PERIOD * SECOND), "joints")
 
     @property
     def now(self) -> int:
@@ -222,7 +222,7 @@ def test_a_jump_is_believed_after_four_states_and_a_fifth_of_a_second(
     stamp = exact.now + 8 * SECOND
     assert exact.times.accepted_jump() is None
     assert not exact.times.accepts_odom(stamp, "odom")
-    assert not exact.times.admits(stamp, "joints")
+    assert not exact.times.accepts_joints(stamp, "joints")
     begin = exact.wall
     for share in (0.25, 0.5, 0.75, 0.9375):
         exact.wall = begin + share * doubt
@@ -235,7 +235,7 @@ def test_a_jump_is_believed_after_four_states_and_a_fifth_of_a_second(
 
 def test_a_jump_is_not_believed_at_the_first_look_after_a_standstill() -> None:
     exact = Exact()
-    exact.times.admits(exact.now + 8 * SECOND, "joints")
+    exact.times.accepts_joints(exact.now + 8 * SECOND, "joints")
     exact.wall += 60.0
     looks = [exact.times.accepted_jump() is not None for _ in range(3)]
     assert looks == [False, True, False]
@@ -249,10 +249,10 @@ def test_ignored_messages_are_named_with_their_distance_in_time() -> None:
         ("odom", 1234.5678, "1235 s ahead of"),
     ):
         stamp = exact.now + round(ahead * SECOND)
-        put = exact.times.admits if part == "joint_states" else exact.times.accepts_odom
+        put = exact.times.accepts_joints if part == "joint_states" else exact.times.accepts_odom
         assert not put(stamp, "message")
         before = exact.times.ignored
-        assert exact.times.admits(exact.now, "joints")
+        assert exact.times.accepts_joints(exact.now, "joints")
         assert exact.times.ignored == before + 1
         assert exact.times.last_ignored == (
             f"A message on '{part}' is ignored: its stamp is {words} the time of the states."

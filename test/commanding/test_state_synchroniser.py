@@ -38,7 +38,7 @@ class Commander:
         self._poll()
 
     def joints(self, tick: int) -> None:
-        overdue = self.states.overdue()
+        overdue = self.states.take_overdue()
         if overdue is not None:
             self.handed.append((overdue, self._tick))
         self._tick = tick
@@ -50,10 +50,10 @@ class Commander:
         self._poll()
 
     def _poll(self) -> None:
-        pairing = self.states.ready()
+        pairing = self.states.take_ready()
         if pairing is not None:
             self.handed.append((pairing, self._tick))
-        assert self.states.ready() is None, "a state is handed over once"
+        assert self.states.take_ready() is None, "a state is handed over once"
 
 
 # -- pose required ----------------------------------------------------------------------------
@@ -166,12 +166,12 @@ def test_every_reference_must_be_of_the_same_tick(late: str) -> None:
     control.joints(2)
     assert control.handed == [(WHOLE, 1)], "the other reference is of tick 1"
     control.states.put_required(late, *stamped(joints(2)))
-    assert control.states.ready() is WHOLE
+    assert control.states.take_ready() is WHOLE
     control.odom(3)
     control.states.put_required(other, *stamped(joints(3)))
     control.joints(3)
     # The pose is there: what is missing is no loss of the pose, now or later.
-    assert control.states.overdue() is WHOLE
+    assert control.states.take_overdue() is WHOLE
     control.states.put_required(late, *stamped(joints(4)))
     control.states.put_required(other, *stamped(joints(4)))
     control.joints(4)
@@ -223,7 +223,7 @@ def test_an_old_pose_is_no_pose_of_a_new_state() -> None:
 
 def test_the_messages_themselves_are_kept_as_they_came() -> None:
     states = StateSynchroniser(pose_required=True)
-    assert (states.odom, states.joints, states.ready(), states.overdue()) == (
+    assert (states.odom, states.joints, states.take_ready(), states.take_overdue()) == (
         None,
         None,
         None,
@@ -248,17 +248,17 @@ def test_a_pose_after_a_reset_is_not_that_of_joints_before_it(*, pose_required: 
     states = StateSynchroniser(pose_required=pose_required)
     states.put_odom(*stamped(odom(3)))
     states.put_joints(*stamped(joints(3)))
-    assert states.ready() is Pairing.WHOLE
+    assert states.take_ready() is Pairing.WHOLE
     states.forget_pose()
     states.put_odom(*stamped(odom(3)))
-    assert states.ready() is None
+    assert states.take_ready() is None
     states.put_joints(*stamped(joints(3)))
-    assert states.ready() is Pairing.WHOLE
+    assert states.take_ready() is Pairing.WHOLE
     # Joints that were not handed over may be those after the reset.
     states.put_joints(*stamped(joints(4)))
     states.forget_pose()
     states.put_odom(*stamped(odom(4)))
-    assert states.ready() in (Pairing.WHOLE, Pairing.LATE_POSE)
+    assert states.take_ready() in (Pairing.WHOLE, Pairing.LATE_POSE)
 
 
 def test_a_topic_that_is_required_again_keeps_its_message() -> None:
@@ -267,11 +267,11 @@ def test_a_topic_that_is_required_again_keeps_its_message() -> None:
     assert states.latest("joint_reference") is None
     states.put_odom(*stamped(odom(3)))
     states.put_joints(*stamped(joints(3)))
-    assert states.ready() is None, "it waits for its reference"
+    assert states.take_ready() is None, "it waits for its reference"
     states.put_required("joint_reference", *stamped(joints(3)))
     states.require("joint_reference")
     assert states.latest("joint_reference") == joints(3)
-    assert states.ready() is WHOLE
+    assert states.take_ready() is WHOLE
     states.require("joint_reference", required=False)
     assert states.latest("joint_reference") is None
 
@@ -282,13 +282,13 @@ def test_poses_that_contradict_each_other_are_not_used(*, pose_required: bool) -
     assert not states.put_odom(*stamped(odom(1, 0.1)))
     assert states.put_odom(*stamped(odom(1, 9.0)))
     states.put_joints(*stamped(joints(1)))
-    assert states.ready() is Pairing.WITHOUT_POSE
+    assert states.take_ready() is Pairing.WITHOUT_POSE
     assert not states.put_odom(*stamped(odom(2, 0.2)))
     states.put_joints(*stamped(joints(2)))
-    assert states.ready() is Pairing.WHOLE
+    assert states.take_ready() is Pairing.WHOLE
     assert states.put_odom(*stamped(odom(2, 9.0)))
-    assert states.ready() is None
+    assert states.take_ready() is None
     assert not states.put_odom(*stamped(odom(3, 0.3)))
     assert not states.put_odom(*stamped(odom(3, 0.3)))  # The same again, as for a new subscriber.
     states.put_joints(*stamped(joints(3)))
-    assert states.ready() is Pairing.WHOLE
+    assert states.take_ready() is Pairing.WHOLE

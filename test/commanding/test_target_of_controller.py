@@ -53,7 +53,7 @@ class Rig:
     def report_event(self, event: Event) -> None:
         pass
 
-    def announce(self, start: Any) -> None:
+    def publish_start(self, start: Any) -> None:
         pass
 
     def log(self, level: str, message: str) -> None:

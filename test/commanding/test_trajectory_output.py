@@ -26,7 +26,7 @@ class Server:
         self.sent: list[tuple[int, Any]] = []
         self.cancelled: list[int] = []
 
-    def ready(self) -> bool:
+    def is_available(self) -> bool:
         return self.present
 
     def send(self, number: int, start: Any) -> None:
@@ -55,11 +55,11 @@ def test_a_schedule_is_sent_and_ends_with_its_result() -> None:
     sent = Sent()
     number = sent.start("first")
     assert sent.server.sent == [(number, "first")]
-    assert sent.output.waits
+    assert sent.output.awaits_result
     sent.output.on_phase_change(Phase.EXECUTING)
     sent.output.ended(number, Outcome.SUCCEEDED, 0, "")
     assert sent.ends == [TrajectoryEnd()]
-    assert not sent.output.waits
+    assert not sent.output.awaits_result
     # Each schedule ends once, and nothing that has ended is cancelled.
     sent.output.ended(number, Outcome.ABORTED, -4, "")
     sent.output.rejected(number)
@@ -104,7 +104,7 @@ def test_what_is_left_is_cancelled_and_its_result_does_not_count() -> None:
             Phase.EXECUTING, Phase.PLANNING, Phase.REPLANNING, Phase.TAKING_OVER
         )  # fmt: skip
         assert sent.server.cancelled == ([] if goes_on else [number])
-        assert sent.output.waits is goes_on
+        assert sent.output.awaits_result is goes_on
         sent.output.ended(number, Outcome.CANCELED, 0, "")
         assert len(sent.ends) == (1 if goes_on else 0)
 
@@ -136,23 +136,23 @@ def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
     sent.output.start(lost)
     assert sent.server.sent == []
     assert sent.ends.pop() == TrajectoryEnd("no server of the action '/arm/follow' is there", True)
-    assert not sent.output.waits
+    assert not sent.output.awaits_result
     sent.server.present = True
     number = sent.start(accepted=False)
     for second in range(6):
         assert not sent.ends
-        sent.output.watch(FIRST + second * SECOND)
-    sent.output.watch(FIRST + 5 * SECOND + 1)
+        sent.output.check_server(FIRST + second * SECOND)
+    sent.output.check_server(FIRST + 5 * SECOND + 1)
     assert sent.ends == [TrajectoryEnd("the action '/arm/follow' has not answered", True)]
     assert sent.server.cancelled == [number]
     # One that was accepted may take any time; a schedule that is left ends nothing.
     later = sent.start()
     for second in range(20):
-        sent.output.watch(FIRST + second * SECOND)
+        sent.output.check_server(FIRST + second * SECOND)
     sent.output.on_phase_change(Phase.EVALUATING)
     reset = sent.start(accepted=False)
     sent.output.on_phase_change(Phase.EVALUATING)
-    sent.output.watch(FIRST + 60 * SECOND)
+    sent.output.check_server(FIRST + 60 * SECOND)
     assert len(sent.ends) == 1
     assert sent.server.cancelled == [number, later, reset]
 
@@ -160,30 +160,30 @@ def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
 def test_the_time_for_an_answer_begins_with_the_state_after_the_schedule() -> None:
     sent = Sent()
     sent.start()
-    sent.output.watch(FIRST)
+    sent.output.check_server(FIRST)
     # Planning took ten seconds, and time may jump back.
     sent.start(accepted=False)
-    sent.output.watch(FIRST + 15 * SECOND)
-    sent.output.watch(FIRST)
-    sent.output.watch(FIRST + 5 * SECOND)
+    sent.output.check_server(FIRST + 15 * SECOND)
+    sent.output.check_server(FIRST)
+    sent.output.check_server(FIRST + 5 * SECOND)
     assert sent.ends == []
-    sent.output.watch(FIRST + 5 * SECOND + 1)
+    sent.output.check_server(FIRST + 5 * SECOND + 1)
     assert len(sent.ends) == 1
 
 
 def test_a_server_that_goes_ends_the_goal_within_a_second() -> None:
     sent = Sent()
     number = sent.start()
-    sent.output.watch(FIRST)
+    sent.output.check_server(FIRST)
     sent.server.present = False
-    sent.output.watch(FIRST + SECOND - 1)
+    sent.output.check_server(FIRST + SECOND - 1)
     assert sent.ends == []
-    sent.output.watch(FIRST + SECOND)
+    sent.output.check_server(FIRST + SECOND)
     wanted = TrajectoryEnd("the server of the action '/arm/follow' is gone", True)
     assert sent.ends == [wanted]
     # It may still drive the joints, and only this planner not see it.
     assert sent.server.cancelled == [number]
-    sent.output.watch(FIRST + 2 * SECOND)
+    sent.output.check_server(FIRST + 2 * SECOND)
     assert sent.ends == [wanted]
 
 

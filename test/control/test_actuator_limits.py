@@ -19,8 +19,8 @@ def test_force_and_torque_keep_their_directions() -> None:
     np.testing.assert_allclose(wrench[3:], COMMAND.wrench_B[3:] / 2)
     np.testing.assert_array_equal(saturated.realised.tau, [5.0, -6.0])
     assert saturated.limited
-    np.testing.assert_allclose(saturated.loss.wrench_B, COMMAND.wrench_B - wrench)
-    np.testing.assert_array_equal(saturated.loss.tau, [0.0, -1.0])
+    np.testing.assert_allclose(saturated.excess.wrench_B, COMMAND.wrench_B - wrench)
+    np.testing.assert_array_equal(saturated.excess.tau, [0.0, -1.0])
 
 
 def test_force_and_torque_are_limited_apart() -> None:

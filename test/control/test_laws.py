@@ -216,6 +216,6 @@ def test_gains_are_bounded_so_that_commands_are_numbers(law: str) -> None:
     state = replace(planar_start(), qdot=np.array([0.5, -0.25]))
     controller.command(0.0, state, state.q, state.qdot)
     result = controller.command(0.01, replace(state, r_WB=np.full(3, 100.0)), state.q, state.qdot)
-    for part in (result.realised, result.loss):
+    for part in (result.realised, result.excess):
         assert np.isfinite(part.wrench_B).all()
         assert np.isfinite(part.tau).all()

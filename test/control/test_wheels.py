@@ -495,7 +495,7 @@ class Loop:
         state = ControlState(zero, np.array([0.0, 0, 0, 1]), zero, twist, q, np.array(qdot))
         result = self.executive.command(time, state, q, np.array(qdot))
         self.executive.evaluate(time, result)
-        assert result.loss.tau.shape == (4,)
+        assert result.excess.tau.shape == (4,)
         return result.realised
 
 

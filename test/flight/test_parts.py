@@ -75,7 +75,7 @@ def test_commands_after_a_decision_before_them_are_logged_alone(
         return refusal
 
     source: Any = SimpleNamespace(topic="joint_commands")
-    made = loop(_commands=SimpleNamespace(offer=offer), _decided=decided)
+    made = loop(_commands=SimpleNamespace(accept_or_refuse=offer), _decided=decided)
     made._report_plant_status = reported.append
     made._offer_command(source, "values", 17)
     assert made.log.commands == [("joint_commands", 6, "values")]
@@ -96,7 +96,7 @@ def test_the_decision_is_that_of_the_commander_that_has_the_goal() -> None:
 
     planned = PlannerStatus(PlannerState.IDLE, "")
     controlled = ControllerStatus(next(iter(ControllerState)), "")
-    made = loop(_follower=SimpleNamespace(take=take), _planner=object())
+    made = loop(_follower=SimpleNamespace(update=take), _planner=object())
     assert made._expected_end == 0.0
     for status in (planned, controlled, planned, planned):
         made.take_status(status)
@@ -105,7 +105,7 @@ def test_the_decision_is_that_of_the_commander_that_has_the_goal() -> None:
     assert made._decided is BEFORE
     assert made._expected_end == planned.ends_at_s
     taken.clear()
-    alone = loop(_follower=SimpleNamespace(take=take), _moment=AFTER)
+    alone = loop(_follower=SimpleNamespace(update=take), _moment=AFTER)
     for status in (planned, controlled, controlled):
         alone.take_status(status)
     assert taken == [controlled, controlled]

@@ -178,7 +178,7 @@ def assert_latches_if_malformed(
     )
     commands = CommandValidator(build_plant(robot(), config), config)
     stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-    commands.begin(stamp)  # So that no stamp is of a state before the start.
+    commands.revoke_before(stamp)  # So that no stamp is of a state before the start.
     reader = CommandReader(commands.sources[number], robot())
     refusal = reader.offer(commands, bytes(serialize_message(message)), stamp)
     assert (refusal is not None and refusal.reason is not Reason.NOT_FINITE) == bool(commands.fault)

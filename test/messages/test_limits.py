@@ -178,7 +178,7 @@ def test_references_lack_what_they_do_not_give() -> None:
     decoder = MessageDecoder(["a", "b"])
     position, velocity = decoder.joint_reference(state(["b", "a"]))
     assert (position.tolist(), velocity.tolist()) == ([2, 1], [0, 0])
-    decoder.accept(state(["a", "b"], velocity=[0.5, 0.25]))
+    decoder.decode_joints(state(["a", "b"], velocity=[0.5, 0.25]))
     assert (decoder.q.tolist(), decoder.qdot.tolist()) == ([1, 2], [0.5, 0.25])
 
 

@@ -127,7 +127,7 @@ def test_a_replay_begins_when_its_readers_are_there(paused: bool) -> None:
         SimpleNamespace(topic_name=name, get_subscription_count=lambda count=count: count)
         for name, count in (("/a", 1), ("/b", 0))
     ]
-    node = replaying(_outputs=outputs, _wait=SimpleNamespace(check=check), _paused=paused)
+    node = replaying(_outputs=outputs, _wait=SimpleNamespace(may_begin=check), _paused=paused)
     node.count_subscribers = {"/a": 2, "/b": 3}.get
     ReplayNode._on_reader_check(node)
     assert node.done == []

@@ -214,7 +214,7 @@ def test_wall_time_steps_as_often_as_is_due(
     PlantNode._on_wall_tick(node)
     assert node.done == done
     if active is RUNNING:
-        assert asked == [("time.due", 7 * S, 40), *[("time.count_tick", 7 * S, 40)] * due]
+        assert asked == [("time.due_ticks", 7 * S, 40), *[("time.count_tick", 7 * S, 40)] * due]
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ def test_a_reset_is_known_before_the_next_state(active: PlantState) -> None:
     node = plant("_on_reset", _active=active)
     said = (True, "The robot is back in its initial state; time goes on.")
     assert answer(PlantNode._on_reset, node) == said
-    first = [("plant.reset",), ("commands.begin", 2 * S), "_publish_changed_status"]
+    first = [("plant.reset",), ("commands.revoke_before", 2 * S), "_publish_changed_status"]
     assert node.done == first + ["_publish"] * (active is not INACTIVE)
     assert (node._monitor.resets, node._monitor.rearms) == (6, 2)
 

@@ -36,7 +36,7 @@ class DrivenFlight(Flight):
     def find_server(self) -> None:
         output = self.planner.commander.trajectories
         assert output is not None
-        self.harness.spin_until(output._server.ready, "the server")
+        self.harness.spin_until(output._server.is_available, "the server")
 
     def ended(self, place: Any) -> tuple[str, str, str]:
         """Return state, corrections and message of the end of a goal."""

@@ -43,7 +43,7 @@ class Rig:
     def offer(
         self, stamp_ns: int, now_ns: int, values: npt.NDArray[np.float64] | CommandError = FAST
     ) -> Refusal | None:
-        return self.commands.offer(self.joints, stamp_ns, values, now_ns)
+        return self.commands.accept_or_refuse(self.joints, stamp_ns, values, now_ns)
 
     def reason(self, *args: Any) -> Reason:
         refusal = self.offer(*args)
@@ -291,7 +291,7 @@ def test_a_coincidence_of_numbers_hides_a_second_commander_for_one_message_only(
 def test_commands_from_before_a_start_a_reset_or_a_fault_are_refused() -> None:
     rig, now = real_time(), 10 * SECOND
     assert rig.offer(now, now) is None
-    rig.commands.begin(now + TICK)
+    rig.commands.revoke_before(now + TICK)
     assert rig.reason(now, now + TICK) is Reason.STALE
     assert rig.offer(now + TICK, now + TICK) is None
     rig.commands.latch("abort", "aborted on request", now + TICK)
@@ -381,7 +381,7 @@ def test_the_first_of_several_latched_faults_is_the_one_shown() -> None:
 def test_latching_takes_back_what_was_accepted_in_the_same_tick() -> None:
     rig = Rig(ARM, actuation="effort", latched_faults="malformed")
     wrench = rig.commands.sources[1]
-    assert rig.commands.offer(wrench, 0, np.ones(6), 0) is None
+    assert rig.commands.accept_or_refuse(wrench, 0, np.ones(6), 0) is None
     assert rig.reason(0, 0, CommandError("a joint is missing")) is Reason.MALFORMED
     assert rig.commands.complete
     assert not rig.commands.begin_step()[1].any()
@@ -396,7 +396,7 @@ def test_a_wrench_is_waited_for_only_while_somebody_publishes_it() -> None:
     rig = Rig(ARM, actuation="effort")
     joints, wrench = rig.commands.sources
     joints.commanders = wrench.commanders = 0
-    assert rig.commands.offer(wrench, 0, np.ones(6), 0) is None
+    assert rig.commands.accept_or_refuse(wrench, 0, np.ones(6), 0) is None
     rig.commands.require_commanded()
     assert (joints.required, wrench.required) == (True, False)
     assert not rig.commands.begin_step()[1].any(), "nobody is left who could end the thrust"

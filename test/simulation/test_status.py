@@ -43,7 +43,10 @@ class Rig:
         return self.monitor.status.state, self.monitor.status.reason
 
     def command(self) -> None:
-        assert self.commands.offer(self.commands.sources[0], self.now, FAST, self.now) is None
+        assert (
+            self.commands.accept_or_refuse(self.commands.sources[0], self.now, FAST, self.now)
+            is None
+        )
 
 
 def test_a_plant_in_real_time_rests_until_commanded_and_again_when_commands_are_old() -> None:

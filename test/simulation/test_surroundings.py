@@ -239,10 +239,10 @@ def test_an_altitude_is_a_mean_motion() -> None:
     found = Surroundings.of(OrbitConfig(altitude=400e3, orientation=(0, 0, 3, 4)), TableConfig())
     assert 2 * math.pi / found.mean_motion == pytest.approx(5553.6, abs=0.1)
     assert found.quaternion_WO == pytest.approx((0.0, 0.0, 0.6, 0.8))
-    assert found.act
+    assert found.has_loads
     assert not found.on_table
     assert Surroundings.of(OrbitConfig(mean_motion=0.5), TableConfig()).mean_motion == 0.5
-    assert not Surroundings.of(OrbitConfig(), TableConfig()).act
+    assert not Surroundings.of(OrbitConfig(), TableConfig()).has_loads
     assert Surroundings.of(OrbitConfig(), TableConfig(friction=0.1)).on_table
     steep = Surroundings.of(OrbitConfig(), TableConfig(tilt=0.1, direction=0.5, gravity=2.0))
     expected = 2 * math.sin(0.1) * np.array([math.cos(0.5), math.sin(0.5), 0.0])
@@ -299,10 +299,10 @@ def test_loads_that_act_are_told_from_those_that_do_not() -> None:
     robot = robot_of(DUMBBELL)
     loads = PlantLoads(robot)
     loads.time = 3.5
-    assert not loads.act
+    assert not loads.has_loads
     assert loads.time == 3.5
     loads.in_link[0, 5] = 1.0
-    assert loads.act
+    assert loads.has_loads
     given = [{"mean_motion": 0.1}, {"gravity_W": (0.0, 0.1, 0.0)}, {"friction": 0.1}]
     for each in given:
-        assert PlantLoads(robot, Surroundings(**each)).act
+        assert PlantLoads(robot, Surroundings(**each)).has_loads

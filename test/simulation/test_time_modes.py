@@ -46,12 +46,12 @@ def test_ticks_are_due_by_the_clock_two_at_a_time_and_ten_at_most() -> None:
         (1015, 9, 1),
         (1050, 7, 2),
     ):
-        assert time.due(now * MS, tick) == wanted, (now, tick)
+        assert time.due_ticks(now * MS, tick) == wanted, (now, tick)
     assert time.ticks_lost == 0
-    assert time.due(1065 * MS, 7) == 2
+    assert time.due_ticks(1065 * MS, 7) == 2
     assert time.ticks_lost == 3, "13 behind, ten are made up"
-    assert time.due(1065 * MS, 17) == 0
-    assert time.due(1070 * MS, 17) == 1
+    assert time.due_ticks(1065 * MS, 17) == 0
+    assert time.due_ticks(1070 * MS, 17) == 1
 
 
 def test_reports_count_ticks_and_answers_since_the_start_and_the_rate_since_the_last() -> None:

@@ -52,7 +52,7 @@ def track(robot: SpaceRobot, schedule: GaitSchedule) -> TrackedFlight:
         state = ControlState(r_WB, quaternion, v_WB, omega_WB, plant.q.copy(), plant.qdot.copy())
         controller.follow(Reference(joints=held.at_command(wanted, rates)))
         result = controller.command(tick * h, state, state.q, state.qdot)
-        asked.append(result.realised.tau + result.loss.tau)
+        asked.append(result.realised.tau + result.excess.tau)
         plant.step(result.realised.tau)
         realised.append(plant.effort.copy())
     return TrackedFlight(np.array(asked), np.array(realised), plant.pose[3:].copy())

@@ -373,7 +373,7 @@ class ControlLaw(ABC):
         integral = {"integral": np.zeros(self.outputs.m)}
         return {**integral, **self._inputs(), **self.robot.mass_arguments}
 
-    def defined(self, results: Mapping[str, ca.SX]) -> ca.SX:
+    def is_complete(self, results: Mapping[str, ca.SX]) -> ca.SX:
         """Return whether the results of :attr:`function` are the command without further steps."""
         return ca.SX(1)
 

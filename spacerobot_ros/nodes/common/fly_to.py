@@ -147,7 +147,7 @@ class FlyToAction(GoalAction):
             request.position_tolerance, request.attitude_tolerance, request.joint_tolerance
         )
         limit = request.time_limit
-        return FlyTo.checked(goal, tolerance, limit.sec + limit.nanosec / SECOND)
+        return FlyTo.from_numbers(goal, tolerance, limit.sec + limit.nanosec / SECOND)
 
     def feedback(self, progress: Progress, world_frame: str) -> Any:
         """Return the course of a goal as a message."""

@@ -214,7 +214,7 @@ class PlantNode(FlightNode):
     def activate(self) -> None:
         """Publish the robot and its present state, and start stepping."""
         self._active = self._when_active
-        self._commands.begin(self.time_ns)
+        self._commands.revoke_before(self.time_ns)
         self._publisher.publish_description()
         if self._tf_ticks:
             self._transforms.publish_static(self.time_ns)
@@ -409,7 +409,7 @@ class PlantNode(FlightNode):
         assert real_time is not None
         if self._active is not PlantState.RUNNING:
             return
-        for _ in range(real_time.due(self._steady.now().nanoseconds, self._tick)):
+        for _ in range(real_time.due_ticks(self._steady.now().nanoseconds, self._tick)):
             real_time.count_tick(self._steady.now().nanoseconds, self._tick)
             silent = self._commands.drop_old(self.time_ns)
             for source in silent:

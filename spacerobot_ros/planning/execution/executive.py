@@ -405,7 +405,7 @@ class Executive:
         return self._followers[link]
 
     @property
-    def pursued(self) -> frozenset[str]:
+    def unfinished_goals(self) -> frozenset[str]:
         """Ids of the goals that are pursued, planned for, or wait to be."""
         goals = (self._new_goal, self._planned_goal(), self._pursued_goal())
         return frozenset(goal.goal_id for goal in goals if goal is not None)
