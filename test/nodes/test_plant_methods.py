@@ -208,7 +208,7 @@ def test_wall_time_steps_as_often_as_is_due(
     active: PlantState, due: int, silent: list[str], done: list[Any]
 ) -> None:
     asked: list[Any] = []
-    real_time = Kept(asked, "time", due=lambda *_: due)
+    real_time = Kept(asked, "time", due_ticks=lambda *_: due)
     commands = SimpleNamespace(drop_old=lambda time_ns: silent if time_ns == 2 * S else None)
     node = plant("_on_wall_tick", _active=active, _real_time=real_time, _commands=commands)
     PlantNode._on_wall_tick(node)
@@ -323,7 +323,7 @@ def test_a_reset_is_known_before_the_next_state(active: PlantState) -> None:
     node = plant("_on_reset", _active=active)
     said = (True, "The robot is back in its initial state; time goes on.")
     assert answer(PlantNode._on_reset, node) == said
-    first = [("plant.reset",), ("commands.revoke_before", 2 * S), "_publish_changed_status"]
+    first = [("plant.reset",), ("commands.reset", 2 * S), "_publish_changed_status"]
     assert node.done == first + ["_publish"] * (active is not INACTIVE)
     assert (node._monitor.resets, node._monitor.rearms) == (6, 2)
 
