@@ -350,7 +350,7 @@ class CommandValidator:
         self._earliest = now_ns
 
     def reset(self, now_ns: int) -> None:
-        """Begin again (:meth:`revoke_before`) with a plant in its initial state, whose wheels rest, too."""
+        """Begin again (:meth:`revoke_before`) with a plant whose wheels rest, as initially."""
         for source in self.sources:
             source.command[:] = 0.0
         self.revoke_before(now_ns)
