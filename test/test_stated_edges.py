@@ -78,13 +78,15 @@ def test_yaml_may_have_a_million_characters(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize(
     ("left", "duration", "share"),
-    [(2.0, 8.0, 0.75), (9.0, 8.0, 0.0), (None, 8.0, None), (2.0, 0.0, None), (2.0, None, None)],
+    [(2.0, 5.0, 0.75), (9.0, 5.0, 0.0), (None, 5.0, None), (2.0, 0.0, None), (2.0, None, None)],
 )
 def test_there_is_no_share_where_nothing_is_flown(
     left: float | None, duration: float | None, share: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(content, "time_to_go", lambda state: left)
-    planner = None if duration is None else SimpleNamespace(manoeuvre_time_s=duration)
+    planner = (
+        None if duration is None else SimpleNamespace(manoeuvre_time_s=duration, remaining_s=3.0)
+    )
     state: Any = SimpleNamespace(planner=planner)
     assert content.progress(state) == share
 

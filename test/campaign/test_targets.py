@@ -130,7 +130,7 @@ def test_a_name_changes_what_it_says_and_nothing_else(name: str, scenario: Scena
     targets, found = applied(name, scenario, value)
     assert found == expected
     assert {target.unit for target in targets} == {unit}
-    assert not any(target.text for target in targets)
+    assert not any(target.is_text for target in targets)
 
 
 def test_several_bodies_have_a_target_each_or_one_together(scenario: Scenario) -> None:
