@@ -302,7 +302,13 @@ _MAX_MESH_FACES = 20_000
 
 _BACKGROUND = [246 / 255, 247 / 255, 249 / 255]
 _FIELD_OF_VIEW = 30.0
-"""Field of view of the camera, deg."""
+"""Field of view of the camera from top to bottom, deg."""
+
+_MIN_ASPECT = 1.3
+"""Width of the picture over its height, on narrow screens."""
+
+_MARGIN = 1.06
+"""Distance of the camera over the least from which the whole scene is seen."""
 
 _AXIS_COLOURS = ("#d55e00", "#009e73", "#0072b2")
 WORLD, ROBOT, TARGET = "/flight", "/flight/robot", "/flight/target"
@@ -313,9 +319,11 @@ def scene_of(flight: FlightReport) -> Scene | str:
     drawn = flight.drawn
     if drawn is None:
         return flight.hidden_links_text
-    center, radius = _center_and_radius(flight, drawn)
+    points = _visible_points(flight, drawn)
+    low, high = points.min(axis=0), points.max(axis=0)
+    center, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
     frames = key_frames(_scaled_motion(flight, radius), flight.cycles)
-    commands = _stage_commands(center, radius, flight.flat)
+    commands = _stage_commands(points, center, radius, flight.flat)
     commands += _robot_commands(drawn.robot, flight.meshes)
     commands += _obstacle_commands(flight)
     commands += _target_commands(flight)
@@ -326,8 +334,8 @@ def scene_of(flight: FlightReport) -> Scene | str:
     return Scene(commands, _time_spans(flight), _caption_text(flight, frames, radius, bool(ghosts)))
 
 
-def _center_and_radius(flight: FlightReport, drawn: SolidRobot) -> tuple[Array, float]:
-    """Return center (3,) and radius of the visible scene, m."""
+def _visible_points(flight: FlightReport, drawn: SolidRobot) -> Array:
+    """Return points (N, 3) of robot, paths, goals and target in W, m, which are to be seen."""
     clouds = [flight.position.values, flight.tool.values[:, :3]]
     for index in flight.samples(12):
         clouds.append(drawn.at(flight.joints[index], flight.base_at(index)).points())
@@ -335,9 +343,7 @@ def _center_and_radius(flight: FlightReport, drawn: SolidRobot) -> tuple[Array, 
     clouds += [t.goal.position[np.newaxis] for t in (*targets, *flight.tool_targets)]
     clouds += [goal.position[np.newaxis] for goal in flight.link_goals.values()]
     clouds.append(flight.target_pose.values[:, :3])
-    points = np.concatenate(clouds)
-    low, high = points.min(axis=0), points.max(axis=0)
-    return (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
+    return np.concatenate(clouds)
 
 
 def _scaled_motion(flight: FlightReport, radius: float) -> Signal:
@@ -351,20 +357,32 @@ def _scaled_motion(flight: FlightReport, radius: float) -> Signal:
     return Signal(flight.position.time, np.column_stack(columns))
 
 
-def _stage_commands(center: Array, radius: float, flat: bool) -> list[Command]:
-    """Background, camera, world axes and grid; the scene is moved and scaled to radius 1."""
-    world = np.eye(4)
-    world[:3, :3] /= radius
-    world[:3, 3] = -center / radius
+def _camera_position(points: Array, flat: bool) -> Array:
+    """Return the position (3,) from which the origin is looked at and all points (N, 3) are seen.
+
+    It is the nearest one in the direction of the view, with a margin.
+    """
     azimuth, elevation = math.radians(-90 if flat else -58), math.radians(89.9 if flat else 24)
-    distance = 0.85 / math.sin(math.radians(_FIELD_OF_VIEW / 2))
-    x, y, z = distance * np.array(
+    backwards = np.array(
         [
             math.cos(elevation) * math.cos(azimuth),
             math.cos(elevation) * math.sin(azimuth),
             math.sin(elevation),
         ]
     )
+    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+    up = np.cross(backwards, right)
+    slope = math.tan(math.radians(_FIELD_OF_VIEW / 2))
+    sideways = np.maximum(np.abs(points @ up), np.abs(points @ right) / _MIN_ASPECT) / slope
+    return _MARGIN * float((points @ backwards + sideways).max()) * backwards
+
+
+def _stage_commands(points: Array, center: Array, radius: float, flat: bool) -> list[Command]:
+    """Background, camera, world axes and grid; the scene is moved and scaled to radius 1."""
+    world = np.eye(4)
+    world[:3, :3] /= radius
+    world[:3, 3] = -center / radius
+    x, y, z = _camera_position((points - center) / radius, flat).tolist()
     camera = "/Cameras/default/rotated/<object>"
     spacing = 10.0 ** math.floor(math.log10(radius))
     spacing *= 1.0 if radius / spacing > 4 else 0.5

@@ -789,3 +789,23 @@ def test_without_meshcat_there_is_no_3d_view(monkeypatch: pytest.MonkeyPatch) ->
         '<p class="missing">The 3D view needs the Python package meshcat: pip install meshcat.</p>'
     )
     assert scene.player_of("No <robot>.").markup == '<p class="missing">No &lt;robot&gt;.</p>'
+
+
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize(
+    "sizes", [(1.0, 1.0, 1.0), (0.1, 0.2, 1.9), (1.8, 0.1, 0.3), (0.2, 1.7, 0.05)]
+)
+def test_the_whole_scene_is_in_the_picture_and_fills_it(
+    sizes: tuple[float, float, float], flat: bool
+) -> None:
+    """By the projection that graphics libraries use, for the narrowest picture."""
+    points = np.random.default_rng(4).uniform(-0.5, 0.5, (60, 3)) * sizes
+    eye = scene._camera_position(points, flat)
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    seen = (points - eye) @ np.column_stack([right, np.cross(right, forward), forward])
+    half = np.tan(np.radians(30.0) / 2)
+    x, y = seen[:, 0] / (1.3 * half * seen[:, 2]), seen[:, 1] / (half * seen[:, 2])
+    largest = max(np.abs(x).max(), np.abs(y).max())
+    assert 0.8 < largest < 1.0
