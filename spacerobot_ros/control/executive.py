@@ -393,8 +393,8 @@ class ControlExecutive:
         result = self.controller.command(time, measured, q, qdot)
         if wheels is None:
             return result
-        loss = Actuation(result.excess.wrench_B, wheels.shape(result.excess.tau))
-        return Saturated(wheels.actuation(result.realised), loss)
+        excess = Actuation(result.excess.wrench_B, wheels.shape(result.excess.tau))
+        return Saturated(wheels.actuation(result.realised), excess)
 
     def dump_momentum(self) -> tuple[bool, str]:
         """Dump the momentum of the reaction wheels; return whether it is done, and a sentence."""
@@ -684,16 +684,16 @@ _STATE_AND_EVENT_OF_DECISION = {
 
 
 def _command_report(controller: CoordinatedController, result: Saturated) -> CommandReport:
-    status, loss, wheels = controller.law.status, result.excess, controller.wheels
+    status, excess, wheels = controller.law.status, result.excess, controller.wheels
     state = controller.law.state
     return CommandReport(
         law=controller.law.name,
         singular=status.singular,
         smallest_singular_value=status.smallest_singular_value,
         damping=status.damping,
-        lost_force_N=float(np.linalg.norm(loss.wrench_B[:3])),
-        lost_torque_Nm=float(np.linalg.norm(loss.wrench_B[3:])),
-        lost_effort=float(np.abs(loss.tau).max(initial=0.0)),
+        lost_force_N=float(np.linalg.norm(excess.wrench_B[:3])),
+        lost_torque_Nm=float(np.linalg.norm(excess.wrench_B[3:])),
+        lost_effort=float(np.abs(excess.tau).max(initial=0.0)),
         errors=controller.labelled_errors(),
         wheels={} if wheels is None else wheels.shares,
         momentum={} if wheels is None else wheels.budget(state.q, state.qdot),

@@ -100,8 +100,8 @@ class MotionLimits:
 
 @dataclass(frozen=True)
 class Saturated:
-    """A command within the limits of the actuators: ``realised``, and ``loss``, commanded minus
-    realised.
+    """A command within the limits of the actuators: ``realised``, and ``excess``,
+    commanded minus realised.
     """
 
     realised: Actuation
