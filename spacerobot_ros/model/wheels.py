@@ -31,6 +31,9 @@ _MAX_OFFSET = 1e-4
 _MOMENTUM_ROUNDING, _LEAST_MOMENTUM = 1e-9, 1e-12
 """Angular momentum that wheels may leave to the base, relative to all of it, and kg m^2/s."""
 
+_REST_SHARE = 1e-9
+"""Share of the largest rates of wheels up to which they rest."""
+
 _MAX_ASYMMETRY = 1e-3
 """Largest difference of a wheel's inertia from that of a body of revolution, relative."""
 
@@ -86,6 +89,10 @@ class ReactionWheels:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def are_spinning(self, qdot: Array) -> bool:
+        """Return whether any wheel turns in the base, at joint velocities (n,), rad/s."""
+        return bool(np.any(np.abs(qdot[self.index]) > _REST_SHARE * self.rate))
 
     def spins(self, omega_WB_B: Array, rates: Array) -> Array:
         """Return the momenta h (k,) about the axes, kg m^2/s, at relative rates (k,), rad/s."""

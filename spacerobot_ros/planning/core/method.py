@@ -25,9 +25,6 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
 _REST_MOMENTUM = 1e-9
 """Momenta per mass below this count as zero, m/s and m^2/s."""
 
-_REST_SHARE = 1e-9
-"""Share of the largest rates of wheels below which they rest."""
-
 END_EFFECTOR_METHOD = "optimal"
 """Name of the method that plans for goals of end-effectors."""
 
@@ -379,9 +376,7 @@ class GaitMethod(ABC):
                 "shape changes cannot remove it, and optimal plans for robots that drift."
             )
         wheels = ReactionWheels.of(self.robot.description)
-        if state.qdot is not None and np.any(
-            np.abs(state.qdot[wheels.index]) > _REST_SHARE * wheels.rate
-        ):
+        if state.qdot is not None and wheels.are_spinning(state.qdot):
             raise PlanningError(
                 f"Reaction wheels spin, and {self.name} begins with all joints at rest; optimal "
                 "plans from spinning wheels."

@@ -82,9 +82,6 @@ _MAX_CORRECTION_INTERVALS = 40
 _MAX_STARTS_IN_MOTION = 12
 """Largest number of guesses for a manoeuvre from moving joints: the robot flies on meanwhile."""
 
-_ZERO_RATE_SHARE = 1e-9
-"""Share of the largest rates of wheels below which all of them rest."""
-
 _ZERO_ERROR = 1e-10
 """Largest error that counts as zero: the robot is at the goal; rad, m and joint coordinates."""
 
@@ -323,7 +320,7 @@ class OptimalGait(GaitMethod):
         rates, index = np.zeros(self.robot.n), self._wheels.index
         if qdot is not None and not np.all(np.isfinite(qdot[index])):
             raise PlanningError("The velocities of the wheels at the start are not finite.")
-        if qdot is not None and np.any(np.abs(qdot[index]) > _ZERO_RATE_SHARE * self._wheels.rate):
+        if qdot is not None and self._wheels.are_spinning(qdot):
             rates[index] = qdot[index]
         return rates
 
