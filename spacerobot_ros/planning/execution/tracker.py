@@ -425,12 +425,15 @@ class TrajectoryTracker:
         if self._commands_plant or not self._holds_position or not obeyed:
             if math.isfinite(q.dot(q)):
                 self.setpoint.position[:] = q
+            self._holds_position = True
+            if not len(self._wheels):
+                self.setpoint.velocity[:] = 0.0
+                return
             kept = self.setpoint.velocity[self._wheels]
             if not self._spins and qdot is not None and np.all(np.isfinite(qdot)):
                 kept, self._spins = qdot[self._wheels], True
             self.setpoint.velocity[:] = 0.0
             self.setpoint.velocity[self._wheels] = kept
-            self._holds_position = True
 
 
 # -- stuck joints ---------------------------------------------------------------------------------
