@@ -319,6 +319,30 @@ def test_a_goal_that_is_refused_in_flight_leaves_the_one_that_is_pursued(
     assert (shown.state, shown.message) == (states.REFUSED, "Too far.")
 
 
+def test_goals_that_are_refused_one_after_the_other_leave_the_one_that_is_pursued(
+    viewed: Viewed,
+) -> None:
+    """Both are sent before the first refusal comes."""
+
+    def send(x: float) -> None:
+        message = PoseStamped(pose=pose_of(x, 0.0, 0.0))
+        message.header.frame_id = "world"
+        viewed.heard["goal_pose"](message)
+
+    def report(state: ControllerState, goal_id: str) -> None:
+        status = ControllerStatus(state, "So it is.", goal_id)
+        viewed.report("controller/status", status, "/it")
+
+    send(0.5)
+    report(ControllerState.TRACKING, "1.0")
+    send(9.0)
+    send(8.0)
+    report(ControllerState.TRACKING, "1.0")
+    for refused in ("2.0", "3.0"):
+        report(ControllerState.REFUSED, refused)
+        assert viewed.look().goals["base"].position[0] == 0.5
+
+
 def test_goals_of_links_are_those_of_the_planner(viewed: Viewed) -> None:
     pose, place = (0.5, 0.25, 0.125, *TURNED), (4.0, -2.0, 1.0)
 

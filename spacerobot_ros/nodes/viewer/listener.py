@@ -155,8 +155,8 @@ class Listener:
         self._schedule: _Schedule | None = None
         self._motion: Array | None = None
         self._goals: dict[Part, Goal] = {}
-        self._earlier_goals: dict[Part, Goal] = {}
-        """Goals before the last one was sent."""
+        self._pursued_goals: dict[Part, Goal] = {}
+        """Goals when the one that is pursued was begun."""
         self._pursued: dict[str, Any] = {}
         """The last status of a goal that is pursued, by kind of status."""
         self.forget_state()
@@ -359,12 +359,14 @@ class Listener:
                 PlannerStatus(state=PlannerState.EXECUTING)
                 | ControllerStatus(state=ControllerState.TRACKING)
             ):
+                if pursued is None or pursued.goal_id != status.goal_id:
+                    self._pursued_goals = dict(self._goals)
                 self._pursued[key] = status
             case (
                 PlannerStatus(state=PlannerState.REFUSED)
                 | ControllerStatus(state=ControllerState.REFUSED)
             ) if pursued is not None and pursued.goal_id != status.goal_id:
-                self._goals = dict(self._earlier_goals)
+                self._goals = dict(self._pursued_goals)
                 return replace(pursued, message=f"{pursued.message}{_REFUSED}{status.message}")
             case PlannerStatus(state=PlannerState.PLANNING):
                 pass  # It flies on meanwhile.
@@ -430,7 +432,6 @@ class Listener:
             self._motion = motion if np.all(np.isfinite(motion)) else None
 
     def _on_goal(self, part: Part, message: PoseStamped) -> None:
-        self._earlier_goals = dict(self._goals)
         try:
             self._goals[part] = goal_of(message, self._frame)
         except SpaceRobotError:
