@@ -80,6 +80,12 @@ def test_all_figures_of_a_bag_by_the_command(bag: Path, tmp_path: Path) -> None:
     assert_one_sentence(asked.stderr, "efforts", "none")
 
 
+def test_the_help_names_every_figure() -> None:
+    text = " ".join(CliRunner().invoke(main, ["figures", "--help"]).stdout.split())
+    known = list(FIGURES)
+    assert f"There are {', '.join(known[:-1])} and {known[-1]}." in text
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [
