@@ -272,7 +272,7 @@ $(STAMP)/venv:
 	@mkdir -p $(STAMP)
 	@touch $@
 
-$(STAMP)/demo: EXTRAS := jazzy,viewer
+$(STAMP)/demo: EXTRAS := jazzy,viewer,collision
 $(STAMP)/test: EXTRAS := jazzy,test
 $(STAMP)/mutants: EXTRAS := jazzy,test,mutants
 $(STAMP)/docs: EXTRAS := jazzy,docs
