@@ -14,6 +14,7 @@ import math
 import resource
 import runpy
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -51,6 +52,9 @@ _SLIDING_PERIOD, _TIME_BEFORE_CYCLES, _CYCLE_PERIOD = 0.05, 100.0, 3.0
 _CONTROLLED_FLIGHT = ["coordinated_control", "--set=coordinated_control.settle_time=55"]
 """Words of a flight under control that lasts longer than the first look at it takes."""
 
+_SERVICER_FLIGHT = ["servicer"]
+"""Words of a flight with a six-joint arm, thrusters and an end-effector under control."""
+
 _MIN_CYCLES = 170
 """Least number of cycles; with fewer, the loops are too large for the rotation of the goal."""
 
@@ -63,6 +67,7 @@ _PLANNED_SCENARIOS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 """Scenarios, methods and options of the plans."""
 
 _PLANS_PER_MEDIAN = 15
+_IMPORTS_PER_MEDIAN = 5
 _FLIGHTS_PER_MEDIAN = 3
 """Number of flights without ROS of which medians are taken."""
 
@@ -86,8 +91,9 @@ def tick_times(ticks: int) -> dict[str, float]:
     Returns
     -------
     In us a tick: ``stack_us`` (plant, planner and recorder as nodes), ``controlled_stack_us``
-    (with coordinated control), ``loop_us`` and ``controlled_loop_us`` (without ROS); in ms a plan:
-    ``plan_METHOD_ms``.
+    (with coordinated control), ``servicer_stack_us`` (of the six-joint servicer), ``loop_us`` and
+    ``controlled_loop_us`` (without ROS); in ms a plan: ``plan_METHOD_ms``; in ms:
+    ``import_plant_ms`` (the plant's node in a new process).
     """
     package = _imported_package()
     cycles = gait_cycles_for(ticks * _SLIDING_PERIOD)
@@ -97,6 +103,8 @@ def tick_times(ticks: int) -> dict[str, float]:
     figures = {
         "stack_us": _stack_tick_time(words, ticks * _SLIDING_PERIOD),
         "controlled_stack_us": _stack_tick_time(_CONTROLLED_FLIGHT, math.inf),
+        "servicer_stack_us": _stack_tick_time(_SERVICER_FLIGHT, math.inf),
+        "import_plant_ms": 1e3 * import_time("spacerobot_ros.nodes.plant.node"),
     }
     scenario = "sliding_masses"
     planning = _cpu_time(lambda: package.plan(scenario, method="lie_bracket", cycles=cycles))
@@ -132,6 +140,19 @@ def _fly_by_command(words: list[str], longest: float) -> tuple[float, int]:
             runpy.run_module("spacerobot_ros", run_name="__main__")
         used = time.process_time() - began
         return used, json.loads(result.read_text("utf-8"))["ticks"]
+
+
+_IMPORT_PROGRAM = (
+    "import time; began = time.process_time(); import {module}; print(time.process_time() - began)"
+)
+
+
+def import_time(module: str) -> float:
+    """Return the CPU time of the import of a module in a new process, s: a median."""
+    words = [sys.executable, "-c", _IMPORT_PROGRAM.format(module=module)]
+    # The first process writes the byte code.
+    times = [float(subprocess.check_output(words)) for _ in range(1 + _IMPORTS_PER_MEDIAN)]
+    return statistics.median(times[1:])
 
 
 def _imported_package() -> Any:

@@ -30,6 +30,7 @@ from std_msgs.msg import Float64MultiArray
 
 from spacerobot_ros.bag import BagWriter
 from spacerobot_ros.benchmarks.engines import dynamics_benchmark, median_cpu_times
+from spacerobot_ros.benchmarks.measurements import import_time
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import c_compiler
 from spacerobot_ros.nodes import ReplayNode
@@ -61,6 +62,9 @@ _SCENARIOS_AND_METHODS = (
 )
 """Scenarios of the papers with their methods."""
 
+_SERVICER_TICKS = 2_000
+"""Most ticks of a flight of the servicer, which is at its goal later."""
+
 _PLANS_PER_MEDIAN = 5
 _PLANT_TICKS = 5_000
 
@@ -78,7 +82,8 @@ def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float 
     The stack and the minimal exchange take turns, and medians are compared, so that the machine's
     other load affects both alike.
     """
-    flights: dict[str, list[_Speed]] = {"recorded": [], "unrecorded": [], "minimal": []}
+    names = ("recorded", "unrecorded", "minimal", "servicer")
+    flights: dict[str, list[_Speed]] = {name: [] for name in names}
     with ros(private=True), tempfile.TemporaryDirectory() as folder:
         bag = Path(folder, "bench.mcap")
         for _ in range(_DYNAMICS_ROUNDS):
@@ -87,16 +92,20 @@ def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float 
             flights["recorded"].append(_stack_speed(ticks, bag))
             bag.unlink()
             flights["unrecorded"].append(_stack_speed(ticks, None))
+            few = min(ticks, _SERVICER_TICKS)
+            flights["servicer"].append(_stack_speed(few, bag, scenario="servicer"))
+            bag.unlink()
             show(
                 f"round: {flights['recorded'][-1].cpu_us:.1f} us of CPU time a tick with plant, "
                 f"planner and recorder, {flights['minimal'][-1].cpu_us:.1f} us minimal exchange"
             )
         spacing, worst_spacing = _replay_spacing(Path(folder))
-    stack, unrecorded, minimal = (
+    stack, unrecorded, minimal, servicer = (
         _Speed(*np.median(speeds, axis=0).tolist()) for speeds in flights.values()
     )
     recorder_share = 1 - unrecorded.cpu_us / stack.cpu_us
     tick = _plant_tick_cpu_time()
+    importing = import_time("spacerobot_ros.nodes.plant.node")
     figures: dict[str, float | str] = {
         "ticks_per_s": stack.ticks_per_s,
         "bare_ticks_per_s": minimal.ticks_per_s,
@@ -105,6 +114,8 @@ def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float 
         "bare_tick_cpu_us": minimal.cpu_us,
         "recorder_cost": recorder_share,
         "ratio_to_bare": minimal.cpu_us / stack.cpu_us,
+        "servicer_tick_cpu_us": servicer.cpu_us,
+        "plant_import_cpu_s": importing,
         "replay_spacing_error_s": spacing,
         "plant_tick_us": tick,
         "compiler": c_compiler() or "none (virtual machine)",
@@ -119,6 +130,8 @@ def ticks_benchmark(ticks: int, show: Callable[[str], None]) -> dict[str, float 
     )
     show(f"ratio of the CPU times: {minimal.cpu_us / stack.cpu_us:.2f}")
     show(f"the recorder takes {100 * recorder_share:.0f} % of the CPU time")
+    show(f"the servicer under control, recorded: {servicer.cpu_us:.1f} us of CPU time a tick")
+    show(f"the import of the plant's node: {importing:.2f} s of CPU time")
     show(
         f"replay at rate 1, 100 messages a second: spacing off by {1e3 * spacing:.2f} ms (median), "
         f"{1e3 * worst_spacing:.1f} ms at most"
@@ -161,10 +174,12 @@ def _speed_of(ticks: int, wall: float, cpu: float) -> _Speed:
     return _Speed(ticks / wall, 1e6 * cpu / ticks)
 
 
-def _stack_speed(ticks: int, bag: Path | None) -> _Speed:
-    """Return the speed of the first ``ticks`` of sliding_masses, without planning."""
-    scenario = load_scenario("sliding_masses").with_overrides("planner", {"method": "lie_bracket"})
-    stack = InProcessStack(scenario, bag)
+def _stack_speed(ticks: int, bag: Path | None, scenario: str = "sliding_masses") -> _Speed:
+    """Return the speed of the first ``ticks`` of a scenario, without planning."""
+    flown = load_scenario(scenario)
+    if "planner" in flown.commanders:
+        flown = flown.with_overrides("planner", {"method": "lie_bracket"})
+    stack = InProcessStack(flown, bag)
     try:
         stack.start(stack.scenario.goal)
         first_tick, wall, cpu = 0, 0.0, 0.0

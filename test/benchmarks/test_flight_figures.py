@@ -605,11 +605,13 @@ def test_the_lines_and_figures_of_ticks(monkeypatch: pytest.MonkeyPatch) -> None
     def speeds(name: str, cpu: float) -> Callable[..., Any]:
         numbers = iter([9.0, 1.0, 3.0, 2.0, 8.0])
 
-        def measure(ticks: int, path: Path | None) -> Any:
-            asked.append((name, ticks, path is not None))
+        def measure(ticks: int, path: Path | None, scenario: str = "") -> Any:
+            asked.append((scenario or name, ticks, path is not None))
             if path is not None:
                 assert not path.exists()
                 path.touch()
+            if scenario:
+                return ticks_speed(50.0, next(numbers_of_servicer))
             unrecorded = 0.75 if path is None else 1.0
             number = next(numbers) if path is not None else 3.0
             return ticks_speed(100.0 * number * cpu, number * cpu * unrecorded)
@@ -617,6 +619,7 @@ def test_the_lines_and_figures_of_ticks(monkeypatch: pytest.MonkeyPatch) -> None
         return measure
 
     ticks_speed = ticks._Speed
+    numbers_of_servicer = iter([150.0, 90.0, 99.0, 300.0, 111.0])
     dynamics: dict[str, float | str] = {"compiler": "cc", "mujoco": "3"}
     dynamics["step_without_compiler_us"] = 9.0
 
@@ -634,12 +637,13 @@ def test_the_lines_and_figures_of_ticks(monkeypatch: pytest.MonkeyPatch) -> None
         "_planning_times": lambda: iter([("square_path", 0.5004, 0.1236)]),
         "dynamics_benchmark": lambda: dynamics,
         "c_compiler": lambda: None,
+        "import_time": lambda module: {"spacerobot_ros.nodes.plant.node": 0.456}[module],
     }.items():
         monkeypatch.setattr(ticks, name, value)
     lines: list[str] = []
-    figures = ticks.ticks_benchmark(700, lines.append)
-    turn = [("exchange", 700, True), ("stack", 700, True), ("stack", 700, False)]
-    assert asked == turn * 5
+    figures = ticks.ticks_benchmark(2700, lines.append)
+    turn = [("exchange", 2700, True), ("stack", 2700, True), ("stack", 2700, False)]
+    assert asked == [*turn, ("servicer", 2000, True)] * 5
     assert lines[0] == (
         "round: 360.0 us of CPU time a tick with plant, planner and recorder, "
         "135.0 us minimal exchange"
@@ -650,6 +654,8 @@ def test_the_lines_and_figures_of_ticks(monkeypatch: pytest.MonkeyPatch) -> None
         "45.0 us of CPU time a tick",
         "ratio of the CPU times: 0.38",
         "the recorder takes 25 % of the CPU time",
+        "the servicer under control, recorded: 111.0 us of CPU time a tick",
+        "the import of the plant's node: 0.46 s of CPU time",
         "replay at rate 1, 100 messages a second: spacing off by 0.12 ms (median), 3.5 ms at most",
         "one plant tick alone: 4.6 us (compiler: none (virtual machine))",
         "planning by square_path: 124 ms, the first time 500 ms",
@@ -664,6 +670,8 @@ def test_the_lines_and_figures_of_ticks(monkeypatch: pytest.MonkeyPatch) -> None
         "bare_tick_cpu_us": 45.0,
         "recorder_cost": 0.25,
         "ratio_to_bare": 0.375,
+        "servicer_tick_cpu_us": 111.0,
+        "plant_import_cpu_s": 0.456,
         "replay_spacing_error_s": 0.00012,
         "plant_tick_us": 4.56,
         "plan_square_path_first_s": 0.5004,

@@ -279,10 +279,10 @@ def test_ticks_are_the_difference_of_two_flights(monkeypatch: pytest.MonkeyPatch
 
     def by_command(words: list[str], longest: float) -> tuple[float, int]:
         flown.append((words, longest))
-        controlled = words[0] == "coordinated_control"
+        factor = {"sliding_masses": 1, "coordinated_control": 2, "servicer": 3}[words[0]]
         ticks = 500 if math.isinf(longest) else round(longest / 0.05)
-        # 3 s to start, and more the first time; 250 us a tick, twice that under control.
-        return 3.0 + 9.0 * (len(flown) % 3 == 1) + 250e-6 * (1 + controlled) * ticks, ticks
+        # 3 s to start, and more the first time; 250 us a tick, more under control.
+        return 3.0 + 9.0 * (len(flown) % 3 == 1) + 250e-6 * factor * ticks, ticks
 
     def fly(scenario: str, **arguments: Any) -> Any:
         calls.append(("fly", scenario, arguments))
@@ -296,10 +296,14 @@ def test_ticks_are_the_difference_of_two_flights(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(measurements, "time", clock)
     monkeypatch.setattr(measurements, "_fly_by_command", by_command)
     monkeypatch.setattr(measurements, "_imported_package", lambda: named(fly=fly, plan=plan))
+    times = {"spacerobot_ros.nodes.plant.node": 0.456}
+    monkeypatch.setattr(measurements, "import_time", times.__getitem__)
     found = measurements.tick_times(20_000)
     assert found == {
         "stack_us": pytest.approx(250.0),
         "controlled_stack_us": pytest.approx(500.0),
+        "servicer_stack_us": pytest.approx(750.0),
+        "import_plant_ms": pytest.approx(456.0),
         "loop_us": pytest.approx(1e6 * (0.040 - 0.008) / 200),
         "controlled_loop_us": pytest.approx(1e6 * 0.030 / 200),
         **{
@@ -310,7 +314,8 @@ def test_ticks_are_the_difference_of_two_flights(monkeypatch: pytest.MonkeyPatch
     sliding = ["sliding_masses", "--method", "lie_bracket", "--set=planner.lie_bracket.cycles=301"]
     assert flown[:3] == [(sliding, 5.0), (sliding, 5.0), (sliding, 1000.0)]
     controlled = ["coordinated_control", "--set=coordinated_control.settle_time=55"]
-    assert flown[3:] == [(controlled, t) for t in (5.0, 5.0, math.inf)]
+    assert flown[3:6] == [(controlled, t) for t in (5.0, 5.0, math.inf)]
+    assert flown[6:] == [(["servicer"], t) for t in (5.0, 5.0, math.inf)]
     plans = [call for call in calls if call[0] == "plan"]
     gait = ("plan", "sliding_masses", {"method": "lie_bracket", "cycles": 301})
     assert plans[:16] == [gait] * 16, "15 after the first one"
@@ -321,6 +326,23 @@ def test_ticks_are_the_difference_of_two_flights(monkeypatch: pytest.MonkeyPatch
         "method": "lie_bracket",
         "parameters": {"planner.lie_bracket.cycles": 301},
     }
+
+
+def test_an_import_is_timed_in_new_processes_after_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The module burns CPU time: 0.2 s more where it has no byte code yet, 20 ms otherwise."""
+    (tmp_path / "burning.py").write_text(
+        "import pathlib, time\n"
+        "seen = pathlib.Path(__file__).with_name('seen')\n"
+        "count = len(seen.read_text()) if seen.exists() else 0\n"
+        "seen.write_text('x' * (count + 1))\n"
+        "end = time.process_time() + (0.2 if count == 0 else 0.02)\n"
+        "while time.process_time() < end: pass\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert 0.02 <= measurements.import_time("burning") < 0.15
+    assert (tmp_path / "seen").read_text() == "x" * 6
 
 
 @pytest.mark.parametrize("longest", [7.5, math.inf])
