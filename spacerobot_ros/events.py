@@ -1,12 +1,158 @@
-"""Events of a flight: one record for each change of a node's state, as on the topic ``events``."""
+"""Events of a flight, and how events and statuses are written as key-value pairs.
+
+Every status and event is a diagnostic_msgs/DiagnosticStatus, whose content is pairs of texts. A
+:class:`KeyValueFormat` is the one description of the pairs of a class, for writing and for reading.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import MISSING, dataclass, field, fields
 from enum import Enum
+from typing import Any, TypeVar
 
 from spacerobot_ros.errors import SpaceRobotError
+
+
+@dataclass(frozen=True)
+class TextFormat:
+    """How a value is written as a text, and read from it."""
+
+    write: Callable[[Any], str]
+    read: Callable[[str], Any]
+
+
+def number_format(specification: str) -> TextFormat:
+    """Return the format of a number with a format specification such as ``.9g``."""
+    return TextFormat(lambda number: format(number, specification), float)
+
+
+def choice_format(choices: type[Enum]) -> TextFormat:
+    """Return the format of a member of an enumeration."""
+    return TextFormat(lambda member: str(member.value), choices)
+
+
+def list_format(separator: str) -> TextFormat:
+    """Return the format of a tuple of texts."""
+    return TextFormat(separator.join, lambda text: tuple(text.split(separator) if text else ()))
+
+
+PLAIN_TEXT = TextFormat(str, str)
+INTEGER = TextFormat(str, int)
+BOOLEAN = TextFormat(lambda truth: str(truth).lower(), "true".__eq__)
+SECONDS = number_format(".9f")
+"""Times with nanoseconds."""
+
+
+@dataclass(frozen=True)
+class KeyValueField:
+    """An attribute of a status or event, and its key-value pair or pairs.
+
+    An attribute is left out while it has the default of its class.
+
+    Attributes
+    ----------
+    attribute
+        Name of the attribute.
+    format
+        How its value is written.
+    key
+        Key of the pair; empty: the name of the attribute.
+    prefix
+        For a mapping, with a pair for each item: the beginning of their keys. Empty: all pairs that
+        no earlier field takes.
+    always
+        Whether the attribute is written with its default, too.
+    present_with
+        The attribute without which this one is left out; empty: none.
+    """
+
+    attribute: str
+    format: TextFormat = PLAIN_TEXT
+    key: str = ""
+    prefix: str | None = None
+    always: bool = False
+    present_with: str = ""
+
+
+_Record = TypeVar("_Record")
+
+
+class KeyValueFormat:
+    """The key-value pairs of the statuses or events of one class, in the order of its fields.
+
+    Parameters
+    ----------
+    subject
+        Name of such a status or event in messages.
+    described
+        The fields that are written.
+    """
+
+    def __init__(self, subject: str, *described: KeyValueField) -> None:
+        self._subject, self._described = subject, described
+        self._known_defaults: dict[str, Any] = {}
+
+    def to_values(self, record: Any) -> dict[str, str]:
+        """Return a status or event (a dataclass) as pairs."""
+        defaults = self._defaults(type(record))
+        values: dict[str, str] = {}
+        for each in self._described:
+            value = getattr(record, each.attribute)
+            decides = each.present_with or each.attribute
+            if not each.always and getattr(record, decides) == defaults[decides]:
+                continue
+            if each.prefix is None:
+                values[each.key or each.attribute] = each.format.write(value)
+            else:
+                for name, item in value.items():
+                    values[f"{each.prefix}{name}"] = each.format.write(item)
+        return values
+
+    def from_values(self, kind: type[_Record], values: Mapping[str, str], **given: Any) -> _Record:
+        """Return the status or event of a class that :meth:`to_values` has turned into pairs.
+
+        Attributes that are not among the pairs are taken from ``given``, or have their defaults.
+
+        Raises
+        ------
+        SpaceRobotError
+            The pairs are not those of the class: the message says which is missing or unreadable.
+        """
+        left, arguments = dict(values), dict(given)
+        defaults = self._defaults(kind)
+        with self.reading():
+            for each in self._described:
+                key = each.key or each.attribute
+                if each.prefix is not None:
+                    names = [name for name in left if name.startswith(each.prefix)]
+                    arguments[each.attribute] = {
+                        name.removeprefix(each.prefix): each.format.read(left.pop(name))
+                        for name in names
+                    }
+                elif key in left or defaults[each.attribute] is MISSING:
+                    arguments[each.attribute] = each.format.read(left.pop(key))
+        return kind(**arguments)
+
+    def _defaults(self, kind: Any) -> dict[str, Any]:
+        """Return the defaults of the attributes of the class; MISSING: an attribute has none."""
+        if not self._known_defaults:
+            self._known_defaults = {
+                each.name: each.default_factory()
+                if callable(each.default_factory)
+                else each.default
+                for each in fields(kind)
+            }
+        return self._known_defaults
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Turn errors of a missing key or an unreadable value into a message for the user."""
+        try:
+            yield
+        except (KeyError, ValueError) as error:
+            raise SpaceRobotError(f"The values are no {self._subject}: {error}.") from error
 
 
 class EventKind(str, Enum):
@@ -123,14 +269,11 @@ class Event:
         wall_time_s
             Wall time of the publication, s since the epoch; None leaves the entry out.
         """
-        values = {"event": self.kind.value}
-        if self.time_s is not None:
-            values["time"] = f"{self.time_s:.9f}"
+        values = _EVENT_FORMAT.to_values(self)
+        times = {key: values.pop(key) for key in list(values) if key in ("event", "time")}
         if wall_time_s is not None:
-            values["wall_time"] = f"{wall_time_s:.6f}"
-        if self.goal_id:
-            values["goal_id"] = self.goal_id
-        return values | dict(self.about)
+            times["wall_time"] = f"{wall_time_s:.6f}"
+        return times | values
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "", level: int = 0) -> Event:
@@ -141,11 +284,14 @@ class Event:
         SpaceRobotError
             The pairs are no event.
         """
-        given = dict(values)
-        try:
-            kind, time = EventKind(given.pop("event")), given.pop("time", None)
-            time_s = None if time is None else float(time)
-        except (KeyError, ValueError) as error:
-            raise SpaceRobotError(f"The message is no event of a flight: {error}.") from error
-        given.pop("wall_time", None)
-        return cls(kind, message, level, time_s, given.pop("goal_id", ""), given)
+        given = {key: value for key, value in values.items() if key != "wall_time"}
+        return _EVENT_FORMAT.from_values(cls, given, message=message, level=level)
+
+
+_EVENT_FORMAT = KeyValueFormat(
+    "event of a flight",
+    KeyValueField("kind", choice_format(EventKind), key="event"),
+    KeyValueField("time_s", SECONDS, key="time"),
+    KeyValueField("goal_id"),
+    KeyValueField("about", prefix=""),
+)

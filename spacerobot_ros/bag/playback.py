@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.reader import Bag
-from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError, RecordingError
+from spacerobot_ros.events import SECONDS, KeyValueField, KeyValueFormat, number_format
 from spacerobot_ros.times import SECOND
 
 _LATEST_TIME_NS = 2**63 - 1
@@ -55,12 +56,8 @@ class ReplayStatus:
 
     def to_values(self) -> dict[str, str]:
         """Return the status as the key-value pairs of a DiagnosticStatus."""
-        return {
-            "state": "ended" if self.ended else "paused" if self.paused else "playing",
-            "position_s": f"{self.position_s:.9f}",
-            "duration_s": f"{self.duration_s:.9f}",
-            "rate": f"{self.rate:.9g}",
-        }
+        state = "ended" if self.ended else "paused" if self.paused else "playing"
+        return {"state": state, **_STATUS_FORMAT.to_values(self)}
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> ReplayStatus:
@@ -71,13 +68,18 @@ class ReplayStatus:
         SpaceRobotError
             They are no status of a replay.
         """
-        try:
+        with _STATUS_FORMAT.reading():
             state = values["state"]
-            position, duration = float(values["position_s"]), float(values["duration_s"])
-            rate = float(values["rate"])
-        except (KeyError, ValueError) as error:
-            raise SpaceRobotError(f"The message is no status of a replay: {error}.") from error
-        return cls(position, duration, state != "playing", state == "ended", rate)
+        paused, ended = state != "playing", state == "ended"
+        return _STATUS_FORMAT.from_values(cls, values, paused=paused, ended=ended)
+
+
+_STATUS_FORMAT = KeyValueFormat(
+    "status of a replay",
+    KeyValueField("position_s", SECONDS),
+    KeyValueField("duration_s", SECONDS),
+    KeyValueField("rate", number_format(".9g")),
+)
 
 
 @dataclass(frozen=True)

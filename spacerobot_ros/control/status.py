@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import (
+    BOOLEAN,
+    KeyValueField,
+    KeyValueFormat,
+    choice_format,
+    number_format,
+)
 from spacerobot_ros.planning.core.goal import Controlled
-
-_ERROR_PREFIX = "error."
-"""Prefix of the keys of output errors."""
-
-_WHEEL_PREFIX, _MOMENTUM_PREFIX = "wheel.", "momentum."
-"""Prefixes of the keys of the rates of reaction wheels, and of the momentum budget."""
 
 
 class ControllerState(str, Enum):
@@ -133,30 +133,8 @@ class ControllerStatus:
 
     def to_values(self) -> dict[str, str]:
         """Return the status as the key-value pairs of a DiagnosticStatus; numbers have 6 digits."""
-        values = {"state": self.state.value}
-        if self.goal_id:
-            values["goal_id"] = self.goal_id
-        if self.task:
-            values["task"] = self.task
-        if self.ends_at_s:
-            # Long flights have large times.
-            values["ends_at_s"] = f"{self.ends_at_s:.9g}"
-        if self.command is not None:
-            values["law"] = self.command.law
-            values["singular"] = str(self.command.singular).lower()
-            values.update((name, f"{getattr(self.command, name):.6g}") for name in _NUMBER_KEYS)
-            values.update(
-                (f"{_ERROR_PREFIX}{label}", f"{error:.6g}")
-                for label, error in self.command.errors.items()
-            )
-            if self.command.wheels:
-                values["dumping"] = str(self.command.dumping).lower()
-            for prefix, numbers in (
-                (_WHEEL_PREFIX, self.command.wheels),
-                (_MOMENTUM_PREFIX, self.command.momentum),
-            ):
-                values.update((f"{prefix}{key}", f"{x:.6g}") for key, x in numbers.items())
-        return values
+        command = {} if self.command is None else _COMMAND_FORMAT.to_values(self.command)
+        return _FORMAT.to_values(self) | command
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> ControllerStatus:
@@ -167,43 +145,34 @@ class ControllerStatus:
         SpaceRobotError
             The pairs are not those of a controller.
         """
-        try:
-            command = None
-            if "law" in values:
-                command = CommandReport(
-                    law=values["law"],
-                    singular=values["singular"] == "true",
-                    **{name: float(values[name]) for name in _NUMBER_KEYS},
-                    errors=_numbers_below(_ERROR_PREFIX, values),
-                    wheels=_numbers_below(_WHEEL_PREFIX, values),
-                    momentum=_numbers_below(_MOMENTUM_PREFIX, values),
-                    dumping=values.get("dumping") == "true",
-                )
-            state = ControllerState(values["state"])
-            goal_id, task = values.get("goal_id", ""), values.get("task", "")
-            ends_at = float(values.get("ends_at_s", 0.0))
-            return cls(state, message, goal_id, command, task, ends_at)
-        except (KeyError, ValueError) as error:
-            raise SpaceRobotError(f"This is no status of a controller: {error}.") from error
+        command = None
+        if "law" in values:
+            command = _COMMAND_FORMAT.from_values(CommandReport, values)
+        return _FORMAT.from_values(cls, values, message=message, command=command)
 
 
-def _numbers_below(prefix: str, values: Mapping[str, str]) -> dict[str, float]:
-    """Return the numbers whose keys begin with a prefix, by the rest of their keys."""
-    return {
-        key.removeprefix(prefix): float(value)
-        for key, value in values.items()
-        if key.startswith(prefix)
-    }
-
-
-_NUMBER_KEYS = (
-    "smallest_singular_value",
-    "damping",
-    "lost_force_N",
-    "lost_torque_Nm",
-    "lost_effort",
+_NUMBER = number_format(".6g")
+_FORMAT = KeyValueFormat(
+    "status of a controller",
+    KeyValueField("state", choice_format(ControllerState)),
+    KeyValueField("goal_id"),
+    KeyValueField("task"),
+    KeyValueField("ends_at_s", number_format(".9g")),  # Long flights have large times.
 )
-"""Values of a command report that are one number each."""
+_COMMAND_FORMAT = KeyValueFormat(
+    "status of a controller",
+    KeyValueField("law"),
+    KeyValueField("singular", BOOLEAN),
+    KeyValueField("smallest_singular_value", _NUMBER),
+    KeyValueField("damping", _NUMBER),
+    KeyValueField("lost_force_N", _NUMBER),
+    KeyValueField("lost_torque_Nm", _NUMBER),
+    KeyValueField("lost_effort", _NUMBER),
+    KeyValueField("errors", _NUMBER, prefix="error."),
+    KeyValueField("dumping", BOOLEAN, present_with="wheels"),
+    KeyValueField("wheels", _NUMBER, prefix="wheel."),
+    KeyValueField("momentum", _NUMBER, prefix="momentum."),
+)
 
 
 def tracking_time(states: Iterable[tuple[float, ControllerState]]) -> float | None:

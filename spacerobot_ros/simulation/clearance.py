@@ -11,8 +11,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair, ObstaclePair
-from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.events import (
+    SECONDS,
+    Event,
+    EventKind,
+    KeyValueField,
+    KeyValueFormat,
+    number_format,
+)
 from spacerobot_ros.files import warn_first_time
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -57,12 +63,8 @@ class ClearanceStatus:
 
     def to_values(self) -> dict[str, str]:
         """Return the status as key-value pairs of a DiagnosticStatus."""
-        values = {
-            "time": f"{self.time_s:.9f}",
-            "distance": f"{self.distance:.9g}",
-            "first": self.links.first,
-            "second": self.links.second,
-        }
+        values = _FORMAT.to_values(self)
+        values |= {"first": self.links.first, "second": self.links.second}
         if isinstance(self.links, ObstaclePair):
             values["second_is"] = _OBSTACLE
         return values
@@ -76,12 +78,17 @@ class ClearanceStatus:
         SpaceRobotError
             They are not those of a clearance.
         """
-        try:
+        with _FORMAT.reading():
             kind = ObstaclePair if values.get("second_is") == _OBSTACLE else LinkPair
             links = kind(values["first"], values["second"])
-            return cls(float(values["distance"]), links, float(values["time"]))
-        except (KeyError, ValueError) as error:
-            raise SpaceRobotError(f"The values are not a clearance: {error}.") from error
+        return _FORMAT.from_values(cls, values, links=links)
+
+
+_FORMAT = KeyValueFormat(
+    "clearance",
+    KeyValueField("time_s", SECONDS, key="time"),
+    KeyValueField("distance", number_format(".9g")),
+)
 
 
 class ClearanceMonitor:

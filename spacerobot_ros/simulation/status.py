@@ -6,15 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.events import (
+    INTEGER,
+    SECONDS,
+    Event,
+    EventKind,
+    KeyValueField,
+    KeyValueFormat,
+    choice_format,
+    list_format,
+)
 from spacerobot_ros.simulation.actuators import FaultyPlant
 from spacerobot_ros.simulation.capture import CaptureReport, ReleaseReport
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
-
-_SEPARATOR = "; "
-"""Between the lines of faults or disturbances."""
 
 
 class PlantState(str, Enum):
@@ -89,23 +94,7 @@ class PlantStatus:
 
     def to_values(self) -> dict[str, str]:
         """Return the status as key-value pairs of a DiagnosticStatus."""
-        values = {
-            "state": self.state.value,
-            "reason": self.reason,
-            "latched_fault": self.latched_fault,
-            "time_s": f"{self.time_s:.9f}",
-            "rearms": str(self.rearms),
-            "resets": str(self.resets),
-            "timeouts": str(self.timeouts),
-        }
-        if self.last_command_s is not None:
-            values["last_command_s"] = f"{self.last_command_s:.9f}"
-        values["faults"] = _SEPARATOR.join(self.faults)
-        if self.disturbances:
-            values["disturbances"] = _SEPARATOR.join(self.disturbances)
-        if self.payload:
-            values["payload"] = self.payload
-        return values
+        return _FORMAT.to_values(self)
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> PlantStatus:
@@ -116,25 +105,23 @@ class PlantStatus:
         SpaceRobotError
             They are not those of a plant.
         """
-        try:
-            faults, disturbances = (values.get(key, "") for key in ("faults", "disturbances"))
-            last = values.get("last_command_s")
-            return cls(
-                state=PlantState(values["state"]),
-                message=message,
-                reason=values.get("reason", ""),
-                latched_fault=values.get("latched_fault", ""),
-                time_s=float(values.get("time_s", "0")),
-                rearms=int(values.get("rearms", "0")),
-                resets=int(values.get("resets", "0")),
-                timeouts=int(values.get("timeouts", "0")),
-                last_command_s=None if last is None else float(last),
-                faults=tuple(faults.split(_SEPARATOR)) if faults else (),
-                disturbances=tuple(disturbances.split(_SEPARATOR)) if disturbances else (),
-                payload=values.get("payload", ""),
-            )
-        except (KeyError, ValueError) as error:
-            raise SpaceRobotError(f"The values are not a status of a plant: {error}.") from error
+        return _FORMAT.from_values(cls, values, message=message)
+
+
+_FORMAT = KeyValueFormat(
+    "status of a plant",
+    KeyValueField("state", choice_format(PlantState)),
+    KeyValueField("reason", always=True),
+    KeyValueField("latched_fault", always=True),
+    KeyValueField("time_s", SECONDS, always=True),
+    KeyValueField("rearms", INTEGER, always=True),
+    KeyValueField("resets", INTEGER, always=True),
+    KeyValueField("timeouts", INTEGER, always=True),
+    KeyValueField("last_command_s", SECONDS),
+    KeyValueField("faults", list_format("; "), always=True),
+    KeyValueField("disturbances", list_format("; ")),
+    KeyValueField("payload"),
+)
 
 
 class PlantMonitor:

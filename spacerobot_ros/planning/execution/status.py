@@ -7,7 +7,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.events import (
+    INTEGER,
+    KeyValueField,
+    KeyValueFormat,
+    TextFormat,
+    choice_format,
+    number_format,
+)
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import (
     Controlled,
@@ -17,24 +24,6 @@ from spacerobot_ros.planning.core.goal import (
     uncontrolled_parts,
 )
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
-
-_END_EFFECTOR_ERRORS = ("end_effector_position_error_m", "end_effector_attitude_error_rad")
-
-_GOAL_PREFIX = "goal_of_"
-"""Beginning of the keys of goals of end-effectors, before the link."""
-
-_WAYPOINTS_PREFIX = "waypoints_of_"
-"""Beginning of the keys of numbers of waypoints, before the link."""
-
-_PARTS: tuple[Controlled, ...] = ("position", "attitude", "shape")
-"""The parts of a goal that a method may leave uncontrolled."""
-
-_NUMBER_KEYS = (
-    *_END_EFFECTOR_ERRORS,
-    *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "ends_at_s", "duration_s"),
-    "remaining_s",
-)
-"""Keys of status values that are single numbers."""
 
 
 class PlannerState(str, Enum):
@@ -128,35 +117,7 @@ class PlannerStatus:
 
     def to_values(self) -> dict[str, str]:
         """Return the status as the key-value pairs of a DiagnosticStatus; numbers have 9 digits."""
-        values = {"state": self.state.value, "corrections": str(self.corrections)}
-        if self.goal_id:
-            values["goal_id"] = self.goal_id
-        if self.goal:
-            values["goal"] = _format_note(list(self.goal))
-        if self.position_error_m is not None:
-            values["position_error_m"] = _format_note(self.position_error_m)
-        if self.attitude_error_rad is not None:
-            values["attitude_error_rad"] = _format_note(self.attitude_error_rad)
-        for link, numbers in self.end_effector_goals.items():
-            values[f"{_GOAL_PREFIX}{link}"] = _format_note(list(numbers))
-        for link, count in self.end_effector_waypoints.items():
-            values[f"{_WAYPOINTS_PREFIX}{link}"] = str(count)
-        for name in _END_EFFECTOR_ERRORS:
-            error = getattr(self, name)
-            if error is not None:
-                values[name] = _format_note(error)
-        if self.not_controlled:
-            values["not_controlled"] = " ".join(self.not_controlled)
-        if self.ends_at_s:
-            values["manoeuvre_time_s"] = _format_note(self.manoeuvre_time_s)
-            values["ends_at_s"] = _format_note(self.ends_at_s)
-        if self.remaining_s:
-            values["remaining_s"] = _format_note(self.remaining_s)
-        if self.method:
-            values["method"] = self.method
-            values["duration_s"] = _format_note(self.duration_s)
-            values.update((name, _format_note(note)) for name, note in self.notes.items())
-        return values
+        return _FORMAT.to_values(self)
 
     @classmethod
     def from_values(cls, values: Mapping[str, str], message: str = "") -> PlannerStatus:
@@ -167,36 +128,53 @@ class PlannerStatus:
         SpaceRobotError
             They are no status of a planner.
         """
-        given = dict(values)
-        try:
-            state = PlannerState(given.pop("state"))
-            numbers = {name: float(given.pop(name)) for name in _NUMBER_KEYS if name in given}
-            end_effectors = {
-                name.removeprefix(_GOAL_PREFIX): tuple(map(float, given.pop(name).split()))
-                for name in list(given)
-                if name.startswith(_GOAL_PREFIX)
-            }
-            waypoints = {
-                name.removeprefix(_WAYPOINTS_PREFIX): int(given.pop(name))
-                for name in list(given)
-                if name.startswith(_WAYPOINTS_PREFIX)
-            }
-            left_out = given.pop("not_controlled", "").split()
-            return cls(
-                state=state,
-                message=message,
-                goal_id=given.pop("goal_id", ""),
-                not_controlled=tuple(part for part in _PARTS if part in left_out),
-                goal=tuple(float(word) for word in given.pop("goal", "").split()),
-                end_effector_goals=end_effectors,
-                end_effector_waypoints=waypoints,
-                corrections=int(given.pop("corrections", "0")),
-                method=given.pop("method", ""),
-                **numbers,
-                notes={name: _note_from_text(text) for name, text in given.items()},
-            )
-        except (KeyError, ValueError) as error:
-            raise SpaceRobotError(f"This is no status of a planner: {error}.") from error
+        return _FORMAT.from_values(cls, values, message=message)
+
+
+def _format_note(note: list[float] | Array | float | str) -> str:
+    numbers = note if isinstance(note, list) else [note]
+    return " ".join(f"{x:.9g}" if isinstance(x, float) else str(x) for x in numbers)
+
+
+def _note_from_text(text: str) -> list[float] | float | str:
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        return text
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+_NUMBER = number_format(".9g")
+_NUMBERS = TextFormat(
+    lambda numbers: _format_note(list(numbers)), lambda text: tuple(map(float, text.split()))
+)
+_NOTE = TextFormat(_format_note, _note_from_text)
+_PARTS = TextFormat(
+    " ".join,
+    lambda text: tuple(part for part in ("position", "attitude", "shape") if part in text.split()),
+)
+"""The parts of a goal that a method may leave uncontrolled; unknown words are left out."""
+
+_FORMAT = KeyValueFormat(
+    "status of a planner",
+    KeyValueField("state", choice_format(PlannerState)),
+    KeyValueField("corrections", INTEGER, always=True),
+    KeyValueField("goal_id"),
+    KeyValueField("goal", _NUMBERS),
+    KeyValueField("position_error_m", _NUMBER),
+    KeyValueField("attitude_error_rad", _NUMBER),
+    KeyValueField("end_effector_goals", _NUMBERS, prefix="goal_of_"),
+    KeyValueField("end_effector_waypoints", INTEGER, prefix="waypoints_of_"),
+    KeyValueField("end_effector_position_error_m", _NUMBER),
+    KeyValueField("end_effector_attitude_error_rad", _NUMBER),
+    KeyValueField("not_controlled", _PARTS),
+    KeyValueField("manoeuvre_time_s", _NUMBER, present_with="ends_at_s"),
+    KeyValueField("ends_at_s", _NUMBER),
+    KeyValueField("remaining_s", _NUMBER),
+    KeyValueField("method"),
+    KeyValueField("duration_s", _NUMBER, present_with="method"),
+    KeyValueField("notes", _NOTE, prefix="", present_with="method"),
+)
 
 
 class Severity(Enum):
@@ -309,19 +287,6 @@ def describe_remaining_error(
     if goal is not None and (parts_left := uncontrolled_parts(goal, controls)):
         notes.append(f"{' and '.join(parts_left)} not controlled")
     return remaining + (f" ({'; '.join(notes)})" if notes else "")
-
-
-def _format_note(note: list[float] | Array | float | str) -> str:
-    numbers = note if isinstance(note, list) else [note]
-    return " ".join(f"{x:.9g}" if isinstance(x, float) else str(x) for x in numbers)
-
-
-def _note_from_text(text: str) -> list[float] | float | str:
-    try:
-        numbers = [float(word) for word in text.split()]
-    except ValueError:
-        return text
-    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
