@@ -19,8 +19,8 @@ from itertools import product
 import numpy as np
 
 from spacerobot_ros.collision import BasePoses, CollisionGeometry, LinkPair
+from spacerobot_ros.control.inverse_kinematics import REACHED_DISTANCE, FixedBaseArm
 from spacerobot_ros.control.limits import MotionLimits
-from spacerobot_ros.control.outputs import AXES
 from spacerobot_ros.control.reference import quintic_duration
 from spacerobot_ros.control.state import ControlState, PoseReference
 from spacerobot_ros.control.target_motion import (
@@ -32,11 +32,7 @@ from spacerobot_ros.control.target_motion import (
 )
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
-from spacerobot_ros.model.rotations import (
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    rotvec_from_quaternion,
-)
+from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
@@ -55,19 +51,11 @@ _SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 4.0, 1.4, 60.0
 _CLOSING_SHARE = 0.5
 """Share of the largest acceleration for closing in; the grapple frame's own takes the rest."""
 
-_REACHED_DISTANCE = 1e-3
-"""Distance of an end-effector from its reference (m, rad) below which the arm reaches it."""
-
 _STANDOFF_FACTORS = (1.0, 2.0, 3.0)
 """Standoff distances that are tried where the target blocks the way, over the given one."""
 
 _MAX_BLOCKED_PATHS = 100
 """Number of paths past the body of the target that are tried."""
-
-_MAX_ITERATIONS = 30
-_DAMPING = 0.02
-_LONGEST_TURN = 0.2
-"""Iterations of inverse kinematics, their damping, and the largest step of a joint, m or rad."""
 
 _ARM_RATE_SHARE = 0.9
 """Share of the joint rates that the path of an arm may take."""
@@ -179,72 +167,42 @@ class ArmReach:
     def __init__(
         self, robot: SpaceRobot, link: str, axes: tuple[str, ...], state: ControlState, rates: Array
     ) -> None:
-        self._robot, self._link, self._rates = robot, link, rates
-        self._rows = [AXES.index(axis) for axis in axes]
-        self._r_WB, self._R_WB = state.r_WB.copy(), matrix_from_quaternion(state.quaternion_WB)
+        self.base = Pose(matrix_from_quaternion(state.quaternion_WB), state.r_WB.copy())
+        """Pose of the base in W."""
+        self._arm = FixedBaseArm(robot, link, self.base, axes)
+        self._joint_names, self._rates = robot.joint_names, rates
         self._q = state.q.copy()
 
-    def distance(self, motion: FrameMotion, k: int) -> float:
+    def distance_to(self, motion: FrameMotion, k: int) -> float:
         """Return the distance (m or rad) that remains to the k-th pose, from the present shape."""
-        return self._solve(self._q, motion, k)[1]
+        return self._arm.nearest_shape(self._q, Pose(motion.R[k], motion.r[k]))[1]
 
-    @property
-    def base(self) -> Pose:
-        """Pose of the base in W."""
-        return Pose(self._R_WB, self._r_WB)
-
-    def waiting(self, count: int) -> Array:
+    def present_shapes(self, count: int) -> Array:
         """Return the present shape, ``count`` times (count, n)."""
         return np.tile(self._q, (count, 1))
 
-    def follows(self, motion: FrameMotion, period: float) -> tuple[Array, str]:
+    def shapes_along(self, motion: FrameMotion, period: float) -> tuple[Array, str]:
         """Return the shapes (K, n) of the arm that follows a motion from its present shape on, and
-        why it does not; empty: it does.
+        the reason why it does not; empty: it does.
 
         ``period`` is the time between two poses of the motion, s.
         """
         q, shapes = self._q, np.empty((len(motion.r), len(self._q)))
         for k in range(len(motion.r)):
             before = q
-            q, distance = self._solve(q, motion, k)
+            q, distance = self._arm.nearest_shape(q, Pose(motion.R[k], motion.r[k]))
             shapes[k] = q
-            if distance > _REACHED_DISTANCE:
+            if distance > REACHED_DISTANCE:
                 return shapes, f"the end-effector stays {distance:.3g} m or rad away from it"
             rate = np.abs(q - before) / period
             share = rate / (_ARM_RATE_SHARE * self._rates)
             if k and share.max(initial=0.0) > 1.0:
                 worst = int(share.argmax())
                 return shapes, (
-                    f"joint '{self._robot.joint_names[worst]}' would move at {rate[worst]:.3g}/s, "
+                    f"joint '{self._joint_names[worst]}' would move at {rate[worst]:.3g}/s, "
                     f"of {self._rates[worst]:.3g}/s"
                 )
         return shapes, ""
-
-    def _solve(self, q: Array, motion: FrameMotion, k: int) -> tuple[Array, float]:
-        """Return the shape nearest to a pose, from a shape on, and the distance that remains."""
-        lower, upper = self._robot.lower, self._robot.upper
-        distance = np.inf
-        for _ in range(_MAX_ITERATIONS):
-            error, J = self._error(q, motion, k)
-            distance = float(np.abs(error).max())
-            if distance < 0.1 * _REACHED_DISTANCE:
-                break
-            step = J.T @ np.linalg.solve(J @ J.T + _DAMPING**2 * np.eye(len(error)), error)
-            step *= min(1.0, _LONGEST_TURN / max(float(np.abs(step).max()), 1e-12))
-            q = np.clip(q + step, lower, upper)
-        return q, distance
-
-    def _error(self, q: Array, motion: FrameMotion, k: int) -> tuple[Array, Array]:
-        robot, R_WB = self._robot, self._R_WB
-        R_BE, r_BE = robot.link_pose(self._link, q)
-        R_WE = R_WB @ R_BE
-        turn = rotvec_from_quaternion(quaternion_from_matrix(R_WE.T @ motion.R[k]))
-        error = np.concatenate([motion.r[k] - self._r_WB - R_WB @ r_BE, R_WE @ turn])
-        J = robot.jacobian(self._link, q)
-        # With the base at rest the centre of mass moves against the base's part of its Jacobian.
-        fixed = J[:, 6:] - J[:, :3] @ robot.jacobian(robot.base_link, q)[:3, 6:]
-        J_W = np.vstack([R_WB @ fixed[:3], R_WB @ fixed[3:]])
-        return error[self._rows], J_W[self._rows]
 
 
 def plan_approach(
@@ -315,21 +273,21 @@ def plan_approach(
             failure.note(excess, sentence)
             if excess > 1.0:
                 continue
-            distance = reach.distance(motion, -1)
-            if distance > _REACHED_DISTANCE:
+            distance = reach.distance_to(motion, -1)
+            if distance > REACHED_DISTANCE:
                 failure.out_of_reach(distance, plan.contact)
                 if way:
                     continue
                 break  # A longer path meets the target later, which other start times do, too.
             near: NearestLinks | None = None
             for every in (_COARSE_STRIDE, 1):
-                shapes, why = reach.follows(
+                shapes, why = reach.shapes_along(
                     motion.rows(slice(None, None, every)), every * _SAMPLE_PERIOD
                 )
                 if clearance is None or why:
                     continue
                 ticks = np.r_[0:first:every, first:last:every]
-                shapes = np.concatenate([reach.waiting(len(ticks) - len(shapes)), shapes])
+                shapes = np.concatenate([reach.present_shapes(len(ticks) - len(shapes)), shapes])
                 # A hand that is planned for in motion may be beside the target already.
                 closes = 0 if moving else int(np.sum(ticks * _SAMPLE_PERIOD < plan.closing_time))
                 near = clearance.nearest(reach.base, shapes, grapple.rows(ticks), closes)

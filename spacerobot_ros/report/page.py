@@ -27,6 +27,7 @@ from spacerobot_ros.report.page_parts import (
 from spacerobot_ros.report.signals import simplified
 from spacerobot_ros.report.tables import (
     Table,
+    different_goals,
     headline,
     joint_table,
     published_table,
@@ -127,27 +128,12 @@ def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str
     flights = [flight, *beside]
     parts = ["<h2>Runs side by side</h2>", _table_html("runs", runs_table(flights))]
     files = [each.file_name for each in flights]
-    if goals := _different_goals(flights):
+    if goals := different_goals(flights):
         parts += ["<h3>Goals that differ</h3>", table("goals", ("Goal", *files), goals)]
     if rows := different_parameters([each.flight.scenario for each in flights]):
         head = ("Parameter", *files)
         parts += ["<h3>Parameters that differ</h3>", table("different", head, rows)]
     return parts
-
-
-def _different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
-    """Return the rows of the goals that are not the same in all flights."""
-    goals = [
-        {
-            label.removeprefix("Goal ").removesuffix(" (refused)"): text
-            for label, text, *_ in result_table(each).rows
-            if label.startswith("Goal ")
-        }
-        for each in flights
-    ]
-    labels = dict.fromkeys(label for each in goals for label in each)
-    rows = [(label, *(each.get(label, "–") for each in goals)) for label in labels]
-    return [row for row in rows if len({*row[1:]}) > 1]
 
 
 def _numbers_html(flight: FlightReport) -> list[str]:

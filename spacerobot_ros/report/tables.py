@@ -15,6 +15,7 @@ from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.report.flight import FlightReport, joint_unit
 from spacerobot_ros.scenario import Published
 
@@ -116,16 +117,12 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
 def result_table(flight: FlightReport) -> Table:
     """Return goal, final state, errors, times and momentum drift, as far as the bag has them."""
     rows: list[tuple[str, ...]] = []
-    goal, error = flight.goal, flight.flight.error
-    if goal is not None and (flight.controls("base") or not flight.outputs):
-        last = flight.statuses[-1].state if flight.statuses else ""
-        refused = " (refused)" if last == "refused" and not flight.executing else ""
-        rows.append((f"Goal position{refused}", f"({_format_vector(goal.position)}) m"))
-        rows.append(
-            (f"Goal attitude{refused}", _format_attitude(rotvec_from_quaternion(goal.quaternion)))
-        )
-    if flight.link_goals and goal is None:
-        rows.append(("Goal of the base", "not controlled"))
+    error = flight.flight.error
+    last = flight.statuses[-1].state if flight.statuses else ""
+    refused = " (refused)" if last == "refused" and not flight.executing else ""
+    for part, text in _base_goal_texts(flight).items():
+        pose = part != _FREE_BASE
+        rows.append((f"Goal {part}{refused if pose else ''}", text))
     if len(flight.position):
         rows.append(("Final position", f"({_format_vector(flight.position.values[-1])}) m"))
         rows.append(
@@ -165,6 +162,39 @@ def result_table(flight: FlightReport) -> Table:
         at = f"links {nearest.links} at {clearance.nearest_time:.6g} s"
         rows.append(("Clearance", f"{nearest.distance:.4g} m, {at}"))
     return Table(("Quantity", "Value"), rows)
+
+
+_FREE_BASE = "of the base"
+
+
+def _base_goal_texts(flight: FlightReport) -> dict[str, str]:
+    """Return the goal of the base by its parts, as texts; empty: there is none."""
+    goal = flight.goal
+    if goal is None:
+        return {_FREE_BASE: "not controlled"} if flight.link_goals else {}
+    if not flight.controls("base") and flight.outputs:
+        return {}
+    attitude = _format_attitude(rotvec_from_quaternion(goal.quaternion))
+    return {"position": f"({_format_vector(goal.position)}) m", "attitude": attitude}
+
+
+def _link_goal_text(goal: EndEffectorGoal) -> str:
+    attitude = "any attitude"
+    if goal.quaternion is not None:
+        attitude = _format_attitude(rotvec_from_quaternion(goal.quaternion))
+    return f"({_format_vector(goal.position)}) m, {attitude}"
+
+
+def different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
+    """Return a row for each part of the goals that differs between flights: name, and texts."""
+    goals = [
+        _base_goal_texts(flight)
+        | {f"of {link}": _link_goal_text(goal) for link, goal in flight.link_goals.items()}
+        for flight in flights
+    ]
+    parts = dict.fromkeys(part for each in goals for part in each)
+    rows = [(part, *(each.get(part, _NO_VALUE) for each in goals)) for part in parts]
+    return [row for row in rows if len({*row[1:]}) > 1]
 
 
 def _payload_rows(flight: FlightReport) -> list[tuple[str, ...]]:
@@ -216,10 +246,7 @@ def _link_rows(flight: FlightReport) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     errors = flight.flight.end_effector_errors
     for link, goal in flight.link_goals.items():
-        attitude = "any attitude"
-        if goal.quaternion is not None:
-            attitude = _format_attitude(rotvec_from_quaternion(goal.quaternion))
-        rows.append((f"Goal of {link}", f"({_format_vector(goal.position)}) m, {attitude}"))
+        rows.append((f"Goal of {link}", _link_goal_text(goal)))
         if link not in errors:
             continue
         error = errors[link]

@@ -27,15 +27,11 @@ from typing import IO
 
 import numpy as np
 
+from spacerobot_ros.control.inverse_kinematics import FixedBaseArm, is_reached
 from spacerobot_ros.errors import GoalError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
-from spacerobot_ros.model.kinematics import ForwardKinematics
-from spacerobot_ros.model.rotations import (
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    rotvec_from_quaternion,
-)
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Pose, RobotDescription
+from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.shared_parameters import robot_from_text
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured, declared
@@ -52,62 +48,6 @@ from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
 from spacerobot_ros.termination import Terminated, end_child, guarded, start_child
 from spacerobot_ros.viewer.state import Part, StackState
-
-_SEARCH_STARTS = 8
-"""Joint positions from which the search starts: the current ones, and random ones."""
-
-_MAX_EVALUATIONS = 30
-"""Largest number of evaluations of the error in each search."""
-
-_REACHED_ERROR = 1e-4
-"""Error below which an arm reaches its goal, m and rad."""
-
-_RADIAN_LENGTH = 0.5
-"""Weight of an error of one radian in the search, m."""
-
-
-def reaching_positions(
-    robot: RobotDescription, link: str, base: Goal, tool: Goal, q: Array
-) -> tuple[Array, float, float]:
-    """Return the joint positions (n,) that bring a link nearest to its goal, and the error, m, rad.
-
-    The search starts at ``q`` and at random positions within the limits of the joints; for equal
-    arguments the result is the same.
-    """
-    # Imported here because scipy.optimize loads slowly.
-    from scipy.optimize import least_squares
-
-    kinematics = ForwardKinematics(robot)
-    end = kinematics.links.index(link)
-    R_WB = matrix_from_quaternion(base.quaternion)
-    goal_r = R_WB.T @ (tool.position - base.position)
-    goal_R = R_WB.T @ matrix_from_quaternion(tool.quaternion)
-
-    def error(shape: Array) -> Array:
-        R, r = kinematics.link_poses(shape)
-        turn = rotvec_from_quaternion(quaternion_from_matrix(R[end].T @ goal_R))
-        return np.concatenate([goal_r - r[end], _RADIAN_LENGTH * turn])
-
-    lower = np.where(np.isfinite(robot.limits("lower")), robot.limits("lower"), -math.pi)
-    upper = np.where(np.isfinite(robot.limits("upper")), robot.limits("upper"), math.pi)
-    # The solver requires a lower bound below the upper one.
-    lower, upper = np.minimum(lower, q) - 1e-9, np.maximum(upper, q) + 1e-9
-    random = np.random.default_rng(0)
-    best, least = q, error(q)
-    for number in range(_SEARCH_STARTS):
-        start = q if number == 0 else random.uniform(lower, upper)
-        found = least_squares(error, start, bounds=(lower, upper), max_nfev=_MAX_EVALUATIONS)
-        if np.linalg.norm(found.fun) < np.linalg.norm(least):
-            best, least = found.x, found.fun
-        if np.linalg.norm(least) < _REACHED_ERROR:
-            break
-    return best, float(np.linalg.norm(least[:3])), float(np.linalg.norm(least[3:]) / _RADIAN_LENGTH)
-
-
-def is_reached(distance: float, angle: float) -> bool:
-    """Whether an arm with such an error, m and rad, reaches its goal."""
-    return distance <= 2 * _REACHED_ERROR and angle <= 4 * _REACHED_ERROR
-
 
 _NICENESS = 10
 """Added to the niceness of the process, so that everything else runs first."""
@@ -474,9 +414,11 @@ def _uncontrolled_text(
 
 def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
     """Return whether the arm reaches its goal."""
-    robot = parse_robot(question.urdf)
-    q = question.state.q
-    shape, distance, angle = reaching_positions(robot, question.link, question.goal, tool, q)
+    base, end = (
+        Pose(matrix_from_quaternion(g.quaternion), g.position) for g in (question.goal, tool)
+    )
+    arm = FixedBaseArm(SpaceRobot(parse_robot(question.urdf)), question.link, base)
+    shape, distance, angle = arm.search_shape(question.state.q, end)
     if is_reached(distance, angle):
         message = "The end-effector can reach its goal there."
         return GoalCheck(Verdict.REACHABLE, message, shape=shape)

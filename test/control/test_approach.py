@@ -168,9 +168,9 @@ def test_a_hand_that_moves_sets_out_at_once_or_not() -> None:
 
 def test_the_distance_of_a_reach_is_that_of_two_links() -> None:
     arm = reach()
-    assert arm.distance(at(np.array([1.2, 0.9, 0.0])), 0) < 1e-3
+    assert arm.distance_to(at(np.array([1.2, 0.9, 0.0])), 0) < 1e-3
     # Straight to the left of the shoulder at (0.5, 0) the arm ends 2 m away.
-    assert arm.distance(at(np.array([0.5, 2.4, 0.0])), 0) == pytest.approx(0.4, abs=0.02)
-    shapes, why = arm.follows(at(np.array([1.2, 0.9, 0.0])), 0.25)
+    assert arm.distance_to(at(np.array([0.5, 2.4, 0.0])), 0) == pytest.approx(0.4, abs=0.02)
+    shapes, why = arm.shapes_along(at(np.array([1.2, 0.9, 0.0])), 0.25)
     assert (why, shapes.shape) == ("", (1, 2))
-    assert "stays 0.4" in arm.follows(at(np.array([0.5, 2.4, 0.0])), 0.25)[1]
+    assert "stays 0.4" in arm.shapes_along(at(np.array([0.5, 2.4, 0.0])), 0.25)[1]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import pickle
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 
 from spacerobot_ros.model import load_robot
-from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
@@ -23,10 +21,8 @@ from spacerobot_ros.viewer.reachability import (
     GoalChecker,
     GoalQuestion,
     Verdict,
-    is_reached,
     make_question,
     planner_config,
-    reaching_positions,
 )
 from spacerobot_ros.viewer.state import Measured, StackState
 
@@ -156,39 +152,6 @@ def test_a_process_that_has_ended_is_told(now: list[float]) -> None:
     checker.ended = -9
     assert said(checker) == (Verdict.UNCHECKED, "The process that checks goals has ended.")
     assert checker.latest_answer() is None
-
-
-# -- the arm of a controlled robot ----------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("distance", "angle", "reached"),
-    [(2e-4, 4e-4, True), (2.01e-4, 0.0, False), (0.0, 4.01e-4, False), (0.0, 0.0, True)],
-)
-def test_an_arm_reaches_its_goal_within_a_fifth_of_a_millimetre(
-    distance: float, angle: float, reached: bool
-) -> None:
-    assert is_reached(distance, angle) is reached
-
-
-def test_the_error_of_the_nearest_joint_positions_is_in_metres_and_radians() -> None:
-    """A planar arm stays in its plane, and its end at the tilt of its base."""
-    robot = load_robot(robot_file("planar_manipulator"))
-    link = robot.end_effector()
-    base = Goal.checked([0.3, -0.2, 0.1], IDENTITY)
-    q = np.zeros(len(robot.joint_names))
-    near = np.array([0.3, -0.2, 0.1])
-    tilted = [math.sin(0.15), 0.0, 0.0, math.cos(0.15)]
-    kinematics = ForwardKinematics(robot)
-    _, r = kinematics.link_poses(q)
-    place = near + r[kinematics.links.index(link)]
-    tool = Goal.checked(place + np.array([0.0, 0.0, 0.04]), tilted)
-    _, distance, angle = reaching_positions(robot, link, base, tool, q)
-    assert distance == pytest.approx(0.04, abs=2e-3)
-    assert angle == pytest.approx(0.3, abs=5e-3)
-    shape, distance, angle = reaching_positions(robot, link, base, Goal.checked(place, IDENTITY), q)
-    assert max(distance, angle) < 1e-9
-    np.testing.assert_array_equal(shape, q)
 
 
 # -- sentences ------------------------------------------------------------------------------------

@@ -29,10 +29,8 @@ from spacerobot_ros.viewer.reachability import (
     Verdict,
     _LastQuestion,
     _uncontrolled_text,
-    is_reached,
     make_question,
     planner_config,
-    reaching_positions,
 )
 from spacerobot_ros.viewer.state import Measured, Momenta, StackState
 
@@ -264,51 +262,6 @@ def test_the_robot_of_a_planner_is_that_of_the_page() -> None:
 
 
 # -- the answer ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("distance", "angle", "reached"),
-    [
-        (2e-4, 4e-4, True),
-        (2.1e-4, 0.0, False),
-        (0.0, 4.1e-4, False),
-        (1.9e-4, 3.9e-4, True),
-    ],
-)
-def test_an_arm_is_at_its_goal_within_a_fifth_of_a_millimetre(
-    distance: float, angle: float, reached: bool
-) -> None:
-    assert is_reached(distance, angle) is reached
-
-
-def test_the_nearest_positions_of_an_arm_and_their_errors() -> None:
-    robot = load_robot(robot_file("planar_manipulator"))
-    link, q = robot.end_effector(), np.array([0.3, -0.4])
-    base = Goal.checked([0.4, -0.2, 0.0], Goal.from_rotvec([0, 0, 0], [0, 0, 0.5]).quaternion)
-    away = base.position + np.array([7.0, 0.0, 0.0])
-    tool = Goal.checked(away, base.quaternion)
-    shape, distance, angle = reaching_positions(robot, link, base, tool, q)
-    again = reaching_positions(robot, link, base, tool, q)
-    np.testing.assert_array_equal(shape, again[0])
-    # Stretched towards the goal and turned by the sum of the joints, the way it counts by both.
-    lever = np.array([0.5, 1.0, 1.0])
-    angles = np.cumsum([0.5, *shape])
-    reach = base.position[:2] + sum(
-        length * np.array([math.cos(a), math.sin(a)])
-        for length, a in zip(lever, angles, strict=True)
-    )
-    assert distance == pytest.approx(float(np.linalg.norm(away[:2] - reach)), rel=1e-6)
-    assert angle == pytest.approx(abs(float(shape.sum())), rel=1e-6)
-    # No neighbour is nearer in the weighted error.
-    weighted = distance**2 + (0.5 * angle) ** 2
-    for step in 1e-3 * np.vstack([np.eye(2), -np.eye(2)]):
-        moved = np.cumsum([0.5, *(shape + step)])
-        at = base.position[:2] + sum(
-            length * np.array([math.cos(a), math.sin(a)])
-            for length, a in zip(lever, moved, strict=True)
-        )
-        error = float(np.sum((away[:2] - at) ** 2)) + (0.5 * float((shape + step).sum())) ** 2
-        assert error >= weighted - 1e-9
 
 
 def schedule(**changes: Any) -> Any:

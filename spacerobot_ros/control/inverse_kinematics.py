@@ -1,0 +1,134 @@
+"""Inverse kinematics of an arm whose base stays where it is: from the present shape, and a search.
+
+A controller that holds its base follows a path with the arm alone; the page asks whether the arm
+can reach a goal at all. Both use the same errors and the same Jacobian.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from spacerobot_ros.control.outputs import AXES
+from spacerobot_ros.model.description import Array, Pose
+from spacerobot_ros.model.rotations import quaternion_from_matrix, rotvec_from_quaternion
+from spacerobot_ros.model.space_robot import SpaceRobot
+
+REACHED_DISTANCE = 1e-3
+"""Error of an end-effector (m, rad) below which an arm follows its path."""
+
+_MAX_ITERATIONS = 30
+_DAMPING = 0.02
+_LARGEST_STEP = 0.2
+"""Iterations from the present shape, their damping, and the largest step of a joint, m or rad."""
+
+_SEARCH_STARTS = 8
+"""Shapes from which a search starts: the present one, and random ones."""
+
+_MAX_EVALUATIONS = 30
+"""Largest number of evaluations of the error from each start."""
+
+_SEARCH_TOLERANCE = 1e-4
+"""Error below which a search ends, m and rad."""
+
+_RADIAN_LENGTH = 0.5
+"""Weight of an error of one radian in a search, m."""
+
+
+class FixedBaseArm:
+    """An arm on a base that stays where it is.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    link
+        Link of the end-effector.
+    base
+        Pose of the base in W.
+    axes
+        Axes of the end-effector whose errors count; all, unless others are given.
+    """
+
+    def __init__(
+        self, robot: SpaceRobot, link: str, base: Pose, axes: tuple[str, ...] = AXES
+    ) -> None:
+        self._robot, self._link = robot, link
+        self.base = base
+        self._rows = [AXES.index(axis) for axis in axes]
+
+    def error(self, q: Array, goal: Pose) -> tuple[Array, Array]:
+        """Return the error (m,) of the end-effector in the axes that count, m over rad, in W.
+
+        Also returned is its derivative by the joints (m, n), with the sign of their motion.
+        """
+        robot, R_WB = self._robot, self.base.R
+        R_BE, r_BE = robot.link_pose(self._link, q)
+        R_WE = R_WB @ R_BE
+        turn = rotvec_from_quaternion(quaternion_from_matrix(R_WE.T @ goal.R))
+        error = np.concatenate([goal.r - self.base.r - R_WB @ r_BE, R_WE @ turn])
+        J = robot.jacobian(self._link, q)
+        # With the base at rest the centre of mass moves against the base's part of its Jacobian.
+        fixed = J[:, 6:] - J[:, :3] @ robot.jacobian(robot.base_link, q)[:3, 6:]
+        J_W = np.vstack([R_WB @ fixed[:3], R_WB @ fixed[3:]])
+        return error[self._rows], J_W[self._rows]
+
+    def nearest_shape(self, q: Array, goal: Pose) -> tuple[Array, float]:
+        """Return the shape (n,) nearest to a pose that is found from ``q`` on.
+
+        Also returned is the largest error that remains, m or rad. The search is damped least
+        squares, with steps that are short enough to stay on one branch of solutions.
+        """
+        lower, upper = self._robot.lower, self._robot.upper
+        distance = np.inf
+        for _ in range(_MAX_ITERATIONS):
+            error, J = self.error(q, goal)
+            distance = float(np.abs(error).max())
+            if distance < 0.1 * REACHED_DISTANCE:
+                break
+            step = J.T @ np.linalg.solve(J @ J.T + _DAMPING**2 * np.eye(len(error)), error)
+            step *= min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-12))
+            q = np.clip(q + step, lower, upper)
+        return q, distance
+
+    def search_shape(self, q: Array, goal: Pose) -> tuple[Array, float, float]:
+        """Return the shape (n,) nearest to a pose within all joint limits; all axes count.
+
+        Also returned are the distance and the angle that remain, m and rad. The search starts at
+        ``q`` and at random shapes; for equal arguments the result is the same.
+        """
+        # Imported here because scipy.optimize loads slowly.
+        from scipy.optimize import least_squares
+
+        weights = np.repeat([1.0, _RADIAN_LENGTH], 3)
+
+        def error(shape: Array) -> Array:
+            return weights * self.error(shape, goal)[0]
+
+        def jacobian(shape: Array) -> Array:
+            # The rotation vector is an eigenvector of its own derivative: the gradient is exact.
+            return -weights[:, np.newaxis] * self.error(shape, goal)[1]
+
+        lower = np.where(np.isfinite(self._robot.lower), self._robot.lower, -math.pi)
+        upper = np.where(np.isfinite(self._robot.upper), self._robot.upper, math.pi)
+        # The solver requires a lower bound below the upper one.
+        lower, upper = np.minimum(lower, q) - 1e-9, np.maximum(upper, q) + 1e-9
+        random = np.random.default_rng(0)
+        best, least = q, error(q)
+        for number in range(_SEARCH_STARTS):
+            start = q if number == 0 else random.uniform(lower, upper)
+            found = least_squares(
+                error, start, jacobian, bounds=(lower, upper), max_nfev=_MAX_EVALUATIONS
+            )
+            if np.linalg.norm(found.fun) < np.linalg.norm(least):
+                best, least = found.x, found.fun
+            if np.linalg.norm(least) < _SEARCH_TOLERANCE:
+                break
+        angle = float(np.linalg.norm(least[3:])) / _RADIAN_LENGTH
+        return best, float(np.linalg.norm(least[:3])), angle
+
+
+def is_reached(distance: float, angle: float) -> bool:
+    """Whether an arm with such an error after a search, m and rad, reaches its goal."""
+    return distance <= 2 * _SEARCH_TOLERANCE and angle <= 4 * _SEARCH_TOLERANCE
