@@ -22,6 +22,23 @@ def matrix_from_quaternion(quaternion: ca.SX) -> ca.SX:
     )
 
 
+def quaternion_from_matrix(R: ca.SX) -> ca.SX:
+    """Return the unit quaternion (4,) of a rotation matrix (3, 3), as the numeric one does."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (ca.horzsplit(row) for row in ca.vertsplit(R))
+    trace = xx + yy + zz
+    squares = [1 + 2 * xx - trace, 1 + 2 * yy - trace, 1 + 2 * zz - trace, 1 + trace]
+    # The divisor is the largest of four squares, which keeps precision near half turns.
+    largest = ca.mmax(ca.vertcat(*squares))
+    whole, s = ca.sqrt(largest) / 2, 0.5 / ca.sqrt(largest)
+    about_x = ca.vertcat(whole, (yx + xy) * s, (zx + xz) * s, (zy - yz) * s)
+    about_y = ca.vertcat((xy + yx) * s, whole, (zy + yz) * s, (xz - zx) * s)
+    about_z = ca.vertcat((xz + zx) * s, (yz + zy) * s, whole, (yx - xy) * s)
+    found = ca.vertcat((zy - yz) * s, (xz - zx) * s, (yx - xy) * s, whole)
+    for square, candidate in zip(squares[2::-1], (about_z, about_y, about_x), strict=True):
+        found = ca.if_else(square == largest, candidate, found)
+    return found
+
+
 def matrix_about_axis(axis: np.ndarray, angle: ca.SX) -> ca.SX:
     """Return the rotation (3, 3) by an angle (rad) about a constant unit axis (Rodrigues)."""
     a = ca.sparsify(ca.DM(axis))

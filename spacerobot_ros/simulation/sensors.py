@@ -9,10 +9,10 @@ import numpy as np
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, Pose
+from spacerobot_ros.model.kinematics import LinkPlacement
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
-    quaternion_from_matrix,
     quaternion_from_rotvec,
     quaternion_multiply,
 )
@@ -242,12 +242,13 @@ class ReportedState:
     def __init__(self, plant: FaultyPlant, config: PlantConfig) -> None:
         self._plant = plant
         self.sensors = Sensors(plant, config.sensors, config.control_period)
-        self._link = _end_effector_index(plant.robot, config.end_effector_frame)
-        self._end_effector_pose = np.zeros(7)
+        robot, count = plant.robot, len(plant.robot.link_names)
+        link = _end_effector_index(robot, config.end_effector_frame)
+        self._end_effector = None if link is None else LinkPlacement(count, [(link, Pose())])
         self._end_effectors = config.end_effectors
-        self._links = _link_indices(plant.robot, config.end_effectors)
-        self._poses_of_links = [np.zeros(7) for _ in self._links]
-        self._link_poses = plant.robot.buffered("link_poses") if self._links else None
+        named = [(index, Pose()) for index in _link_indices(robot, config.end_effectors)]
+        self._named_links = LinkPlacement(count, named) if named else None
+        self._link_poses = robot.buffered("link_poses") if named else None
         self._thrusters = thrusters_in(plant)
         capturing = plant.capturing
         self.target = None if capturing is None else capturing.target.description
@@ -291,14 +292,12 @@ class ReportedState:
         self.sensors.measure()
         if self.target_sensors is not None:
             self.target_sensors.measure()
-        if self._link is not None:
+        if self._end_effector is not None:
             plant = self._plant
-            _place(self._end_effector_pose, plant.pose, plant.link_R, plant.link_r, self._link)
-        if self._link_poses is not None:
+            self._end_effector.update(plant.pose, plant.link_R, plant.link_r)
+        if self._named_links is not None and self._link_poses is not None:
             measured = self.sensors if self.sensors.used else self._plant
-            link_R, link_r = self._link_poses(measured.q)
-            for index, pose in zip(self._links, self._poses_of_links, strict=True):
-                _place(pose, measured.pose, link_R, link_r, index)
+            self._named_links.update(measured.pose, *self._link_poses(measured.q))
         loaded = self._plant.loads is not None
         if self.sensors.used == self._sensors_used and loaded == self._loaded:
             return False
@@ -318,10 +317,11 @@ class ReportedState:
             "measured_q": measured.q,
             "measured_qdot": measured.qdot,
         }
-        if self._link is not None:
-            quantities["end_effector_pose"] = self._end_effector_pose
-        for name, pose in zip(self._end_effectors, self._poses_of_links, strict=True):
-            quantities[pose_topic(name).state[0].quantity] = pose
+        if self._end_effector is not None:
+            quantities["end_effector_pose"] = self._end_effector.poses[0]
+        if self._named_links is not None:
+            for name, pose in zip(self._end_effectors, self._named_links.poses, strict=True):
+                quantities[pose_topic(name).state[0].quantity] = pose
         capturing = plant.capturing
         if capturing is not None:
             assert self.target_sensors is not None
@@ -351,13 +351,6 @@ class ReportedState:
                 "thruster_force": thrusters.thrust,
             }
         return quantities
-
-
-def _place(target: Array, base: Array, link_R: Array, link_r: Array, index: int) -> None:
-    """Write the pose (7,) of a link in W, for that of the base and those of all links in B."""
-    R_WB = matrix_from_quaternion(base[3:])
-    target[:3] = base[:3] + R_WB @ link_r[:, index]
-    target[3:] = quaternion_from_matrix(R_WB @ link_R[:, 3 * index : 3 * index + 3])
 
 
 def _link_indices(robot: SpaceRobot, names: Sequence[str]) -> list[int]:

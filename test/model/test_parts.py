@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import integration, meshes, rotations, xacro_files
+from spacerobot_ros.model.description import Pose
 from spacerobot_ros.model.integration import count_steps, repeat_step
+from spacerobot_ros.model.kinematics import LinkPlacement
 
 
 @pytest.mark.parametrize(
@@ -107,6 +109,27 @@ def test_quaternions_of_matrices_keep_their_digits(axis: list[int], angle: float
     assert abs(found @ turn.as_quat()) == pytest.approx(1.0, abs=1e-14)
     assert rotations.rotation_angles(turn.as_matrix()) == pytest.approx(angle, abs=1e-9)
     assert np.linalg.norm(found) == pytest.approx(1.0, abs=1e-14)
+
+
+def test_frames_on_links_are_placed_in_the_world() -> None:
+    """Against SciPy, at turns of which each of the four components is the largest."""
+    rng = np.random.default_rng(5)
+    turns = [Rotation.random(rng=rng) for _ in range(4)]
+    turns += [Rotation.from_quat(np.roll([0.97, 0.2, -0.1, 0.05], k)) for k in range(4)]
+    offsets = rng.normal(size=(8, 3))
+    frames = [(k % 3, Pose(turns[k].as_matrix(), offsets[k])) for k in range(8)]
+    frames.append((2, Pose()))
+    placement = LinkPlacement(3, frames)
+    for _ in range(20):
+        base, links = Rotation.random(rng=rng), Rotation.random(3, rng=rng)
+        r_WB, r_BL = rng.normal(size=3), rng.normal(size=(3, 3))
+        link_R = np.hstack(list(links.as_matrix()))
+        placement.update(np.append(r_WB, base.as_quat()), link_R, r_BL.T)
+        for (link, pose), found in zip(frames, placement.poses, strict=True):
+            position = r_WB + base.apply(r_BL[link] + links[link].apply(pose.r))
+            np.testing.assert_allclose(found[:3], position, atol=1e-14)
+            turn = base * links[link] * Rotation.from_matrix(pose.R)
+            assert abs(found[3:] @ turn.as_quat()) == pytest.approx(1.0, abs=1e-14)
 
 
 def test_rotation_vectors_of_the_smallest_turns_are_twice_their_quaternions() -> None:

@@ -435,16 +435,6 @@ def test_targets_float_where_no_parameter_says_otherwise() -> None:
 # -- sensors -------------------------------------------------------------------------------------
 
 
-def test_links_are_placed_by_the_pose_of_the_base() -> None:
-    base, links = Rotation.random(random_state=5), Rotation.random(3, random_state=6)
-    r = np.arange(1.0, 10.0).reshape(3, 3)
-    pose, target = np.concatenate([[0.5, -1.5, 2.5], base.as_quat()]), np.zeros(7)
-    sensors._place(target, pose, np.hstack(list(links.as_matrix())), r, 1)
-    np.testing.assert_allclose(target[:3], pose[:3] + base.apply([2.0, 5.0, 8.0]))
-    turned = (base * links[1]).as_quat()
-    assert abs(target[3:] @ turned) == pytest.approx(1.0, abs=1e-14)
-
-
 def test_covariances_are_those_of_the_noise_on_the_diagonals() -> None:
     config = PlantConfig(
         robot="sliding_masses",

@@ -23,6 +23,7 @@ from spacerobot_ros.messages.readers import MessageTemplate
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Pose, RobotDescription
+from spacerobot_ros.model.kinematics import LinkPlacement
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.nodes.common.messages import (
     diagnostic_name,
@@ -560,22 +561,21 @@ class LinkMarkers:
             self._template.floats(f"markers[{i}].pose.position.x", 7)
             for i in range(len(self._poses) + len(self._of_target))
         ]
+        self._placement = LinkPlacement(len(plant.robot.description.links), self._poses)
 
     def publish(self, time_ns: int) -> None:
         """Publish the markers of all visuals at their present poses."""
         if not self._targets:
             return
         plant = self._plant
-        R_WB, r_WB = matrix_from_quaternion(plant.pose[3:]), plant.pose[:3]
         count = len(self._poses)
-        for (index, pose), target in zip(self._poses, self._targets[:count], strict=True):
-            R_BL = plant.link_R[:, 3 * index : 3 * index + 3]
-            target[:3] = r_WB + R_WB @ (plant.link_r[:, index] + R_BL @ pose.r)
-            target[3:] = quaternion_from_matrix(R_WB @ R_BL @ pose.R)
+        self._placement.update(plant.pose, plant.link_R, plant.link_r)
+        for placed, target in zip(self._placement.poses, self._targets[:count], strict=True):
+            target[:] = placed
         if plant.capturing is not None:
             of_target = plant.capturing.target_pose
             at = Pose(matrix_from_quaternion(of_target[3:]), of_target[:3])
             for pose, target in zip(self._of_target, self._targets[count:], strict=True):
-                placed = at @ pose
-                target[:3], target[3:] = placed.r, quaternion_from_matrix(placed.R)
+                shape = at @ pose
+                target[:3], target[3:] = shape.r, quaternion_from_matrix(shape.R)
         self._publisher.publish(self._template.serialised(stamp_bytes(time_ns)))
