@@ -9,7 +9,6 @@ from typing import Any
 
 import click
 
-from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import (
     PATH,
     bag_argument,
@@ -22,6 +21,7 @@ from spacerobot_ros.cli.options import (
     view_option,
     viewer_if_requested,
 )
+from spacerobot_ros.cli.terminal import fail
 from spacerobot_ros.errors import printable
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import PATH, DefaultGroup, json_option, write_json
+from spacerobot_ros.cli.terminal import fail
 
 if TYPE_CHECKING:
     from spacerobot_ros.benchmarks.checkouts import Checkout

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spacerobot_ros.cli.errors import exit_if_terminated, fail
 from spacerobot_ros.cli.options import PATH, DefaultGroup, bag_option, out_option, report_option
+from spacerobot_ros.cli.terminal import exit_if_terminated, fail
 from spacerobot_ros.errors import ParameterError
 
 if TYPE_CHECKING:

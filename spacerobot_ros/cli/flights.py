@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.errors import exit_if_terminated, fail
 from spacerobot_ros.cli.options import (
     LAWS,
     METHODS,
@@ -32,7 +31,7 @@ from spacerobot_ros.cli.options import (
     warn_of_large_angles,
     write_json,
 )
-from spacerobot_ros.cli.progress import display
+from spacerobot_ros.cli.terminal import display, exit_if_terminated, fail
 from spacerobot_ros.termination import termination
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from spacerobot_ros.cli import start
-from spacerobot_ros.cli.errors import sentences
+from spacerobot_ros.cli.terminal import sentences
 from spacerobot_ros.version import __version__
 
 _COMMAND_NAMES_BY_MODULE = {

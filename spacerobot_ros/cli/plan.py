@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import (
     METHODS,
     GoalOptions,
@@ -26,7 +25,7 @@ from spacerobot_ros.cli.options import (
     within_option,
     write_json,
 )
-from spacerobot_ros.cli.progress import display
+from spacerobot_ros.cli.terminal import display, fail
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.files import write_output
 

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.errors import fail
 from spacerobot_ros.cli.options import json_option, out_option, picture_option, write_json
-from spacerobot_ros.cli.progress import display
+from spacerobot_ros.cli.terminal import display, fail
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
 

@@ -1,6 +1,5 @@
 """State and reference to thruster wrench and joint efforts: one module a law, one common base."""
 
-from spacerobot_ros.control.estimator import DeadReckoning
 from spacerobot_ros.control.laws.law import ControlLaw, GainPair, Gains, LawOptions, LawStatus
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import ActuatorLimits, MotionLimits, Saturated
@@ -14,6 +13,7 @@ from spacerobot_ros.control.reference import (
 from spacerobot_ros.control.state import (
     Actuation,
     ControlState,
+    DeadReckoning,
     JointReference,
     NotFiniteError,
     PoseReference,

@@ -14,7 +14,6 @@ import numpy as np
 from spacerobot_ros.control.approach import ArmReach
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.detumbling import Detumbling
-from spacerobot_ros.control.estimator import DeadReckoning
 from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
 from spacerobot_ros.control.laws.law import ControlLaw, Gains
 from spacerobot_ros.control.laws.registry import LAWS
@@ -24,6 +23,7 @@ from spacerobot_ros.control.reference import PROFILES, OutputErrors, ReferencePr
 from spacerobot_ros.control.state import (
     Actuation,
     ControlState,
+    DeadReckoning,
     JointReference,
     PoseReference,
     Reference,

@@ -662,7 +662,7 @@ class Flight:
             pandas is not installed.
         """
         from spacerobot_ros.bag.tables import to_pandas
-        from spacerobot_ros.flight.tables import table_of_flight
+        from spacerobot_ros.flight.saved import table_of_flight
 
         made = to_pandas(table_of_flight(self, euler=euler))
         made.attrs = self._attributes | {"units": made.attrs["units"]}
@@ -679,7 +679,7 @@ class Flight:
             xarray is not installed.
         """
         from spacerobot_ros.bag.tables import to_xarray
-        from spacerobot_ros.flight.tables import table_of_flight
+        from spacerobot_ros.flight.saved import table_of_flight
 
         made = to_xarray(table_of_flight(self, euler=euler))
         made.attrs = dict(self._attributes)

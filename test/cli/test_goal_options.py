@@ -13,8 +13,7 @@ import click
 import pytest
 
 import spacerobot_ros.cli as cli
-from spacerobot_ros.cli import errors
-from spacerobot_ros.cli.errors import sentences
+from spacerobot_ros.cli import terminal
 from spacerobot_ros.cli.options import (
     EndEffectorOptions,
     GoalOptions,
@@ -22,6 +21,7 @@ from spacerobot_ros.cli.options import (
     viewer_if_requested,
     warn_of_large_angles,
 )
+from spacerobot_ros.cli.terminal import sentences
 from spacerobot_ros.errors import GoalError
 from spacerobot_ros.termination import Terminated
 
@@ -166,7 +166,7 @@ def test_a_signal_ends_a_command_with_its_code_whatever_a_library_makes_of_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ending = Terminated(signal.SIGTERM)
-    monkeypatch.setattr(errors, "termination", lambda: ending)
+    monkeypatch.setattr(terminal, "termination", lambda: ending)
     with pytest.raises(SystemExit) as ended, sentences():
         raise RuntimeError("The solver was interrupted.")
     assert ended.value.code == 143
@@ -174,11 +174,11 @@ def test_a_signal_ends_a_command_with_its_code_whatever_a_library_makes_of_it(
         raise Terminated(signal.SIGINT)
     assert ended.value.code == 130
     with pytest.raises(SystemExit) as ended:
-        errors.exit_if_terminated()
+        terminal.exit_if_terminated()
     assert ended.value.code == 143
     assert capsys.readouterr() == ("", "Terminated.\nInterrupted.\nTerminated.\n")
-    monkeypatch.setattr(errors, "termination", lambda: None)
-    errors.exit_if_terminated()
+    monkeypatch.setattr(terminal, "termination", lambda: None)
+    terminal.exit_if_terminated()
     with pytest.raises(RuntimeError, match="itself"), sentences():
         raise RuntimeError("itself")
 

@@ -28,9 +28,9 @@ import spacerobot_ros.report
 import spacerobot_ros.session.viewing as viewing
 from spacerobot_ros.bag.tables import ExportFormat
 from spacerobot_ros.cli import campaign
-from spacerobot_ros.cli.errors import sentences
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.options import beside, numbers, viewer_if_requested
+from spacerobot_ros.cli.terminal import sentences
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
 from spacerobot_ros.report.figures import PictureFormat
 

@@ -14,7 +14,7 @@ import pytest
 import spacerobot_ros.planning.core.progress as searches
 from spacerobot_ros.campaign.running import Progress
 from spacerobot_ros.cli import campaign
-from spacerobot_ros.cli.progress import Display, display
+from spacerobot_ros.cli.terminal import Display, display
 from spacerobot_ros.planning.core.progress import SearchProgress
 
 

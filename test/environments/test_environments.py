@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 import spacerobot_ros.environments
 from spacerobot_ros.environments import import_gymnasium
 from spacerobot_ros.environments.episodes import EpisodeConfig, Episodes
+from spacerobot_ros.environments.gymnasium_interface import NormalizeObservation
 from spacerobot_ros.environments.tasks import (
     Reach,
     Reorient,
@@ -30,7 +31,6 @@ from spacerobot_ros.environments.tasks import (
     action_scale,
     command_of,
 )
-from spacerobot_ros.environments.wrappers import NormalizeObservation
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.compilation import cxx_compiler

@@ -8,7 +8,7 @@ import logging
 import pytest
 
 from spacerobot_ros import plan
-from spacerobot_ros.cli.progress import Display, display
+from spacerobot_ros.cli.terminal import Display, display
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE
 from spacerobot_ros.planning.core.progress import SearchProgress, log_progress, report_progress
