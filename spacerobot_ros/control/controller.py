@@ -19,7 +19,13 @@ from spacerobot_ros.control.laws.law import ControlLaw, Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import ActuatorLimits, JointRateLimits, MotionLimits, Saturated
 from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
-from spacerobot_ros.control.reference import PROFILES, OutputErrors, ReferenceProfile, StepReference
+from spacerobot_ros.control.reference import (
+    PROFILES,
+    OutputErrors,
+    ProfileFunction,
+    ReferenceProfile,
+    StepReference,
+)
 from spacerobot_ros.control.state import (
     Actuation,
     ControlState,
@@ -87,8 +93,13 @@ class CoordinatedController:
         wheels: WheelControl | None = None,
     ) -> None:
         self.wheels = wheels
-        self.law, self._kinds = law, law.outputs.selection.error_kinds
-        self._distances = law.outputs.selection.distances
+        self.law, selection = law, law.outputs.selection
+        self._kinds, self._distances = selection.error_kinds, selection.distances
+        self._profiles: ProfileFunction | None = None
+        """The profile as the law's function takes it; None: the law needs the parts."""
+        if law.fixed_inputs is not None:
+            groups = bool(selection.base), bool(selection.end_effector)
+            self._profiles = ProfileFunction(*groups, law.robot.n if selection.joints else 0)
         self._limits, self.joint_rate_limits = limits, rates
         self._profile_type, self._motion = profile, motion
         self._control_period, self._estimation_time = control_period, estimation_time
@@ -242,7 +253,11 @@ class CoordinatedController:
                 )
                 self._began = time
             # The law is always evaluated, for its errors and status.
-            commanded = self.law.command(state, self._reference_at(time))
+            packed = self._packed_reference(time)
+            if packed is None:
+                commanded = self.law.command(state, self._reference_at(time))
+            else:
+                commanded = self.law.command_to_packed(state, packed)
             if self.coming_to_rest:
                 commanded = self._to_rest(state)
         if state is not None:
@@ -374,6 +389,17 @@ class CoordinatedController:
             return self.profile.at(time - self._began)
         link = self.law.outputs.selection.end_effector_link
         return Reference.present(self.law.robot, state, link)
+
+    def _packed_reference(self, time: float) -> Array | None:
+        """Return the reference of the profile for the law's function; None: the law also needs
+        its parts, or other references are followed.
+        """
+        given = self._followed
+        if self._profiles is None or self.profile is None:
+            return None
+        if not (given.base is None and given.joints is None and given.end_effector is None):
+            return None
+        return self._profiles.at(self.profile, time - self._began)
 
     def _reference_at(self, time: float) -> Reference:
         assert self.profile is not None

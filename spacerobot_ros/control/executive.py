@@ -132,13 +132,11 @@ class ControlExecutive:
     @property
     def state(self) -> ControllerState:
         """The state that statuses report."""
-        match self.controller.mode:
-            case Mode.MEASURED:
-                return self._goal_state
-            case Mode.ESTIMATED:
-                return ControllerState.ESTIMATING
-            case Mode.STOPPED:
-                return ControllerState.STOPPED
+        mode = self.controller.mode
+        if mode is Mode.MEASURED:
+            return self._goal_state
+        estimated = mode is Mode.ESTIMATED
+        return ControllerState.ESTIMATING if estimated else ControllerState.STOPPED
 
     # -- goals --------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -113,10 +114,10 @@ class Saturated:
         wrench = commanded.wrench_B - realised.wrench_B
         return cls(realised, Actuation(wrench, commanded.tau - realised.tau))
 
-    @property
+    @cached_property
     def limited(self) -> bool:
         """Whether any limit has changed the command."""
-        return bool(self.excess.wrench_B.any() or self.excess.tau.any())
+        return any(self.excess.wrench_B.tolist()) or any(self.excess.tau.tolist())
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,8 @@ class ActuatorLimits:
 
     def apply(self, commanded: Actuation) -> Saturated:
         """Return the command within the limits."""
+        if self._keeps(commanded):
+            return Saturated(commanded, self._no_excess)
         wrench = np.concatenate(
             [
                 _limit_norm(commanded.wrench_B[:3], self.force),
@@ -160,6 +163,24 @@ class ActuatorLimits:
         )
         tau = np.clip(commanded.tau, -self.effort, self.effort)
         return Saturated.of(commanded, Actuation(wrench, tau))
+
+    def _keeps(self, commanded: Actuation) -> bool:
+        """Whether a command is within the limits, in Python's numbers, which few take less time."""
+        wrench = commanded.wrench_B.tolist()
+        if not (math.hypot(*wrench[:3]) <= self.force and math.hypot(*wrench[3:]) <= self.torque):
+            return False
+        for effort, limit in zip(commanded.tau.tolist(), self._efforts, strict=True):
+            if not -limit <= effort <= limit:
+                return False
+        return True
+
+    @cached_property
+    def _efforts(self) -> list[float]:
+        return self.effort.tolist()
+
+    @cached_property
+    def _no_excess(self) -> Actuation:
+        return Actuation(np.zeros(6), np.zeros(self.effort.size))
 
     def expression(self, actuation: ca.SX) -> ca.SX:
         """Return the realised part of a command ``[f; n; tau]`` (6 + n,), as :meth:`apply` does."""
@@ -210,6 +231,7 @@ class JointRateLimits:
         self._per_rate = 1 / (_SLOW_RATE_SHARE * self.rates)
         self._inverse = (1 / self.rates).tolist()
         self._per_effort = self._largest_mobilities() * control_period * self._per_rate
+        self._shares = list(zip(self._per_rate.tolist(), self._per_effort.tolist(), strict=True))
 
     def apply(
         self, state: ControlState, given: Actuation, effort: Array, periods: int = 1
@@ -219,8 +241,7 @@ class JointRateLimits:
         ``effort`` (n,) are the largest joint efforts, N m or N, which ``given`` keeps; ``periods``
         is the number of control periods for which it will probably be held.
         """
-        gained = np.abs(given.tau) * (periods * self._per_effort)
-        if not (np.abs(state.qdot) * self._per_rate + gained).max(initial=0.0) > 1.0:
+        if not self._may_exceed(state.qdot, given.tau, periods):
             return given
         Js, Fs, G = self._evaluate_dynamics(state)
         pushed = G @ given.wrench_B
@@ -234,6 +255,14 @@ class JointRateLimits:
         share = _affordable_push_share(wanted, pushed, effort)
         tau = np.clip(wanted - share * pushed, -effort, effort)
         return Actuation(share * given.wrench_B, tau)
+
+    def _may_exceed(self, qdot: Array, tau: Array, periods: int) -> bool:
+        """Whether efforts may bring a joint near its rate: a bound, for any shape."""
+        rates, efforts = qdot.tolist(), tau.tolist()
+        for rate, effort, (per_rate, per_effort) in zip(rates, efforts, self._shares, strict=True):
+            if abs(rate) * per_rate + abs(effort) * (periods * per_effort) > 1.0:
+                return True
+        return False
 
     def exceeds_limits_expression(
         self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX

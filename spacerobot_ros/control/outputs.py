@@ -319,7 +319,7 @@ class OutputVector:
             A part of it has the wrong length.
         """
         state.stack(memory)
-        _require_finite("state", memory)
+        require_finite("state", memory)
 
     def pack_reference(self, reference: Reference, memory: Array) -> None:
         """Write a reference into memory for the symbol ``reference``.
@@ -341,7 +341,7 @@ class OutputVector:
         if self.selection.joints:
             parts += _joint_parts(reference.joints)
         np.concatenate(parts, out=memory)
-        _require_finite("reference", memory)
+        require_finite("reference", memory)
 
     def without_force(self, Q: ca.SX) -> ca.SX:
         """Return generalised forces (N,) without their force on the centre of mass, where no
@@ -428,7 +428,8 @@ def _joint_parts(joints: JointReference | None) -> list[Array]:
     return [joints.q, joints.qdot, joints.qddot]
 
 
-def _require_finite(name: str, memory: Array) -> None:
+def require_finite(name: str, memory: Array) -> None:
+    """Refuse numbers that are not finite: NotFiniteError, which names them."""
     # One call: the square sum of finite numbers of any sensible size is finite.
     if not math.isfinite(memory.dot(memory)):
         raise NotFiniteError(f"The {name} holds a number that is not finite.")

@@ -12,7 +12,12 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.control.outputs import OutputSelection, OutputVector, default_selection
+from spacerobot_ros.control.outputs import (
+    OutputSelection,
+    OutputVector,
+    default_selection,
+    require_finite,
+)
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.compilation import dense_function
@@ -119,6 +124,9 @@ class Gains:
             ),
             *(self.joints for _ in selection.joints),
         ]
+
+
+_NO_REFERENCE = Reference()
 
 
 @dataclass(frozen=True)
@@ -311,6 +319,16 @@ class ControlLaw(ABC):
         self.outputs.pack_reference(reference, self._in["reference"])
         return self._actuation(reference)
 
+    def command_to_packed(self, state: ControlState, packed: Array) -> Actuation:
+        """Return :meth:`command` for a reference in the form of its :attr:`function`.
+
+        Only for laws with :attr:`fixed_inputs`: the others look at the joints of references.
+        """
+        self.outputs.pack_state(state, self._in["state"])
+        require_finite("reference", packed)
+        self._in["reference"][:] = packed
+        return self._actuation(_NO_REFERENCE)
+
     def command_per_error(self, state: ControlState) -> Array:
         """Return the command (6 + n, m) at rest per unit of ``Kp e``, in the shape of a state."""
         state = ControlState.at_rest(state.r_WB, state.quaternion_WB, state.q)
@@ -340,7 +358,10 @@ class ControlLaw(ABC):
 
     def largest_error_share(self, bounds: Array) -> float:
         """Return the largest error at the last command as a share of its bound (m,), > 0."""
-        return float(np.abs(self._out["error"] / bounds).max(initial=0.0))
+        largest = 0.0
+        for error, bound in zip(self._out["error"].tolist(), bounds.tolist(), strict=True):
+            largest = max(largest, abs(error / bound))
+        return largest
 
     @property
     def error_rate(self) -> Array:
