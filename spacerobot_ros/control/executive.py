@@ -13,6 +13,7 @@ from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
+from spacerobot_ros.control.reference import OutputErrors
 from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, TaskState
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
@@ -29,6 +30,9 @@ END_EFFECTOR = "end_effector"
 
 GOAL_KEYS = (BASE_GOAL_KEY, END_EFFECTOR)
 """Keys of goals: frames of the robot that goal poses are for."""
+
+
+_NO_ERRORS = OutputErrors(0.0, 0.0, 0.0)
 
 
 class ControlExecutive:
@@ -412,7 +416,8 @@ class ControlExecutive:
         pursued = self._goal_state is ControllerState.TRACKING and self.servicing.task is None
         if self.controller.mode is Mode.MEASURED and pursued:
             at_rest = self.controller.reference_at_rest(time)
-            errors = self.controller.errors()
+            # Errors decide nothing while the reference moves.
+            errors = self.controller.errors() if at_rest else _NO_ERRORS
             decision = self._monitor.decide_by_errors(time, at_rest, errors, self._goal_config)
             if decision != Decision.NONE:
                 self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]

@@ -460,12 +460,17 @@ class _WrenchReader:
         self.values: Array = np.zeros(6)
         self._base_link, self._prefix = base_link, frame_prefix
         self._reader = TemplateReader(WRENCH, {"wrench.force.x": 6})
+        self._known_layout = 0
 
     def accept(self, raw: bytes) -> int:
-        self._reader.accept(raw)
-        require_frame(self._reader.text("header.frame_id"), self._base_link, self._prefix)
-        self.values[:] = self._reader.floats("wrench.force.x")
-        return self._reader.stamp_ns
+        reader = self._reader
+        reader.accept(raw)
+        if reader.layout_changes != self._known_layout:
+            # Messages of one layout name the same frame.
+            require_frame(reader.text("header.frame_id"), self._base_link, self._prefix)
+            self._known_layout = reader.layout_changes
+        self.values[:] = reader.floats("wrench.force.x")
+        return reader.stamp_ns
 
     @property
     def stamp_ns(self) -> int:

@@ -192,6 +192,39 @@ def test_a_new_law_is_one_class_and_one_line_in_the_registry(
     np.testing.assert_allclose(result.realised.tau, [-1.5, 0.75])
 
 
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        {},
+        {"law": "model_based"},
+        {"law": "model_based", "model_based.posture_stiffness": 2.0, "end_effector_outputs": "x"},
+    ],
+)
+def test_on_its_way_to_a_goal_the_law_is_given_the_reference_of_that_time(
+    chosen: dict[str, str | float],
+) -> None:
+    config = configured(
+        ControllerConfig, {"profile": "quintic", "max_force": 0.0, "max_torque": 0.0, **chosen}
+    )
+    robot = load("planar_manipulator")
+    controller, state = build_controller(robot, config), planar_start()
+    controller.command(2.0, state, state.q, state.qdot)
+    shape = state.q + np.array([0.4, -0.3])
+    hand = PLANAR_GOAL.end_effector
+    controller.set_goals(2.0, state, base=PLANAR_GOAL.base, end_effector=hand, joints=shape)
+    assert controller.profile is not None
+    alone = build_controller(robot, config).law
+    for share in (0.2, 0.5, 0.9, 1.0):
+        time = 2.0 + share * controller.profile.duration
+        result = controller.command(time, state, state.q, state.qdot)
+        wanted = alone.command(state, controller.profile.at(time - 2.0))
+        found = result.realised.tau + result.excess.tau
+        assert np.abs(wanted.tau).max() > 1e-3
+        np.testing.assert_allclose(found, wanted.tau, rtol=1e-9, atol=1e-12)
+        found = result.realised.wrench_B + result.excess.wrench_B
+        np.testing.assert_allclose(found, wanted.wrench_B, rtol=1e-9, atol=1e-12)
+
+
 def test_the_units_of_gains_in_the_parameters_are_those_of_the_laws() -> None:
     for name, law in LAWS.items():
         for gain, unit in zip(("kp", "kd"), law.gain_units, strict=True):

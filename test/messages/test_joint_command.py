@@ -192,9 +192,12 @@ def test_a_wrench_in_another_frame_is_malformed() -> None:
         ("world", True), (f"robot_2/{robot.base_link}", True), ("", False),
     ):  # fmt: skip
         sent.header.frame_id = frame
-        refusal = reader.offer(commands, serialize_message(sent), 0)
-        assert (refusal is not None) == refused, frame
-        if refusal is not None:
-            assert refusal.reason is Reason.MALFORMED
-            assert f"'{frame}'" in refusal.clause
+        # The layout of the second message is known: it is refused all the same.
+        for _ in range(2):
+            refusal = reader.offer(commands, serialize_message(sent), 0)
+            source.arrived = False
+            assert (refusal is not None) == refused, frame
+            if refusal is not None:
+                assert refusal.reason is Reason.MALFORMED
+                assert f"'{frame}'" in refusal.clause
     assert source.command.tolist() == [0.0, 0.5, 0.0, 0.0, 0.0, 0.0]
