@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import math
+import os
 import resource
 import runpy
 import statistics
@@ -148,10 +149,17 @@ _IMPORT_PROGRAM = (
 
 
 def import_time(module: str) -> float:
-    """Return the CPU time of the import of a module in a new process, s: a median."""
+    """Return the CPU time of the import of a module from byte code in a new process, s: a median.
+
+    The byte code is written by a process before, also where PYTHONDONTWRITEBYTECODE is set.
+    """
     words = [sys.executable, "-c", _IMPORT_PROGRAM.format(module=module)]
-    # The first process writes the byte code.
-    times = [float(subprocess.check_output(words)) for _ in range(1 + _IMPORTS_PER_MEDIAN)]
+    with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+        variables = {**os.environ, "PYTHONPYCACHEPREFIX": folder, "PYTHONDONTWRITEBYTECODE": ""}
+        times = [
+            float(subprocess.check_output(words, env=variables))
+            for _ in range(1 + _IMPORTS_PER_MEDIAN)
+        ]
     return statistics.median(times[1:])
 
 
