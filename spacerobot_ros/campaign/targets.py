@@ -17,7 +17,7 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.model.shared_parameters import RobotConfig
 from spacerobot_ros.model.urdf import load_robot, parse_robot
-from spacerobot_ros.parameters import Parameter, declared, values_of
+from spacerobot_ros.parameters import Parameter, declared, replaced, values_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import robot_file, suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario
@@ -129,14 +129,16 @@ class DrawnFlight:
 
     def with_overrides(self, node: str, parameters: Mapping[str, Any]) -> DrawnFlight:
         """Return the flight with other parameters of a node."""
-        return replace(self, scenario=self.scenario.with_overrides(node, parameters))
+        return replaced(self, scenario=self.scenario.with_overrides(node, parameters))
 
     @cached_property
     def inertial(self) -> InertialParameters | None:
         """Masses, centres and inertias of the bodies; None: those of the robot's description."""
-        if np.all(self.mass == 1.0) and np.all(self.inertia == 1.0) and not self.com.any():
+        shifted = bool(self.com.any())
+        if not shifted and np.all(self.mass == 1.0) and np.all(self.inertia == 1.0):
             return None
-        return self.parameters.scaled(self.mass, self.mass * self.inertia).shifted(self.com)
+        scaled = self.parameters.scaled(self.mass, self.mass * self.inertia)
+        return scaled.shifted(self.com) if shifted else scaled
 
     def require_physical(self) -> None:
         """Check that drawn masses and inertias are those of bodies.
@@ -353,7 +355,7 @@ def _mass_property_targets(
         def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
             factors = getattr(flight, kind).copy()
             factors[indices] *= float(drawn)
-            return replace(flight, **{kind: factors})
+            return replaced(flight, **{kind: factors})
 
         return DispersionTarget(
             name, apply, "1", False, frozenset(f"{kind}.{body}" for _, body in bodies)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -183,12 +184,12 @@ class RobotDescription:
         """Name of the root link."""
         return self.bodies[0].name
 
-    @property
+    @cached_property
     def movable_joints(self) -> tuple[Joint, ...]:
         """The joints that are neither fixed nor mimic joints, in the order of the coordinates q."""
         return tuple(joint for joint in self.moving_joints if joint.mimic is None)
 
-    @property
+    @cached_property
     def moving_joints(self) -> tuple[Joint, ...]:
         """The joints of ``bodies[1:]``, including mimic joints."""
         return tuple(body.joint for body in self.bodies[1:] if body.joint is not None)
@@ -211,7 +212,7 @@ class RobotDescription:
                 b[row] = joint.mimic.offset
         return G, b
 
-    @property
+    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the coordinates q."""
         return tuple(joint.name for joint in self.movable_joints)

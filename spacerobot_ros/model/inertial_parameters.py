@@ -105,9 +105,9 @@ class InertialParameters:
         by_inertia = by_mass if inertias is None else np.asarray(inertias, dtype=float)
         shape = np.broadcast_shapes(self.masses.shape, by_mass.shape, by_inertia.shape)
         return InertialParameters(
-            np.broadcast_to(self.masses * by_mass, shape),
-            np.broadcast_to(self.centers, (*shape, 3)),
-            np.broadcast_to(self.inertias * by_inertia[..., None, None], (*shape, 3, 3)),
+            _broadcast(self.masses * by_mass, shape),
+            _broadcast(self.centers, (*shape, 3)),
+            _broadcast(self.inertias * by_inertia[..., None, None], (*shape, 3, 3)),
         )
 
     def shifted(self, offsets: npt.ArrayLike) -> InertialParameters:
@@ -118,9 +118,7 @@ class InertialParameters:
         centers = self.centers + np.asarray(offsets, dtype=float)
         shape = centers.shape[:-1]
         return InertialParameters(
-            np.broadcast_to(self.masses, shape),
-            centers,
-            np.broadcast_to(self.inertias, (*shape, 3, 3)),
+            _broadcast(self.masses, shape), centers, _broadcast(self.inertias, (*shape, 3, 3))
         )
 
     def with_payload(self, body: int, payload: Inertia) -> InertialParameters:
@@ -314,3 +312,8 @@ def symmetric(matrix: ca.SX) -> ca.SX:
 def sparse_constant(array: Array) -> ca.DM:
     """Return constants for expressions, in which zeros take no operations."""
     return ca.sparsify(ca.DM(array))
+
+
+def _broadcast(array: Array, shape: tuple[int, ...]) -> Array:
+    # numpy takes as long for an array that has the shape as for the arithmetic of a draw.
+    return array if array.shape == shape else np.broadcast_to(array, shape)

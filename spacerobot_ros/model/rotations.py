@@ -136,7 +136,7 @@ def rotvec_from_quaternion(quaternion: npt.ArrayLike) -> Array:
     q = np.asarray(quaternion, dtype=float)
     if q[3] < 0:
         q = -q
-    sine = float(np.linalg.norm(q[:3]))
+    sine = math.sqrt(q[:3].dot(q[:3]))
     angle = 2 * math.atan2(sine, float(q[3]))
     return q[:3] * (angle / sine if sine > 1e-12 else 2.0)
 

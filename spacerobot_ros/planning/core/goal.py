@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -479,15 +481,15 @@ class PoseError:
             turn = attitude_error(pose[3:], goal.quaternion)
         return cls(goal.position - pose[:3], turn)
 
-    @property
+    @cached_property
     def distance(self) -> float:
         """Length of the position error, m."""
-        return float(np.linalg.norm(self.position))
+        return math.sqrt(self.position.dot(self.position))
 
-    @property
+    @cached_property
     def angle(self) -> float:
         """Angle of the attitude error, rad."""
-        return float(np.linalg.norm(self.rotvec))
+        return math.sqrt(self.rotvec.dot(self.rotvec))
 
     @property
     def max_joint_error(self) -> float:
