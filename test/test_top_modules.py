@@ -10,7 +10,8 @@ import signal
 import stat
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -50,6 +51,7 @@ from spacerobot_ros.parameters import (
     parameter,
     reconfigured,
     registered,
+    replaced,
     require_known,
     values_of,
 )
@@ -364,6 +366,32 @@ def test_declarations_have_full_names_and_defaults() -> None:
     assert reconfigured(changed, {"nothing": 1}) is changed
     other = reconfigured(changed, {"one.on": True})
     assert values_of(other) == {**values_of(changed), "one.on": True}
+
+
+def test_a_copy_with_other_fields_is_checked_and_knows_nothing_of_the_first() -> None:
+    @dataclass(frozen=True)
+    class Limited:
+        low: float
+        high: float = 2.0
+        kept: dict[str, int] = field(default_factory=dict, init=False, compare=False)
+
+        def __post_init__(self) -> None:
+            if self.low > self.high:
+                raise ValueError(f"{self.low} is above {self.high}")
+
+        @cached_property
+        def range(self) -> float:
+            return self.high - self.low
+
+    first = Limited(1.0)
+    first.kept["a"] = 1
+    assert first.range == 1.0
+    second = replaced(first, low=1.5)
+    assert second == replace(first, low=1.5)
+    assert (type(second), second.range, second.kept) == (Limited, 0.5, {"a": 1})
+    assert first == Limited(1.0)
+    with pytest.raises(ValueError, match=r"3.0 is above 2.0"):
+        replaced(first, low=3.0)
 
 
 def test_unknown_names_are_refused_in_alphabetical_order() -> None:

@@ -119,6 +119,95 @@ def tick_times(ticks: int) -> dict[str, float]:
     return figures
 
 
+_OPEN_LOOP_CAMPAIGN = """
+campaign:
+  scenario: sliding_masses
+  method: optimal
+  flights: {flights}
+  seed: 1
+  engine: lanes
+  set: {{planner.max_corrections: 0}}
+  disperse:
+    mass.*: {{uniform: {{loc: 0.95, scale: 0.1}}}}
+  criteria:
+    position_error_m: {{max: 0.02}}
+"""
+
+_SMALL_SHARE = 10
+"""How many times smaller the campaign is that is subtracted from a larger one."""
+
+
+def campaign_times(flights: int) -> dict[str, float]:
+    """Return CPU times of a campaign in open loop, in this process; only the command is used.
+
+    Parameters
+    ----------
+    flights
+        Number of flights of the campaign.
+
+    Returns
+    -------
+    ``campaign_s`` with its report, s; ``campaign_flight_ms``, ms a flight: the difference of this
+    campaign and one of a tenth of the flights, so that plan and report do not count.
+    """
+    few = max(1, flights // _SMALL_SHARE)
+    # The first campaign imports modules and compiles functions.
+    _fly_campaign(few)
+    short, whole = _fly_campaign(few), _fly_campaign(flights)
+    each = 1e3 * (whole - short) / (flights - few)
+    return {"campaign_s": whole, "campaign_flight_ms": each}
+
+
+def _fly_campaign(flights: int) -> float:
+    """Return the CPU time of a campaign with its report, s."""
+    with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+        file = Path(folder, "open_loop.yaml")
+        file.write_text(_OPEN_LOOP_CAMPAIGN.format(flights=flights), "utf-8")
+        words = ["campaign", "fly", str(file), "--workers", "0", "--out", str(Path(folder, "out"))]
+        return _run_command(words)
+
+
+_FLOWN_ROWS = 500
+"""Number of flights whose rows are repeated in the dataset of a large report."""
+
+
+def report_figures(rows: int) -> dict[str, float]:
+    """Return figures of the report of a dataset of many rows, made of the rows of few flights.
+
+    Returns
+    -------
+    ``rows`` of the dataset; ``report_peak_MB``, the largest memory of the process that makes the
+    report, MB; ``report_cpu_s``, its CPU time, s.
+    """
+    import pyarrow as arrow
+    import pyarrow.parquet as parquet
+
+    with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
+        file, out = Path(folder, "open_loop.yaml"), Path(folder, "out")
+        count = min(rows, _FLOWN_ROWS)
+        file.write_text(_OPEN_LOOP_CAMPAIGN.format(flights=count), "utf-8")
+        _run_command(["campaign", "fly", str(file), "--workers", "0", "--out", str(out)])
+        parts = sorted((out / "flights").glob("*.parquet"))
+        table = arrow.concat_tables([parquet.read_table(part) for part in parts])
+        for part in parts:
+            part.unlink()
+        numbers, place = np.array(table["flight"]), table.column_names.index("flight")
+        copies = -(-rows // count)
+        for copy in range(copies):
+            column = arrow.array(numbers + copy * count, type=table.schema.field("flight").type)
+            made = table.set_column(place, "flight", column)
+            parquet.write_table(made, out / "flights" / f"part-{copy:06d}.parquet")
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        words = [sys.executable, "-m", "spacerobot_ros", "campaign", "report", str(out)]
+        subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return {
+        "rows": float(copies * count),
+        "report_peak_MB": after.ru_maxrss * 1024 / 1e6,
+        "report_cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+    }
+
+
 def _stack_tick_time(words: list[str], longest: float) -> float:
     """Return the CPU time of a tick of ``spacerobot run`` in this process, us."""
     # The first flight imports modules and compiles functions.
@@ -135,12 +224,17 @@ def _fly_by_command(words: list[str], longest: float) -> tuple[float, int]:
         if math.isfinite(longest):
             words = [*words, "--longest", str(longest)]
         bag = str(Path(folder, "flight.mcap"))
-        sys.argv = ["spacerobot", "run", *words, "--bag", bag, "--json", str(result)]
-        began = time.process_time()
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
-            runpy.run_module("spacerobot_ros", run_name="__main__")
-        used = time.process_time() - began
+        used = _run_command(["run", *words, "--bag", bag, "--json", str(result)])
         return used, json.loads(result.read_text("utf-8"))["ticks"]
+
+
+def _run_command(words: list[str]) -> float:
+    """Run a command of ``spacerobot`` in this process; return its CPU time, s."""
+    sys.argv = ["spacerobot", *words]
+    began = time.process_time()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        runpy.run_module("spacerobot_ros", run_name="__main__")
+    return time.process_time() - began
 
 
 _IMPORT_PROGRAM = (
@@ -286,6 +380,57 @@ def plans(
     return {"cpu_s": times[1:], "duration_s": durations[1:]}
 
 
+_TOO_SHORT = 0.5
+"""Share of a plan's duration within which its goal is asked for, and refused."""
+
+_TOO_FAR = 2.0
+"""Distance by which goals are moved out of reach, m."""
+
+
+def refusals(urdf: str, case: str, count: int, seed: int) -> dict[str, list[Any]]:
+    """Plan for goals that cannot be reached, and return the CPU time and message of each refusal.
+
+    Half of them are goals of a case that are to be reached in half of their plan's time, half are
+    the same goals moved out of reach.
+
+    Returns
+    -------
+    Of each goal: ``cpu_s``, CPU time of the plan, s; ``sign_s``, CPU time to the first line about
+    the search, or to the end of the plan; ``reason``, the message; empty: the goal was not refused.
+    """
+    from spacerobot_ros.planning.core.progress import report_progress
+    from spacerobot_ros.planning.methods.optimal.method import OptimalGait
+    from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions
+
+    robot, chosen = SpaceRobot.from_file(urdf), CASES[case]
+    found: dict[str, list[Any]] = {"cpu_s": [], "sign_s": [], "reason": []}
+
+    def gait(**options: float) -> Any:
+        given = OptimalOptions(**{**chosen.options, **options, "cache": 0})
+        return OptimalGait(robot, _PLAN_CONTROL_PERIOD, options=given)
+
+    def refuse(method: Any, request: PlanRequest) -> None:
+        signs, reason, began = list[float](), "", time.process_time()
+        with report_progress(lambda _: signs.append(time.process_time() - began)):
+            try:
+                method.plan(request)
+            except PlanningError as error:
+                reason = str(error)
+        used = time.process_time() - began
+        values = {"cpu_s": used, "sign_s": min([*signs, used]), "reason": reason}
+        for name, value in values.items():
+            found[name].append(value)
+
+    for request in requests(robot, chosen, count, seed):
+        method = gait()
+        duration = method.plan(request).duration
+        refuse(gait(longest=_TOO_SHORT * duration), request)
+        position = request.goal.position + np.array([_TOO_FAR, 0.0, 0.0])
+        moved = Goal.checked(position, request.goal.quaternion)
+        refuse(method, PlanRequest(request.state, moved, request.tolerance))
+    return found
+
+
 _FIRST_GOAL_ROTVEC = (0.1, -0.15, 0.2)
 """Rotation vector of the goal of a first plan, rad."""
 
@@ -315,7 +460,14 @@ def first_plan(urdf: str) -> dict[str, float]:
     return {"joints": robot.n, "cpu_s": total, "plan_cpu_s": time.process_time() - began}
 
 
-MEASUREMENTS = {"tick_times": tick_times, "plans": plans, "first_plan": first_plan}
+MEASUREMENTS = {
+    "tick_times": tick_times,
+    "campaign_times": campaign_times,
+    "report_figures": report_figures,
+    "plans": plans,
+    "refusals": refusals,
+    "first_plan": first_plan,
+}
 
 if __name__ == "__main__":
     _, name_of, arguments, file_of = sys.argv

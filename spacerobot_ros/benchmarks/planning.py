@@ -64,8 +64,12 @@ def planning_benchmark(
     for name in CASES:
         plans = _measured_plans(ours, name, goals)
         here = statistics.median(plans["cpu_s"])
-        robot = figures[name] = {"median_cpu_s": here, **plans}
-        show(f"{name}: {here:.3f} s of CPU time in the median of {goals} goals")
+        slowest = max(plans["cpu_s"]) / here
+        robot = figures[name] = {"median_cpu_s": here, "slowest_to_median": slowest, **plans}
+        show(
+            f"{name}: {here:.3f} s of CPU time in the median of {goals} goals, the slowest "
+            f"{slowest:.1f} times as long"
+        )
         without_library = here
         if theirs is not None:
             robot["there"] = _measured_plans(theirs, name, goals)
@@ -87,6 +91,53 @@ def planning_benchmark(
                 plans, robot["long_search"], f"by a search from {starts} guesses", show
             )
     return figures
+
+
+def refusals_benchmark(
+    goals: int, other: Path | None, show: Callable[[str], None]
+) -> dict[str, Any]:
+    """Plan for goals of several robots that cannot be reached; return the figures by the robot.
+
+    Parameters
+    ----------
+    goals
+        Number of goals of each robot: each is asked for in too short a time, and out of reach.
+    other
+        Folder of a checkout that plans for the same goals; None: no comparison.
+    show
+        Called with lines for the user.
+
+    Returns
+    -------
+    By the name of the robot, of each goal: ``cpu_s``, ``sign_s`` and ``reason`` of
+    :func:`.measurements.refusals`; ``there``: the same of the other checkout.
+
+    Raises
+    ------
+    SpaceRobotError
+        The other folder contains no checkout, or a measurement fails.
+    """
+    ours, theirs = Checkout.pair(other)
+    figures: dict[str, Any] = {}
+    for name in CASES:
+        urdf = str(robot_file(name))
+        given: dict[str, Any] = {"urdf": urdf, "case": name, "count": goals, "seed": _GOAL_SEED}
+        found = figures[name] = ours.measure("refusals", **given)
+        show(f"{name}: {_refusals_text(found)}")
+        if theirs is not None:
+            found["there"] = theirs.measure("refusals", **given)
+            show(f"... there {_refusals_text(found['there'])}")
+        for reason in dict.fromkeys(filter(None, found["reason"])):
+            show(f"... {reason}")
+    return figures
+
+
+def _refusals_text(found: Mapping[str, Any]) -> str:
+    refused = sum(map(bool, found["reason"]))
+    return (
+        f"{refused} of {len(found['reason'])} goals refused, the last after "
+        f"{max(found['cpu_s']):.2f} s of CPU time, a first line after {max(found['sign_s']):.2f} s"
+    )
 
 
 def _measured_plans(checkout: Checkout, robot: str, goals: int, **arguments: Any) -> Plans:

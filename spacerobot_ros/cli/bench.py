@@ -189,6 +189,21 @@ def planning(
     _write_figures(json_file, planning_benchmark(goals, against, starts, library, click.echo))
 
 
+@bench_command.command("refusals")
+@click.argument("goals", default=3, type=click.IntRange(min=1))
+@_against_option("Plan for the same goals by CHECKOUT, too.")
+@_json_option
+def refusals(goals: int, against: Path | None, json_file: Path | None) -> None:
+    """Plan for goals out of reach of four robots by optimal.
+
+    Each of GOALS [3] is asked for in half of the time that its plan takes, and moved out of reach.
+    The CPU time to the refusal, and to the first line about the search, is measured.
+    """
+    from spacerobot_ros.benchmarks.planning import refusals_benchmark
+
+    _write_figures(json_file, refusals_benchmark(goals, against, click.echo))
+
+
 @bench_command.command("first-plans")
 @_against_option("Plan by CHECKOUT, too.")
 @_json_option
@@ -204,15 +219,49 @@ def first_plans(against: Path | None, json_file: Path | None) -> None:
 
 
 @bench_command.command("campaign")
+@click.argument("flights", default=10_000, type=click.IntRange(min=100))
+@_against_option(
+    "Instead: measure CPU times of a campaign of FLIGHTS in open loop by this checkout and by "
+    "CHECKOUT in turns, and print the ratios."
+)
+@_rounds_option
 @_json_option
-def campaign(json_file: Path | None) -> None:
+def campaign(flights: int, against: Path | None, rounds: int, json_file: Path | None) -> None:
     """Fly in SIMD lanes, by the plant and by MuJoCo.
 
-    The CPU time of thousands of flights is measured.
+    The CPU time of thousands of flights is measured. With --against, a whole campaign of FLIGHTS
+    [10000] is flown.
     """
-    from spacerobot_ros.benchmarks.engines import lanes_benchmark
+    if against is None:
+        from spacerobot_ros.benchmarks.engines import lanes_benchmark
 
-    _write_figures(json_file, lanes_benchmark(click.echo))
+        _write_figures(json_file, lanes_benchmark(click.echo))
+    else:
+        _compare_checkouts(
+            against,
+            lambda there: there.measure("campaign_times", flights=flights),
+            rounds,
+            json_file,
+        )
+
+
+@bench_command.command("report")
+@click.argument("rows", default=1_000_000, type=click.IntRange(min=1))
+@_json_option
+def report(rows: int, json_file: Path | None) -> None:
+    """Report a campaign of many flights.
+
+    The largest memory and the CPU time of the report of ROWS [1000000] flights are measured; the
+    rows are those of 500 flights.
+    """
+    from spacerobot_ros.benchmarks.checkouts import Checkout
+
+    figures = Checkout.pair(None)[0].measure("report_figures", rows=rows)
+    click.echo(
+        f"{figures['rows']:.0f} flights: {figures['report_peak_MB']:.0f} MB at most, "
+        f"{figures['report_cpu_s']:.1f} s of CPU time"
+    )
+    _write_figures(json_file, figures)
 
 
 @bench_command.command("environments")

@@ -13,6 +13,7 @@ import click
 import pytest
 from support.command_line import CliRunner
 
+from spacerobot_ros.benchmarks import checkouts
 from spacerobot_ros.cli.main import main
 
 OTHER = Path("other") / "checkout"
@@ -41,7 +42,17 @@ CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
         "",
         {"other": OTHER},
     ),
+    f"refusals 4 --against {OTHER}": (
+        "planning.refusals_benchmark",
+        "",
+        {"goals": 4, "other": OTHER},
+    ),
     "campaign": ("engines.lanes_benchmark", "", {}),
+    f"campaign 300 --against {OTHER} --rounds 4": (
+        "checkouts.compare",
+        "measure campaign_times {'flights': 300}",
+        {"other": OTHER, "rounds": 4},
+    ),
     "environments 48": ("engines.environments_benchmark", "", {"lanes": 48}),
     f"ticks 222 --against {OTHER} --rounds 3": (
         "checkouts.compare",
@@ -109,4 +120,24 @@ def test_every_command_of_the_group_is_tried() -> None:
     context = click.Context(main)
     group = main.get_command(context, "bench")
     assert isinstance(group, click.Group)
-    assert {line.split()[0] for line in CASES} == set(group.commands)
+    assert {line.split()[0] for line in CASES} | {"report"} == set(group.commands)
+
+
+def test_a_report_of_some_rows_is_measured_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = {"rows": 2500.0, "report_peak_MB": 456.7, "report_cpu_s": 12.34}
+    asked: list[tuple[str, dict[str, Any]]] = []
+
+    def measure(self: checkouts.Checkout, name: str, **arguments: Any) -> Any:
+        asked.append((name, arguments))
+        assert self == checkouts.Checkout.pair(None)[0]
+        return figures
+
+    monkeypatch.setattr(checkouts.Checkout, "measure", measure)
+    file = tmp_path / "figures.json"
+    result = CliRunner().invoke(main, ["bench", "report", "2300", "--json", str(file)])
+    assert result.exit_code == 0
+    assert result.output == "2500 flights: 457 MB at most, 12.3 s of CPU time\n"
+    assert asked == [("report_figures", {"rows": 2300})]
+    assert json.loads(file.read_text()) == figures

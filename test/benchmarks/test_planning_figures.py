@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import runpy
 import sys
@@ -12,13 +13,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from support.clocks import Clock, named
 
 from spacerobot_ros.benchmarks import measurements, planning
+from spacerobot_ros.campaign.config import parse_campaign
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
+from spacerobot_ros.planning.core.progress import SearchProgress, log_progress
 from spacerobot_ros.planning.methods.optimal import method as optimal
+from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions
 from spacerobot_ros.resources import robot_file
 
 CASES = ("planar_chain", "sliding_masses", "three_joint_arm", "servicer")
@@ -33,6 +38,9 @@ class Checkout:
 
     def measure(self, name: str, **arguments: Any) -> Any:
         self.asked.append((name, arguments))
+        if name == "refusals":
+            times = [self.factor * x for x in (0.5, 0.25, 2.0)]
+            return {"cpu_s": times, "sign_s": times[:2] * 2, "reason": ["far", "", "far"]}
         if name == "first_plan":
             first = len(self.asked) % 4 == 1
             return {
@@ -65,7 +73,8 @@ def test_goals_are_counted_and_compared_with_everything(monkeypatch: pytest.Monk
     figures = planning.planning_benchmark(3, Path("there"), 17, 9, lines.append)
     percent = "0 % at most 1 %, 100 % at most 2 %, 100 % at most 3 % longer; at most 1.015"
     assert lines[:6] == [
-        "planar_chain: 0.250 s of CPU time in the median of 3 goals",
+        "planar_chain: 0.250 s of CPU time in the median of 3 goals, the slowest 28.0 times as "
+        "long",
         "... there 0.750 s: 3.00 times faster here",
         f"... durations beside those there: {percent}",
         "... with a library 0.125 s: 6.00 times faster",
@@ -78,6 +87,7 @@ def test_goals_are_counted_and_compared_with_everything(monkeypatch: pytest.Monk
     assert tuple(figures) == CASES
     for name, robot in figures.items():
         assert robot["median_cpu_s"] == 0.25
+        assert robot["slowest_to_median"] == 28.0
         assert robot["times_faster"] == pytest.approx(3.0)
         assert robot["library_times_faster"] == pytest.approx(6.0)
         assert robot["durations_to_there"]["worst"] == pytest.approx(1 / 0.985)
@@ -94,8 +104,10 @@ def test_goals_alone_are_one_line_a_robot(monkeypatch: pytest.MonkeyPatch) -> No
     stand_in(monkeypatch, Checkout(2.0), None)
     lines: list[str] = []
     figures = planning.planning_benchmark(3, None, None, None, lines.append)
-    assert lines == [f"{name}: 0.500 s of CPU time in the median of 3 goals" for name in CASES]
-    assert all(each.keys() == {"median_cpu_s", "cpu_s", "duration_s"} for each in figures.values())
+    line = "0.500 s of CPU time in the median of 3 goals, the slowest 28.0 times as long"
+    assert lines == [f"{name}: {line}" for name in CASES]
+    names = {"median_cpu_s", "slowest_to_median", "cpu_s", "duration_s"}
+    assert all(each.keys() == names for each in figures.values())
 
 
 def test_a_library_is_compared_with_plans_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,6 +143,28 @@ def test_first_plans_here_and_there(monkeypatch: pytest.MonkeyPatch) -> None:
     lines.clear()
     assert "there" not in planning.first_plan_benchmark(None, lines.append)["quadruped"]
     assert len(lines) == 3
+
+
+def test_refusals_here_and_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = Checkout(1.0), Checkout(3.0)
+    stand_in(monkeypatch, ours, theirs)
+    lines: list[str] = []
+    figures = planning.refusals_benchmark(2, Path("there"), lines.append)
+    assert tuple(figures) == CASES
+    assert lines[:3] == [
+        "planar_chain: 2 of 3 goals refused, the last after 2.00 s of CPU time, a first line after "
+        "0.50 s",
+        "... there 2 of 3 goals refused, the last after 6.00 s of CPU time, a first line after "
+        "1.50 s",
+        "... far",
+    ]
+    assert len(lines) == 12
+    about = {"urdf": str(robot_file("servicer")), "case": "servicer", "count": 2, "seed": 7}
+    assert ours.asked[-1] == theirs.asked[-1] == ("refusals", about)
+    assert figures["servicer"]["there"]["cpu_s"] == [1.5, 0.75, 6.0]
+    lines.clear()
+    assert "there" not in planning.refusals_benchmark(2, None, lines.append)["servicer"]
+    assert len(lines) == 8
 
 
 def test_goals_and_starts_are_within_their_bounds() -> None:
@@ -345,6 +379,78 @@ def test_an_import_is_timed_in_new_processes_after_the_first(
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     assert 0.02 <= measurements.import_time("burning") < 0.15
     assert (tmp_path / "seen").read_text() == "x" * 6
+
+
+def test_a_refusal_is_timed_to_its_end_and_to_the_first_line(
+    gait: type[Gait], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, urdf = gait.clock, str(robot_file("sliding_masses"))
+
+    class Refusing(Gait):
+        made: list[Gait] = []  # noqa: RUF012
+
+        def plan(self, request: Any) -> Any:
+            self.requests.append(request)
+            if self.options.longest > 100.0 and len(self.requests) == 1:
+                return named(duration=12.0)
+            for count in (1, 2):
+                clock.advance(0.25)
+                progress = SearchProgress(count, 9)
+                log_progress(logging.getLogger("spacerobot_ros.any"), progress, "searching")
+            clock.advance(1.0)
+            raise PlanningError(f"{self.options.longest:g} s")
+
+    Refusing.clock = clock
+    monkeypatch.setattr(optimal, "OptimalGait", Refusing)
+    longest = OptimalOptions().longest
+    assert longest > 100.0
+    found = measurements.refusals(urdf, "sliding_masses", 2, 7)
+    assert found["cpu_s"] == pytest.approx([1.5] * 4)
+    assert found["sign_s"] == pytest.approx([0.25] * 4)
+    assert found["reason"] == ["6 s", f"{longest:g} s"] * 2
+    easy, short, *_ = Refusing.made
+    reached, moved = easy.requests
+    assert short.requests == [reached]
+    shift = moved.goal.position - reached.goal.position
+    np.testing.assert_allclose(shift, [2.0, 0.0, 0.0], atol=1e-12)
+    assert (easy.options.cache, short.options.cache) == (0, 0)
+
+
+def test_a_campaign_is_timed_with_its_report_and_by_the_flight(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock, flown = Clock(), []
+
+    def run_module(name: str, run_name: str) -> None:
+        assert (name, run_name) == ("spacerobot_ros", "__main__")
+        _, *words = sys.argv
+        assert words[:2] == ["campaign", "fly"]
+        assert words[3:6] == ["--workers", "0", "--out"]
+        section = yaml.safe_load(Path(words[2]).read_text())["campaign"]
+        flown.append(section["flights"])
+        # 3 s for plan and report, more the first time, and 0.5 ms a flight.
+        clock.advance(3.0 + 5.0 * (len(flown) == 1) + 0.5e-3 * section["flights"])
+
+    monkeypatch.setattr(measurements, "time", clock)
+    monkeypatch.setattr(measurements, "runpy", named(run_module=run_module))
+    monkeypatch.setattr(sys, "argv", ["pytest"])
+    found = measurements.campaign_times(2000)
+    assert flown == [200, 200, 2000]
+    assert found == {
+        "campaign_s": pytest.approx(4.0),
+        "campaign_flight_ms": pytest.approx(0.5),
+    }
+    text = measurements._OPEN_LOOP_CAMPAIGN.format(flights=9)
+    assert parse_campaign("open_loop", yaml.safe_load(text)["campaign"]).flights == 9
+
+
+@pytest.mark.slow
+def test_a_report_of_many_rows_has_memory_and_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["pytest"])
+    found = measurements.report_figures(1200)
+    assert found["rows"] == 1500.0
+    assert 50.0 < found["report_peak_MB"] < 1000.0
+    assert 0.5 < found["report_cpu_s"] < 60.0
 
 
 @pytest.mark.parametrize("longest", [7.5, math.inf])
