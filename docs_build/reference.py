@@ -59,7 +59,7 @@ def topics() -> str:
     for topic in TOPICS.values():
         names = [node if node != "user" else "you" for node in topic.publishers]
         latched = ", latched" if topic.latched else ""
-        condition = f" Where {topic.when}." if topic.when else ""
+        condition = f" Where {topic.condition}." if topic.condition else ""
         rows.append(
             (
                 f"`{topic.name}`",
@@ -76,8 +76,8 @@ def state_fields() -> str:
     rows = []
     for topic in state_topics():
         for field in topic.state:
-            numbers = ", ".join(f"`{each}`" for each in field.members or field.entries)
-            numbers = numbers or f"one for each of the {topic.entries_of}"
+            numbers = ", ".join(f"`{each}`" for each in field.members or field.array_entry_names)
+            numbers = numbers or f"one for each of the {topic.array_entries_of}"
             rows.append((f"`{topic.name}`", f"`{field.path}`", numbers))
     return table(("topic", "field", "numbers"), rows)
 

@@ -118,7 +118,7 @@ def singularity_figures() -> dict[str, str]:
         "start": _numbers(start[:2], 6),
         "det_at_start": f"{abs(example.det_of_generalised_jacobian(example.start.q)):.6f}",
         "length": f"{line:.6f}",
-        "singular_after": f"{path.shares[-1] * line:.6f}",
+        "singular_after": f"{path.path_fractions[-1] * line:.6f}",
         "singular_attitude": f"{theta:.4f}",
         "singular_shape": _numbers(np.degrees(there.q), 4),
         "singular_place": _numbers(example.hand(there)[:2], 6),

@@ -30,7 +30,7 @@ class StateField:
         quantities`.
     members
         The numbers of the part at ``path``, in their order; empty for an array.
-    entries
+    array_entry_names
         Names of the entries of an array; empty: it has one for each joint, or whatever the topic
         is about.
     """
@@ -38,7 +38,7 @@ class StateField:
     path: str
     quantity: str
     members: tuple[str, ...] = ()
-    entries: tuple[str, ...] = ()
+    array_entry_names: tuple[str, ...] = ()
 
     @property
     def columns(self) -> list[str]:
@@ -49,7 +49,7 @@ class StateField:
         """Return a label for each number; ``names`` are of the joints or thrusters."""
         if self.members:
             return self.columns
-        return [entry.replace("_", " ") for entry in self.entries] or [
+        return [entry.replace("_", " ") for entry in self.array_entry_names] or [
             f"{self.path} of {name}" for name in names
         ]
 
@@ -74,7 +74,7 @@ class Topic:
         The nodes that publish it; ``user`` for what comes from outside the stack.
     meaning
         Description of the content.
-    when
+    condition
         Under which condition it is there; empty: always.
     latched
         Whether a late subscriber gets the last message (reliable, transient local, depth 1).
@@ -82,7 +82,7 @@ class Topic:
         The numbers of a state of the plant; empty for other topics.
     frame
         The frame of the header of a state topic: ``world`` or ``base``.
-    entries_of
+    array_entries_of
         Objects that the entries of its arrays belong to: ``joints`` or ``thrusters``.
     every_tick
         Whether a state topic is published in every tick, or every ``base_pose_period``.
@@ -92,11 +92,11 @@ class Topic:
     type: str
     publishers: tuple[str, ...]
     meaning: str
-    when: str = ""
+    condition: str = ""
     latched: bool = False
     state: tuple[StateField, ...] = ()
     frame: str = "world"
-    entries_of: str = "joints"
+    array_entries_of: str = "joints"
     every_tick: bool = True
 
     @property
@@ -150,7 +150,7 @@ _TOPIC_TABLE = (
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_PLANT,
         "pose of the link `end_effector_frame` in the world: the truth",
-        when="the robot has that link",
+        condition="the robot has that link",
         state=(StateField("pose", "end_effector_pose", _POSE_MEMBERS),),
     ),
     Topic(
@@ -159,7 +159,7 @@ _TOPIC_TABLE = (
         _PUBLISHED_BY_PLANT,
         "pose of the link in the world, as measured: of the base and the joints that `odom` and "
         "`joint_states` carry; likewise `NAME/pose` of every link in the plant's `end_effectors`",
-        when="the plant's `end_effectors` list the link",
+        condition="the plant's `end_effectors` list the link",
         state=(StateField("pose", "pose_of_end_effector", _POSE_MEMBERS),),
     ),
     Topic(
@@ -168,7 +168,9 @@ _TOPIC_TABLE = (
         _PUBLISHED_BY_PLANT,
         "linear momentum (kg m/s), angular momentum about the centre of mass (kg m^2/s), both in "
         "the world, and kinetic energy (J), summed over the bodies",
-        state=(StateField("data", "momentum", entries=(*_MOMENTUM_LABELS, "kinetic_energy")),),
+        state=(
+            StateField("data", "momentum", array_entry_names=(*_MOMENTUM_LABELS, "kinetic_energy")),
+        ),
     ),
     Topic(
         "momentum_expected",
@@ -176,8 +178,8 @@ _TOPIC_TABLE = (
         _PUBLISHED_BY_PLANT,
         "expected momenta: those of the beginning plus the impulses of thrusters, disturbances "
         "and captures",
-        when="actuation is effort, a disturbance acts, or there is a target",
-        state=(StateField("data", "expected_momenta", entries=_MOMENTUM_LABELS),),
+        condition="actuation is effort, a disturbance acts, or there is a target",
+        state=(StateField("data", "expected_momenta", array_entry_names=_MOMENTUM_LABELS),),
     ),
     Topic(
         "target/odom",
@@ -185,7 +187,7 @@ _TOPIC_TABLE = (
         _PUBLISHED_BY_PLANT,
         "measured pose of the target's root link in the world, and its twist in its own frame, "
         "whether it floats or is held",
-        when="`target.robot` is set",
+        condition="`target.robot` is set",
         state=_odometry("target"),
     ),
     Topic(
@@ -193,7 +195,7 @@ _TOPIC_TABLE = (
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
         "the truth beside what target/odom then measures",
-        when="`target.sensors` err",
+        condition="`target.sensors` err",
         state=_odometry("true_target"),
     ),
     Topic(
@@ -201,7 +203,7 @@ _TOPIC_TABLE = (
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
         "the truth beside what odom then measures",
-        when="the sensors err",
+        condition="the sensors err",
         state=_odometry("true"),
     ),
     Topic(
@@ -209,7 +211,7 @@ _TOPIC_TABLE = (
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_PLANT,
         "the truth beside what joint_states then measures",
-        when="the sensors err",
+        condition="the sensors err",
         state=_joint_states("true"),
         frame="base",
     ),
@@ -234,7 +236,7 @@ _TOPIC_TABLE = (
         _WRENCH_STAMPED_TYPE,
         _PUBLISHED_BY_PLANT,
         "mean wrench of the thrusters in the last tick, in answer to base_wrench",
-        when="`thrusters` is set",
+        condition="`thrusters` is set",
         state=(StateField("wrench", "thruster_wrench", _WRENCH_MEMBERS),),
         frame="base",
     ),
@@ -244,14 +246,14 @@ _TOPIC_TABLE = (
         _PUBLISHED_BY_PLANT,
         "of each thruster by name: position, for how long it was on since the beginning (s); "
         "velocity, for what part of the last tick; effort, its mean force in it (N)",
-        when="`thrusters` is set",
+        condition="`thrusters` is set",
         state=(
             StateField("position", "thruster_on_time"),
             StateField("velocity", "thruster_duty"),
             StateField("effort", "thruster_force"),
         ),
         frame="base",
-        entries_of="thrusters",
+        array_entries_of="thrusters",
     ),
     Topic(
         "/tf",
@@ -259,14 +261,14 @@ _TOPIC_TABLE = (
         _PUBLISHED_BY_PLANT,
         "base link in the world and links in their parents, as odom and joint_states have them, "
         "every `tf_period`",
-        when="tf2_msgs is installed; in bags always",
+        condition="tf2_msgs is installed; in bags always",
     ),
     Topic(
         "/tf_static",
         _TRANSFORMS_TYPE,
         _PUBLISHED_BY_PLANT,
         "the links that fixed joints hold in their parents",
-        when="likewise, and the robot has such links",
+        condition="likewise, and the robot has such links",
         latched=True,
     ),
     Topic(
@@ -281,7 +283,7 @@ _TOPIC_TABLE = (
         _STRING_TYPE,
         _PUBLISHED_BY_PLANT,
         "the URDF of the target",
-        when="`target.robot` is set",
+        condition="`target.robot` is set",
         latched=True,
     ),
     Topic(
@@ -304,7 +306,7 @@ _TOPIC_TABLE = (
         "smallest distance between two links, every `clearance_period`: `time` (s), `distance` "
         "(m; negative: the depth of a contact), and the links `first` and `second`; `second_is` is "
         "`obstacle` where the second is one",
-        when="links of the robot could touch",
+        condition="links of the robot could touch",
     ),
     Topic(
         "fault_injection",
@@ -377,7 +379,7 @@ _TOPIC_TABLE = (
         _JOINT_STATE_TYPE,
         ("planner",),
         "joint positions and velocities for coordinated control to track",
-        when="`output` is reference",
+        condition="`output` is reference",
     ),
     Topic(
         "base_reference",
@@ -429,7 +431,7 @@ _TOPIC_TABLE = (
         ("replay",),
         "where a replay is: `state` is playing, paused or ended, `position_s` and `duration_s` "
         "from its beginning, `rate`; on every change, and five times a second",
-        when="a bag is replayed",
+        condition="a bag is replayed",
         latched=True,
     ),
     Topic(
@@ -437,7 +439,7 @@ _TOPIC_TABLE = (
         "std_msgs/msg/Float64",
         _PUBLISHED_BY_USER,
         "where a replay is to go on, s from its beginning",
-        when="a bag is replayed",
+        condition="a bag is replayed",
     ),
     Topic(
         "events",

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros import files
 from spacerobot_ros.campaign.statistics import influences
-from spacerobot_ros.collision.geometry import Solid, _in_world
+from spacerobot_ros.collision.geometry import Solid, _solid_in_world
 from spacerobot_ros.collision.rounded_box import RoundedBox
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.measures import METRICS
@@ -123,7 +123,7 @@ def test_vertices_of_an_obstacle_are_moved_with_its_pose() -> None:
     box = RoundedBox(Pose(r=np.array([0.2, 0.0, 0.1])), np.array([0.3, 0.2, 0.4]), 0.05)
     R = Rotation.from_rotvec([0.3, -0.7, 0.4])
     pose = Pose(R.as_matrix(), np.array([1.5, -0.4, 0.9]))
-    found = _in_world(Solid("rock", 0, shape, box, vertices), pose)
+    found = _solid_in_world(Solid("rock", 0, shape, box, vertices), pose)
     assert found.vertices is not None
     np.testing.assert_allclose(found.vertices, R.apply(vertices) + pose.r)
     np.testing.assert_allclose(found.enclosure.pose.r, R.apply([0.2, 0.0, 0.1]) + pose.r)

@@ -25,7 +25,7 @@ def test_every_topic_has_a_type_that_is_installed_and_says_what_it_is(topic: Top
         message_of(topic)
     assert topic.publishers
     assert topic.meaning
-    assert "\n" not in topic.meaning + topic.when
+    assert "\n" not in topic.meaning + topic.condition
 
 
 @pytest.mark.parametrize("topic", state_topics(), ids=lambda topic: topic.name)
@@ -42,7 +42,7 @@ def test_state_topics_name_numbers_of_their_messages(topic: Topic) -> None:
             else:
                 assert len(value) == 0
                 assert value.typecode == "d"
-        width = len(field.members or field.entries) or len(names)
+        width = len(field.members or field.array_entry_names) or len(names)
         assert len(field.labels(names)) == width
 
 

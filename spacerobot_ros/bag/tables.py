@@ -223,7 +223,7 @@ def array_field(
         )
         return Field(path, values, units, tuple(names), column_kind)
     stack = TOPICS.get(topic)
-    labels = stack.state[0].entries if stack is not None and stack.state else ()
+    labels = stack.state[0].array_entry_names if stack is not None and stack.state else ()
     if path != "data" or len(labels) != width:
         return Field(path, values, ("",) * width, tuple(map(str, range(width))))
     units = tuple(_MOMENTUM_UNITS.get(label.partition("_")[0], "") for label in labels)

@@ -2,7 +2,7 @@
 
 from spacerobot_ros.batch.flights import (
     BatchResult,
-    Controlled,
+    ControlledGoals,
     FlightProgram,
     Flights,
     FollowedSchedule,
@@ -17,7 +17,7 @@ from spacerobot_ros.control.goal_monitor import Decision
 
 __all__ = [
     "BatchResult",
-    "Controlled",
+    "ControlledGoals",
     "Decision",
     "FlightProgram",
     "Flights",

@@ -8,7 +8,7 @@ from dataclasses import astuple
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.batch.flights import Controlled, Flights
+from spacerobot_ros.batch.flights import ControlledGoals, Flights
 from spacerobot_ros.control.controller import CoordinatedController, build_controller
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.laws.law import Gains
@@ -58,7 +58,7 @@ class BatchController:
         See :func:`.build_controller`; the gains and goals that it has are replaced.
     """
 
-    def __init__(self, program: Controlled, controller: CoordinatedController) -> None:
+    def __init__(self, program: ControlledGoals, controller: CoordinatedController) -> None:
         self.program, self.controller, self.law = program, controller, controller.law
         self._config, self._n = program.config, controller.law.robot.n
         self._period_ns = round(program.config.control_period * SECOND)
@@ -79,7 +79,7 @@ class BatchController:
             The law cannot control the selected outputs.
         """
         program = flights.program
-        assert isinstance(program, Controlled)
+        assert isinstance(program, ControlledGoals)
         return cls(program, build_controller(program.robot or flights.robot, program.config))
 
     # -- one flight ---------------------------------------------------------------------------

@@ -46,14 +46,15 @@ class InitialStates:
     Attributes
     ----------
     position
-        (N, 3) of the base link in W, m; with ``is_center_of_mass``, of the system's centre of mass.
+        (N, 3) of the base link in W, m; with ``position_is_of_center_of_mass``, of the system's
+        centre of mass.
     quaternion
         (N, 4) of ``R_WB`` (x, y, z, w), unit quaternions.
     q, qdot
         (N, n) joint positions and rates, m or rad (a second).
     momenta
         (N, 6) total linear (kg m/s) over angular momentum about the centre of mass (kg m^2/s), W.
-    is_center_of_mass
+    position_is_of_center_of_mass
         (N,) whether ``position`` is that of the centre of mass.
     """
 
@@ -62,7 +63,7 @@ class InitialStates:
     q: Array
     qdot: Array
     momenta: Array
-    is_center_of_mass: npt.NDArray[np.bool_]
+    position_is_of_center_of_mass: npt.NDArray[np.bool_]
 
     @classmethod
     def of(cls, robot: SpaceRobot, initial: Sequence[InitialState]) -> InitialStates:
@@ -104,7 +105,7 @@ class InitialStates:
 
     def initial_state(self, index: int) -> InitialState:
         """Return one row as an initial state of the plant."""
-        is_center_of_mass = bool(self.is_center_of_mass[index])
+        is_center_of_mass = bool(self.position_is_of_center_of_mass[index])
         state = InitialState(
             quaternion=self.quaternion[index],
             joint_positions=self.q[index],
@@ -173,7 +174,7 @@ class SensorErrors:
         )
 
     @property
-    def used(self) -> npt.NDArray[np.bool_]:
+    def is_active(self) -> npt.NDArray[np.bool_]:
         """(N,) whether measurements differ from the truth: only then noise is drawn."""
         return np.asarray(
             self.noise.any(axis=1) | self.pose_bias.any(axis=1) | self.joint_bias.any(axis=1)
@@ -216,7 +217,7 @@ class HeldCommands:
 
 
 @dataclass(frozen=True)
-class Controlled:
+class ControlledGoals:
     """Commands of a :class:`.CoordinatedController` to goals that it has from the first state on.
 
     Attributes
@@ -231,7 +232,7 @@ class Controlled:
         Gains of each flight; empty: those of the configuration.
     robot
         The controller's model of the robot; None: the nominal one of the flights.
-    until_decided
+    ends_when_decided
         Whether a flight ends with the decision about its goal: a tick later, after the command for
         that state. Otherwise it goes on, and holds the goal.
     """
@@ -242,10 +243,10 @@ class Controlled:
     joints: Array | None = None
     gains: tuple[Gains, ...] = ()
     robot: SpaceRobot | None = None
-    until_decided: bool = False
+    ends_when_decided: bool = False
 
 
-FlightProgram = FollowedSchedule | HeldCommands | Controlled
+FlightProgram = FollowedSchedule | HeldCommands | ControlledGoals
 
 
 @dataclass(frozen=True)
@@ -262,7 +263,7 @@ class Flights:
         Duration of a tick, s.
     ticks
         Ticks of each flight.
-    starts
+    initial_states
         Initial states; the rows are the flights.
     program
         Source of the commands.
@@ -272,7 +273,7 @@ class Flights:
         Errors of sensors; None: none.
     integration_step
         Longest Runge-Kutta step, s; 0: by the actuation.
-    instants
+    report_ticks
         Ticks after which the state is reported, ascending; 0 is the start. Empty: the end alone.
     thrusters
         Thrusters that realise a controller's wrench in pulses; None: it acts as commanded.
@@ -289,12 +290,12 @@ class Flights:
     actuation: str
     control_period: float
     ticks: int
-    starts: InitialStates
+    initial_states: InitialStates
     program: FlightProgram
     inertial: InertialParameters | None = None
     sensors: SensorErrors | None = None
     integration_step: float = 0.0
-    instants: tuple[int, ...] = field(default=())
+    report_ticks: tuple[int, ...] = field(default=())
     thrusters: ThrusterTable | None = None
 
     def __post_init__(self) -> None:
@@ -303,14 +304,14 @@ class Flights:
             raise ParameterError(f"The actuation is '{self.actuation}', not velocity or effort.")
         if self.ticks < 1:
             raise ParameterError(f"A flight of {self.ticks} ticks is too short; it needs one.")
-        if not self.instants:
-            object.__setattr__(self, "instants", (self.ticks,))
+        if not self.report_ticks:
+            object.__setattr__(self, "report_ticks", (self.ticks,))
         self._require_program()
         last = -1
-        for instant in self.instants:
+        for instant in self.report_ticks:
             if not last < instant <= self.ticks:
                 raise ParameterError(
-                    f"The instants {self.instants} are not ascending ticks of a flight of "
+                    f"The instants {self.report_ticks} are not ascending ticks of a flight of "
                     f"{self.ticks}."
                 )
             last = instant
@@ -324,12 +325,12 @@ class Flights:
             self.inertial.require_physical([body.name for body in bodies])
         if self.sensors is not None and len(self.sensors) != count:
             raise ParameterError(f"There are sensors of {len(self.sensors)} flights, not {count}.")
-        if self.actuation == "velocity" and self.starts.qdot.any():
+        if self.actuation == "velocity" and self.initial_states.qdot.any():
             raise ParameterError("Joints under velocity commands must start at rest.")
 
     def _require_program(self) -> None:
         count, n = len(self), self.robot.n
-        if self.thrusters is not None and not isinstance(self.program, Controlled):
+        if self.thrusters is not None and not isinstance(self.program, ControlledGoals):
             raise ParameterError("Only the wrench of a controller can come from thrusters.")
         match self.program:
             case FollowedSchedule(positions=positions):
@@ -341,7 +342,7 @@ class Flights:
                     raise ParameterError("A wrench on the base needs effort actuation.")
                 _require_rows("joints", joints, count, n)
                 _require_rows("wrench", wrench, count, 6)
-            case Controlled(config=config, gains=gains):
+            case ControlledGoals(config=config, gains=gains):
                 if self.robot.description.wheel_names:
                     raise ParameterError(
                         f"Robot '{self.robot.description.name}' has reaction wheels, which the "
@@ -355,7 +356,7 @@ class Flights:
                     raise ParameterError(f"There are gains of {len(gains)} flights, not {count}.")
 
     def __len__(self) -> int:
-        return len(self.starts)
+        return len(self.initial_states)
 
     @property
     def substeps(self) -> int:
@@ -416,7 +417,7 @@ class BatchResult:
         (N, 2) integrals of their norms over time, N s and N m s.
     propellant
         (N,) propellant used, kg; NaN without thrusters.
-    limited
+    limited_ticks
         (N, n) numbers of ticks in which each joint was limited, by the limit, as the plant counts.
     fallback_ticks
         (N,) numbers of ticks of which a step was done outside the lanes.
@@ -424,9 +425,9 @@ class BatchResult:
         (N, n) ranges of the joint positions, over the states at all ticks.
     decision
         (N,) first :class:`.Decision` about the goal of a controller.
-    decided_tick
+    decision_tick
         (N,) tick of the state of that decision; -1: there was none.
-    decided_distance
+    decision_distance
         (N, 3) the :class:`.OutputDistance` to the goal at that state; NaN without a decision.
     end_tick
         (N,) number of flown ticks.
@@ -453,13 +454,13 @@ class BatchResult:
     peak_wrench: Array
     impulse: Array
     propellant: Array
-    limited: Mapping[str, Counts]
+    limited_ticks: Mapping[str, Counts]
     fallback_ticks: Counts
     lowest: Array
     highest: Array
     decision: Counts
-    decided_tick: Counts
-    decided_distance: Array
+    decision_tick: Counts
+    decision_distance: Array
     end_tick: Counts
     end_state: Array
     momentum_drift: Array
@@ -468,7 +469,7 @@ class BatchResult:
     @classmethod
     def empty(cls, flights: Flights) -> BatchResult:
         """Return a result for the flights to fill."""
-        N, instants, n = len(flights), len(flights.instants), flights.robot.n
+        N, instants, n = len(flights), len(flights.report_ticks), flights.robot.n
         first = {"velocity": "rate", "effort": "effort"}[flights.actuation]
 
         def reported(width: int) -> Array:
@@ -476,7 +477,7 @@ class BatchResult:
 
         return cls(
             engine="",
-            time=np.array(flights.instants) * flights.control_period,
+            time=np.array(flights.report_ticks) * flights.control_period,
             pose=reported(7),
             twist=reported(6),
             q=reported(n),
@@ -489,13 +490,13 @@ class BatchResult:
             peak_wrench=np.zeros((N, 2)),
             impulse=np.zeros((N, 2)),
             propellant=np.full(N, np.nan if flights.thrusters is None else 0.0),
-            limited={name: np.zeros((N, n), np.int64) for name in (first, "stroke")},
+            limited_ticks={name: np.zeros((N, n), np.int64) for name in (first, "stroke")},
             fallback_ticks=np.zeros(N, np.int64),
-            lowest=flights.starts.q.copy(),
-            highest=flights.starts.q.copy(),
+            lowest=flights.initial_states.q.copy(),
+            highest=flights.initial_states.q.copy(),
             decision=np.full(N, Decision.NONE, np.int64),
-            decided_tick=np.full(N, -1, np.int64),
-            decided_distance=np.full((N, 3), np.nan),
+            decision_tick=np.full(N, -1, np.int64),
+            decision_distance=np.full((N, 3), np.nan),
             end_tick=np.full(N, flights.ticks, np.int64),
             end_state=np.full((N, 2 * n + 20), np.nan),
             momentum_drift=np.full((N, 2), np.nan),

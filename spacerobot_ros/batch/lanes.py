@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.batch.flights import (
     BatchResult,
-    Controlled,
+    ControlledGoals,
     Counts,
     Flights,
     FollowedSchedule,
@@ -49,7 +49,7 @@ _CHUNK_TICKS = 2000
 _PROGRAMS = {
     HeldCommands: Program.HELD,
     FollowedSchedule: Program.FOLLOWED,
-    Controlled: Program.CONTROLLED,
+    ControlledGoals: Program.CONTROLLED,
 }
 
 Flags = npt.NDArray[np.bool_]
@@ -88,7 +88,7 @@ def _fly_all_in_lanes(flights: Flights) -> BatchResult:
     for first in range(0, len(rows), size):
         block = LaneBlock(flights, tick, model, p, rows[first : first + size])
         block.fly(result, failures)
-    engine = f"{tick.unit.lanes} lanes ({tick.unit.name})"
+    engine = f"{tick.vector_unit.lanes} lanes ({tick.vector_unit.name})"
     return replace(result, engine=engine, failures=failures)
 
 
@@ -102,7 +102,7 @@ def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
 
 def starts_accepted_by_plant(flights: Flights) -> Flags:
     """Return which flights (N,) start in a state that the plant accepts."""
-    starts, robot = flights.starts, flights.robot
+    starts, robot = flights.initial_states, flights.robot
     fit = np.isfinite(starts.position).all(axis=1) & np.isfinite(starts.momenta).all(axis=1)
     fit &= np.isfinite(starts.qdot).all(axis=1)
     fit &= ((starts.q >= robot.lower) & (starts.q <= robot.upper)).all(axis=1)
@@ -114,7 +114,7 @@ def starts_accepted_by_plant(flights: Flights) -> Flags:
 def _block_size(flights: Flights, tick: CompiledTick) -> int:
     """Return how many flights fit into a block."""
     n, chunk = flights.robot.n, min(flights.ticks, _CHUNK_TICKS)
-    each = 8 * (2 * tick.rows.count + 60 * len(flights.instants))
+    each = 8 * (2 * tick.memory_layout.total_rows + 60 * len(flights.report_ticks))
     if flights.sensors is not None:
         each += 8 * chunk * (12 + 2 * n) * 2
     match flights.program:
@@ -122,10 +122,10 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
             tables = [positions]
         case HeldCommands(joints=joints, wrench=wrench):
             tables = [joints] if wrench is None else [joints, wrench]
-        case Controlled():
+        case ControlledGoals():
             tables = []
     each += sum(2 * table[0].nbytes for table in tables if table.ndim == 3)
-    lanes = tick.unit.lanes
+    lanes = tick.vector_unit.lanes
     groups = max(1, min(_MAX_BLOCK_GROUPS, _BLOCK_BYTES // (each * lanes)))
     return int(groups * lanes)
 
@@ -140,7 +140,7 @@ class LaneBlock:
         self, flights: Flights, tick: CompiledTick, model: ModelFunctions, p: Array, rows: Counts
     ) -> None:
         self._flights, self._tick, self._flown = flights, tick, rows
-        self._lanes, self._rows = tick.unit.lanes, tick.rows
+        self._lanes, self._rows = tick.vector_unit.lanes, tick.memory_layout
         self._groups = -(-len(rows) // self._lanes)
         count = self._groups * self._lanes
         self._surplus = count - len(rows)
@@ -148,7 +148,7 @@ class LaneBlock:
         self._modulator = None
         if flights.thrusters is not None:
             self._modulator = ThrusterModulator(flights.thrusters, flights.control_period)
-        self._memory = _aligned_array((self._groups, self._rows.count, self._lanes))
+        self._memory = _aligned_array((self._groups, self._rows.total_rows, self._lanes))
         self._memory[:, self._rows["alive"]] = 1.0
         self._memory[:, self._rows["decided_state"]] = np.nan
         self._memory[:, self._rows["end_state"]] = np.nan
@@ -164,7 +164,9 @@ class LaneBlock:
         self._at = np.zeros(self._groups, np.int64)
         self._pending = np.zeros(self._groups, np.uint8)
         width = tick.report_width
-        self._reports = _aligned_array((self._groups, len(flights.instants), width, self._lanes))
+        self._reports = _aligned_array(
+            (self._groups, len(flights.report_ticks), width, self._lanes)
+        )
         self._job, self._referenced = self._prepare_job()
 
     def _write_rows(self, name: str, values: Array, lanes: Counts | None = None) -> None:
@@ -174,7 +176,7 @@ class LaneBlock:
             self._memory[:, self._rows[name]] = np.swapaxes(part, 1, 2)
             return
         group, lane = np.divmod(lanes[:, np.newaxis], self._lanes)
-        rows = np.arange(self._rows.count)[self._rows[name]]
+        rows = np.arange(self._rows.total_rows)[self._rows[name]]
         self._memory[group, rows, lane] = values
 
     def _read_rows(self, name: str) -> Array:
@@ -184,7 +186,7 @@ class LaneBlock:
 
     def _write_starts(self, model: ModelFunctions, p: Array, lanes: Counts | None = None) -> None:
         """Write masses ``p`` and initial states of the flights in all lanes, or in some."""
-        starts, at = self._flights.starts, self._rows_of_lanes
+        starts, at = self._flights.initial_states, self._rows_of_lanes
         if lanes is not None:
             at = at[lanes]
         self._write_rows("p", p, lanes)
@@ -193,7 +195,7 @@ class LaneBlock:
         q, r = starts.q[at], starts.position[at]
         centers = model.function("center_of_mass", compile=False)(q.T, p.T).full().T
         of_base = r + _rotate_vectors(quaternion, centers)
-        r_cm = np.where(starts.is_center_of_mass[at][:, None], r, of_base)
+        r_cm = np.where(starts.position_is_of_center_of_mass[at][:, None], r, of_base)
         if self._flights.actuation == "velocity":
             state = np.concatenate([q, quaternion], axis=1)
             self._write_rows("momenta", starts.momenta[at], lanes)
@@ -223,7 +225,7 @@ class LaneBlock:
     def _prepare_job(self) -> tuple[Job, list[npt.NDArray[np.generic]]]:
         """Return the driver's job, and the arrays that it points to."""
         flights, program, table = self._flights, self._flights.program, self._command_table()
-        self._instants = np.array(flights.instants, dtype=np.int64)
+        self._instants = np.array(flights.report_ticks, dtype=np.int64)
         each_table = table.ndim == 4
         arrays: dict[str, npt.NDArray[np.generic]] = {
             "memory": self._memory,
@@ -250,9 +252,9 @@ class LaneBlock:
             program=_PROGRAMS[type(program)],
             table_ticks=table.shape[1] if each_table else table.shape[0],
             each_table=each_table,
-            noisy=self._noise.affects_commands,
-            instant_count=len(flights.instants),
-            ends=isinstance(program, Controlled) and program.until_decided,
+            noisy=self._noise.is_fed_back,
+            instant_count=len(flights.report_ticks),
+            ends=isinstance(program, ControlledGoals) and program.ends_when_decided,
             **{name: array.ctypes.data for name, array in arrays.items()},
         )
         if isinstance(program, FollowedSchedule):
@@ -279,8 +281,8 @@ class LaneBlock:
                     [_pad_table(part, ticks, each, len(self._rows_of_lanes)) for part in parts],
                     axis=-1,
                 )
-            case Controlled():
-                table = np.zeros((1, self._rows.size("command")))
+            case ControlledGoals():
+                table = np.zeros((1, self._rows.row_count("command")))
         if table.ndim == 3:
             grouped = table.reshape(self._groups, self._lanes, *table.shape[1:])
             table = np.moveaxis(grouped, 1, 3)
@@ -297,7 +299,7 @@ class LaneBlock:
         # A tick of no duration under no command reports the start.
         library.start_flights(job)
         self._write_rows("h", np.full(len(self._rows_of_lanes), flights.control_period))
-        alive = self._memory[:, self._rows.first("alive")]
+        alive = self._memory[:, self._rows.first_row("alive")]
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
             if not alive.any():
                 break
@@ -322,7 +324,7 @@ class LaneBlock:
         """Prepare for :meth:`restart` and :meth:`step`: surplus lanes are idle."""
         self._job.program = Program.GIVEN
         count = len(self._flown)
-        self.idle(np.arange(count, count + self._surplus))
+        self.end_lanes(np.arange(count, count + self._surplus))
         self._write_rows("h", np.full(len(self._rows_of_lanes), self._flights.control_period))
 
     def continue_from(self, other: LaneBlock) -> None:
@@ -337,7 +339,7 @@ class LaneBlock:
         ``p`` are their masses as arguments of the model.
         """
         self._write_starts(model, p, lanes)
-        width = self._rows.size("command")
+        width = self._rows.row_count("command")
         self._write_rows("command", np.zeros((len(lanes), width)), lanes)
         if self._flights.actuation == "velocity":
             self._write_rows("before", np.zeros((len(lanes), self._flights.robot.n)), lanes)
@@ -356,7 +358,7 @@ class LaneBlock:
             self._stopped.pop(lane, None)
         return reports[lanes // self._lanes, 0, :, lanes % self._lanes]
 
-    def idle(self, lanes: Counts) -> None:
+    def end_lanes(self, lanes: Counts) -> None:
         """End the flights of some lanes; a group whose lanes are all idle costs nothing."""
         self._write_rows("alive", np.zeros((len(lanes), 1)), lanes)
 
@@ -393,8 +395,8 @@ class LaneBlock:
             return
         self._tick.library.measure_starts(self._job)
         states = self._read_rows("measured")
-        numbers = np.zeros((len(states), self._rows.size("profile")))
-        most = np.zeros((len(states), self._rows.size("bounds")))
+        numbers = np.zeros((len(states), self._rows.row_count("profile")))
+        most = np.zeros((len(states), self._rows.row_count("bounds")))
         for index, (row, state) in enumerate(zip(self._rows_of_lanes, states, strict=True)):
             try:
                 profile, most[index] = controller.begin_flight(
@@ -410,14 +412,17 @@ class LaneBlock:
 
     def _step_outside_lanes(self, result: BatchResult, failures: dict[int, str]) -> None:
         """Do the step that lanes wait for: a command, an allocation, or a tick of the plant."""
-        rows, alive = self._rows, self._rows.first("alive")
+        rows, alive = self._rows, self._rows.first_row("alive")
         steps: dict[Pending, tuple[int, Callable[[int, int, int, BatchResult], None]]] = {
-            Pending.COMMIT: (rows.first("limited", 1 + self._flights.robot.n), self._step_lane)
+            Pending.COMMIT: (
+                rows.first_row("limited", 1 + self._flights.robot.n),
+                self._step_lane,
+            )
         }
         if self._tick.controller is not None:
-            steps[Pending.TICK] = rows.first("exact"), self._command_lane
+            steps[Pending.TICK] = rows.first_row("exact"), self._command_lane
         if self._modulator is not None:
-            steps[Pending.FIRE] = rows.first("unallocated"), self._allocate_lane
+            steps[Pending.FIRE] = rows.first_row("unallocated"), self._allocate_lane
         for group in np.flatnonzero(self._pending):
             waiting, step = steps[Pending(self._pending[group])]
             lanes = (self._memory[group, waiting] != 0.0) & (self._memory[group, alive] != 0.0)
@@ -468,17 +473,17 @@ class LaneBlock:
         memory["next_state"][:] = plant.state
         memory["pose"][:], memory["twist"][:] = plant.pose, plant.twist
         memory["momentum"][:], memory["limited"][1 + n] = plant.momentum, 0.0
-        if self._tick.link:
-            memory["link_pose"][:] = pose_of_link(plant, self._tick.link)
+        if self._tick.reported_link:
+            memory["link_pose"][:] = pose_of_link(plant, self._tick.reported_link)
         if index < len(self._flown):
-            result.limited["stroke"][row] += plant.stroke_limited - before
+            result.limited_ticks["stroke"][row] += plant.stroke_limited - before
 
     def _write_results(self, result: BatchResult) -> None:
         count, n, rows = len(self._flown), self._flights.robot.n, self._flown
         reports = np.moveaxis(self._reports, 3, 1).reshape(-1, *self._reports.shape[1:3])
         for index, tick in self._ended.items():
             if index < count:
-                reports[index, np.array(self._flights.instants) > tick] = np.nan
+                reports[index, np.array(self._flights.report_ticks) > tick] = np.nan
         ends = np.cumsum([n, n, 7, 6, 7])
         names = ("q", "qdot", "pose", "twist", "momentum")
         for name, part in zip(names, np.split(reports[:count], ends[:-1], axis=2), strict=True):
@@ -487,9 +492,9 @@ class LaneBlock:
             getattr(result, name)[rows] = self._read_rows(name)[:count]
         limits = self._read_rows("limits")[:count].astype(np.int64)
         first = "effort" if self._flights.actuation == "effort" else "rate"
-        result.limited[first][rows] = limits[:, :n]
+        result.limited_ticks[first][rows] = limits[:, :n]
         if first == "rate":
-            result.limited["stroke"][rows] = limits[:, n:]
+            result.limited_ticks["stroke"][rows] = limits[:, n:]
         if self._modulator is not None:
             result.propellant[rows] = self._read_rows("propellant")[:count, 0]
         if self._tick.controller is not None:
@@ -502,7 +507,7 @@ class LaneBlock:
         controller, count = self._tick.controller, len(rows)
         assert controller is not None
         result.decision[rows] = self._read_rows("decision")[:count, 0].astype(np.int64)
-        result.decided_tick[rows] = self._read_rows("decided")[:count, 0].astype(np.int64)
+        result.decision_tick[rows] = self._read_rows("decided")[:count, 0].astype(np.int64)
         result.momentum_drift[rows] = self._read_rows("drift")[:count]
         result.end_state[rows] = self._read_rows("end_state")[:count]
         result.end_tick[rows] = self._read_rows("ended")[:count, 0].astype(np.int64)
@@ -510,7 +515,7 @@ class LaneBlock:
         for index in np.flatnonzero(result.decision[rows] != Decision.NONE).tolist():
             goal, state = self._profiles[index].goal, ControlState.unstack(states[index])
             distance = controller.distance(state, goal)
-            result.decided_distance[rows[index]] = astuple(distance)
+            result.decision_distance[rows[index]] = astuple(distance)
 
 
 def _rotate_vectors(quaternion: Array, vectors: Array) -> Array:
@@ -539,13 +544,13 @@ class SensorNoise:
 
     def __init__(self, flights: Flights, rows: Counts) -> None:
         self._errors: SensorErrors | None = flights.sensors
-        self._affects_all = isinstance(flights.program, Controlled)
-        self._instants = flights.instants
+        self._affects_all = isinstance(flights.program, ControlledGoals)
+        self._instants = flights.report_ticks
         self._n = flights.robot.n
         self._rows = rows
         if self._errors is None:
             return
-        self._used = self._errors.used[rows] & self._errors.noise[rows].any(axis=1)
+        self._used = self._errors.is_active[rows] & self._errors.noise[rows].any(axis=1)
         self._generators = [
             np.random.default_rng(int(seed)) if used else None
             for seed, used in zip(self._errors.seeds[rows], self._used, strict=True)
@@ -553,7 +558,7 @@ class SensorNoise:
         self._at_instants = np.zeros((len(rows), len(self._instants), 12 + 2 * self._n))
 
     @property
-    def affects_commands(self) -> bool:
+    def is_fed_back(self) -> bool:
         """Whether commands depend on sensor errors: along schedules, on those of joints."""
         errors = self._errors
         if errors is None:
@@ -573,7 +578,7 @@ class SensorNoise:
         ticks, width = end - begin, 12 + 2 * self._n
         columns = slice(0, width) if self._affects_all else slice(12, 12 + self._n)
         kept = None
-        if self.affects_commands:
+        if self.is_fed_back:
             kept = np.zeros((len(self._rows), ticks, columns.stop - columns.start))
         chosen = [(i, tick - begin) for i, tick in enumerate(self._instants) if begin <= tick < end]
         drawn = np.empty((ticks, width))

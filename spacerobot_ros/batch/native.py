@@ -21,7 +21,7 @@ from typing import Any
 import casadi as ca
 
 from spacerobot_ros.batch.controlling import CONTROL_INPUTS, CONTROL_OUTPUTS, BatchController
-from spacerobot_ros.batch.flights import Controlled, Flights
+from spacerobot_ros.batch.flights import ControlledGoals, Flights
 from spacerobot_ros.control.goal_monitor import Decision
 from spacerobot_ros.control.thrusters import PULSE_INPUTS, PULSE_OUTPUTS, pulse_function
 from spacerobot_ros.model.compilation import (
@@ -62,7 +62,7 @@ class VectorUnit:
     libmvec: str
 
 
-UNITS: dict[str, VectorUnit] = {
+VECTOR_UNITS: dict[str, VectorUnit] = {
     "avx512f": VectorUnit("AVX-512", 8, ("-mavx512f", "-mprefer-vector-width=512"), "e"),
     "avx2": VectorUnit("AVX2", 4, ("-mavx2",), "d"),
     "sse2": VectorUnit("SSE2", 2, ("-msse2",), "b"),
@@ -82,7 +82,7 @@ def vector_unit() -> VectorUnit:
         return _PORTABLE_UNIT
     found = re.search(r"^flags\s*:(.*)$", text, re.MULTILINE)
     flags = found[1].split() if found else []
-    return next((unit for flag, unit in UNITS.items() if flag in flags), _PORTABLE_UNIT)
+    return next((unit for flag, unit in VECTOR_UNITS.items() if flag in flags), _PORTABLE_UNIT)
 
 
 class Program(IntEnum):
@@ -153,23 +153,23 @@ class RowLayout:
         for name, size in sizes.items():
             self.slices[name] = slice(end, end + size)
             end += size
-        self.count = end
+        self.total_rows = end
 
     def __getitem__(self, name: str) -> slice:
         return self.slices[name]
 
-    def first(self, name: str, offset: int = 0) -> int:
+    def first_row(self, name: str, offset: int = 0) -> int:
         """Return the first row of a name, or one that is ``offset`` rows later."""
         return int(self.slices[name].start) + offset
 
-    def size(self, name: str) -> int:
+    def row_count(self, name: str) -> int:
         """Return the number of rows of a name."""
         rows = self.slices[name]
         return int(rows.stop - rows.start)
 
-    def span(self, source: str, target: str) -> tuple[int, int, int]:
+    def copy_range(self, source: str, target: str) -> tuple[int, int, int]:
         """Return the first rows of two names of the same size, and that size."""
-        return self.first(source), self.first(target), self.size(source)
+        return self.first_row(source), self.first_row(target), self.row_count(source)
 
 
 @dataclass(frozen=True)
@@ -180,23 +180,23 @@ class CompiledTick:
     ----------
     library
         The functions of ``driver.hpp``, which take a :class:`Job`.
-    unit
+    vector_unit
         Vector registers that they use.
-    rows
+    memory_layout
         Memory of a group.
     report_width
         Numbers of a report.
-    link
+    reported_link
         Link whose pose in B is reported after the rest; empty: none.
     controller
         Source of the commands; None: tables.
     """
 
     library: Any
-    unit: VectorUnit
-    rows: RowLayout
+    vector_unit: VectorUnit
+    memory_layout: RowLayout
     report_width: int
-    link: str = ""
+    reported_link: str = ""
     controller: BatchController | None = None
 
     @classmethod
@@ -216,7 +216,7 @@ class CompiledTick:
         key: tuple[Any, ...] = (cls, flights.actuation, flights.substeps)
         key = (*key, link, vector_unit(), compilation_settings())
         program = flights.program
-        if isinstance(program, Controlled):
+        if isinstance(program, ControlledGoals):
             # The function has all parameters as constants, except the gains of each flight.
             values = values_of(program.config).items()
             parameters = [each for each in values if not each[0].startswith("gains.")]
@@ -226,7 +226,7 @@ class CompiledTick:
         if key not in model.derived:
             model.derived[key] = cls._compile(flights, model, link)
         compiled: CompiledTick = model.derived[key]
-        if compiled.controller is not None and isinstance(program, Controlled):
+        if compiled.controller is not None and isinstance(program, ControlledGoals):
             controller = BatchController(program, compiled.controller.controller)
             return replace(compiled, controller=controller)
         return compiled
@@ -249,7 +249,7 @@ class CompiledTick:
             outputs["link_pose"] = ca.densify(ca.vertcat(ca.vec(R), r))
             reported, poses = (*reported, "link_pose"), {"link_pose": 12}
         arguments = {"FLIGHT": (*names.inputs, "p"), "REPORT": (*names.inputs, "p")}
-        results = {"FLIGHT": names.flight, "REPORT": reported}
+        results = {"FLIGHT": names.results_of_every_tick, "REPORT": reported}
         functions = {
             kind: ca.Function(
                 f"{flights.actuation}_{kind.lower()}", inputs, [outputs[each] for each in chosen]
@@ -262,7 +262,7 @@ class CompiledTick:
             **poses,
         }
         controller, count = None, flights.thruster_count
-        if isinstance(flights.program, Controlled):
+        if isinstance(flights.program, ControlledGoals):
             controller = BatchController.of(flights)
             functions["CONTROL"] = controller.function()
             arguments["CONTROL"], results["CONTROL"] = CONTROL_INPUTS, CONTROL_OUTPUTS
@@ -286,34 +286,39 @@ class CompiledTick:
             }
         )
         arrays = {
-            **{f"{kind}_ARGUMENTS": map(rows.first, names) for kind, names in arguments.items()},
-            **{f"{kind}_RESULTS": map(rows.first, names) for kind, names in results.items()},
+            **{
+                f"{kind}_ARGUMENTS": map(rows.first_row, names) for kind, names in arguments.items()
+            },
+            **{f"{kind}_RESULTS": map(rows.first_row, names) for kind, names in results.items()},
         }
-        copies = dict(names.copies)
+        copies = dict(names.results_fed_back)
         if controller is not None:
             copies["next_monitor"] = "monitor"
         if count:
             copies |= {"next_remaining": "remaining", "next_open": "open"}
-        state, limited = rows.first("next_state"), rows.first("limited", 1)
-        rates = state + n + 4 if effort else rows.first("qdot")
-        efforts = rows.first("realised" if effort else "effort")
-        peaks = [(rates, rows.first("peak_rate"), n), (efforts, rows.first("peak_effort"), n)]
+        state, limited = rows.first_row("next_state"), rows.first_row("limited", 1)
+        rates = state + n + 4 if effort else rows.first_row("qdot")
+        efforts = rows.first_row("realised" if effort else "effort")
+        peaks = [
+            (rates, rows.first_row("peak_rate"), n),
+            (efforts, rows.first_row("peak_effort"), n),
+        ]
         report, width = [(state, 0, n), (rates, n, n)], 2 * n
         for name in ("pose", "twist", "momentum", *poses):
-            report.append((rows.first(name), width, rows.size(name)))
-            width += rows.size(name)
+            report.append((rows.first_row(name), width, rows.row_count(name)))
+            width += rows.row_count(name)
         spans = {
-            "COPIES": [rows.span(*each) for each in copies.items()],
-            "SUMS": [(limited, rows.first("limits"), rows.size("limits"))],
+            "COPIES": [rows.copy_range(*each) for each in copies.items()],
+            "SUMS": [(limited, rows.first_row("limits"), rows.row_count("limits"))],
             "PEAKS": peaks,
             "REPORTED": report,
         }
-        constants = {"ROWS": rows.count, "JOINTS": n, "COMMANDS": sizes["command"]}
+        constants = {"ROWS": rows.total_rows, "JOINTS": n, "COMMANDS": sizes["command"]}
         constants |= {"REPORT_ROWS": width}
         if effort:
             # Lanes whose joint touches a stop are stepped by the scalar plant.
             constants["STOP_ROW"] = limited + n
-            constants["WRENCH_ROW"] = rows.first(
+            constants["WRENCH_ROW"] = rows.first_row(
                 "wanted" if count else "realised", 0 if count else n
             )
         if controller is not None:
@@ -327,14 +332,14 @@ class CompiledTick:
 class _TickVariables:
     """Names of a tick function's arguments and results.
 
-    ``flight`` are the results that every tick needs, ``copies`` the results that become arguments
-    of the next tick.
+    ``results_of_every_tick`` are those that every tick needs, ``results_fed_back`` those that
+    become arguments of the next tick.
     """
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    flight: tuple[str, ...]
-    copies: Mapping[str, str]
+    results_of_every_tick: tuple[str, ...]
+    results_fed_back: Mapping[str, str]
 
 
 _TICK_VARIABLES = {

@@ -10,7 +10,7 @@ import numpy as np
 from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.batch.flights import (
     BatchResult,
-    Controlled,
+    ControlledGoals,
     Flights,
     FollowedSchedule,
     HeldCommands,
@@ -23,7 +23,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.tracker import ScheduleFollower
-from spacerobot_ros.simulation.actuators import PLANTS, FaultyPlant, ThrusterPlant
+from spacerobot_ros.simulation.actuators import PLANTS, PlantWithFaults, ThrusterPlant
 from spacerobot_ros.simulation.config import SensorConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
@@ -43,7 +43,7 @@ def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> Batch
     controller: BatchController | None = None
     for row in range(len(flights)) if rows is None else rows:
         try:
-            if controller is None and isinstance(flights.program, Controlled):
+            if controller is None and isinstance(flights.program, ControlledGoals):
                 controller = BatchController.of(flights)
             _fly_row(flights, row, result, controller)
         except SpaceRobotError as error:
@@ -57,7 +57,7 @@ def plant_of(flights: Flights, row: int) -> Plant:
     return kind.plant(
         flights.robot_of(row),
         flights.control_period,
-        flights.starts.initial_state(row),
+        flights.initial_states.initial_state(row),
         flights.integration_step or kind.integration_step,
     )
 
@@ -77,7 +77,7 @@ def _fly_row(
     if flights.thrusters is not None:
         plant = thrusters = ThrusterPlant(plant, period, flights.thrusters)
     config = SensorConfig() if flights.sensors is None else flights.sensors.config(row)
-    faulty = FaultyPlant(plant, (), period, wrench=flights.actuation == "effort")
+    faulty = PlantWithFaults(plant, (), period, wrench=flights.actuation == "effort")
     sensors = Sensors(faulty, config, period)
     ends = False  # Whether the flight ends at the tick of the decision about its goal.
     match flights.program:
@@ -85,10 +85,10 @@ def _fly_row(
             command = _schedule_commands(flights, program, row)
         case HeldCommands() as program:
             command = _held_commands(flights, program, row)
-        case Controlled(until_decided=ends):
+        case ControlledGoals(ends_when_decided=ends):
             assert controller is not None
             command = _controlled_commands(controller, row, result)
-    instants = {tick: column for column, tick in enumerate(flights.instants)}
+    instants = {tick: column for column, tick in enumerate(flights.report_ticks)}
     momenta, drift = _momenta_beyond_thrust(plant), np.zeros(2)
     try:
         for tick in range(flights.ticks + 1):
@@ -113,7 +113,7 @@ def _fly_row(
             result.propellant[row] = thrusters.propellant
     finally:
         for name, counts in plant.limit_counts.items():
-            result.limited[name][row] = counts
+            result.limited_ticks[name][row] = counts
 
 
 def _held_commands(flights: Flights, program: HeldCommands, row: int) -> _Commands:
@@ -159,8 +159,8 @@ def _controlled_commands(controller: BatchController, row: int, result: BatchRes
         commands = controller.command(tick, state)
         decision = controller.decide(monitor, tick, state.qdot, bounds)
         if decision is not Decision.NONE and result.decision[row] == Decision.NONE:
-            result.decision[row], result.decided_tick[row] = decision, tick
-            result.decided_distance[row] = astuple(controller.distance(state, goal))
+            result.decision[row], result.decision_tick[row] = decision, tick
+            result.decision_distance[row] = astuple(controller.distance(state, goal))
         return commands
 
     return command

@@ -51,7 +51,7 @@ class SteppedFlights:
         (N, 3, 3) and (N, 3): pose in B of the link ``link``; empty arrays without one.
     ``ticks``
         (N,) ticks since the last reset of each flight.
-    ``alive``
+    ``has_not_ended``
         (N,) whether the flight is under way: it has neither failed nor been ended.
     ``failures``
         The messages of flights that failed since their last reset, by row.
@@ -118,9 +118,9 @@ class SteppedFlights:
         self.command_size = robot.n + (6 if PLANTS[actuation].wrench else 0)
         """Numbers of a command: n joint velocities, or n efforts and a wrench (6) on the base."""
         self.ticks = np.zeros(count, dtype=np.int64)
-        self.alive = np.ones(count, dtype=np.bool_)
+        self.has_not_ended = np.ones(count, dtype=np.bool_)
         self.failures: dict[int, str] = {}
-        self._engine = self._choose_engine() if in_lanes else _Plants(self._flights, link)
+        self._engine = self._choose_engine() if in_lanes else _PlantEngine(self._flights, link)
         width = 2 * robot.n + 20 + (LINK_POSE_SIZE if link else 0)
         self._reports = np.zeros((count, width))
         self._attach_reports()
@@ -173,7 +173,7 @@ class SteppedFlights:
                 f"{len(chosen)} flights are reset to {len(starts)} starts"
                 + ("." if inertial is None else f" with {len(inertial.masses)} rows of masses.")
             )
-        of_others = self._flights.starts, self._flights.inertial
+        of_others = self._flights.initial_states, self._flights.inertial
         assert of_others[1] is not None
         # Checked as rows of their own: a refusal changes no flight.
         self.require_startable(starts, of_others[1][chosen] if inertial is None else inertial)
@@ -194,12 +194,12 @@ class SteppedFlights:
         RobotDescriptionError
             A mass or an inertia is not physical.
         """
-        self._require_regular(replace(self._flights, starts=starts, inertial=inertial))
+        self._require_regular(replace(self._flights, initial_states=starts, inertial=inertial))
 
     def end(self, rows: npt.ArrayLike) -> None:
         """End some flights: they are not stepped until they are reset."""
         chosen = np.atleast_1d(np.asarray(rows, dtype=np.int64))
-        self.alive[chosen] = False
+        self.has_not_ended[chosen] = False
         self._engine.end(chosen)
 
     def step(self, commands: Array, ticks: int = 1) -> None:
@@ -226,20 +226,20 @@ class SteppedFlights:
             )
         if ticks < 1:
             raise ParameterError(f"A step of {ticks} ticks is too short; it needs one.")
-        bad = np.flatnonzero(self.alive & ~np.isfinite(commands).all(axis=1))
+        bad = np.flatnonzero(self.has_not_ended & ~np.isfinite(commands).all(axis=1))
         if bad.size:
             raise CommandError(f"The command of flight {bad[0]} is not finite.")
-        before = self.alive.copy()
+        before = self.has_not_ended.copy()
         failed: dict[int, str] = {}
         reports = self._engine.step(commands, ticks, failed)
         self.failures |= failed
-        self.alive[list(failed)] = False
-        self._reports[self.alive] = reports[self.alive]
-        self.ticks[before & self.alive] += ticks
+        self.has_not_ended[list(failed)] = False
+        self._reports[self.has_not_ended] = reports[self.has_not_ended]
+        self.ticks[before & self.has_not_ended] += ticks
 
     def _begin(self, rows: Counts) -> None:
         self._reports[rows] = self._engine.start(rows)
-        self.ticks[rows], self.alive[rows] = 0, True
+        self.ticks[rows], self.has_not_ended[rows] = 0, True
         for row in rows.tolist():
             self.failures.pop(row, None)
 
@@ -251,10 +251,10 @@ class SteppedFlights:
     def _choose_engine(self) -> _Engine:
         self._require_regular(self._flights)
         try:
-            return _Lanes(self._flights, self._link)
+            return _LaneEngine(self._flights, self._link)
         except NoLibraryError as reason:
             warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
-            return _Plants(self._flights, self._link)
+            return _PlantEngine(self._flights, self._link)
 
     def _attach_reports(self) -> None:
         """Let the attributes be parts of the reports."""
@@ -283,7 +283,7 @@ class _Engine(Protocol):
         """Step the flights that are alive; those that fail are ended, with their messages."""
 
 
-class _Lanes:
+class _LaneEngine:
     """Flights in SIMD lanes, all in one block.
 
     Raises
@@ -301,7 +301,7 @@ class _Lanes:
         flights = self._flights
         self._model, p = symbolic_model_of(flights)
         tick = CompiledTick.of(flights, self._model, self._link)
-        self.name = f"{tick.unit.lanes} lanes ({tick.unit.name})"
+        self.name = f"{tick.vector_unit.lanes} lanes ({tick.vector_unit.name})"
         block = LaneBlock(flights, tick, self._model, p, np.arange(len(flights)))
         block.begin_stepping()
         return block
@@ -320,13 +320,13 @@ class _Lanes:
         return self._block.restart(self._model, p, rows)
 
     def end(self, rows: Counts) -> None:
-        self._block.idle(rows)
+        self._block.end_lanes(rows)
 
     def step(self, commands: Array, ticks: int, failures: dict[int, str]) -> Array:
         return self._block.step(commands, ticks, self._result, failures)
 
 
-class _Plants:
+class _PlantEngine:
     """Flights in one plant each."""
 
     name = "scalar"
@@ -350,7 +350,7 @@ class _Plants:
         masses = flights.inertial[row].vector.tobytes()
         if row in self._plants and self._masses[row] == masses:
             plant = self._plants[row]
-            plant.initial = flights.starts.initial_state(row)
+            plant.initial = flights.initial_states.initial_state(row)
             plant.reset()
         else:
             self._plants[row], self._masses[row] = plant_of(flights, row), masses

@@ -61,9 +61,9 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     """
     first, second = (Results.of(folder) for folder in folders)
     require_same_draws(first.campaign, second.campaign)
-    common = np.intersect1d(first.numbers, second.numbers)
-    rows_a = np.searchsorted(first.numbers, common)
-    rows_b = np.searchsorted(second.numbers, common)
+    common = np.intersect1d(first.flight_numbers, second.flight_numbers)
+    rows_a = np.searchsorted(first.flight_numbers, common)
+    rows_b = np.searchsorted(second.flight_numbers, common)
     if not common.size:
         raise ParameterError(
             f"'{first.campaign.name}' and '{second.campaign.name}' have flown no common draw: fly "
@@ -154,7 +154,7 @@ def _difference_table(found: list[PairedDifference], first: Results, second: Res
             f"{each.second:.5g}",
             f"{each.difference:+.4g}",
             f"{each.interval_low:+.4g} to {each.interval_high:+.4g}",
-            "yes" if each.certain else "no",
+            "yes" if each.is_significant else "no",
         ]
         for each in found
     ]

@@ -117,7 +117,7 @@ class Campaign:
         Scenario with the parameters that all flights share.
     flights, seed, sampler
         Number of draws, their seed, and their sampler.
-    longest
+    max_flight_time
         Simulated time after which a flight is interrupted, s.
     dispersions
         Quantities that vary.
@@ -136,7 +136,7 @@ class Campaign:
     flights: int
     seed: int
     sampler: str
-    longest: float
+    max_flight_time: float
     dispersions: tuple[Dispersion, ...]
     criteria: tuple[Criterion, ...]
     engine: str = "auto"
@@ -149,7 +149,7 @@ class Campaign:
         return tuple(dispersion.name for dispersion in self.dispersions)
 
     @property
-    def lines(self) -> list[str]:
+    def description_lines(self) -> list[str]:
         """Lines for the terminal: the range of the drawn numbers, those of one range together."""
         together: dict[str, list[str]] = {}
         for each in self.dispersions:
@@ -246,7 +246,7 @@ def parse_campaign(
         flights=flights,
         seed=_read_whole_number(section, "seed", 0, 0, 2**63 - 1),
         sampler=sampler,
-        longest=_read_real_number("longest", section.get("longest", 100_000.0), 0.0),
+        max_flight_time=_read_real_number("longest", section.get("longest", 100_000.0), 0.0),
         dispersions=dispersions,
         criteria=_read_criteria(_read_mapping(section, "criteria"), scenario),
         engine=engine,
@@ -341,7 +341,7 @@ def _read_dispersions(section: Mapping[str, Any], scenario: Scenario) -> tuple[D
             if target.name in found:
                 raise ParameterError(f"'{target.name}' is dispersed twice.")
             for other in found.values():
-                if other.target.sets & target.sets:
+                if other.target.assigned_parameters & target.assigned_parameters:
                     raise ParameterError(
                         f"'{other.name}' and '{target.name}' set the same numbers: leave one out."
                     )

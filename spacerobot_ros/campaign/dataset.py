@@ -352,7 +352,11 @@ def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
     """Return the settings that determine the rows of a campaign, beside the scenario."""
     own = {"flights", "engine", "description", "scenario", "set", "method"}
     section = {key: value for key, value in campaign.section.items() if key not in own}
-    section |= {"seed": campaign.seed, "sampler": campaign.sampler, "longest": campaign.longest}
+    section |= {
+        "seed": campaign.seed,
+        "sampler": campaign.sampler,
+        "longest": campaign.max_flight_time,
+    }
     if campaign.sampler in FIXED_SIZE_SAMPLERS:
         section["flights"] = campaign.flights
     return section

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.batch import (
-    Controlled,
+    ControlledGoals,
     Decision,
     Flights,
     FollowedSchedule,
@@ -114,7 +114,7 @@ class _Plan:
 
 
 @dataclass(frozen=True)
-class _ReadyDraw:
+class _PreparedDraw:
     """A draw that is ready for lanes: with its plan, if it follows one, and wall time for it, s."""
 
     draw: Draw
@@ -174,7 +174,7 @@ class LanesEngine:
         lanes: _ScheduledLanes | _ControlledLanes = self._controlled
         if "planner" in campaign.scenario.commanders:
             lanes = self._scheduled
-        common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_ReadyDraw](), 0
+        common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_PreparedDraw](), 0
         began = time.perf_counter()
         for draw in draws:
             if stopped():
@@ -200,7 +200,7 @@ class LanesEngine:
         self,
         campaign: Campaign,
         lanes: _ScheduledLanes | _ControlledLanes,
-        batch: Sequence[_ReadyDraw],
+        batch: Sequence[_PreparedDraw],
     ) -> Iterator[Row | Fallback]:
         """Fly a batch."""
         began = time.perf_counter()
@@ -219,7 +219,7 @@ class LanesEngine:
             measures = lanes.measures(result, row, ready, flights)
             if isinstance(measures, str):
                 yield Fallback(ready.draw, measures)
-            elif measures.duration > campaign.longest and ready.plan is not None:
+            elif measures.duration > campaign.max_flight_time and ready.plan is not None:
                 yield Fallback(ready.draw, "took longer than the campaign allows")
             else:
                 measures = replaced(measures, wall_time=taken + ready.plan_time)
@@ -258,13 +258,13 @@ class _ScheduledLanes:
 
     def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
-    ) -> _ReadyDraw | Fallback:
+    ) -> _PreparedDraw | Fallback:
         """Let the executive plan a draw."""
         began = time.perf_counter()
         plan = self._plan_first_state(flight)
         if plan is None:
             return Fallback(draw, "had no schedule at the first state")
-        return _ReadyDraw(draw, flight, plan, time.perf_counter() - began)
+        return _PreparedDraw(draw, flight, plan, time.perf_counter() - began)
 
     def _plan_first_state(self, flight: DrawnFlight) -> _Plan | None:
         """Return the plan for the first state; the last one if the same values determine it."""
@@ -282,7 +282,7 @@ class _ScheduledLanes:
             self._extremes = schedule, positions.min(axis=0), positions.max(axis=0)
         return self._extremes[1:]
 
-    def flights(self, campaign: Campaign, batch: Sequence[_ReadyDraw]) -> Flights:
+    def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
         """Return the batch of some draws."""
         planner = batch[0].flight.scenario.planner
         first, ticks = batch[0].schedule, [each.schedule.ticks for each in batch]
@@ -300,15 +300,15 @@ class _ScheduledLanes:
         )
 
     def measures(
-        self, result: BatchResult, row: int, ready: _ReadyDraw, flights: Flights
+        self, result: BatchResult, row: int, ready: _PreparedDraw, flights: Flights
     ) -> Measures | str:
         """Return the measures of a flight whose goal is decided at the end of its schedule, or the
         reason for a fallback.
         """
-        if any(counts[row].any() for counts in result.limited.values()):
+        if any(counts[row].any() for counts in result.limited_ticks.values()):
             return "had a joint at its limit"
         scenario, schedule = ready.flight.scenario, ready.schedule
-        end = flights.instants.index(schedule.ticks)
+        end = flights.report_ticks.index(schedule.ticks)
         measured, q = result.measured_pose[row, end], result.measured_q[row, end]
         band = max(_END_POSITION_TOLERANCE, scenario.planner.shape_deadband)
         if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
@@ -394,16 +394,16 @@ class _ControlledLanes:
 
     def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
-    ) -> _ReadyDraw | Fallback:
+    ) -> _PreparedDraw | Fallback:
         """Check that a draw can be in a batch, whose other flights its error would end."""
-        ready = _ReadyDraw(draw, flight)
+        ready = _PreparedDraw(draw, flight)
         try:
             self.flights(campaign, [ready])
         except SpaceRobotError as error:
             return Fallback(draw, str(error))
         return ready
 
-    def flights(self, campaign: Campaign, batch: Sequence[_ReadyDraw]) -> Flights:
+    def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
         """Return the batch of some draws.
 
         Raises
@@ -416,24 +416,26 @@ class _ControlledLanes:
         goals = [_goals_by_frame(each.scenario) for each in drawn]
         dispersed = any(each.name.startswith(_GAIN_PREFIX) for each in campaign.dispersions)
         gains = tuple(each.scenario.controller.gains for each in drawn) if dispersed else ()
-        program = Controlled(
+        program = ControlledGoals(
             scenario.controller,
             base=_goal_poses([each["base"] for each in goals]),
             end_effector=_goal_poses([each["end_effector"] for each in goals]),
             gains=gains,
             robot=nominal_robots(scenario).controller,
-            until_decided=True,
+            ends_when_decided=True,
         )
         return _batch_of_flights(
-            drawn, program, _tick_of_interruption(campaign.longest, scenario.plant.period_ns)
+            drawn,
+            program,
+            _tick_of_interruption(campaign.max_flight_time, scenario.plant.period_ns),
         )
 
     def measures(
-        self, result: BatchResult, row: int, ready: _ReadyDraw, flights: Flights
+        self, result: BatchResult, row: int, ready: _PreparedDraw, flights: Flights
     ) -> Measures | str:
         """Return the measures of a flight, or the reason for a fallback."""
         decision, period_ns = Decision(result.decision[row]), ready.flight.scenario.plant.period_ns
-        decided = int(result.decided_tick[row])
+        decided = int(result.decision_tick[row])
         if decision is Decision.LOST:
             return "lost control"
         if decided == 0:
@@ -451,7 +453,7 @@ class _ControlledLanes:
             message = f"Interrupted after {duration:.6g} s of simulated time."
         else:
             outcome, state = _OUTCOME_OF_DECISION[decision]
-            left = OutputDistance(*result.decided_distance[row].tolist())
+            left = OutputDistance(*result.decision_distance[row].tolist())
             message = decided_message(state, left, ready.flight.scenario.controller)
             flown = decided * period_ns / SECOND
         return Measures(
@@ -460,7 +462,7 @@ class _ControlledLanes:
             duration=duration,
             manoeuvre_time=flown,
             error=PoseError.between(pose[:3], pose[3:], ready.flight.scenario.goal),
-            peak_rate=np.maximum(result.peak_rate[row], np.abs(flights.starts.qdot[row])),
+            peak_rate=np.maximum(result.peak_rate[row], np.abs(flights.initial_states.qdot[row])),
             peak_effort=result.peak_effort[row],
             peak_wrench=result.peak_wrench[row],
             lowest=np.minimum(result.lowest[row], q),
@@ -475,7 +477,7 @@ class _ControlledLanes:
 
 def _batch_of_flights(
     drawn: Sequence[DrawnFlight],
-    program: FollowedSchedule | Controlled,
+    program: FollowedSchedule | ControlledGoals,
     ticks: int,
     instants: tuple[int, ...] = (),
 ) -> Flights:
@@ -485,15 +487,15 @@ def _batch_of_flights(
     source = plants[0].thrusters
     return Flights(
         robot=robot,
-        actuation="effort" if isinstance(program, Controlled) else "velocity",
+        actuation="effort" if isinstance(program, ControlledGoals) else "velocity",
         control_period=plants[0].control_period,
         ticks=ticks,
-        starts=InitialStates.of(robot, [InitialState.of(plant) for plant in plants]),
+        initial_states=InitialStates.of(robot, [InitialState.of(plant) for plant in plants]),
         program=program,
         inertial=InertialParameters.stacked([each.inertial or nominal for each in drawn]),
         sensors=SensorErrors.of(robot, [plant.sensors for plant in plants]),
         integration_step=plants[0].integration_step,
-        instants=instants,
+        report_ticks=instants,
         thrusters=find_thrusters(source, robot.description) if source else None,
     )
 
@@ -517,7 +519,7 @@ def _end_effector_error(
 def _turns_end_effector(flights: Flights) -> bool:
     """Whether the controller of a batch turns the end-effector to an attitude."""
     program = flights.program
-    assert isinstance(program, Controlled)
+    assert isinstance(program, ControlledGoals)
     law_type = LAWS[program.config.law]
     outputs = controlled_outputs(program.robot or flights.robot, program.config, law_type)
     return any(axis.startswith("r") for axis in outputs.end_effector)

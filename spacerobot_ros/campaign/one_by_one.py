@@ -80,7 +80,7 @@ class FlightsEngine(_OneByOneEngine):
             flight.scenario,
             robots=robots_of(flight),
             progress=lambda now, end: stopped(),
-            longest=campaign.longest,
+            longest=campaign.max_flight_time,
             contacts=False,
         )
 
@@ -173,9 +173,11 @@ class RosEngine(_OneByOneEngine):
         with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
             bag = Path(folder, "flight.mcap")
             scenario = flight.with_masses_in_urdf().scenario
-            self._run_scenario(scenario, Path(folder, "draw.yaml"), bag, campaign.longest)
+            self._run_scenario(scenario, Path(folder, "draw.yaml"), bag, campaign.max_flight_time)
             flown = read_run(bag)
-        if flown.duration > campaign.longest:  # The stack looks five times a second of wall time.
+        if (
+            flown.duration > campaign.max_flight_time
+        ):  # The stack looks five times a second of wall time.
             message = f"Interrupted after {flown.duration:.6g} s of simulated time."
             flown = replace(flown, outcome=Outcome.INTERRUPTED, message=message)
         return replace(flown, wall_time=time.perf_counter() - began)

@@ -27,7 +27,7 @@ from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
     Influence,
     Share,
-    corrected,
+    corrected_for_multiple_tests,
     influences,
     percentiles,
     share,
@@ -50,7 +50,7 @@ from spacerobot_ros.version import __version__
 FOOTER_TEXT = f"Made by spacerobot_ros {__version__}."
 """Footer of the pages of campaigns."""
 
-PASSING = "passing"
+PASSED_COLOUR = "passing"
 """Name, among the metrics, of whether a flight passed."""
 
 _WORST_FLIGHTS_SHOWN = 10
@@ -169,19 +169,19 @@ class Results:
         The campaign.
     folder
         Folder of the dataset.
-    numbers
+    flight_numbers
         (N,) numbers of the flights.
     columns
         Columns by name: arrays of numbers, lists of texts.
-    total
+    planned_flights
         Number of flights of the whole campaign.
     """
 
     campaign: Campaign
     folder: Path
-    numbers: Array
+    flight_numbers: Array
     columns: Mapping[str, Any]
-    total: int
+    planned_flights: int
 
     @classmethod
     def of(cls, folder: Path) -> Results:
@@ -202,15 +202,15 @@ class Results:
         return cls(campaign, folder, columns["flight"], columns, len(Draws(campaign)))
 
     def __len__(self) -> int:
-        return len(self.numbers)
+        return len(self.flight_numbers)
 
     @property
-    def bias(self) -> str:
+    def incompleteness_warning(self) -> str:
         """Warning that missing flights bias the numbers; empty if none are missing.
 
         Flights that take long finish late and are underrepresented in an incomplete campaign.
         """
-        missing = int(self.numbers.max()) + 1 - len(self) if len(self) else 0
+        missing = int(self.flight_numbers.max()) + 1 - len(self) if len(self) else 0
         if not missing:
             return ""
         draws = "1 draw is" if missing == 1 else f"{missing} draws are"
@@ -225,7 +225,7 @@ class Results:
         return np.asarray(self.columns["passed"] > 0)
 
     @property
-    def success(self) -> Share:
+    def success_share(self) -> Share:
         """Share of flights that passed."""
         return share(int(self.passed.sum()), len(self))
 
@@ -276,7 +276,7 @@ class Results:
         return [name for name in self.shown_metrics if not _metric(name).yes_or_no]
 
     @property
-    def shares(self) -> dict[str, Share]:
+    def sampler_shares(self) -> dict[str, Share]:
         """Shares of the flights with a yes, by name of the metric."""
         found = {}
         for name, metric in METRICS.items():
@@ -297,16 +297,19 @@ class Results:
 
     def influences(self) -> list[Influence]:
         """Return the sensitivities, the strongest first, with Sobol indices if available."""
-        passing = {PASSING: self.passed.astype(float)}
-        found = corrected(influences(self.drawn_numbers, passing | self.metrics()))
-        whole = self.campaign.sampler == "saltelli" and len(self) == self.total
+        passing = {PASSED_COLOUR: self.passed.astype(float)}
+        found = corrected_for_multiple_tests(
+            influences(self.drawn_numbers, passing | self.metrics())
+        )
+        whole = self.campaign.sampler == "saltelli" and len(self) == self.planned_flights
         if whole and len(self.drawn_numbers) == len(self.campaign.dispersions):
             names = list(self.drawn_numbers)
-            indices = {PASSING: sobol_indices(names, self.passed.astype(float))}
+            indices = {PASSED_COLOUR: sobol_indices(names, self.passed.astype(float))}
             indices |= {name: sobol_indices(names, x) for name, x in self.metrics().items()}
             for place, each in enumerate(found):
                 if known := indices[each.metric].get(each.cause):
-                    found[place] = replace(each, first=known[:2], total=known[2:])
+                    first, total = known[:2], known[2:]
+                    found[place] = replace(each, first_order_index=first, total_order_index=total)
         return sorted(found, key=lambda each: -each.strength)
 
     def worst_rows(self) -> list[int]:
@@ -332,7 +335,7 @@ class Results:
             badness = np.nan_to_num(self.columns["position_error_m"])
         badness += 1e6 * (np.array(self.columns["outcome"]) != "reached")
         badness += 1e3 * ~self.passed
-        order = np.lexsort((self.numbers, -badness))
+        order = np.lexsort((self.flight_numbers, -badness))
         return [int(row) for row in order[:_WORST_FLIGHTS_SHOWN]]
 
 
@@ -349,9 +352,11 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     results = Results.of(folder)
     title = f"Campaign {results.campaign.name}"
     write_output(path, html_page(title, _page_body(results), FOOTER_TEXT))
-    lines = [f"success     {results.success}"]
-    lines += [f"{name:<11} {each}" for name, each in results.shares.items()]
-    lines += [f"note        {results.bias}"] if results.bias else []
+    lines = [f"success     {results.success_share}"]
+    lines += [f"{name:<11} {each}" for name, each in results.sampler_shares.items()]
+    lines += (
+        [f"note        {results.incompleteness_warning}"] if results.incompleteness_warning else []
+    )
     lines += [f"required    {c}: {results.share_meeting(c)}" for c in results.campaign.criteria]
     lines += [
         f"{outcome:<11} {count} of {len(results)}: {message}"
@@ -368,7 +373,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
 
 def _sort_passing_first(found: Sequence[Influence]) -> list[Influence]:
     """Return sensitivities in their order, those of passing before the others."""
-    return sorted(found, key=lambda each: each.metric != PASSING)
+    return sorted(found, key=lambda each: each.metric != PASSED_COLOUR)
 
 
 def messages_of(results: Results) -> list[tuple[str, int, str]]:
@@ -453,20 +458,24 @@ def _facts_section(results: Results) -> str:
     engines = Counter(results.columns["engine"])
     found = [
         f"scenario {campaign.scenario.name}",
-        f"{len(results)} of {results.total} flights",
+        f"{len(results)} of {results.planned_flights} flights",
         f"sampler {campaign.sampler}, seed {campaign.seed}",
         "engine " + ", ".join(f"{name} ({count})" for name, count in engines.items()),
     ]
     found += [f"not controlled: {part}" for part in results.not_controlled]
-    note = f'<p class="missing">{escape(results.bias)}</p>' if results.bias else ""
+    note = (
+        f'<p class="missing">{escape(results.incompleteness_warning)}</p>'
+        if results.incompleteness_warning
+        else ""
+    )
     return f"{facts(found)}{note}"
 
 
 def _success_section(results: Results) -> str:
     wall = float(np.nansum(results.columns["wall_time_s"]))
     rows = []
-    for name, found in {"success": results.success, **results.shares}.items():
-        low, high = found.exact
+    for name, found in {"success": results.success_share, **results.sampler_shares}.items():
+        low, high = found.exact_interval
         rows += [
             (name, f"{100 * found.value:.4g} %", f"{found.count} of {found.total}"),
             ("95 % interval (Wilson)", _share_cells(found)[1], ""),
@@ -484,7 +493,7 @@ def _criteria_section(results: Results) -> str:
         middle, high = values[PERCENTILES.index(50.0)], values[PERCENTILES.index(95.0)]
         met = results.share_meeting(criterion)
         rows.append([str(criterion), *_share_cells(met), f"{middle:.4g}", f"{high:.4g}"])
-    rows.append(["all together", *_share_cells(results.success), "", ""])
+    rows.append(["all together", *_share_cells(results.success_share), "", ""])
     head = ["requirement", "met by", "95 % interval", "median", "95 percentile"]
     return table("requirements", head, rows)
 
@@ -561,13 +570,13 @@ def _histograms_section(results: Results) -> str:
 def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
     if not found:
         return '<p class="missing">No drawn number varies with a metric.</p>'
-    sobol = any(each.total is not None for each in found)
+    sobol = any(each.total_order_index is not None for each in found)
     rows = []
     for each in _sort_passing_first(found)[:15]:
-        cells = [each.cause, each.metric, f"{each.correlation:+.3f}", f"{each.p:.2g}"]
-        cells += [f"{each.departure:+.3f}", f"{each.p_distance_from_median:.2g}"]
+        cells = [each.cause, each.metric, f"{each.correlation:+.3f}", f"{each.p_value:.2g}"]
+        cells += [f"{each.distance_correlation:+.3f}", f"{each.distance_p_value:.2g}"]
         if sobol:
-            for index in (each.first, each.total):
+            for index in (each.first_order_index, each.total_order_index):
                 cells.append("" if index is None else f"{index[0]:.3f} ± {index[1]:.3f}")
         rows.append(cells)
     head = ["drawn", "metric", "rank correlation", "p", "of its distance from the median", "p"]
@@ -583,7 +592,7 @@ def _sensitivity_section(results: Results, found: Sequence[Influence]) -> str:
 
 
 def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
-    chosen = [each for each in found if each.metric != PASSING][:_MAX_SCATTER_PLOTS]
+    chosen = [each for each in found if each.metric != PASSED_COLOUR][:_MAX_SCATTER_PLOTS]
     if not chosen:
         return ""
     figure, axes = figure_with_axes(len(chosen), 3, 2.4)
@@ -606,7 +615,7 @@ def _worst_flights_section(results: Results) -> str:
     names = results.shown_metrics
     rows = []
     for row in results.worst_rows():
-        number = int(results.numbers[row])
+        number = int(results.flight_numbers[row])
         values = [f"{results.columns[name][row]:.4g}" for name in names]
         command = f"spacerobot campaign rerun {shlex.quote(str(results.folder))} {number}"
         rows.append([str(number), command, results.columns["outcome"][row], *values])

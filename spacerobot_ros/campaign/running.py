@@ -44,23 +44,27 @@ class Progress:
 
     Attributes
     ----------
-    done, total
+    flown, total
         Flights.
-    rate
+    flights_per_second
         Flights a second of wall time, in this process.
     seconds
         Wall time so far.
     """
 
-    done: int
+    flown: int
     total: int
-    rate: float
+    flights_per_second: float
     seconds: float
 
     @property
     def seconds_left(self) -> float:
         """Estimated wall time left, s; infinite before the first flight."""
-        return (self.total - self.done) / self.rate if self.rate else float("inf")
+        return (
+            (self.total - self.flown) / self.flights_per_second
+            if self.flights_per_second
+            else float("inf")
+        )
 
 
 def run_campaign(
@@ -186,7 +190,7 @@ class Rerun:
         return self.outcome == self.row.outcome and self.deviation <= RERUN_TOLERANCE
 
     @property
-    def lines(self) -> list[str]:
+    def report_lines(self) -> list[str]:
         """Lines of text for the user."""
         row = self.row
         drawn = ", ".join(
@@ -228,7 +232,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
         )
     draw = draws[number]
     flight = drawn_flight(campaign, draw)
-    run_scenario(flight.with_masses_in_urdf().scenario, bag, longest=campaign.longest)
+    run_scenario(flight.with_masses_in_urdf().scenario, bag, longest=campaign.max_flight_time)
     measures = read_run(bag).measured(clearance=campaign.measures_clearance)
     row = Row.of(campaign, draw, measures, "ros")
     known = stored_flight(dataset, number)

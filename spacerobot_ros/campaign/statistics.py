@@ -20,7 +20,7 @@ CONFIDENCE = 0.95
 
 PERCENTILES = (5.0, 50.0, 95.0, 99.0)
 
-_MOST_PERMUTED = 8
+_MAX_PERMUTED_VALUES = 8
 """Largest number of samples whose permutations are counted."""
 
 
@@ -28,15 +28,15 @@ _MOST_PERMUTED = 8
 class Share:
     """A share of flights with its confidence intervals.
 
-    ``interval_low`` to ``interval_high`` is the interval of Wilson, ``exact`` that of Clopper and
-    Pearson.
+    ``interval_low`` to ``interval_high`` is the interval of Wilson, ``exact_interval`` that
+    Clopper and Pearson.
     """
 
     count: int
     total: int
     interval_low: float
     interval_high: float
-    exact: tuple[float, float]
+    exact_interval: tuple[float, float]
 
     @property
     def value(self) -> float:
@@ -78,45 +78,49 @@ class Influence:
         Names of the dispersion and of the metric.
     correlation
         Spearman's rank correlation.
-    p
+    p_value
         Probability of a correlation at least as large by chance.
-    departure, p_distance_from_median
+    distance_correlation, distance_p_value
         The same for the distance of the drawn value from its median, with which a metric correlates
         that grows to both sides.
-    first, total
+    first_order_index, total_order_index
         Sobol indices with the half widths of their intervals, if the sampler provides them.
     """
 
     cause: str
     metric: str
     correlation: float
-    p: float
-    departure: float = 0.0
-    p_distance_from_median: float = 1.0
-    first: tuple[float, float] | None = None
-    total: tuple[float, float] | None = None
+    p_value: float
+    distance_correlation: float = 0.0
+    distance_p_value: float = 1.0
+    first_order_index: tuple[float, float] | None = None
+    total_order_index: tuple[float, float] | None = None
 
     @property
     def is_significant(self) -> bool:
         """Whether the total index, or else the larger correlation, is unlikely to be by chance."""
-        if self.total is not None:
-            return self.total[0] > self.total[1]
-        p = self.p if abs(self.correlation) >= abs(self.departure) else self.p_distance_from_median
+        if self.total_order_index is not None:
+            return self.total_order_index[0] > self.total_order_index[1]
+        p = (
+            self.p_value
+            if abs(self.correlation) >= abs(self.distance_correlation)
+            else self.distance_p_value
+        )
         return p < _SIGNIFICANCE
 
     @property
     def strength(self) -> float:
         """Key for sorting: the total index, or the larger correlation."""
-        if self.total is not None:
-            return self.total[0]
-        return max(abs(self.correlation), abs(self.departure))
+        if self.total_order_index is not None:
+            return self.total_order_index[0]
+        return max(abs(self.correlation), abs(self.distance_correlation))
 
     def __str__(self) -> str:
         name = f"{self.cause} of {self.metric}"
-        if self.total is not None:
-            return f"{name}: total Sobol index {self.total[0]:.2f}"
-        if abs(self.departure) > abs(self.correlation):
-            return f"{name}: {self.departure:+.2f} with its distance from the median"
+        if self.total_order_index is not None:
+            return f"{name}: total Sobol index {self.total_order_index[0]:.2f}"
+        if abs(self.distance_correlation) > abs(self.correlation):
+            return f"{name}: {self.distance_correlation:+.2f} with its distance from the median"
         return f"{name}: {self.correlation:+.2f}"
 
 
@@ -153,7 +157,7 @@ def rank_correlation(x: Array, y: Array) -> tuple[float, float]:
     from scipy.stats import rankdata, spearmanr
 
     known = spearmanr(x, y)
-    if len(x) > _MOST_PERMUTED:
+    if len(x) > _MAX_PERMUTED_VALUES:
         return float(known.statistic), float(known.pvalue)
     ranks, others = rankdata(x), rankdata(y)
     sums = (others - others.mean())[_permutations(len(x))] @ (ranks - ranks.mean())
@@ -168,7 +172,7 @@ def _permutations(count: int) -> npt.NDArray[np.int64]:
     return np.array(list(permutations(range(count))), dtype=np.int64)
 
 
-def corrected(found: Sequence[Influence]) -> list[Influence]:
+def corrected_for_multiple_tests(found: Sequence[Influence]) -> list[Influence]:
     """Return sensitivities whose probabilities are corrected for their number.
 
     All of both kinds together, by the procedure of Benjamini and Hochberg: of those at most p a
@@ -178,10 +182,10 @@ def corrected(found: Sequence[Influence]) -> list[Influence]:
         return []
     from scipy.stats import false_discovery_control
 
-    chances = np.array([[each.p, each.p_distance_from_median] for each in found])
+    chances = np.array([[each.p_value, each.distance_p_value] for each in found])
     adjusted = false_discovery_control(np.nan_to_num(chances, nan=1.0).ravel()).reshape(-1, 2)
     return [
-        replace(each, p=p, p_distance_from_median=p_distance_from_median)
+        replace(each, p_value=p, distance_p_value=p_distance_from_median)
         for each, (p, p_distance_from_median) in zip(found, adjusted.tolist(), strict=True)
     ]
 
@@ -224,7 +228,7 @@ class PairedDifference:
     interval_high: float
 
     @property
-    def certain(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the interval excludes zero."""
         return self.interval_low > 0.0 or self.interval_high < 0.0
 

@@ -33,7 +33,7 @@ _PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
     *("planner.resume_file", "coordinated_control.resume_file"),
 )
 """Parameters that are the same in all flights of a campaign."""
-_LEAST_FACTOR = 1e-6
+_MIN_FACTOR = 1e-6
 """Factors of masses and inertias between this and its inverse need no check of every body."""
 
 _POSE_TARGET_NAMES = ("goal", "end_effector_goal", "initial")
@@ -68,7 +68,7 @@ class DispersionTarget:
         Unit, for people.
     text
         Whether its values are texts.
-    sets
+    assigned_parameters
         Names of the numbers that it sets; two targets that set the same number share one.
     """
 
@@ -76,7 +76,7 @@ class DispersionTarget:
     apply: Callable[[DrawnFlight, Any], DrawnFlight]
     unit: str
     is_text: bool
-    sets: frozenset[str]
+    assigned_parameters: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class DrawnFlight:
         factors = np.concatenate([self.mass, self.inertia])
         small, large = factors.min(), factors.max()
         # Positive factors leave the ratios of principal moments: the slow check is not needed.
-        mild = _LEAST_FACTOR < small <= large < 1.0 / _LEAST_FACTOR
+        mild = _MIN_FACTOR < small <= large < 1.0 / _MIN_FACTOR
         if self.is_physical and mild and np.isfinite(self.com).all():
             return
         self.inertial.require_physical([body.name for body in self.nominal.bodies])

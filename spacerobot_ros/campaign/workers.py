@@ -1,7 +1,7 @@
 """Workers of a campaign: processes of this machine behind pipes, or a cluster of dask.distributed.
 
-:meth:`TaskDistributor.rows` gives the draws to the workers in tasks of about :data:`TASK_TIME`, and
-yields the rows as tasks end.
+:meth:`TaskDistributor.rows` gives the draws to the workers in tasks of about
+:data:`TARGET_TASK_TIME`, and yields the rows as tasks end.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from spacerobot_ros.files import warn_once
 from spacerobot_ros.termination import end_with_parent
 from spacerobot_ros.version import __version__
 
-TASK_TIME = 2.0
+TARGET_TASK_TIME = 2.0
 """Wall time that a task should take, s: the overhead of its distribution is small beside it."""
 
 _MIN_FIRST_TASK_FLIGHTS, _MAX_TASK_FLIGHTS = 4, 2000
@@ -82,14 +82,14 @@ THIS_PROCESS = Cluster()
 # -- a task in a worker -----------------------------------------------------------------------
 
 
-def pack_campaign(campaign: Campaign) -> bytes:
+def serialise_campaign(campaign: Campaign) -> bytes:
     """Return a campaign as it is sent to workers: the content of its file, and its scenario."""
     campaign = self_contained(campaign)
     return pickle.dumps((campaign.name, dict(campaign.section), Path(), campaign.scenario))
 
 
 @lru_cache(maxsize=4)
-def _unpack_campaign(packed: bytes) -> Campaign:
+def _deserialise_campaign(packed: bytes) -> Campaign:
     return parse_campaign(*pickle.loads(packed))
 
 
@@ -101,7 +101,7 @@ def fly_task(
     Parameters
     ----------
     packed, version
-        Result of :func:`pack_campaign`, and the version of the package that made it.
+        Result of :func:`serialise_campaign`, and the version of the package that made it.
     draws, engine
         Draws, and name of the engine.
     include_fallbacks
@@ -117,7 +117,7 @@ def fly_task(
             f"A worker has spacerobot_ros {__version__}, and this process {version}: "
             "all need the same."
         )
-    flying, campaign = engine_by_name(engine), _unpack_campaign(packed)
+    flying, campaign = engine_by_name(engine), _deserialise_campaign(packed)
     fly = partial(fly_all, flying) if include_fallbacks else flying.fly
     return list(fly(campaign, draws, lambda: False))
 
@@ -413,7 +413,7 @@ class _SubmittedTask:
 
     numbers: list[int]
     engine: str
-    alone: bool
+    runs_alone: bool
 
 
 class TaskDistributor:
@@ -444,7 +444,7 @@ class TaskDistributor:
         engine: str,
         stopped: Callable[[], bool],
     ) -> None:
-        self._workers, self._packed = workers, pack_campaign(campaign)
+        self._workers, self._packed = workers, serialise_campaign(campaign)
         self._draws, self._engine, self._stopped = draws, engine, stopped
         self._sizes = {
             name: float(max(_MIN_FIRST_TASK_FLIGHTS, engine_by_name(name).efficient_flights))
@@ -479,7 +479,7 @@ class TaskDistributor:
         """Keep the workers busy."""
         workers = self._workers.count()
         most = workers * self._workers.tasks_per_worker
-        alone = any(task.alone for task in self._running.values())
+        alone = any(task.runs_alone for task in self._running.values())
         if self._retry_alone and not alone and len(self._running) < most:
             self._submit_task([self._retry_alone.popleft()], self._engine, alone=True)
         while (self._fallbacks or waiting) and len(self._running) < most:
@@ -507,10 +507,10 @@ class TaskDistributor:
         passed_on = [each for each in made if isinstance(each, Fallback)]
         self._fallbacks += [each.draw.number for each in passed_on]
         self._reasons |= {each.draw.number: each.reason for each in passed_on}
-        if not task.alone and rows:
+        if not task.runs_alone and rows:
             took = sum(row.wall_time for row in rows if not math.isnan(row.wall_time))
             if took > 0:
-                size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TASK_TIME / took
+                size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TARGET_TASK_TIME / took
                 least = engine_by_name(task.engine).efficient_flights
                 self._sizes[task.engine] = max(least, min(_MAX_TASK_FLIGHTS, size))
         return [
@@ -524,7 +524,7 @@ class TaskDistributor:
         """Have the flights of a task flown again alone; return rows of those that died twice."""
         given_up = []
         for number in task.numbers:
-            if task.alone or not self._deaths[number]:
+            if task.runs_alone or not self._deaths[number]:
                 self._deaths[number] += 1
             if self._deaths[number] >= _MAX_WORKER_DEATHS:
                 reason = f"The process that flew it died {_MAX_WORKER_DEATHS} times."

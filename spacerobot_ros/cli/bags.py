@@ -242,7 +242,7 @@ def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
     Exit code 0: every recorded state follows from the commands; 1: one does not, the bag lacks
     states by its own counts, or the other engine differs; 2: bad input.
     """
-    from spacerobot_ros.flight.second_opinion import AGREEMENT
+    from spacerobot_ros.flight.second_opinion import AGREEMENT_TOLERANCE
     from spacerobot_ros.flight.verification import verify_bag
 
     result = verify_bag(bag, tolerance, mujoco=engine == "mujoco")
@@ -263,6 +263,6 @@ def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
             f"{other.joints:.2g} m or rad, most at {other.time:.9g} s of {other.ticks} ticks"
         )
         if not other.agrees:
-            fail(f"{other.engine} differs by more than {AGREEMENT:g} m or rad.")
-        if other.until:
-            click.echo(f"note        compared until {other.until}")
+            fail(f"{other.engine} differs by more than {AGREEMENT_TOLERANCE:g} m or rad.")
+        if other.stop_reason:
+            click.echo(f"note        compared until {other.stop_reason}")

@@ -135,7 +135,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
 
     path = bag or free_name(folder / f"flight_{number}.mcap")
     result = rerun_flight(folder, number, path)
-    for line in result.lines:
+    for line in result.report_lines:
         click.echo(line)
     exit_if_terminated()
     if not result.agrees:
@@ -154,14 +154,14 @@ def _fly_campaign(
     if name:
         campaign = replace(campaign, name=name)
     folder = out or Path("out") / campaign.name
-    for line in campaign.lines:
+    for line in campaign.description_lines:
         click.echo(line)
     with ended_on_request() as stopped, _progress_bar(campaign.name) as show:
         progress = run_campaign(
             campaign, folder, engine=engine, cluster=cluster, show=show, stopped=stopped
         )
-    flown = f"{progress.done} of {progress.total} flights"
-    click.echo(f"{campaign.name}: {flown}, {progress.rate:.3g} a second; {folder}")
+    flown = f"{progress.flown} of {progress.total} flights"
+    click.echo(f"{campaign.name}: {flown}, {progress.flights_per_second:.3g} a second; {folder}")
     return folder
 
 
@@ -176,10 +176,10 @@ def _progress_bar(label: str) -> Iterator[Callable[[Progress], None]]:
     ) as bar:
 
         def show(progress: Progress) -> None:
-            flown = f"{progress.done}/{progress.total}, {progress.rate:.3g}/s"
+            flown = f"{progress.flown}/{progress.total}, {progress.flights_per_second:.3g}/s"
             seconds = progress.seconds_left
             left = "?" if math.isinf(seconds) else timedelta(seconds=round(seconds))
-            step = max(0, 1000 * progress.done // progress.total - bar.pos)
+            step = max(0, 1000 * progress.flown // progress.total - bar.pos)
             bar.update(step, f"{flown}, {left} left")
 
         yield show

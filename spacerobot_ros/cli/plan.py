@@ -146,7 +146,7 @@ def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:
     nearest = PathCheck(geometry).nearest(positions, base)
     if nearest is not None:
         return f"clearance   {nearest}"
-    reasons = Counter(geometry.ignored.values())
+    reasons = Counter(geometry.ignored_pairs.values())
     listed = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
     return f"clearance   no pair of links is looked at{listed and f' ({listed})'}"
 

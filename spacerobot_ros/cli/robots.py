@@ -130,7 +130,7 @@ def workspace_lines(found: Analysis) -> list[str]:
     for each in found.workspaces:
         limits = "within joint limits" if each.within_limits else "joints turn freely"
         place = " in a plane" if each.dimensions == 2 else ""
-        reach = _interval_text(each.reach)
+        reach = _interval_text(each.distance_range)
         count = f", from {each.singular_shapes} singular shapes" if each.singular_shapes else ""
         lines += [
             f"'{each.link}', {limits}: {reach} m from the centre of mass{place}",
@@ -196,7 +196,7 @@ def analysis_json(found: Analysis) -> dict[str, Any]:
                 "link": each.link,
                 "within_limits": each.within_limits,
                 "dimensions": each.dimensions,
-                "reach_m": list(each.reach),
+                "reach_m": list(each.distance_range),
                 "path_dependent_m": [list(ends) for ends in each.path_dependent],
                 "path_independent_m": [list(ends) for ends in each.path_independent],
                 "singular_shapes": each.singular_shapes,
@@ -344,7 +344,7 @@ def _distance_lines(found: Analysis) -> list[str]:
     lines += [f"  {d:.3g} m  {pair}" for pair, d in list(distances.items())[:_MAX_LISTED_DISTANCES]]
     if len(distances) > _MAX_LISTED_DISTANCES:
         lines.append(f"  and more of {len(distances) - _MAX_LISTED_DISTANCES} others")
-    lines += [f"not counted: {pair} ({why})" for pair, why in geometry.ignored.items()]
+    lines += [f"not counted: {pair} ({why})" for pair, why in geometry.ignored_pairs.items()]
     lines += geometry.notes
     if not geometry.exact and distances:
         lines.append("Distances are bounds, since the package coal is not installed.")

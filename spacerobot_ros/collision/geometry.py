@@ -145,13 +145,13 @@ class UnreadMesh:
         Name of its link.
     reason
         A sentence that says why.
-    declared
+    is_collision_shape
         Whether it is that of a ``<collision>``, not only of a ``<visual>``.
     """
 
     link: str
     reason: str
-    declared: bool
+    is_collision_shape: bool
 
     @property
     def note(self) -> str:
@@ -183,12 +183,12 @@ class CollisionGeometry:
         All solids, link by link.
     pairs
         (P, 2) indices of the solids whose distances count.
-    ignored
+    ignored_pairs
         Reason why a pair of links does not count, for those that are neither of one body nor of
         neighbouring ones.
     notes
         Sentences on links whose shape may surprise the user.
-    unread
+    unread_meshes
         Meshes that are left out.
     """
 
@@ -201,15 +201,15 @@ class CollisionGeometry:
     ) -> None:
         self.robot = robot
         self._kinematics = ForwardKinematics(robot)
-        self.solids, self.notes, self.unread = _read_solids(robot, mesh_of)
+        self.solids, self.notes, self.unread_meshes = _read_solids(robot, mesh_of)
         if robot.world is not None:
             obstacles, notes, unread = _read_solids(robot.world, mesh_of)
             frames = robot.world.frames
-            self.solids += tuple(_in_world(each, frames[each.link][1]) for each in obstacles)
+            self.solids += tuple(_solid_in_world(each, frames[each.link][1]) for each in obstacles)
             self.notes += notes
-            self.unread += unread
-        self.notes += tuple(each.note for each in self.unread)
-        self.ignored: dict[LinkPair, str] = {}
+            self.unread_meshes += unread
+        self.notes += tuple(each.note for each in self.unread_meshes)
+        self.ignored_pairs: dict[LinkPair, str] = {}
         links = self._kinematics.links
         self._link_of = np.array(
             [len(links) if each.is_obstacle else links.index(each.link) for each in self.solids],
@@ -221,7 +221,7 @@ class CollisionGeometry:
         if obstacles_alone:
             self.pairs = self.pairs[[self.solids[j].is_obstacle for _, j in self.pairs]]
             return
-        self._exclude_pairs(self._always_in_contact())
+        self._exclude_pairs(self._pairs_always_in_contact())
 
     @cached_property
     def distance_function(self) -> DistanceFunction:
@@ -273,7 +273,7 @@ class CollisionGeometry:
             np.concatenate([r, r_BW[..., np.newaxis, :]], axis=-2),
         )
 
-    def place(self, pair: int, shape: Array, base: BasePoses) -> Array:
+    def nearest_point_on_obstacle(self, pair: int, shape: Array, base: BasePoses) -> Array:
         """Return the approximate point (3,) in W, m, at which a link is nearest to an obstacle.
 
         ``shape`` is (n,), and ``base`` has one pose.
@@ -306,10 +306,10 @@ class CollisionGeometry:
         """Return the smallest distance at a shape (n,), m, and its pair; None without pairs."""
         if not len(self.pairs):
             return None
-        distances, pairs = self.nearest_at(shape[np.newaxis])
+        distances, pairs = self.nearest_along(shape[np.newaxis])
         return float(distances[0]), int(pairs[0])
 
-    def nearest_at(
+    def nearest_along(
         self, shapes: Array, base: BasePoses | None = None
     ) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the smallest distances (N,) at shapes (N, n), m, and their pairs (N,).
@@ -360,12 +360,12 @@ class CollisionGeometry:
                 if parents[bodies[1]] == bodies[0]:
                     continue
                 if frozenset({first.link, second.link}) in disabled:
-                    self.ignored[LinkPair(first.link, second.link)] = "disabled by the SRDF"
+                    self.ignored_pairs[LinkPair(first.link, second.link)] = "disabled by the SRDF"
                     continue
                 found.append((i, j))
         return np.array(found, dtype=np.int64).reshape(-1, 2)
 
-    def _always_in_contact(self) -> npt.NDArray[np.bool_]:
+    def _pairs_always_in_contact(self) -> npt.NDArray[np.bool_]:
         """Return for every pair (P,) whether it is in contact at all random shapes."""
         contact = np.ones(len(self.pairs), dtype=np.bool_)
         if not len(self.pairs):
@@ -383,12 +383,12 @@ class CollisionGeometry:
 
     def _exclude_pairs(self, contact: npt.NDArray[np.bool_]) -> None:
         for pair in np.flatnonzero(contact):
-            self.ignored.setdefault(self.links_of(int(pair)), "always in contact")
+            self.ignored_pairs.setdefault(self.links_of(int(pair)), "always in contact")
         self.pairs = self.pairs[~contact]
 
     # -- motion -------------------------------------------------------------------------------
 
-    def reaches(self, shapes: Array) -> tuple[Array, Array]:
+    def largest_lever_arms(self, shapes: Array) -> tuple[Array, Array]:
         """Return a bound of the relative motion of solids, ``reaches @ |dtheta|`` (P,), m.
 
         ``reaches`` (P, m) is the largest distance of a point of the pair from each of the moving
@@ -448,7 +448,7 @@ def _spins_in_place(solid: Solid, link_pose: Pose, joint: Joint) -> bool:
     )
 
 
-def _in_world(obstacle: Solid, pose: Pose) -> Solid:
+def _solid_in_world(obstacle: Solid, pose: Pose) -> Solid:
     """Return an obstacle in the frame of the world, from its link's frame at a pose there."""
     box, vertices = obstacle.enclosure, obstacle.vertices
     return replace(
@@ -504,7 +504,7 @@ def _read_solids(
                 except MeshError as error:
                     unread.append(UnreadMesh(link.name, str(error), bool(link.collisions)))
                     continue
-                hull = _hull(vertices)
+                hull = _convex_hull(vertices)
                 vertices = vertices if hull is None else vertices[hull.vertices]
                 enclosure = RoundedBox.around(shape, vertices)
                 solids.append(Solid(link.name, body, shape, enclosure, vertices))
@@ -513,7 +513,7 @@ def _read_solids(
     return tuple(solids), tuple(notes), tuple(unread)
 
 
-def _hull(points: Array) -> Any:
+def _convex_hull(points: Array) -> Any:
     """Return the convex hull of points (V, 3) by scipy; None where all lie in a plane."""
     # Slow to import, and few robots have meshes.
     from scipy.spatial import ConvexHull, QhullError
@@ -555,7 +555,7 @@ def _mesh_of(solid: Solid) -> TriangleMesh:
     points = solid.vertices
     if points is None:
         return solid_mesh(solid.shape)
-    hull = _hull(points)
+    hull = _convex_hull(points)
     if hull is None:
         return TriangleMesh(points, np.zeros((0, 3), np.int32))
     faces = hull.simplices.astype(np.int32)

@@ -1,7 +1,7 @@
 """Nearest pairs: at one state after another, as fast as in flight, and along held commands.
 
 Along held commands a pair of solids moves against each other by at most v in a tick
-(``CollisionGeometry.reaches``). So its distance within the tick is at least
+(``CollisionGeometry.largest_lever_arms``). So its distance within the tick is at least
 ``(d_0 + d_1 - v) / 2``, with d_0 and d_1 those at its ends. Ticks where that is less than the
 clearance are halved until v is small. Against obstacles the base moves, too, along a straight line
 and about one axis within a tick.
@@ -18,7 +18,7 @@ from spacerobot_ros.collision.distances import ExactDistances
 from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair
 from spacerobot_ros.model.description import Array
 
-_MARGIN = 1e-9
+_DISTANCE_MARGIN = 1e-9
 """Rounding of the bounds by balls, m."""
 
 
@@ -48,7 +48,7 @@ class NearestPair:
         )
         self._centers = np.array([each.enclosure.pose.r for each in solids])[:, :, np.newaxis]
         radii = np.array([each.enclosure.bounding_radius for each in solids])
-        self._reach = radii[self._first] + radii[self._second] + _MARGIN
+        self._body_reach = radii[self._first] + radii[self._second] + _DISTANCE_MARGIN
 
     def nearest(self, link_R: Array, link_r: Array, pose: Array) -> tuple[float, int]:
         """Return the smallest distance, m, and its pair.
@@ -70,7 +70,7 @@ class NearestPair:
                 best, nearest = distance, pair
         return best, nearest
 
-    def touching(self, link_R: Array, link_r: Array, pose: Array) -> frozenset[LinkPair]:
+    def links_in_contact(self, link_R: Array, link_r: Array, pose: Array) -> frozenset[LinkPair]:
         """Return the links that touch, for poses as of :meth:`nearest`."""
         near = np.flatnonzero(self._bounds(link_R, link_r, pose) <= 0).tolist()
         return frozenset(
@@ -89,7 +89,7 @@ class NearestPair:
         self._place.move(R, r)
         centers = r + (R @ self._centers)[:, :, 0]
         between = centers[self._first] - centers[self._second]
-        return np.sqrt(np.einsum("pa,pa->p", between, between)) - self._reach
+        return np.sqrt(np.einsum("pa,pa->p", between, between)) - self._body_reach
 
 
 # -- along held commands --------------------------------------------------------------------------
@@ -114,7 +114,7 @@ class Approach:
         When, in ticks from the first shape.
     shape
         (n,) there, m or rad.
-    place
+    place_on_obstacle
         (3,) there, in W, m, on the obstacle; None: the pair are two links.
     """
 
@@ -123,10 +123,14 @@ class Approach:
     distance: float
     tick: float
     shape: Array
-    place: Array | None = None
+    place_on_obstacle: Array | None = None
 
     def __str__(self) -> str:
-        where = "" if self.place is None else f" near {np.round(self.place, 3).tolist()} m"
+        where = (
+            ""
+            if self.place_on_obstacle is None
+            else f" near {np.round(self.place_on_obstacle, 3).tolist()} m"
+        )
         if self.distance <= 0:
             return f"{self.links.subject} touch, {-self.distance:.3g} m deep{where}"
         return f"{self.links.subject} come within {self.distance:.3g} m{where}"
@@ -142,21 +146,21 @@ class _Path:
         (N + 1, n) shapes at the ticks, m or rad.
     base
         Poses of the base at the ticks; None: obstacles do not count.
-    bounds
+    distance_bounds
         (N + 1, P) lower bounds of the distances of pairs at the ticks, m.
-    motion
+    largest_motions
         (N, P): how far pairs move against each other at most in each tick, m.
     """
 
     positions: Array
     base: BasePoses | None
-    bounds: Array
-    motion: Array
+    distance_bounds: Array
+    largest_motions: Array
 
     @classmethod
     def of(cls, geometry: CollisionGeometry, positions: Array, base: BasePoses | None) -> _Path:
         bounds = geometry.lower_bounds(geometry.poses(positions, base))
-        reaches, from_base = geometry.reaches(positions)
+        reaches, from_base = geometry.largest_lever_arms(positions)
         moved = np.abs(np.diff(geometry.moving_positions(positions), axis=0))
         motion = moved @ reaches.T
         if base is not None and geometry.with_obstacles.any():
@@ -168,13 +172,17 @@ class _Path:
         return cls(positions, base, bounds, motion)
 
     @property
-    def least(self) -> Array:
+    def lower_bounds_along_path(self) -> Array:
         """Lower bounds (P,) of the distances along the whole path, m."""
-        if not len(self.motion):
-            return np.asarray(self.bounds.min(axis=0))
-        return np.asarray(((self.bounds[:-1] + self.bounds[1:] - self.motion) / 2).min(axis=0))
+        if not len(self.largest_motions):
+            return np.asarray(self.distance_bounds.min(axis=0))
+        return np.asarray(
+            ((self.distance_bounds[:-1] + self.distance_bounds[1:] - self.largest_motions) / 2).min(
+                axis=0
+            )
+        )
 
-    def at(self, ticks: Array) -> tuple[Array, BasePoses | None]:
+    def interpolated(self, ticks: Array) -> tuple[Array, BasePoses | None]:
         """Return shapes (K, n) and poses of the base at times (K,) in ticks."""
         if len(self.positions) == 1:
             return self.positions, self.base
@@ -213,7 +221,7 @@ class PathCheck:
         if not len(self.geometry.pairs):
             return []
         path = _Path.of(self.geometry, positions, base)
-        near = np.flatnonzero(path.least < required)
+        near = np.flatnonzero(path.lower_bounds_along_path < required)
         found = (self._nearest(path, p, required[p]) for p in near.tolist())
         return sorted((each for each in found if each), key=lambda each: each.distance)
 
@@ -225,7 +233,7 @@ class PathCheck:
         if not len(self.geometry.pairs):
             return None
         path = _Path.of(self.geometry, positions, base)
-        least = path.least
+        least = path.lower_bounds_along_path
         best: Approach | None = None
         for pair in np.argsort(least, kind="stable").tolist():
             if best is not None and least[pair] >= best.distance:
@@ -236,16 +244,16 @@ class PathCheck:
 
     def _nearest(self, path: _Path, pair: int, limit: float) -> Approach | None:
         """Return the nearest approach of a pair; None where it does not come nearer than limit."""
-        geometry, motion, bounds = self.geometry, path.motion, path.bounds
+        geometry, motion, bounds = self.geometry, path.largest_motions, path.distance_bounds
 
         def distances(ticks: Array) -> Array:
-            return geometry.distances(pair, geometry.poses(*path.at(ticks)))
+            return geometry.distances(pair, geometry.poses(*path.interpolated(ticks)))
 
         def approach(distance: float, tick: float) -> Approach:
-            shapes, base = path.at(np.array([tick]))
+            shapes, base = path.interpolated(np.array([tick]))
             place = None
             if base is not None and geometry.with_obstacles[pair]:
-                place = geometry.place(pair, shapes[0], base)
+                place = geometry.nearest_point_on_obstacle(pair, shapes[0], base)
             return Approach(geometry.links_of(pair), pair, distance, tick, shapes[0], place)
 
         if not len(motion):
@@ -279,6 +287,6 @@ class PathCheck:
         return approach(best, at) if best < limit else None
 
 
-def names(approaches: Iterable[Approach]) -> list[LinkPair]:
+def names_of_links(approaches: Iterable[Approach]) -> list[LinkPair]:
     """Return the links of approaches, each pair once."""
     return list(dict.fromkeys(each.links for each in approaches))

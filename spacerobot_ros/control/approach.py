@@ -111,7 +111,7 @@ class ApproachPlan:
     ----------
     start
         When the end-effector sets out.
-    outward, closing
+    path_to_standoff, path_to_contact
         Its paths relative to the grapple frame: to the standoff, and from there to contact.
     standoff_time
         Time at the standoff, s.
@@ -121,25 +121,25 @@ class ApproachPlan:
     """
 
     start: float
-    outward: RelativePath | PathInWorld
-    closing: RelativePath
+    path_to_standoff: RelativePath | PathInWorld
+    path_to_contact: RelativePath
     standoff_time: float
     distance: float = math.inf
 
     @property
     def closing_time(self) -> float:
         """When the end-effector leaves the standoff."""
-        return self.start + self.outward.duration + self.standoff_time
+        return self.start + self.path_to_standoff.duration + self.standoff_time
 
     @property
     def contact(self) -> float:
         """When the end-effector has the pose of the grapple frame."""
-        return self.closing_time + self.closing.duration
+        return self.closing_time + self.path_to_contact.duration
 
     def relative(self, times: Array) -> RelativeMotionOverTime:
         """Return the motion relative to the grapple frame at times (K,) from the start on."""
-        out = self.outward.at(times - self.start)
-        inward = self.closing.at(np.maximum(times - self.closing_time, 0.0))
+        out = self.path_to_standoff.at(times - self.start)
+        inward = self.path_to_contact.at(np.maximum(times - self.closing_time, 0.0))
         late = (times >= self.closing_time)[:, np.newaxis]
         names = ("x", "xdot", "xddot", "phi", "phidot", "phiddot")
         return RelativeMotionOverTime(
@@ -244,14 +244,14 @@ def plan_approach(
     standoffs = [factor * np.array(options.standoff) for factor in _STANDOFF_FACTORS]
     ways = [(each, _closing_path(each, options, limits)) for each in standoffs]
     ways.insert(0, ways[0])  # Relative to the grapple frame; the others are short in W.
-    at_rest, failure = FrameMotion.of_reference(held), _Failure()
+    at_rest, failure = FrameMotion.of_reference(held), _RefusalReasons()
     longest = _LONGEST_PATH + options.standoff_time + ways[-1][1].duration + 2 * _SAMPLE_PERIOD
     samples = round((options.horizon + longest) / _SAMPLE_PERIOD)
     grapple = target.grapple(_SAMPLE_PERIOD * np.arange(samples))
     in_the_way = False
     for start in [0.0] if moving else starts.tolist():
         first = round(start / _SAMPLE_PERIOD)
-        begin = RelativeMotionOverTime.between(grapple.part(first, first + 1), at_rest)
+        begin = RelativeMotionOverTime.between(grapple.between_samples(first, first + 1), at_rest)
         for duration, (way, (standoff, closing)) in product(_outward_durations(), enumerate(ways)):
             if not way:
                 in_the_way = False
@@ -266,7 +266,9 @@ def plan_approach(
             # Few samples refuse most of the paths.
             for every in (_COARSE_STRIDE, 1):
                 times = _SAMPLE_PERIOD * np.arange(first, last, every)
-                motion = grapple.part(first, last, every).carrying(plan.relative(times))
+                motion = grapple.between_samples(first, last, every).with_relative_motion(
+                    plan.relative(times)
+                )
                 excess, sentence = _excess(motion, limits, axes)
                 if excess > 1.0:
                     break
@@ -291,11 +293,15 @@ def plan_approach(
                 # A hand that is planned for in motion may be beside the target already.
                 closes = 0 if moving else int(np.sum(ticks * _SAMPLE_PERIOD < plan.closing_time))
                 near = clearance.nearest(reach.base, shapes, grapple.rows(ticks), closes)
-                if near is not None and near.distance < clearance.least:
+                if near is not None and near.distance < clearance.min_distance:
                     break
-            if clearance is not None and near is not None and near.distance < clearance.least:
+            if (
+                clearance is not None
+                and near is not None
+                and near.distance < clearance.min_distance
+            ):
                 in_the_way = True
-                failure.blocked(near, clearance.least, plan.contact)
+                failure.blocked(near, clearance.min_distance, plan.contact)
             elif why:
                 failure.arm_cannot_follow(why, plan.contact)
             else:
@@ -340,7 +346,7 @@ def _excess(motion: FrameMotion, limits: MotionLimits, axes: tuple[str, ...]) ->
     return max(shares)
 
 
-class _Failure:
+class _RefusalReasons:
     """The reasons why start times were not taken, and the best of each kind."""
 
     def __init__(self) -> None:
@@ -421,7 +427,7 @@ class TargetClearance:
         The target, one rigid body.
     grapple
         Pose of the grapple frame in the frame T of the target.
-    least
+    min_distance
         The distance that is to be kept, m.
     """
 
@@ -433,12 +439,12 @@ class TargetClearance:
         grapple: Pose,
         least: float,
     ) -> None:
-        self.least = least
+        self.min_distance = least
         self._grapple = grapple
         self._geometry = CollisionGeometry(replace(robot, world=target), obstacles_alone=True)
         hand = robot.frames[link][0]
         bodies = np.array([self._geometry.solids[i].body for i, _ in self._geometry.pairs])
-        self._of_hand = bodies == hand
+        self._is_pair_of_end_effector = bodies == hand
 
     def nearest(
         self, base: Pose, shapes: Array, grapple: FrameMotion, closes: int
@@ -461,7 +467,7 @@ class TargetClearance:
             return None
         poses = geometry.poses(shapes, self._base_in_target(base, grapple))
         bounds = geometry.lower_bounds(poses)
-        bounds[closes:, self._of_hand] = np.inf
+        bounds[closes:, self._is_pair_of_end_effector] = np.inf
         found: NearestLinks | None = None
         for pair in np.argsort(bounds.min(axis=0), kind="stable").tolist():
             at = np.flatnonzero(bounds[:, pair] < (np.inf if found is None else found.distance))

@@ -295,7 +295,7 @@ class CoordinatedController:
 
     def _realised_with_wheels(self, wheels: WheelControl, wanted: Actuation) -> Actuation:
         """Return what wheels and then thrusters and joints give of a command."""
-        torque = wheels.give(wanted.wrench_B[3:])
+        torque = wheels.command_torque(wanted.wrench_B[3:])
         rest = wanted.wrench_B.copy()
         rest[3:] -= torque
         limited = self._limits.apply(Actuation(rest, wanted.tau)).realised

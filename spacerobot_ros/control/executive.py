@@ -388,7 +388,7 @@ class ControlExecutive:
             self._begin_anew = False
             too_fast = self.controller.coming_to_rest and self._monitor.fast_states
             if not too_fast:
-                self._pursue(time, measured)
+                self._follow_goals(time, measured)
             self._watch_rates(qdot)
         if reference is not None:
             self.controller.follow(reference)
@@ -483,7 +483,7 @@ class ControlExecutive:
             self._goal_state, self._goal_id = ControllerState.HOLDING, ""
         self._abort_requested = self._hold_here = False
 
-    def _pursue(self, time: float, state: ControlState) -> None:
+    def _follow_goals(self, time: float, state: ControlState) -> None:
         """Go on with the tasks before the pending goals, and start towards the goals after them."""
         servicing = self.servicing
         if self._requested is not None:

@@ -209,7 +209,7 @@ class _OutputGroup:
     error_rate: ca.SX
     acceleration: ca.SX
     J: ca.SX
-    bias: ca.SX
+    bias_acceleration: ca.SX
 
     def rows(self, chosen: list[int]) -> _OutputGroup:
         return _OutputGroup(
@@ -217,7 +217,7 @@ class _OutputGroup:
             self.error_rate[chosen],
             self.acceleration[chosen],
             self.J[chosen, :],
-            self.bias[chosen],
+            self.bias_acceleration[chosen],
         )
 
 
@@ -306,7 +306,7 @@ class OutputVector:
         if not thrust:
             # No actuator moves the centre of mass.
             self.J_z[:, :3] = 0
-        self.bias = ca.vertcat(*(group.bias for group in groups))
+        self.bias_acceleration = ca.vertcat(*(group.bias_acceleration for group in groups))
 
     def pack_state(self, state: ControlState, memory: Array) -> None:
         """Write a state into memory (13 + 2 n,) for the symbol ``state``.

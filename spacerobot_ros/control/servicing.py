@@ -135,7 +135,7 @@ class ApproachTask:
         self._predicted: TorqueFreeMotion | None = None
         self._planned_at = 0.0
         self._began: float | None = None
-        self._far: RelativeMotion | None = None
+        self._out_of_reach: RelativeMotion | None = None
         self._remaining = math.inf
         """Time until contact, s."""
 
@@ -176,14 +176,14 @@ class ApproachTask:
             state.qdot,
         )
         hand = frame_motion(controller.law.robot, link, motion)
-        self._far = RelativeMotion.between(hand, grapple.body_motion())
+        self._out_of_reach = RelativeMotion.between(hand, grapple.body_motion())
         if now > plan.contact + options.patience:
             return self._ended(
                 f"the target is missed: at contact the end-effector is {self._distance_text}, and "
                 f"nothing captured it within {options.patience:g} s"
             )
         if now >= plan.start:
-            moving = grapple.carrying(plan.relative(np.array([now])))
+            moving = grapple.with_relative_motion(plan.relative(np.array([now])))
             controller.follow(Reference(end_effector=moving.reference()))
         self._remaining = plan.contact - now
         return _ACTIVE
@@ -191,7 +191,7 @@ class ApproachTask:
     @property
     def message(self) -> str:
         """Sentence on the approach."""
-        if self._far is None:
+        if self._out_of_reach is None:
             return "Approaching the target."
         left = self._remaining
         when = f"contact in {left:.3g} s" if left > 0 else "in contact"
@@ -199,7 +199,7 @@ class ApproachTask:
 
     @property
     def _distance_text(self) -> str:
-        far = self._far
+        far = self._out_of_reach
         assert far is not None
         return (
             f"{far.distance:.3g} m, {far.angle:.3g} rad, {far.speed:.3g} m/s and {far.rate:.3g} "

@@ -81,7 +81,7 @@ class FrameMotion:
             self.alpha[k],
         )
 
-    def part(self, first: int, last: int, every: int = 1) -> FrameMotion:
+    def between_samples(self, first: int, last: int, every: int = 1) -> FrameMotion:
         """Return the motion at times from the first up to the last, which is not included."""
         return self.rows(slice(first, last, every))
 
@@ -93,7 +93,7 @@ class FrameMotion:
         """Return the motion at the k-th time without accelerations."""
         return BodyMotion(self.R[k], self.r[k], self.v[k], self.omega[k])
 
-    def carrying(self, path: RelativeMotionOverTime) -> FrameMotion:
+    def with_relative_motion(self, path: RelativeMotionOverTime) -> FrameMotion:
         """Return the motion of a frame that moves relative to this one."""
         R, omega, alpha = self.R, self.omega, self.alpha
         arm, v_rel, a_rel = (_rotate_vectors(R, each) for each in (path.x, path.xdot, path.xddot))
@@ -372,7 +372,7 @@ class PathInWorld:
         self._relative, self._target, self._start = relative, target, start
         zero = np.zeros((1, 3))
         fixed = RelativeMotionOverTime(position[np.newaxis], zero, zero, zero, zero, zero)
-        end = target.grapple([start + self.duration]).carrying(fixed)
+        end = target.grapple([start + self.duration]).with_relative_motion(fixed)
         first, last = ((each.r[0], each.v[0], each.a[0]) for each in (moving, end))
         self._coefficients = _quintic(first, last, self.duration)
 

@@ -255,7 +255,7 @@ class WheelControl:
 
     # -- torques ------------------------------------------------------------------------------
 
-    def give(self, torque: Array) -> Array:
+    def command_torque(self, torque: Array) -> Array:
         """Command torques for a wanted torque (3,) on the base, N m; return the part they give.
 
         The torque ``omega x A h`` of turning the spins with the base is compensated for.

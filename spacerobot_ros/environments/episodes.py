@@ -243,7 +243,7 @@ def _require_steppable(scenario: Scenario, robot: SpaceRobot) -> None:
         "disturbances, an orbit or a table": (plant.disturbances, plant.orbit, plant.table)
         != ((), OrbitConfig(), TableConfig()),
         "thrusters that are on or off": bool(plant.thrusters),
-        "errors of sensors": bool(SensorErrors.of(robot, [plant.sensors]).used[0]),
+        "errors of sensors": bool(SensorErrors.of(robot, [plant.sensors]).is_active[0]),
     }
     for part, given in parts.items():
         if given:
@@ -443,12 +443,12 @@ class Episodes:
         shares = as_numbers(actions, "The array of actions", CommandError)
         if shares.shape != (count, size):
             raise CommandError(f"The actions are {shares.shape}, not ({count}, {size}).")
-        under_way, before = self._flights.alive.copy(), self.errors
+        under_way, before = self._flights.has_not_ended.copy(), self.errors
         self._flights.step(command_of(shares, self.scale, self.taken), self._config.hold)
         self._observe()
         weights, seconds = self._weights, self.step_duration
-        reached = self._flights.alive & (self.errors <= self._tolerance)
-        failed = under_way & ~self._flights.alive
+        reached = self._flights.has_not_ended & (self.errors <= self._tolerance)
+        failed = under_way & ~self._flights.has_not_ended
         square = np.mean(np.clip(shares, -1.0, 1.0) ** 2, axis=1)
         reward = weights.progress * (before - self.errors)
         reward -= seconds * (weights.time + weights.action * square)
@@ -457,7 +457,7 @@ class Episodes:
         self.reached = reached
         self.terminations = reached | failed
         late = self._flights.time > self._config.time_limit - 0.5 * seconds
-        self.truncations = self._flights.alive & late & ~reached
+        self.truncations = self._flights.has_not_ended & late & ~reached
 
     def _observe(self) -> None:
         states = self._states(slice(None))

@@ -42,7 +42,7 @@ _SAME_TIME = 1e-6
 
 
 @dataclass(frozen=True)
-class HeldBody:
+class HeldTarget:
     """The target, while the robot held it.
 
     Attributes
@@ -119,7 +119,7 @@ class States:
         return np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64))
 
 
-def held_bodies(flight: Flight) -> tuple[HeldBody, ...]:
+def held_bodies(flight: Flight) -> tuple[HeldTarget, ...]:
     """Return the bodies that the robot of a flight held, one for each capture.
 
     Where the grasp is follows from the poses of robot and target after the capture.
@@ -127,7 +127,7 @@ def held_bodies(flight: Flight) -> tuple[HeldBody, ...]:
     robot, target = flight.robot, flight.target
     if robot is None or target is None:
         return ()
-    held: list[HeldBody] = []
+    held: list[HeldTarget] = []
     start = math.nan
     for event in flight.events:
         if event.kind is EventKind.CAPTURED and event.time_s is not None:
@@ -140,7 +140,7 @@ def held_bodies(flight: Flight) -> tuple[HeldBody, ...]:
 
 def _held_between(
     flight: Flight, robot: RobotDescription, target: RobotDescription, start: float, end: float
-) -> list[HeldBody]:
+) -> list[HeldTarget]:
     """Return the body that was held between a capture and a release; none without states."""
     if math.isnan(start):
         return []
@@ -153,7 +153,7 @@ def _held_between(
     hand = kinematics.link_in_world(link, states.pose[own[0]], states.q[own[0]])
     held = relative_pose(hand, poses.values[other[0]])
     grasp = Pose(matrix_from_quaternion(held[3:]), held[:3])
-    return [HeldBody(start, end, Payload(link, target.bodies[0].inertia.moved(grasp)))]
+    return [HeldTarget(start, end, Payload(link, target.bodies[0].inertia.moved(grasp)))]
 
 
 def momentum_budget_over_time(flight: Flight, most: int) -> Signal:

@@ -125,7 +125,7 @@ class FlightClearance:
     ) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the smallest distances, m, and their pairs in some states."""
         base = None if self.base is None else self.base.rows(rows)
-        return self.geometry.nearest_at(self.shapes[rows], base)
+        return self.geometry.nearest_along(self.shapes[rows], base)
 
     @property
     def nearest_time(self) -> float:

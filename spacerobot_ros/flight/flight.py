@@ -43,7 +43,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.core.goal import Controlled, EndEffectorGoal, uncontrolled_parts
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
-from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
+from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
 from spacerobot_ros.simulation.capture import capture_values, load_target
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
 from spacerobot_ros.simulation.sensors import ReportedState
@@ -800,7 +800,7 @@ class FlightLog:
 
     def __init__(
         self,
-        plant: FaultyPlant,
+        plant: PlantWithFaults,
         reported: ReportedState,
         commands: CommandValidator,
         period_ns: int,

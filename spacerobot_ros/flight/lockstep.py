@@ -48,7 +48,7 @@ from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus, ScheduleStart
 from spacerobot_ros.scenario import Scenario
-from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
+from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState
@@ -243,7 +243,7 @@ class _LockstepFlight:
         self._scenario, self._robots = scenario, robots
         self._period_ns = config.period_ns
         self._tick = 0
-        self._plant: FaultyPlant = build_plant(robots.plant, config)
+        self._plant: PlantWithFaults = build_plant(robots.plant, config)
         scenario.require_shape_of(robots.plant)
         self._reported = ReportedState(self._plant, config)
         self._commands = CommandValidator(self._plant, config)

@@ -185,7 +185,7 @@ class FlightBag:
 
     def quantity(self, name: str, field: StateField) -> Signal:
         """Return the numbers of a field of a state topic over time."""
-        width = len(field.members) or len(field.entries) or len(self.names(name))
+        width = len(field.members) or len(field.array_entry_names) or len(self.names(name))
         return self.signal(name, field.columns, width)
 
     def true_signal(self, name: str, number: int) -> Signal:

@@ -102,7 +102,7 @@ def _state_streams(flight: Flight) -> Iterator[_Stream]:
     for topic in state_topics(config.end_effectors):
         if not all(field.quantity in quantities for field in topic.state):
             continue
-        names = thrusters if topic.entries_of == "thrusters" else flight.joint_names
+        names = thrusters if topic.array_entries_of == "thrusters" else flight.joint_names
         base = config.frame_prefix + robot.base_link
         target = "" if flight.target is None else flight.target.base_link
         message = state_message(topic, names, config.world_frame, base, target)
@@ -279,7 +279,7 @@ def _names(flight: Flight, topic: Topic) -> Sequence[str]:
     """Return the names in the messages of a topic, of joints or thrusters."""
     if topic.short_type != "sensor_msgs/JointState":
         return ()
-    if topic.entries_of != "thrusters":
+    if topic.array_entries_of != "thrusters":
         return flight.joint_names
     # A table of thrusters that is a file of its own is not looked for: a bag may name any file.
     source, robot = flight.scenario.plant.thrusters, flight.robot

@@ -14,17 +14,17 @@ import numpy.typing as npt
 
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error
-from spacerobot_ros.simulation.actuators import FaultyPlant
+from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.simulation.mujoco_engine import EFFORT_STEP, VELOCITY_STEP, MujocoEngine
 from spacerobot_ros.simulation.plant import Plant, WrappedPlant
 
-AGREEMENT = 1e-8
+AGREEMENT_TOLERANCE = 1e-8
 """Largest deviation, m or rad, of an engine that agrees with a flight."""
 
 
 @dataclass(frozen=True)
-class SecondOpinion:
+class EngineComparison:
     """The largest differences between a flight and another engine under the same commands.
 
     Attributes
@@ -40,7 +40,7 @@ class SecondOpinion:
         or rad.
     time
         Simulated time of the largest one, s.
-    until
+    stop_reason
         Reason why the engine flew no further; empty: it flew to the end.
     """
 
@@ -51,12 +51,12 @@ class SecondOpinion:
     attitude: float
     joints: float
     time: float
-    until: str = ""
+    stop_reason: str = ""
 
     @property
     def agrees(self) -> bool:
-        """Whether all differences are at most :data:`AGREEMENT`."""
-        return max(self.position, self.attitude, self.joints) <= AGREEMENT
+        """Whether all differences are at most :data:`AGREEMENT_TOLERANCE`."""
+        return max(self.position, self.attitude, self.joints) <= AGREEMENT_TOLERANCE
 
 
 class EngineFlight:
@@ -75,7 +75,7 @@ class EngineFlight:
         MuJoCo is not installed, or refuses the robot.
     """
 
-    def __init__(self, plant: FaultyPlant, period: float) -> None:
+    def __init__(self, plant: PlantWithFaults, period: float) -> None:
         self._plant, self._period = plant, period
         dynamics: Plant = plant
         while isinstance(dynamics, WrappedPlant):
@@ -90,7 +90,7 @@ class EngineFlight:
         self._poses, self._shapes = [self._engine.pose], [self._engine.q]
         self._until = ""
 
-    def follow(self) -> None:
+    def fly_next_tick(self) -> None:
         """Fly the tick that the plant has just taken."""
         if self._until:
             return
@@ -119,7 +119,9 @@ class EngineFlight:
         stopped = np.flatnonzero(plant.limit_counts["stroke"] > self._stopped)
         return f"joint '{names[int(stopped[0])]}' is at its stop" if stopped.size else ""
 
-    def compared(self, ticks: npt.NDArray[np.int64], poses: Array, shapes: Array) -> SecondOpinion:
+    def comparison(
+        self, ticks: npt.NDArray[np.int64], poses: Array, shapes: Array
+    ) -> EngineComparison:
         """Return the differences to the states in a bag.
 
         Parameters
@@ -143,7 +145,7 @@ class EngineFlight:
         bend = np.abs(np.array(self._shapes)[rows] - shapes[known]).max(axis=1, initial=0.0)
         worst = int(np.argmax(np.maximum(np.maximum(place, turn), bend)))
         step = VELOCITY_STEP if self._effort_plant is None else EFFORT_STEP
-        return SecondOpinion(
+        return EngineComparison(
             engine=self._engine.name,
             integrator=f"Runge-Kutta 4 with steps of at most {step:g} s",
             ticks=len(rows) - 1,
@@ -151,5 +153,5 @@ class EngineFlight:
             attitude=float(turn.max()),
             joints=float(bend.max()),
             time=float(ticks[known][worst]) * self._period,
-            until=self._until,
+            stop_reason=self._until,
         )

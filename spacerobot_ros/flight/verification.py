@@ -15,7 +15,7 @@ from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.reading import namespaces, recorded_target
-from spacerobot_ros.flight.second_opinion import EngineFlight, SecondOpinion
+from spacerobot_ros.flight.second_opinion import EngineComparison, EngineFlight
 from spacerobot_ros.messages.readers import CommandReader, UnreadableError
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model import SpaceRobot
@@ -102,7 +102,7 @@ class Verification:
     difference: Difference | None
     topics: tuple[str, ...] = ()
     missing: str = ""
-    second_opinion: SecondOpinion | None = None
+    second_opinion: EngineComparison | None = None
 
 
 def verify_bag(
@@ -317,7 +317,7 @@ class _PublishedTopic:
         """Leave out the messages until a tick, from which on-times of thrusters count."""
         kept = self.ticks > tick
         values = self.values[kept]
-        if self.topic.entries_of == "thrusters" and not kept.all():
+        if self.topic.array_entries_of == "thrusters" and not kept.all():
             count = self.values.shape[1] // len(self.topic.state)
             values[:, :count] -= self.values[~kept][-1, :count]
         return replace(self, ticks=self.ticks[kept], values=values)
@@ -364,7 +364,7 @@ def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
                 f"A message on {series.topic} of the bag {flight.path} is stamped "
                 f"{stamps[between[0]] / SECOND:.9g} s, between the ticks of the plant in it."
             )
-        named = recorded.names(topic.name) if topic.entries_of == "thrusters" else names
+        named = recorded.names(topic.name) if topic.array_entries_of == "thrusters" else names
         labels = [each.labels(named) for each in topic.state]
         table = np.hstack(
             [
@@ -554,13 +554,13 @@ def _resimulate(
             done.end, done.stopped = tick, str(error)
             break
         if done.engine is not None:
-            done.engine.follow()
+            done.engine.fly_next_tick()
     return done
 
 
 def _second_opinion(
     resimulation: _Resimulation, published: list[_PublishedTopic]
-) -> SecondOpinion | None:
+) -> EngineComparison | None:
     """Return the differences of the engine to the true states in the bag; None: none has flown."""
     if resimulation.engine is None:
         return None
@@ -568,7 +568,7 @@ def _second_opinion(
     odom, joints = (topics.get(f"{name}_true", topics[name]) for name in ("odom", "joint_states"))
     ticks, rows, columns = np.intersect1d(odom.ticks, joints.ticks, return_indices=True)
     n = joints.values.shape[1] // 3
-    return resimulation.engine.compared(ticks, odom.values[rows, :7], joints.values[columns, :n])
+    return resimulation.engine.comparison(ticks, odom.values[rows, :7], joints.values[columns, :n])
 
 
 def _require_no_reset(

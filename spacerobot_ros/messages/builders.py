@@ -198,7 +198,7 @@ def state_message(
     """
     values: dict[str, Any] = {}
     if topic.type == "std_msgs/msg/Float64MultiArray":
-        words = topic.state[0].entries
+        words = topic.state[0].array_entry_names
         dimension = {"label": " ".join(words), "size": len(words), "stride": len(words)}
         values["layout"] = {"dim": [dimension]}
     elif topic.state:
@@ -209,7 +209,7 @@ def state_message(
         values["name"] = names
     for field in topic.state:
         if not field.members:
-            values[field.path] = np.zeros(len(field.entries or names))
+            values[field.path] = np.zeros(len(field.array_entry_names or names))
     return encode(topic.type, values)
 
 

@@ -243,7 +243,7 @@ class RelativeMotion:
 
 
 @dataclass(frozen=True)
-class Impact:
+class GraspImpact:
     """The result of a grasp.
 
     Attributes
@@ -279,7 +279,7 @@ def frame_motion(robot: SpaceRobot, link: str, motion: RobotMotion) -> BodyMotio
 
 def grasp_impact(
     robot: SpaceRobot, link: str, motion: RobotMotion, body: BodyMotion, inertia: Inertia
-) -> Impact:
+) -> GraspImpact:
     """Return the impact by which a link grasps a floating body where both are.
 
     Parameters
@@ -309,7 +309,7 @@ def grasp_impact(
     approach = G @ nu - J @ z
     L = np.linalg.solve(J @ by_robot + G @ by_body, approach)
     after = z + by_robot @ L
-    return Impact(
+    return GraspImpact(
         twist=after[:6],
         qdot=after[6:],
         impulse=np.concatenate([R_WB @ L[:3], R_WB @ L[3:]]),

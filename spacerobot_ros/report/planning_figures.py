@@ -113,9 +113,9 @@ def draw_rings(axes: Axes, workspaces: Workspaces) -> None:
     ):
         for low, high in intervals:
             # A single distance is a thin ring.
-            width = max(high - low, 1e-3 * workspaces.reach[1])
+            width = max(high - low, 1e-3 * workspaces.distance_range[1])
             axes.add_patch(Wedge((0.0, 0.0), high, 0.0, 360.0, width=width, **_RING_STYLES[kind]))
-    far = 1.05 * workspaces.reach[1]
+    far = 1.05 * workspaces.distance_range[1]
     axes.plot(0.0, 0.0, marker="+", color=TEXT_COLOUR, ms=8, mew=1.3, linestyle="none")
     axes.set(xlim=(-far, far), ylim=(-far, far), aspect="equal")
 

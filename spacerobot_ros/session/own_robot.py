@@ -189,7 +189,7 @@ def first_problem(name: str, robot: SpaceRobot, file: Path) -> PlanningProblem:
     """
     turning = BaseRotations.of(robot)
     if not len(turning.axes):
-        how = "only to and fro along one curve of attitudes" if turning.moves else "not at all"
+        how = "only to and fro along one curve of attitudes" if turning.turns_base else "not at all"
         raise PlanningError(
             f"The joints of '{robot.description.name}' turn its base {how}: there is no attitude "
             "to fly to, and so no scenario is written. `spacerobot analyze` says more."

@@ -2,7 +2,7 @@
 
 :func:`build_plant` makes the plant of a configuration: :class:`.VelocityPlant` or
 :class:`.EffortPlant`, within a :class:`.CapturePlant` if there is a target, within a
-:class:`ThrusterPlant` if thrusters are modelled, within a :class:`FaultyPlant`.
+:class:`ThrusterPlant` if thrusters are modelled, within a :class:`PlantWithFaults`.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def thrusters_in(plant: Plant) -> ThrusterPlant | None:
     return plant if isinstance(plant, ThrusterPlant) else None
 
 
-class FaultyPlant(WrappedPlant):
+class PlantWithFaults(WrappedPlant):
     """A :class:`Plant` whose actuators have the faults of a timeline, and which disturbances push.
 
     Its state arrays are those of the wrapped plant. A reset sets back neither the time nor the
@@ -447,7 +447,7 @@ PLANTS: dict[str, PlantKind] = {
 
 def build_plant(
     robot: SpaceRobot, config: PlantConfig, initial: InitialState | None = None
-) -> FaultyPlant:
+) -> PlantWithFaults:
     """Build the plant of a configuration, with its thrusters and faults.
 
     Parameters
@@ -498,7 +498,7 @@ def build_plant(
     else:
         plant = _own_engine_plant(robot, config, start, step or kind.integration_step, description)
     plant = with_thrusters(plant, control_period, config.thrusters, config.thrusters_excluded)
-    return FaultyPlant(
+    return PlantWithFaults(
         plant,
         config.faults,
         control_period,

@@ -22,7 +22,7 @@ from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.grasp import (
     BodyMotion,
-    Impact,
+    GraspImpact,
     Payload,
     RelativeMotion,
     RobotMotion,
@@ -214,7 +214,7 @@ class CaptureReport:
         The joints, and the largest joint impulse that they stand, N m s or N s; 0: any.
     """
 
-    impact: Impact
+    impact: GraspImpact
     R_WB: Array
     momenta: Array
     residual: float

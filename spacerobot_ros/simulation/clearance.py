@@ -163,7 +163,7 @@ class ClearanceMonitor:
         before = self._touching
         if distance > 0 and not before:
             return status, []
-        self._touching = self._nearest.touching(link_R, link_r, pose)
+        self._touching = self._nearest.links_in_contact(link_R, link_r, pose)
         return status, [
             *(self._begun(each, time_s) for each in sorted(self._touching - before)),
             *(_ended(each, time_s) for each in sorted(before - self._touching)),

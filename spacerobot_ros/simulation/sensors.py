@@ -16,7 +16,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_rotvec,
     quaternion_multiply,
 )
-from spacerobot_ros.simulation.actuators import FaultyPlant, thrusters_in
+from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
 from spacerobot_ros.simulation.capture import CapturePlant
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig, TargetSensorConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS, POSE_AXES, Fault
@@ -57,7 +57,7 @@ class Sensors:
         The bias of the joints has the wrong length.
     """
 
-    def __init__(self, plant: FaultyPlant, config: SensorConfig, control_period: float) -> None:
+    def __init__(self, plant: PlantWithFaults, config: SensorConfig, control_period: float) -> None:
         n = plant.robot.n
         if len(config.joint_bias) not in (0, n):
             raise ParameterError(
@@ -239,7 +239,7 @@ class ReportedState:
         The robot has no link of the name ``end_effector_frame``, or the sensors are refused.
     """
 
-    def __init__(self, plant: FaultyPlant, config: PlantConfig) -> None:
+    def __init__(self, plant: PlantWithFaults, config: PlantConfig) -> None:
         self._plant = plant
         self.sensors = Sensors(plant, config.sensors, config.control_period)
         robot, count = plant.robot, len(plant.robot.link_names)
@@ -272,7 +272,7 @@ class ReportedState:
 
     def names(self, topic: Topic) -> tuple[str, ...]:
         """Return the names of the entries of a topic's arrays: joints or thrusters."""
-        if topic.entries_of == "thrusters" and self._thrusters is not None:
+        if topic.array_entries_of == "thrusters" and self._thrusters is not None:
             return tuple(self._thrusters.table.names)
         return tuple(self._plant.robot.joint_names)
 

@@ -16,7 +16,7 @@ from spacerobot_ros.events import (
     choice_format,
     list_format,
 )
-from spacerobot_ros.simulation.actuators import FaultyPlant
+from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.capture import CaptureReport, ReleaseReport
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
@@ -135,7 +135,9 @@ class PlantMonitor:
         Whether the plant waits for commands, and so never rests without one.
     """
 
-    def __init__(self, commands: CommandValidator, plant: FaultyPlant, *, lockstep: bool) -> None:
+    def __init__(
+        self, commands: CommandValidator, plant: PlantWithFaults, *, lockstep: bool
+    ) -> None:
         self._commands, self._plant, self._lockstep = commands, plant, lockstep
         self.rearms = self.resets = 0
         """Number of rearms and resets, counted by the owner."""

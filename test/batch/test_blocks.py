@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.batch import (
     BatchResult,
-    Controlled,
+    ControlledGoals,
     Flights,
     FollowedSchedule,
     HeldCommands,
@@ -70,7 +70,14 @@ def flights_of(robot: SpaceRobot, actuation: str, program: Any, **changes: Any) 
     bodies = len(robot.description.bodies)
     inertial = robot.inertial.scaled(rng.uniform(0.8, 1.2, (COUNT, bodies)))
     return Flights(
-        robot, actuation, 0.04, 7, starts, program, inertial, **{"instants": (0, 3, 7), **changes}
+        robot,
+        actuation,
+        0.04,
+        7,
+        starts,
+        program,
+        inertial,
+        **{"report_ticks": (0, 3, 7), **changes},
     )
 
 
@@ -124,12 +131,12 @@ def block_of(
     state = {"state": 2 * N + 13 if effort else N + 4}
     state["next_state"] = state["state"]
     tick = SimpleNamespace(
-        unit=SimpleNamespace(lanes=2, name="pairs"),
-        rows=RowLayout({**SIZES, **state, "p": p.shape[1], **sizes}),
+        vector_unit=SimpleNamespace(lanes=2, name="pairs"),
+        memory_layout=RowLayout({**SIZES, **state, "p": p.shape[1], **sizes}),
         controller=controller,
         library=library or Library(),
         report_width=2 * N + 20,
-        link="",
+        reported_link="",
     )
     return lanes.LaneBlock(flights, cast(Any, tick), model, p, np.array(rows))
 
@@ -147,24 +154,24 @@ def test_lanes_start_in_the_states_of_the_plants(sliders: SpaceRobot, actuation:
     block = block_of(flights)
     at = [0, 2, 3, 4, 6, 6]
     assert block._rows_of_lanes.tolist() == at
-    assert block._memory.shape == (3, block._rows.count, 2)
+    assert block._memory.shape == (3, block._rows.total_rows, 2)
     for index, row in enumerate(at):
         plant: Any = plant_of(flights, row)
-        size = np.linalg.norm(flights.starts.quaternion[row])
-        quaternion = flights.starts.quaternion[row] / size
-        center = flights.starts.position[row]
-        if not flights.starts.is_center_of_mass[row]:
+        size = np.linalg.norm(flights.initial_states.quaternion[row])
+        quaternion = flights.initial_states.quaternion[row] / size
+        center = flights.initial_states.position[row]
+        if not flights.initial_states.position_is_of_center_of_mass[row]:
             R_WB = Rotation.from_quat(quaternion).as_matrix()
             center = center + R_WB @ flights.robot_of(row).center_of_mass(plant.q)
-        shape = flights.starts.q[row], quaternion
+        shape = flights.initial_states.q[row], quaternion
         if actuation == "effort":
-            parts = flights.starts.qdot[row], flights.starts.momenta[row], center
+            parts = flights.initial_states.qdot[row], flights.initial_states.momenta[row], center
             expected = np.concatenate([*shape, *parts])
         else:
             expected = np.concatenate(shape)
             np.testing.assert_allclose(block._read_rows("r_cm")[index], center, atol=1e-12)
             np.testing.assert_array_equal(
-                block._read_rows("momenta")[index], flights.starts.momenta[row]
+                block._read_rows("momenta")[index], flights.initial_states.momenta[row]
             )
         np.testing.assert_allclose(block._read_rows("state")[index], expected, atol=1e-12)
         assert flights.sensors is not None
@@ -172,7 +179,7 @@ def test_lanes_start_in_the_states_of_the_plants(sliders: SpaceRobot, actuation:
             block._read_rows("joint_bias")[index], flights.sensors.joint_bias[row]
         )
         assert block._read_rows("joint_noise")[index].tolist() == [flights.sensors.noise[row, 4]]
-        assert block._read_rows("p")[index] @ np.ones(block._rows.size("p")) == pytest.approx(
+        assert block._read_rows("p")[index] @ np.ones(block._rows.row_count("p")) == pytest.approx(
             block._memory[index // 2, block._rows["p"], index % 2].sum()
         )
     assert (block._read_rows("alive") == 1.0).all()
@@ -288,8 +295,8 @@ def test_results_come_from_the_rows_of_their_names(sliders: SpaceRobot) -> None:
             wanted = block._memory[group, block._rows[name], lane]
             np.testing.assert_array_equal(getattr(result, name)[row], wanted)
         limits = block._memory[group, block._rows["limits"], lane]
-        np.testing.assert_array_equal(result.limited["rate"][row], limits[:N])
-        np.testing.assert_array_equal(result.limited["stroke"][row], limits[N:])
+        np.testing.assert_array_equal(result.limited_ticks["rate"][row], limits[:N])
+        np.testing.assert_array_equal(result.limited_ticks["stroke"][row], limits[N:])
     np.testing.assert_array_equal(result.measured_q, result.q)
     np.testing.assert_array_equal(result.measured_pose, result.pose)
     assert np.isnan(result.propellant).all()
@@ -298,15 +305,15 @@ def test_results_come_from_the_rows_of_their_names(sliders: SpaceRobot) -> None:
 
 def test_a_lane_at_a_stop_is_stepped_by_its_plant(sliders: SpaceRobot) -> None:
     flights = flights_of(sliders, "effort", held())
-    flights.starts.q[3, 1] = sliders.upper[1] - 1e-4
-    flights.starts.qdot[3, 1] = 0.1
+    flights.initial_states.q[3, 1] = sliders.upper[1] - 1e-4
+    flights.initial_states.qdot[3, 1] = 0.1
     result = BatchResult.empty(flights)
 
     def wait() -> None:
         memory, at = block._memory, block._rows
         block._pending[1], block._at[1] = Pending.COMMIT, 5
         memory[1, at["command"], 0] = 0.1 * np.arange(1, N + 7)
-        memory[1, at.first("limited", 1 + N)] = [1.0, 0.0]
+        memory[1, at.first_row("limited", 1 + N)] = [1.0, 0.0]
 
     block = block_of(flights, library=Library([wait]))
     block.fly(result, {})
@@ -323,7 +330,7 @@ def test_a_lane_at_a_stop_is_stepped_by_its_plant(sliders: SpaceRobot) -> None:
     assert not memory["limited"].any()
     assert result.fallback_ticks.tolist() == [0, 0, 0, 1, 0, 0, 0]
     assert plant.stroke_limited.tolist() == [0, 1, 0]
-    np.testing.assert_array_equal(result.limited["stroke"][3], plant.stroke_limited)
+    np.testing.assert_array_equal(result.limited_ticks["stroke"][3], plant.stroke_limited)
     assert list(block._stopped) == [2]
 
 
@@ -361,7 +368,7 @@ def test_controlled_lanes_begin_decide_and_end_each_for_itself(
 ) -> None:
     config = ControllerConfig(tick_rate=25.0)
     flights = flights_of(
-        sliders, "effort", Controlled(config, until_decided=True), sensors=sensors_of()
+        sliders, "effort", ControlledGoals(config, ends_when_decided=True), sensors=sensors_of()
     )
     result, state = BatchResult.empty(flights), 2 * N + 13
     failures: dict[int, str] = {}
@@ -415,17 +422,17 @@ def test_controlled_lanes_begin_decide_and_end_each_for_itself(
     assert block._read_rows("profile").tolist() == [[0, 8], [2, 8], [3, 8], [0, 0], [6, 8], [6, 8]]
     assert block._read_rows("bounds")[:4, 0].tolist() == [0.1, 2.1, 3.1, 0.0]
     assert result.decision.tolist() == [1, 0, 0, 1, 0, 0, 1]
-    assert result.decided_tick.tolist() == [5, -1, -1, 5, -1, -1, 5]
+    assert result.decision_tick.tolist() == [5, -1, -1, 5, -1, -1, 5]
     assert result.end_tick[[0, 2, 3]].tolist() == [6, 7, 6]
     assert result.momentum_drift[2].tolist() == [0.6, 0.8]
     assert result.end_state[3, 4] == 1.5
     # The sixth lane repeats the fifth, whose goal is decided; others have no distance.
-    assert result.decided_distance[[0, 3, 6]].tolist() == [
+    assert result.decision_distance[[0, 3, 6]].tolist() == [
         [0, 0.25, 18],
         [1, 0.25, 19],
         [2, 0.25, 20],
     ]
-    assert np.isnan(result.decided_distance[2]).all()
+    assert np.isnan(result.decision_distance[2]).all()
     assert [each for each in controller.asked if len(each) == 2] == [
         ("goal 0", 18.0),
         ("goal 3", 19.0),
@@ -468,7 +475,7 @@ def noise_of(
     program: Any, sensors: SensorErrors | None, rows: Sequence[int], instants: tuple[int, ...]
 ) -> lanes.SensorNoise:
     flights = SimpleNamespace(
-        sensors=sensors, program=program, instants=instants, robot=SimpleNamespace(n=N)
+        sensors=sensors, program=program, report_ticks=instants, robot=SimpleNamespace(n=N)
     )
     return lanes.SensorNoise(cast(Any, flights), np.array(rows))
 
@@ -476,11 +483,13 @@ def noise_of(
 @pytest.mark.parametrize("all_of_it", [False, True])
 def test_noise_of_chunks_is_that_of_each_seed_in_one_go(all_of_it: bool) -> None:
     """A lane draws all numbers of a tick, whichever of them its commands need."""
-    program = Controlled(ControllerConfig()) if all_of_it else FollowedSchedule(np.zeros((2, N)))
+    program = (
+        ControlledGoals(ControllerConfig()) if all_of_it else FollowedSchedule(np.zeros((2, N)))
+    )
     sensors, rows = sensors_of(), [5, 1, 2, 6]
     sensors.noise[2] = 0.0  # The third lane's sensors are biased alone.
     noise = noise_of(program, sensors, rows, (0, 2, 4, 6))
-    assert noise.affects_commands
+    assert noise.is_fed_back
     alive = np.ones((2, 2))
     first = noise.draw_noise(0, 4, alive)
     alive[1, 1] = 0.0  # The fourth fails.
@@ -517,12 +526,12 @@ def test_noise_of_chunks_is_that_of_each_seed_in_one_go(all_of_it: bool) -> None
 def test_noise_that_no_command_needs_is_not_kept() -> None:
     program, sensors = held(), sensors_of()
     none = noise_of(program, None, [0, 1], (0,))
-    assert (none.affects_commands, none.draw_noise(0, 3, np.ones((1, 2)))) == (False, None)
+    assert (none.is_fed_back, none.draw_noise(0, 3, np.ones((1, 2)))) == (False, None)
     pose, q = np.ones((2, 1, 7)), np.ones((2, 1, N))
     assert none.measure(pose, q) == (pose, q)
     sensors.noise[:, 4], sensors.joint_bias[:] = 0.0, 0.0
     quiet = noise_of(program, sensors, [0, 3], (0,))
-    assert (quiet.affects_commands, quiet.draw_noise(0, 3, np.ones((1, 2)))) == (False, None)
+    assert (quiet.is_fed_back, quiet.draw_noise(0, 3, np.ones((1, 2)))) == (False, None)
     # It is drawn all the same, for what is reported.
     assert quiet.measure(pose, q)[0][1, 0, 0] == pytest.approx(
         1
@@ -530,10 +539,10 @@ def test_noise_that_no_command_needs_is_not_kept() -> None:
         + sensors.noise[3, 0] * np.random.default_rng(33).standard_normal()
     )
     sensors.joint_bias[3, 1] = 1e-9
-    assert noise_of(program, sensors, [0, 3], (0,)).affects_commands
-    assert not noise_of(program, sensors, [0, 4], (0,)).affects_commands
+    assert noise_of(program, sensors, [0, 3], (0,)).is_fed_back
+    assert not noise_of(program, sensors, [0, 4], (0,)).is_fed_back
     sensors.joint_bias[:], sensors.noise[0, 4] = 0.0, 1e-9
-    assert noise_of(program, sensors, [0, 4], (0,)).affects_commands
+    assert noise_of(program, sensors, [0, 4], (0,)).is_fed_back
 
 
 def test_starts_that_the_plant_would_refuse_are_left_to_it() -> None:
@@ -563,7 +572,7 @@ def test_starts_that_the_plant_would_refuse_are_left_to_it() -> None:
     for row, (name, value, _) in enumerate(cases):
         starts[name][row] = value
     robot = SimpleNamespace(lower=lower, upper=upper)
-    flights: Any = SimpleNamespace(starts=SimpleNamespace(**starts), robot=robot)
+    flights: Any = SimpleNamespace(initial_states=SimpleNamespace(**starts), robot=robot)
     assert lanes.starts_accepted_by_plant(flights).tolist() == [fit for _, _, fit in cases]
 
 
@@ -571,11 +580,11 @@ def test_starts_that_the_plant_would_refuse_are_left_to_it() -> None:
     ("program", "noisy", "rows", "flights"),
     [
         # 8 bytes (2 * 100 rows + 60 * 3 instants) are 3040; 2**25 // (4 * 3040) = 2759 groups.
-        (Controlled(ControllerConfig()), False, 100, 64 * 4),
+        (ControlledGoals(ControllerConfig()), False, 100, 64 * 4),
         # 8 (2 * 40000 + 180) = 641440: 13 groups.
-        (Controlled(ControllerConfig()), False, 40_000, 13 * 4),
+        (ControlledGoals(ControllerConfig()), False, 40_000, 13 * 4),
         # With noise of 2000 ticks, 2 * 8 * 2000 * 18 = 576000 more: 6.89 groups of four.
-        (Controlled(ControllerConfig()), True, 40_000, 6 * 4),
+        (ControlledGoals(ControllerConfig()), True, 40_000, 6 * 4),
         (FollowedSchedule(np.zeros((9, 3))), True, 40_000, 6 * 4),
         # Tables of each flight, twice 8 * 3 * 5000 = 240000 more.
         (FollowedSchedule(np.zeros((2, 5000, 3))), False, 40_000, 9 * 4),
@@ -584,18 +593,20 @@ def test_starts_that_the_plant_would_refuse_are_left_to_it() -> None:
         (HeldCommands(np.zeros((9, 3)), np.zeros((2, 2500, 6))), False, 40_000, 9 * 4),
         (HeldCommands(np.zeros((2, 2500, 3)), np.zeros((2, 2500, 6))), False, 40_000, 8 * 4),
         # At least one group, however large.
-        (Controlled(ControllerConfig()), False, 5_000_000, 4),
+        (ControlledGoals(ControllerConfig()), False, 5_000_000, 4),
     ],
 )
 def test_blocks_fill_their_memory(program: Any, noisy: bool, rows: int, flights: int) -> None:
     made: Any = SimpleNamespace(
         robot=SimpleNamespace(n=3),
         ticks=12_345,
-        instants=(0, 5, 9),
+        report_ticks=(0, 5, 9),
         sensors=object() if noisy else None,
         program=program,
     )
-    tick: Any = SimpleNamespace(rows=SimpleNamespace(count=rows), unit=SimpleNamespace(lanes=4))
+    tick: Any = SimpleNamespace(
+        memory_layout=SimpleNamespace(total_rows=rows), vector_unit=SimpleNamespace(lanes=4)
+    )
     assert lanes._block_size(made, tick) == flights
 
 
@@ -604,11 +615,13 @@ def test_short_flights_need_little_noise() -> None:
     made: Any = SimpleNamespace(
         robot=SimpleNamespace(n=3),
         ticks=100,
-        instants=(0,),
+        report_ticks=(0,),
         sensors=object(),
-        program=Controlled(ControllerConfig()),
+        program=ControlledGoals(ControllerConfig()),
     )
-    tick: Any = SimpleNamespace(rows=SimpleNamespace(count=20_000), unit=SimpleNamespace(lanes=8))
+    tick: Any = SimpleNamespace(
+        memory_layout=SimpleNamespace(total_rows=20_000), vector_unit=SimpleNamespace(lanes=8)
+    )
     assert lanes._block_size(made, tick) == 12 * 8
 
 

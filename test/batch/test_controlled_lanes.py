@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.batch import (
     BatchResult,
-    Controlled,
+    ControlledGoals,
     Decision,
     Flights,
     InitialStates,
@@ -41,8 +41,15 @@ needs_compiler = pytest.mark.skipif(cxx_compiler() is None, reason="there is no 
 
 NUMBERS = (
     *("pose", "twist", "q", "qdot", "momentum", "measured_pose", "measured_q"),
-    *("peak_rate", "peak_effort", "peak_wrench", "impulse", "lowest", "highest"),
-    *("decision", "decided_tick", "decided_distance", "end_tick", "end_state"),
+    *(
+        "peak_rate",
+        "peak_effort",
+        "peak_wrench",
+        "impulse",
+        "lowest",
+        "highest",
+    ),
+    *("decision", "decision_tick", "decision_distance", "end_tick", "end_state"),
     "momentum_drift",
 )
 
@@ -78,10 +85,10 @@ def controlled(
     )
     return Flights(
         *(robot, "effort", 0.01, ticks, starts),
-        Controlled(config, base=BASE, end_effector=end_effector, gains=gains),
+        ControlledGoals(config, base=BASE, end_effector=end_effector, gains=gains),
         robot.inertial.scaled(rng.uniform(0.95, 1.05, (count, len(robot.inertial.masses)))),
         sensors,
-        instants=(0, ticks // 2, ticks),
+        report_ticks=(0, ticks // 2, ticks),
     )
 
 
@@ -111,7 +118,7 @@ def test_control_in_lanes_is_that_of_the_controller() -> None:
     assert not here.fallback_ticks.any()
     # Goals are reached at times of their own, and the force was at its limit.
     assert set(there.decision.tolist()) == {Decision.REACHED}
-    assert len(set(there.decided_tick.tolist())) > 1
+    assert len(set(there.decision_tick.tolist())) > 1
     np.testing.assert_allclose(there.peak_wrench[:, 0].max(), 10.0)
 
 
@@ -152,7 +159,7 @@ def test_the_servicer_is_controlled_in_lanes() -> None:
     gains = Gains.uniform(4.0, 4.0)
     flights = controlled("servicer", shape, ticks=60, law="computed_torque", gains=gains)
     program = flights.program
-    assert isinstance(program, Controlled)
+    assert isinstance(program, ControlledGoals)
     shaped = dataclasses.replace(program, base=None, joints=shape + 0.1)
     flights = dataclasses.replace(flights, program=shaped)
     here, there = fly_lanes(flights), fly_one_by_one(flights)
@@ -207,10 +214,10 @@ def test_the_noise_of_a_flight_is_that_of_its_seed() -> None:
         gains=Gains.uniform(30.0, 60.0),
     )
     assert flights.sensors is not None
-    flights.starts.position[:], flights.sensors.pose_bias[:] = 0.0, 0.0
+    flights.initial_states.position[:], flights.sensors.pose_bias[:] = 0.0, 0.0
     flights.sensors.noise[:], flights.sensors.seeds[:] = 1e-3, [7, 8, 7, 9]
     program = flights.program
-    assert isinstance(program, Controlled)
+    assert isinstance(program, ControlledGoals)
     alike = dataclasses.replace(
         flights, program=dataclasses.replace(program, gains=()), inertial=None
     )
@@ -322,7 +329,7 @@ def test_a_flight_ends_a_tick_after_the_decision_or_holds_its_goal(
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
     flights = controlled("planar_manipulator", SHAPE, ticks=5, count=3)
     config = cast(Any, flights.program).config
-    program = Controlled(config, base=BASE, until_decided=until_decided)
+    program = ControlledGoals(config, base=BASE, ends_when_decided=until_decided)
     flights = dataclasses.replace(flights, program=program, sensors=None)
     seen: list[tuple[Any, ...]] = []
 
@@ -348,8 +355,8 @@ def test_a_flight_ends_a_tick_after_the_decision_or_holds_its_goal(
     scalar._fly_row(flights, 1, result, cast(Any, Stub()))
     ticks = 3 if until_decided else 5
     assert [each[:2] for each in seen] == [("begin", 1), *(("command", k) for k in range(ticks))]
-    assert seen[0][2] == pytest.approx(flights.starts.position[1, 0])
-    assert (result.decision[1], result.decided_tick[1]) == (Decision.FAILED, 2)
+    assert seen[0][2] == pytest.approx(flights.initial_states.position[1, 0])
+    assert (result.decision[1], result.decision_tick[1]) == (Decision.FAILED, 2)
     assert result.end_tick.tolist() == [5, ticks, 5]
     np.testing.assert_allclose(result.peak_wrench[1], [5.0, 0.5 * ticks])
     # Of every tick of 10 ms the force of 5 N, and torques of 0.5, 1, 1.5 N m and so on.
@@ -365,7 +372,7 @@ def test_a_flight_ends_a_tick_after_the_decision_or_holds_its_goal(
     np.testing.assert_array_equal(result.highest[1], np.max(shapes, axis=0))
     np.testing.assert_array_equal(result.peak_rate[1], np.max(rates, axis=0))
     np.testing.assert_array_equal(result.end_state[1, :2], shapes[-1])
-    assert result.decided_distance[1].tolist() == [shapes[2][0], 0.25, 0.125]
+    assert result.decision_distance[1].tolist() == [shapes[2][0], 0.25, 0.125]
     # The wrench is all that changes the momenta.
     assert result.momentum_drift[1].max() < 1e-12
     assert np.abs(result.end_state[1, -7:-4]).max() > 0.01

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.batch import (
     BatchResult,
-    Controlled,
+    ControlledGoals,
     Flights,
     FollowedSchedule,
     HeldCommands,
@@ -35,8 +35,15 @@ def sliders() -> SpaceRobot:
 def flights(sliders: SpaceRobot, program: Any, **changes: Any) -> Flights:
     """Return two flights of 10 ticks under velocity commands, but for what is given."""
     starts = InitialStates.repeated(sliders, InitialState(), 2)
-    chosen: dict[str, Any] = {"actuation": "velocity", "ticks": 10, "starts": starts, **changes}
-    actuation, ticks, starts = (chosen.pop(name) for name in ("actuation", "ticks", "starts"))
+    chosen: dict[str, Any] = {
+        "actuation": "velocity",
+        "ticks": 10,
+        "initial_states": starts,
+        **changes,
+    }
+    actuation, ticks, starts = (
+        chosen.pop(name) for name in ("actuation", "ticks", "initial_states")
+    )
     return Flights(sliders, actuation, 0.05, ticks, starts, program, **chosen)
 
 
@@ -45,11 +52,11 @@ NOT_A_NUMBER = np.zeros((2, 5, 3))
 NOT_A_NUMBER[1, 2, 0] = np.nan
 
 
-def controlled(period: float = 0.05, gains: tuple[object, ...] = ()) -> Controlled:
-    made: Any = object.__new__(Controlled)
+def controlled(period: float = 0.05, gains: tuple[object, ...] = ()) -> ControlledGoals:
+    made: Any = object.__new__(ControlledGoals)
     object.__setattr__(made, "config", SimpleNamespace(control_period=period))
     object.__setattr__(made, "gains", gains)
-    result: Controlled = made
+    result: ControlledGoals = made
     return result
 
 
@@ -58,11 +65,11 @@ def controlled(period: float = 0.05, gains: tuple[object, ...] = ()) -> Controll
     [
         (STILL, {"actuation": "speed"}, "The actuation is 'speed', not velocity or effort."),
         (STILL, {"ticks": 0}, "A flight of 0 ticks is too short; it needs one."),
-        (STILL, {"instants": (0, 5, 11)},
+        (STILL, {"report_ticks": (0, 5, 11)},
          "The instants (0, 5, 11) are not ascending ticks of a flight of 10."),
-        (STILL, {"instants": (0, 5, 5)},
+        (STILL, {"report_ticks": (0, 5, 5)},
          "The instants (0, 5, 5) are not ascending ticks of a flight of 10."),
-        (STILL, {"instants": (-1, 5)},
+        (STILL, {"report_ticks": (-1, 5)},
          "The instants (-1, 5) are not ascending ticks of a flight of 10."),
         (STILL, {"sensors": range(3)}, "There are sensors of 3 flights, not 2."),
         (STILL, {"thrusters": SimpleNamespace(names=("a",))},
@@ -109,15 +116,15 @@ def test_joints_that_move_at_the_start_need_efforts(sliders: SpaceRobot) -> None
     moving = InitialState(joint_velocities=np.array([0.0, 0.1, 0.0]))
     starts = InitialStates.of(sliders, [InitialState(), moving])
     with pytest.raises(ParameterError) as refusal:
-        flights(sliders, STILL, starts=starts)
+        flights(sliders, STILL, initial_states=starts)
     assert str(refusal.value) == "Joints under velocity commands must start at rest."
-    assert len(flights(sliders, STILL, starts=starts, actuation="effort")) == 2
+    assert len(flights(sliders, STILL, initial_states=starts, actuation="effort")) == 2
 
 
 def test_flights_have_their_last_tick_and_the_steps_of_their_plant(sliders: SpaceRobot) -> None:
     plain = flights(sliders, STILL)
-    assert (plain.instants, plain.thruster_count, len(plain)) == ((10,), 0, 2)
-    assert flights(sliders, STILL, instants=(0, 4, 10)).instants == (0, 4, 10)
+    assert (plain.report_ticks, plain.thruster_count, len(plain)) == ((10,), 0, 2)
+    assert flights(sliders, STILL, report_ticks=(0, 4, 10)).report_ticks == (0, 4, 10)
     assert flights(sliders, STILL, integration_step=0.02).substeps == 3
     assert flights(sliders, STILL, integration_step=0.05).substeps == 1
 
@@ -144,14 +151,18 @@ def test_starts_are_rows_of_initial_states(sliders: SpaceRobot) -> None:
     assert starts.q[0].tolist() == [0.1, 0.2, 0.3]
     assert starts.qdot.tolist() == [[0.01, 0.02, 0.03], [0, 0, 0]]
     assert starts.momenta.tolist() == [[4, 5, 6, 7, 8, 9], [0] * 6]
-    assert starts.is_center_of_mass.tolist() == [False, True]
+    assert starts.position_is_of_center_of_mass.tolist() == [False, True]
     for index, wanted in enumerate((first, second)):
         again = InitialStates.of(sliders, [starts.initial_state(index)])
         once = InitialStates.of(sliders, [wanted])
         for each in dataclasses.fields(InitialStates):
             assert getattr(again, each.name).tolist() == getattr(once, each.name).tolist()
     three = InitialStates.repeated(sliders, first, 3)
-    assert (len(three), three.momenta.shape, three.is_center_of_mass.shape) == (3, (3, 6), (3,))
+    assert (len(three), three.momenta.shape, three.position_is_of_center_of_mass.shape) == (
+        3,
+        (3, 6),
+        (3,),
+    )
     three.q[1] = 0.0
     assert three.q[2].tolist() == [0.1, 0.2, 0.3]
 
@@ -170,21 +181,21 @@ def test_sensors_are_rows_of_configurations(sliders: SpaceRobot) -> None:
     assert errors.joint_bias.tolist() == [[0.0] * 3, [7, 8, 9]]
     assert (errors.seeds.tolist(), len(errors)) == ([3, 17], 2)
     assert errors.config(1) == one
-    assert errors.used.tolist() == [False, True]
+    assert errors.is_active.tolist() == [False, True]
     none = SensorErrors.none(sliders, 4)
     assert (len(none), none.noise.shape, none.pose_bias.shape) == (4, (4, 6), (4, 6))
     assert none.joint_bias.shape == (4, 3)
     assert none.seeds.tolist() == [0] * 4
-    assert not none.used.any()
+    assert not none.is_active.any()
     none.noise[0, 5], none.pose_bias[1, 5], none.joint_bias[2, 0] = 1e-9, -1e-9, 1e-9
-    assert none.used.tolist() == [True, True, True, False]
+    assert none.is_active.tolist() == [True, True, True, False]
     # The order of the groups is that in which the plant's sensors name them.
     assert [name.rpartition("_")[2] for name in NOISES] == ["noise"] * 6
 
 
 def test_results_begin_empty(sliders: SpaceRobot) -> None:
-    made = flights(sliders, STILL, instants=(0, 4, 10))
-    made.starts.q[1] = 0.125
+    made = flights(sliders, STILL, report_ticks=(0, 4, 10))
+    made.initial_states.q[1] = 0.125
     result = BatchResult.empty(made)
     np.testing.assert_allclose(result.time, [0.0, 0.2, 0.5])
     shapes = {"pose": 7, "twist": 6, "q": 3, "qdot": 3, "momentum": 7, "measured_pose": 7}
@@ -194,27 +205,27 @@ def test_results_begin_empty(sliders: SpaceRobot) -> None:
     shapes = {"peak_rate": 3, "peak_effort": 3, "peak_wrench": 2, "impulse": 2}
     for name, width in shapes.items():
         assert getattr(result, name).tolist() == [[0.0] * width] * 2
-    for name, width in {"decided_distance": 3, "end_state": 26, "momentum_drift": 2}.items():
+    for name, width in {"decision_distance": 3, "end_state": 26, "momentum_drift": 2}.items():
         assert getattr(result, name).shape == (2, width)
         assert np.isnan(getattr(result, name)).all()
-    assert {name: each.tolist() for name, each in result.limited.items()} == {
+    assert {name: each.tolist() for name, each in result.limited_ticks.items()} == {
         "rate": [[0] * 3] * 2,
         "stroke": [[0] * 3] * 2,
     }
-    assert (result.decision.tolist(), result.decided_tick.tolist()) == ([0, 0], [-1, -1])
+    assert (result.decision.tolist(), result.decision_tick.tolist()) == ([0, 0], [-1, -1])
     assert (result.end_tick.tolist(), result.fallback_ticks.tolist()) == ([10, 10], [0, 0])
     assert np.isnan(result.propellant).all()
     for limits in (result.lowest, result.highest):
-        assert limits.tolist() == made.starts.q.tolist()
+        assert limits.tolist() == made.initial_states.q.tolist()
         limits[0] = 9.0
-        assert not (made.starts.q == 9.0).any()
+        assert not (made.initial_states.q == 9.0).any()
     efforts = flights(sliders, STILL, actuation="effort")
-    assert list(BatchResult.empty(efforts).limited) == ["effort", "stroke"]
+    assert list(BatchResult.empty(efforts).limited_ticks) == ["effort", "stroke"]
 
 
 def test_errors_are_distances_and_angles_to_a_pose(sliders: SpaceRobot) -> None:
     rng, rotations = np.random.default_rng(6), Rotation.random(6, random_state=2)
-    result = BatchResult.empty(flights(sliders, STILL, instants=(0, 4, 10)))
+    result = BatchResult.empty(flights(sliders, STILL, report_ticks=(0, 4, 10)))
     result.pose[:] = np.hstack([rng.normal(size=(6, 3)), rotations.as_quat()]).reshape(2, 3, 7)
     one = Rotation.from_quat([0.5, -0.1, 0.2, 0.4])
     distance, angle = result.errors(np.array([1.0, -2.0, 0.5]), one.as_quat())

@@ -45,8 +45,8 @@ def assert_equal_flights(here: BatchResult, there: BatchResult, rtol: float = 1e
         one, two = getattr(here, name), getattr(there, name)
         # An attitude has no size of its own: numbers below one are compared absolutely.
         np.testing.assert_allclose(one, two, rtol=rtol, atol=rtol, err_msg=name)
-    for name, counts in there.limited.items():
-        np.testing.assert_array_equal(here.limited[name], counts)
+    for name, counts in there.limited_ticks.items():
+        np.testing.assert_array_equal(here.limited_ticks[name], counts)
     assert here.failures == there.failures
 
 
@@ -91,7 +91,7 @@ def velocity_flights(robot: SpaceRobot, count: int, *, each: bool, deadband: flo
         *(robot, "velocity", 0.05, 70, starts, program),
         inertial,
         sensors,
-        instants=(0, 7, 61, 70),
+        report_ticks=(0, 7, 61, 70),
     )
 
 
@@ -111,7 +111,7 @@ def effort_flights(robot: SpaceRobot, count: int) -> Flights:
         *(robot, "effort", 0.01, 45, starts, program),
         inertial,
         sensors,
-        instants=(0, 3, 44, 45),
+        report_ticks=(0, 3, 44, 45),
     )
 
 
@@ -126,8 +126,8 @@ def test_velocity_flights_in_lanes_are_those_of_the_plant(
     here, there = fly_lanes(flights), fly_one_by_one(flights)
     assert "lanes" in here.engine
     assert_equal_flights(here, there)
-    assert there.limited["rate"].any(axis=1).sum() > 10
-    assert there.limited["stroke"].any(axis=1).sum() > 10
+    assert there.limited_ticks["rate"].any(axis=1).sum() > 10
+    assert there.limited_ticks["stroke"].any(axis=1).sum() > 10
     assert not here.fallback_ticks.any()
 
 
@@ -137,10 +137,10 @@ def test_effort_flights_in_lanes_are_those_of_the_plant(robots: dict[str, SpaceR
     flights = effort_flights(robots["sliding_masses"], 19)
     here, there = fly_lanes(flights), fly_one_by_one(flights)
     assert_equal_flights(here, there)
-    assert there.limited["effort"].any(axis=1).sum() > 10
-    assert 0 < there.limited["stroke"].any(axis=1).sum() < 19
+    assert there.limited_ticks["effort"].any(axis=1).sum() > 10
+    assert 0 < there.limited_ticks["stroke"].any(axis=1).sum() < 19
     # Ticks at a stop, and no others, are the scalar plant's.
-    assert (here.fallback_ticks > 0).sum() == there.limited["stroke"].any(axis=1).sum()
+    assert (here.fallback_ticks > 0).sum() == there.limited_ticks["stroke"].any(axis=1).sum()
     assert here.fallback_ticks.sum() < 0.5 * 45 * 19
 
 
@@ -149,11 +149,11 @@ def test_a_flight_that_fails_says_why_and_leaves_its_neighbours_alone(
     robots: dict[str, SpaceRobot],
 ) -> None:
     flights = effort_flights(robots["sliding_masses"], 9)
-    momenta, q = flights.starts.momenta.copy(), flights.starts.q.copy()
+    momenta, q = flights.initial_states.momenta.copy(), flights.initial_states.q.copy()
     momenta[4] = 1e80
     q[7, 0] = 50.0
-    starts = dataclasses.replace(flights.starts, momenta=momenta, q=q)
-    broken = dataclasses.replace(flights, starts=starts)
+    starts = dataclasses.replace(flights.initial_states, momenta=momenta, q=q)
+    broken = dataclasses.replace(flights, initial_states=starts)
     here, there = fly_lanes(broken), fly_one_by_one(broken)
     assert here.failures == there.failures
     assert sorted(here.failures) == [4, 7]
@@ -192,12 +192,12 @@ def test_the_widest_registers_that_there_are_are_chosen(monkeypatch: pytest.Monk
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("unit", [*native.UNITS, "plain"])
+@pytest.mark.parametrize("unit", [*native.VECTOR_UNITS, "plain"])
 def test_narrower_registers_give_the_same_flights(
     robots: dict[str, SpaceRobot], monkeypatch: pytest.MonkeyPatch, unit: str
 ) -> None:
     widest = native.vector_unit()
-    chosen = native._PORTABLE_UNIT if unit == "plain" else native.UNITS[unit]
+    chosen = native._PORTABLE_UNIT if unit == "plain" else native.VECTOR_UNITS[unit]
     if chosen.lanes > widest.lanes:
         pytest.skip(f"this processor has no {chosen.name}")
     monkeypatch.setattr(native, "vector_unit", lambda: chosen)
@@ -223,6 +223,6 @@ def test_a_thousand_draws_are_the_plants_to_twelve_digits(
     ):
         here, there = fly_lanes(flights), fly_one_by_one(flights)
         assert_equal_flights(here, there)
-        for counts in there.limited.values():
+        for counts in there.limited_ticks.values():
             assert counts.any(axis=1).sum() >= 10
         assert len(set(itertools.chain(map(tuple, here.pose[:, -1])))) == 1000

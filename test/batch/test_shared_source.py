@@ -26,10 +26,14 @@ def small_function() -> ca.Function:
 
 
 def test_rows_follow_one_another() -> None:
-    assert ROWS.count == 11
+    assert ROWS.total_rows == 11
     assert [ROWS[name] for name in ROWS.slices] == [slice(0, 1), slice(1, 8), slice(8, 11)]
-    assert (ROWS.first("measured"), ROWS.first("state", 4), ROWS.size("state")) == (8, 5, 7)
-    assert ROWS.span("state", "measured") == (1, 8, 7)
+    assert (ROWS.first_row("measured"), ROWS.first_row("state", 4), ROWS.row_count("state")) == (
+        8,
+        5,
+        7,
+    )
+    assert ROWS.copy_range("state", "measured") == (1, 8, 7)
 
 
 def test_a_compiler_reads_the_declarations_as_python_means_them(tmp_path: Path) -> None:
@@ -146,9 +150,11 @@ def test_registers_of_64_bits_by_the_options_of_compilers(
 ) -> None:
     """A register of 512 bits has eight numbers; the options are those that GCC knows."""
     bits = {"avx512f": 512, "avx2": 256, "sse2": 128}
-    assert {flag: 64 * unit.lanes for flag, unit in native.UNITS.items()} == bits
-    assert [unit.flags[0] for unit in native.UNITS.values()] == [f"-m{flag}" for flag in bits]
-    assert [unit.libmvec for unit in native.UNITS.values()] == ["e", "d", "b"]
+    assert {flag: 64 * unit.lanes for flag, unit in native.VECTOR_UNITS.items()} == bits
+    assert [unit.flags[0] for unit in native.VECTOR_UNITS.values()] == [
+        f"-m{flag}" for flag in bits
+    ]
+    assert [unit.libmvec for unit in native.VECTOR_UNITS.values()] == ["e", "d", "b"]
     assert (native._PORTABLE_UNIT.lanes, native._PORTABLE_UNIT.libmvec) == (2, "")
 
     def refuse(*_: Any, **__: Any) -> str:

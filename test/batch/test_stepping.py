@@ -133,7 +133,7 @@ def fly_with_resets(
         assert flights.ticks.tolist() == age.tolist()
         on = (flights.q <= robot.lower) | (flights.q >= robot.upper)
         at_stops += int(on.sum())
-    assert flights.alive.all()
+    assert flights.has_not_ended.all()
     assert flights.failures == {}
     np.testing.assert_allclose(flights.time, age * period)
     return flights, at_stops
@@ -210,12 +210,12 @@ def test_a_flight_that_is_ended_stays_where_it_is(three: SteppedFlights) -> None
     before = three.pose.copy()
     commands[1, 4] = np.nan  # Nobody looks at the command of a flight that has ended.
     three.step(commands, 2)
-    assert three.alive.tolist() == [True, False, True]
+    assert three.has_not_ended.tolist() == [True, False, True]
     assert three.ticks.tolist() == [3, 1, 3]
     assert three.pose[1].tolist() == before[1].tolist()
     assert (three.pose[[0, 2]] != before[[0, 2]]).any(axis=1).all()
     three.reset([1], drawn_starts(three.robot, 1, np.random.default_rng(6)))
-    assert three.alive.all()
+    assert three.has_not_ended.all()
     assert three.ticks.tolist() == [3, 0, 3]
 
 
@@ -226,7 +226,7 @@ def test_a_flight_that_fails_says_why_and_the_others_go_on(three: SteppedFlights
     commands = np.zeros((3, 9))
     for _ in range(3):
         three.step(commands)
-    assert three.alive.tolist() == [True, False, True]
+    assert three.has_not_ended.tolist() == [True, False, True]
     assert list(three.failures) == [1]
     assert "no longer finite" in three.failures[1]
     assert three.ticks.tolist() == [3, 0, 3]

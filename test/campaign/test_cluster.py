@@ -22,7 +22,12 @@ from support.campaigns import campaign, section
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.running import run_campaign
-from spacerobot_ros.campaign.workers import Cluster, TaskDistributor, open_workers, pack_campaign
+from spacerobot_ros.campaign.workers import (
+    Cluster,
+    TaskDistributor,
+    open_workers,
+    serialise_campaign,
+)
 from spacerobot_ros.version import __version__
 
 pytestmark = pytest.mark.slow
@@ -216,7 +221,7 @@ def test_workers_of_this_machine_listen_nowhere() -> None:
     made = campaign(**{**GIVEN, "flights": 2})
     with open_workers(Cluster(workers=2), 2) as workers:
         tasks = [
-            workers.submit(pack_campaign(made), __version__, [draw], "flights", True)
+            workers.submit(serialise_campaign(made), __version__, [draw], "flights", True)
             for draw in Draws(made)
         ]
         ended: list[Any] = []

@@ -19,7 +19,12 @@ from spacerobot_ros.campaign import one_by_one as engine_of_flights
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.draws import Draw, Draws
 from spacerobot_ros.campaign.engines import fly_all, select_engine
-from spacerobot_ros.campaign.lanes import LanesEngine, _ControlledLanes, _ReadyDraw, _ScheduledLanes
+from spacerobot_ros.campaign.lanes import (
+    LanesEngine,
+    _ControlledLanes,
+    _PreparedDraw,
+    _ScheduledLanes,
+)
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
 from spacerobot_ros.campaign.rows import Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
@@ -226,9 +231,9 @@ def test_an_engine_is_chosen_by_name_or_the_first_that_can(
 # -- batches --------------------------------------------------------------------------------------
 
 
-def ready(number: int, ticks: int = 0, plan_time: float = 0.5) -> _ReadyDraw:
+def ready(number: int, ticks: int = 0, plan_time: float = 0.5) -> _PreparedDraw:
     plan: Any = SimpleNamespace(schedule=SimpleNamespace(ticks=ticks)) if ticks else None
-    return _ReadyDraw(Draw(number, 1, {}), None, plan, plan_time)  # type: ignore[arg-type]
+    return _PreparedDraw(Draw(number, 1, {}), None, plan, plan_time)  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -243,13 +248,13 @@ def batched(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[list[Any], l
     ) -> tuple[list[Any], list[list[int]]]:
         engine, batches, now = LanesEngine(), list[list[int]](), [0.0]
 
-        def prepare(campaign: Campaign, draw: Draw, flight: Any) -> _ReadyDraw | Fallback:
+        def prepare(campaign: Campaign, draw: Draw, flight: Any) -> _PreparedDraw | Fallback:
             now[0] += pace
             if draw.number == 2:
                 raise ValueError("no\n way")
             return Fallback(draw, "left") if draw.number == 4 else ready(draw.number, ticks)
 
-        def flown(campaign: Campaign, of: Any, batch: list[_ReadyDraw]) -> Iterator[Any]:
+        def flown(campaign: Campaign, of: Any, batch: list[_PreparedDraw]) -> Iterator[Any]:
             batches.append([each.draw.number for each in batch])
             yield from (each.draw.number for each in batch)
 
@@ -303,7 +308,7 @@ def measures(**given: Any) -> Measures:
 
 def test_a_batch_is_rows_and_what_is_left_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Times of planning are added to each flight's share of the wall time of its batch."""
-    made = replace(PLANNED, longest=2.0)
+    made = replace(PLANNED, max_flight_time=2.0)
     answers = {
         0: measures(),
         1: "had a joint at its limit",
@@ -311,7 +316,7 @@ def test_a_batch_is_rows_and_what_is_left_to_others(monkeypatch: pytest.MonkeyPa
         4: measures(duration=2.25),
     }
 
-    def measured(result: Any, row: int, draw: _ReadyDraw, flights: Any) -> Any:
+    def measured(result: Any, row: int, draw: _PreparedDraw, flights: Any) -> Any:
         assert (result.failures, flights) == ({2: "no"}, "flights")
         return answers[row]
 
@@ -375,7 +380,7 @@ def scheduled(**given: Any) -> Any:
     momentum[1, :, 4] = 7.0, 5.0, 6.5
     limited = np.array(given.get("limited", [[1], [0]]))
     result = SimpleNamespace(
-        limited={"position": np.zeros((2, 3), int), "rate": limited},
+        limited_ticks={"position": np.zeros((2, 3), int), "rate": limited},
         measured_pose=measured,
         measured_q=np.broadcast_to(shape + given.get("off", 0.0), (2, 3, 3)),
         pose=poses,
@@ -391,9 +396,9 @@ def scheduled(**given: Any) -> Any:
     plan: Any = SimpleNamespace(schedule=schedule, status=SimpleNamespace(corrections=1))
     planner = {"max_corrections": 0, "position_tolerance": 0.02, **given.get("planner", {})}
     flight = DrawnFlight.of(START.with_poses(goal, None).with_overrides("planner", planner))
-    draw = _ReadyDraw(Draw(1, 1, {}), flight, plan, 0.375)
+    draw = _PreparedDraw(Draw(1, 1, {}), flight, plan, 0.375)
     robot = SimpleNamespace(description=SimpleNamespace(end_effector=lambda frame: ""))
-    flights: Any = SimpleNamespace(instants=(0, 1, 2), robot=robot)
+    flights: Any = SimpleNamespace(report_ticks=(0, 1, 2), robot=robot)
     return _ScheduledLanes().measures(result, 1, draw, flights)  # type: ignore[arg-type]
 
 
@@ -499,10 +504,10 @@ def decided(decision: Decision, tick: int, **given: Any) -> Any:
 
     result: Any = SimpleNamespace(
         decision=np.array([0, int(decision)]),
-        decided_tick=np.array([5, tick]),
+        decision_tick=np.array([5, tick]),
         end_state=end,
         end_tick=np.array([10, 30]),
-        decided_distance=second(0.125, 0.25, math.nan),
+        decision_distance=second(0.125, 0.25, math.nan),
         peak_rate=second(0.5, 1.0),
         peak_effort=second(2.0, 3.0),
         peak_wrench=second(4.0, 5.0),
@@ -513,8 +518,10 @@ def decided(decision: Decision, tick: int, **given: Any) -> Any:
     )
     robot = SimpleNamespace(n=n, description=SimpleNamespace(end_effector=lambda frame: ""))
     starts = SimpleNamespace(qdot=second(-0.75, 0.25))
-    flights: Any = SimpleNamespace(robot=robot, starts=starts, thrusters=given.get("thrusters"))
-    return _ControlledLanes().measures(result, 1, _ReadyDraw(Draw(1, 1, {}), flight), flights)
+    flights: Any = SimpleNamespace(
+        robot=robot, initial_states=starts, thrusters=given.get("thrusters")
+    )
+    return _ControlledLanes().measures(result, 1, _PreparedDraw(Draw(1, 1, {}), flight), flights)
 
 
 def test_the_measures_of_control_are_those_of_the_end_of_the_flight() -> None:
@@ -611,7 +618,7 @@ def test_a_plan_serves_all_draws_whose_values_are_those_that_determine_it(
     seeded = flight.with_overrides("plant", {"sensors.seed": 5})
     made = [way.prepare_draw(PLANNED, Draw(0, 1, {}), each) for each in (flight, heavier, seeded)]
     assert len(plans) == 1
-    assert all(isinstance(each, _ReadyDraw) for each in made)
+    assert all(isinstance(each, _PreparedDraw) for each in made)
     others = [
         flight.with_overrides("planner", {"lie_bracket.t1": 3.0}),
         flight.with_overrides("plant", {"initial_joint_positions": [0.1, 0.0, 0.0]}),
@@ -726,7 +733,7 @@ def test_a_flight_is_flown_with_the_limits_of_its_campaign(
         one_by_one, "fly_scenario", lambda scenario, **given: asked.append((scenario, given))
     )
     flight = DrawnFlight.of(START)
-    FlightsEngine().fly_draw(replace(PLANNED, longest=7.5), flight, lambda: True)
+    FlightsEngine().fly_draw(replace(PLANNED, max_flight_time=7.5), flight, lambda: True)
     FlightsEngine().fly_draw(PLANNED, flight)
     (scenario, given), (_, others) = asked
     assert scenario is START
@@ -764,7 +771,7 @@ def test_the_stack_flies_a_draw_in_a_process_of_its_own(
     monkeypatch.setattr(one_by_one, "run_child", run)
     monkeypatch.setattr(one_by_one, "read_run", lambda bag: read if bag.exists() else None)
     monkeypatch.setattr(one_by_one, "replace", _replaced)
-    made = replace(PLANNED, longest=7.5)
+    made = replace(PLANNED, max_flight_time=7.5)
     found: Any = RosEngine().fly_draw(made, DrawnFlight.of(START), lambda: False)
     assert asked == [
         [*("-m", "spacerobot_ros", "run"), "draw.yaml", "--bag", "flight.mcap", "--longest", "7.5"]

@@ -205,7 +205,7 @@ def test_draws_that_are_no_robot_and_no_number_end_no_other_flight() -> None:
 def test_control_in_lanes_is_flown_in_this_process_too(tmp_path: Path) -> None:
     """Where no workers take the draws apart, lanes do."""
     end = run_campaign(controlled(flights=3, longest=0.2), tmp_path)
-    assert end.done == 3
+    assert end.flown == 3
     assert Dataset(tmp_path).table()["engine"].to_pylist() == ["lanes"] * 3
 
 

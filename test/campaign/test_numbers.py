@@ -29,7 +29,7 @@ from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation, 
 from spacerobot_ros.campaign.statistics import (
     Influence,
     PairedDifference,
-    corrected,
+    corrected_for_multiple_tests,
     influences,
     paired_difference,
     paired_success,
@@ -64,7 +64,7 @@ def test_shares_have_intervals(count: int, total: int) -> None:
     )
     low = stats.beta.ppf(0.025, count, total - count + 1) if count else 0.0
     high = stats.beta.ppf(0.975, count + 1, total - count) if count < total else 1.0
-    assert found.exact == pytest.approx((low, high), abs=1e-9)
+    assert found.exact_interval == pytest.approx((low, high), abs=1e-9)
     assert str(found) == (
         f"{100 * count / total:.4g} % ({count} of {total}; 95 % interval "
         f"{100 * found.interval_low:.4g} to {100 * found.interval_high:.4g} %)"
@@ -73,7 +73,11 @@ def test_shares_have_intervals(count: int, total: int) -> None:
 
 def test_a_share_of_nothing_is_between_none_and_all() -> None:
     nothing = share(0, 0)
-    assert (nothing.interval_low, nothing.interval_high, nothing.exact) == (0.0, 1.0, (0.0, 1.0))
+    assert (nothing.interval_low, nothing.interval_high, nothing.exact_interval) == (
+        0.0,
+        1.0,
+        (0.0, 1.0),
+    )
     assert math.isnan(nothing.value)
 
 
@@ -87,14 +91,19 @@ def test_what_is_said_of_an_influence() -> None:
     plain = Influence("mass", "error_m", -0.456, 0.01, 0.4, 0.02)
     assert str(plain) == "mass of error_m: -0.46"
     assert plain.strength == 0.456
-    away = replace(plain, departure=-0.5)
+    away = replace(plain, distance_correlation=-0.5)
     assert str(away) == "mass of error_m: -0.50 with its distance from the median"
     assert away.strength == 0.5
-    whole = replace(away, first=(0.125, 0.01), total=(0.375, 0.02))
+    whole = replace(away, first_order_index=(0.125, 0.01), total_order_index=(0.375, 0.02))
     assert str(whole) == "mass of error_m: total Sobol index 0.38"
     assert whole.strength == 0.375
     bare = Influence("a", "b", 0.25, 0.5)
-    assert (bare.departure, bare.p_distance_from_median, bare.first, bare.total) == (
+    assert (
+        bare.distance_correlation,
+        bare.distance_p_value,
+        bare.first_order_index,
+        bare.total_order_index,
+    ) == (
         0.0,
         1.0,
         None,
@@ -123,13 +132,13 @@ def test_chances_are_corrected_for_the_number_of_tests() -> None:
         Influence("a", "m", 0.5, 0.01, 0.25, 0.04),
         Influence("b", "m", 0.25, 0.03, 0.1, 0.5),
     ]
-    first, second = corrected(given)
-    assert (first.p, first.p_distance_from_median) == pytest.approx((0.04, 0.16 / 3))
-    assert (second.p, second.p_distance_from_median) == pytest.approx((0.16 / 3, 0.5))
-    assert (first.cause, first.correlation, second.departure) == ("a", 0.5, 0.1)
-    assert corrected([]) == []
-    (constant,) = corrected([Influence("a", "m", 0.0, math.nan)])
-    assert constant.p == 1.0
+    first, second = corrected_for_multiple_tests(given)
+    assert (first.p_value, first.distance_p_value) == pytest.approx((0.04, 0.16 / 3))
+    assert (second.p_value, second.distance_p_value) == pytest.approx((0.16 / 3, 0.5))
+    assert (first.cause, first.correlation, second.distance_correlation) == ("a", 0.5, 0.1)
+    assert corrected_for_multiple_tests([]) == []
+    (constant,) = corrected_for_multiple_tests([Influence("a", "m", 0.0, math.nan)])
+    assert constant.p_value == 1.0
 
 
 def test_influences_are_rank_correlations_of_finite_values() -> None:
@@ -146,14 +155,14 @@ def test_influences_are_rank_correlations_of_finite_values() -> None:
         expected = stats.spearmanr(values[there], metric[there])
         away = np.abs(values[there] - np.median(values[there]))
         departure = stats.spearmanr(away, metric[there])
-        assert (each.correlation, each.p) == pytest.approx(tuple(expected))
-        assert (each.departure, each.p_distance_from_median) == pytest.approx(tuple(departure))
+        assert (each.correlation, each.p_value) == pytest.approx(tuple(expected))
+        assert (each.distance_correlation, each.distance_p_value) == pytest.approx(tuple(departure))
     three = {"m": np.array([1.0, 3.0, 2.0])}
     (only,) = influences({"x": np.array([1.0, 2.0, 3.0])}, three)
     assert only.correlation == pytest.approx(0.5)
     # Two values are as far from their median: that distance says nothing.
     (sides,) = influences({"x": np.array([1.0, 2.0, 1.0, 2.0])}, {"m": np.arange(4.0)})
-    assert (sides.departure, sides.p_distance_from_median) == (0.0, 1.0)
+    assert (sides.distance_correlation, sides.distance_p_value) == (0.0, 1.0)
 
 
 @pytest.mark.parametrize("ties", [False, True])
@@ -168,9 +177,9 @@ def test_the_chance_of_a_correlation_of_few_flights_is_that_of_their_permutation
         (x,), lambda drawn: stats.spearmanr(drawn, y).statistic, permutation_type="pairings",
     )  # fmt: skip
     (each,) = influences({"x": x}, {"m": y})
-    assert (each.correlation, each.p) == pytest.approx((found.statistic, found.pvalue))
+    assert (each.correlation, each.p_value) == pytest.approx((found.statistic, found.pvalue))
     (perfect,) = influences({"x": np.arange(3.0)}, {"m": np.array([1.0, 2.0, 4.0])})
-    assert (perfect.correlation, perfect.p) == pytest.approx((1.0, 1 / 3))
+    assert (perfect.correlation, perfect.p_value) == pytest.approx((1.0, 1 / 3))
     assert not perfect.is_significant
 
 
@@ -193,7 +202,7 @@ def test_paired_differences_are_those_of_student() -> None:
     assert (found.first, found.second) == pytest.approx((7 / 3, 9.25 / 3))
     assert found.difference == pytest.approx(0.75)
     assert (found.interval_low, found.interval_high) == pytest.approx(tuple(interval))
-    assert not found.certain
+    assert not found.is_significant
     two = paired_difference("m", first[:2], second[:2])
     assert two is not None
     assert two.count == 2
@@ -205,7 +214,7 @@ def test_paired_differences_are_those_of_student() -> None:
     [(0.1, 0.2, True), (-0.2, -0.1, True), (-0.1, 0.1, False), (0.0, 1.0, False), (-1, 0.0, False)],
 )
 def test_an_interval_that_excludes_zero_is_certain(low: float, high: float, certain: bool) -> None:
-    assert PairedDifference("m", 3, 0.0, 0.0, 0.0, low, high).certain is certain
+    assert PairedDifference("m", 3, 0.0, 0.0, 0.0, low, high).is_significant is certain
 
 
 def test_paired_success_is_mcnemars() -> None:
@@ -276,9 +285,14 @@ def test_what_is_refused_of_a_campaign(given: dict[str, Any], sentence: str) -> 
 
 def test_a_campaign_has_defaults() -> None:
     made = campaign()
-    assert (made.flights, made.seed, made.sampler, made.longest) == (100, 0, "random", 100_000.0)
+    assert (made.flights, made.seed, made.sampler, made.max_flight_time) == (
+        100,
+        0,
+        "random",
+        100_000.0,
+    )
     assert (made.engine, made.description, made.dispersions, made.criteria) == ("auto", "", (), ())
-    assert campaign(flights=10_000_000, seed=2**63 - 1, longest=0).longest == 0.0
+    assert campaign(flights=10_000_000, seed=2**63 - 1, longest=0).max_flight_time == 0.0
     (criterion,) = campaign(criteria={"duration_s": {"max": 2}}).criteria
     assert (criterion.minimum, criterion.maximum) == (-math.inf, 2.0)
     assert not made.measures_clearance
@@ -415,7 +429,9 @@ def test_a_campaign_is_flown_by_the_engine_and_the_workers_that_it_is_given(
     cluster = running.Cluster(workers=3)
     end = run_campaign(MADE, tmp_path, cluster=cluster, show=seen.append)
     assert asked == ["auto", ([0, 2, 3, 4, 5], "lanes", (3, "", 5)), "closed"]
-    assert [(each.done, each.total, each.rate, each.seconds) for each in [*seen, end]] == [
+    assert [
+        (each.flown, each.total, each.flights_per_second, each.seconds) for each in [*seen, end]
+    ] == [
         (1, 6, 0.0, 1.0),
         (4, 6, 1.5, 2.0),
         (6, 6, 1.25, 4.0),
@@ -488,18 +504,18 @@ def rerun(**given: Any) -> Rerun:
 def test_what_is_said_of_a_rerun(given: dict[str, Any], agrees: bool, last: str) -> None:
     found = rerun(**given)
     assert found.agrees is agrees
-    assert found.lines[:3] == [
+    assert found.report_lines[:3] == [
         "flight 7: reached. There.",
         "drawn       mass 1.23457, planner.method optimal; seed 123",
         "bag         b.mcap",
     ]
-    assert found.lines[-1] == last
-    assert len(found.lines) == (5 if "note" in given else 4)
+    assert found.report_lines[-1] == last
+    assert len(found.report_lines) == (5 if "note" in given else 4)
 
 
 def test_a_rerun_without_dispersions() -> None:
     row = Row(Draw(0, 5, {}), "failed", "Off.")
-    assert Rerun(row, None, "", "", Path("b")).lines[1] == "drawn       nothing; seed 5"
+    assert Rerun(row, None, "", "", Path("b")).report_lines[1] == "drawn       nothing; seed 5"
 
 
 @pytest.mark.parametrize(
@@ -527,7 +543,7 @@ def test_a_flight_is_compared_with_its_row(
 ) -> None:
     plant = SimpleNamespace(thrusters=thrusters)
     made: Any = SimpleNamespace(
-        longest=7.5, measures_clearance="clearance", scenario=SimpleNamespace(plant=plant)
+        max_flight_time=7.5, measures_clearance="clearance", scenario=SimpleNamespace(plant=plant)
     )
     asked: list[Any] = []
 
@@ -712,9 +728,9 @@ def results(outcomes: list[str], **columns: Any) -> Results:
     ],
 )
 def test_missing_flights_are_counted(numbers: list[int], sentence: str) -> None:
-    found = replace(results(["reached"]), numbers=np.array(numbers, float))
-    assert found.bias.startswith(sentence)
-    assert bool(found.bias) is bool(sentence)
+    found = replace(results(["reached"]), flight_numbers=np.array(numbers, float))
+    assert found.incompleteness_warning.startswith(sentence)
+    assert bool(found.incompleteness_warning) is bool(sentence)
 
 
 def test_the_worst_flights_are_ten() -> None:
@@ -755,7 +771,7 @@ def test_shown_metrics_are_those_with_criteria_and_the_main_ones() -> None:
     assert list(found.metrics()) == found.shown_metrics
     met = found.share_meeting(criteria[1])
     assert (met.count, met.total) == (1, 2)
-    assert found.success.count == 2
+    assert found.success_share.count == 2
 
 
 @pytest.mark.parametrize(
@@ -799,11 +815,12 @@ def test_indices_are_computed_of_whole_saltelli_samples(monkeypatch: pytest.Monk
     monkeypatch.setattr(
         reports, "sobol_indices", lambda names, x: dict.fromkeys(names, (0.1, 0.2, 0.3, 0.4))
     )
-    assert [each.total for each in found.influences()] == [None]
+    assert [each.total_order_index for each in found.influences()] == [None]
     whole = replace(found, campaign=replace(MADE, sampler="saltelli"))
     (each,) = whole.influences()
-    assert (each.first, each.total) == ((0.1, 0.2), (0.3, 0.4))
-    assert [each.total for each in replace(whole, total=10).influences()] == [None]
+    assert (each.first_order_index, each.total_order_index) == ((0.1, 0.2), (0.3, 0.4))
+    short = replace(whole, planned_flights=10)
+    assert [each.total_order_index for each in short.influences()] == [None]
 
 
 def test_a_campaign_without_dispersions_says_so() -> None:

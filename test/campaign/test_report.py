@@ -22,7 +22,7 @@ from spacerobot_ros.campaign.comparing import write_comparison
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draw, Draws
-from spacerobot_ros.campaign.report import PASSING, Results, write_campaign_report
+from spacerobot_ros.campaign.report import PASSED_COLOUR, Results, write_campaign_report
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.errors import ParameterError
 
@@ -73,7 +73,7 @@ def test_a_report_of_flights_that_ended_early_says_that_late_ones_are_missing(
         filled(tmp_path / name, made, ishigami, flown=flown)
         for name, flown in (("first", lambda n: n < 40), ("quick", lambda n: n < 40 and n % 4))
     )
-    assert not Results.of(first).bias
+    assert not Results.of(first).incompleteness_warning
     page = tmp_path / "page.html"
     lines = write_campaign_report(quick, page)
     sentence = "10 draws are not flown yet although later ones are"
@@ -114,19 +114,19 @@ def test_shares_of_captures_have_their_intervals(tmp_path: Path) -> None:
         dataset.add([Row(draw, "reached", "Reached.", metrics, ok, "flights")])
     dataset.close()
     results = Results.of(folder)
-    assert list(results.shares) == ["captured", "placed"]
-    found = results.shares["captured"]
+    assert list(results.sampler_shares) == ["captured", "placed"]
+    found = results.sampler_shares["captured"]
     assert (found.count, found.total) == (30, 40)
     exact = stats.binomtest(30, 40).proportion_ci(0.95, "exact")
-    assert found.exact == pytest.approx((exact.low, exact.high))
-    assert results.shares["placed"].count == 0
+    assert found.exact_interval == pytest.approx((exact.low, exact.high))
+    assert results.sampler_shares["placed"].count == 0
     assert results.distributed_metrics == ["position_error_m", "capture_impulse_Ns"]
     assert results.shown_metrics[0] == "captured"
     lines = write_campaign_report(folder, tmp_path / "report.html")
     assert lines[1].startswith("captured    75 % (30 of 40; 95 % interval ")
     assert lines[2].startswith("placed      0 % (0 of 40; ")
     page = (tmp_path / "report.html").read_text("utf-8")
-    low, high = (f"{100 * x:.4g}" for x in found.exact)
+    low, high = (f"{100 * x:.4g}" for x in found.exact_interval)
     assert "<dt>captured</dt><dd>75 %<small>30 of 40</small></dd>" in page
     assert f"<dd>{low} to {high} %</dd>" in page
     assert "capture_impulse_Ns" in page
@@ -135,11 +135,11 @@ def test_shares_of_captures_have_their_intervals(tmp_path: Path) -> None:
 def test_sobol_indices_are_those_of_a_function_that_is_known(tmp_path: Path) -> None:
     made = campaign(disperse=TURNS, sampler="saltelli", flights=512 * 5, seed=3)
     results = Results.of(filled(tmp_path, made, ishigami))
-    drivers = [each for each in results.influences() if each.metric != PASSING]
+    drivers = [each for each in results.influences() if each.metric != PASSED_COLOUR]
     found = {each.cause: each for each in drivers}
     first, total = (0.3139, 0.4424, 0.0), (0.5576, 0.4424, 0.2437)
     for name, one, all_together in zip(NAMES, first, total, strict=True):
-        indices = found[name].first, found[name].total
+        indices = found[name].first_order_index, found[name].total_order_index
         assert indices[0] is not None
         assert indices[1] is not None
         assert indices[0][0] == pytest.approx(one, abs=0.08)
@@ -149,7 +149,7 @@ def test_sobol_indices_are_those_of_a_function_that_is_known(tmp_path: Path) -> 
     # An incomplete sample has none.
     few = campaign(disperse=TURNS, sampler="random", flights=40, seed=3)
     others = Results.of(filled(tmp_path / "few", few, ishigami)).influences()
-    assert all(each.total is None for each in others)
+    assert all(each.total_order_index is None for each in others)
 
 
 def bowl(draw: Draw) -> float:
@@ -171,16 +171,16 @@ def test_what_grows_to_both_sides_is_found(tmp_path: Path) -> None:
     (passing,) = (
         each
         for each in results.influences()
-        if (each.metric, each.cause) == (PASSING, "mass.mass_1")
+        if (each.metric, each.cause) == (PASSED_COLOUR, "mass.mass_1")
     )
     # The farther the mass is off, the fewer pass.
-    assert passing.departure < -0.6
+    assert passing.distance_correlation < -0.6
     assert (strongest.cause, strongest.metric) == ("mass.mass_1", "position_error_m")
     assert abs(strongest.correlation) < 0.3
-    assert strongest.departure > 0.9
+    assert strongest.distance_correlation > 0.9
     x, y = results.drawn_numbers["mass.mass_1"], results.columns["position_error_m"]
     expected = stats.spearmanr(np.abs(x - np.median(x)), y)
-    assert strongest.departure == pytest.approx(expected.statistic)
+    assert strongest.distance_correlation == pytest.approx(expected.statistic)
     assert "distance from the median" in str(strongest)
     worst = results.worst_rows()
     errors = results.columns["position_error_m"]
@@ -292,7 +292,7 @@ def test_counts_below_the_convergence_are_plain_numbers(
         for name, values in results.columns.items()
     }
     monkeypatch.setattr(report, "picture_part", seen)
-    results = replace(results, columns=columns, numbers=many.astype(float))
+    results = replace(results, columns=columns, flight_numbers=many.astype(float))
     # Of ten flights or fewer there is one point, which shows no convergence.
     assert (report._convergence_section(results) == []) is (count <= 10)
     assert any(labels) is (count > 10)

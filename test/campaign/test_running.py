@@ -59,22 +59,22 @@ def rows(folder: Path) -> list[dict[str, Any]]:
 def test_a_campaign_that_is_ended_goes_on_where_it_was(tmp_path: Path) -> None:
     """Every draw once, with the same numbers as without the break."""
     whole = run_campaign(small(), tmp_path / "whole")
-    assert (whole.done, whole.total) == (5, 5)
+    assert (whole.flown, whole.total) == (5, 5)
     seen: list[Progress] = []
     cut = run_campaign(small(), tmp_path / "cut", show=seen.append, stopped=lambda: len(seen) >= 2)
-    assert cut.done == 2
-    assert [progress.done for progress in seen] == [1, 2]
-    assert run_campaign(small(), tmp_path / "cut").done == 5
+    assert cut.flown == 2
+    assert [progress.flown for progress in seen] == [1, 2]
+    assert run_campaign(small(), tmp_path / "cut").flown == 5
     assert str(rows(tmp_path / "cut")) == str(rows(tmp_path / "whole"))
     assert [row["flight"] for row in rows(tmp_path / "cut")] == list(range(5))
     # And more flights of the same campaign are only those that are missing.
-    assert run_campaign(small(flights=6), tmp_path / "cut").done == 6
+    assert run_campaign(small(flights=6), tmp_path / "cut").flown == 6
     assert str(rows(tmp_path / "cut")[:5]) == str(rows(tmp_path / "whole"))
     # Fewer take none away.
     fewer = run_campaign(small(flights=2), tmp_path / "cut")
-    assert (fewer.done, fewer.total) == (2, 2)
+    assert (fewer.flown, fewer.total) == (2, 2)
     results = Results.of(tmp_path / "cut")
-    assert (len(results), results.total) == (6, 6)
+    assert (len(results), results.planned_flights) == (6, 6)
 
 
 @pytest.mark.slow
@@ -97,11 +97,11 @@ def test_a_scheduler_that_is_not_there_is_refused_before_a_folder_is_made(
     assert not (tmp_path / "out").exists()
     # A campaign that is flown already asks for no scheduler.
     run_campaign(small(flights=2), folder)
-    assert run_campaign(small(flights=2), folder, cluster=nowhere).done == 2
+    assert run_campaign(small(flights=2), folder, cluster=nowhere).flown == 2
     assert len(asked) == 1
     with pytest.raises(SpaceRobotError, match="no scheduler"):
         run_campaign(small(flights=3), folder, cluster=nowhere)
-    assert run_campaign(small(flights=3), folder).done == 3, "the folder is free"
+    assert run_campaign(small(flights=3), folder).flown == 3, "the folder is free"
 
 
 @pytest.mark.slow
@@ -162,7 +162,7 @@ def test_two_processes_do_not_fly_into_one_folder(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="Another process flies the campaign"):
         run_campaign(small(), tmp_path)
     first.close()
-    assert run_campaign(small(flights=1), tmp_path).done == 1
+    assert run_campaign(small(flights=1), tmp_path).flown == 1
 
 
 def test_what_is_half_written_is_not_there(tmp_path: Path) -> None:
@@ -191,14 +191,14 @@ def test_a_damaged_file_is_named(tmp_path: Path, name: str, content: bytes) -> N
     with pytest.raises(ParameterError, match=f"The file {tmp_path / name} is damaged"):
         Results.of(tmp_path)
     if name == "campaign.yaml":
-        assert run_campaign(small(flights=1), tmp_path).done == 1
+        assert run_campaign(small(flights=1), tmp_path).flown == 1
         assert len(Results.of(tmp_path)) == 1
         return
     with pytest.raises(ParameterError, match=f"The file {tmp_path / name} is damaged"):
         run_campaign(small(flights=2), tmp_path)
     if name.startswith("flights"):
         (tmp_path / name).unlink()
-        assert run_campaign(small(flights=2), tmp_path).done == 2
+        assert run_campaign(small(flights=2), tmp_path).flown == 2
         assert [row["flight"] for row in rows(tmp_path)] == [0, 1]
 
 
@@ -226,14 +226,14 @@ def test_a_disk_that_is_full_costs_nothing_that_is_there(
         with pytest.raises(RecordingError, match=r"The last 1 flights cannot be .*goes on from"):
             run_campaign(small(flights=3), tmp_path)
     assert str(rows(tmp_path)) == str(before)
-    assert run_campaign(small(flights=3), tmp_path).done == 3
+    assert run_campaign(small(flights=3), tmp_path).flown == 3
 
 
 def test_a_campaign_that_was_killed_while_it_began_begins_again(tmp_path: Path) -> None:
     (tmp_path / "flights").mkdir()
     (tmp_path / ".scenario.yaml").write_text("half")
     (tmp_path / "scenario.yaml").write_text("whole")
-    assert run_campaign(small(flights=1), tmp_path).done == 1
+    assert run_campaign(small(flights=1), tmp_path).flown == 1
 
 
 def test_a_flight_is_flown_again_as_often_as_one_likes(
@@ -255,7 +255,7 @@ def test_a_flight_is_flown_again_as_often_as_one_likes(
 
 def test_a_worker_of_another_version_flies_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     made = small(flights=1)
-    task = workers.pack_campaign(made), __version__, [_draw(made, 0)], "flights", False
+    task = workers.serialise_campaign(made), __version__, [_draw(made, 0)], "flights", False
     assert len(workers.fly_task(*task)) == 1
     monkeypatch.setattr(workers, "__version__", "9.9")
     with pytest.raises(SpaceRobotError, match=r"A worker has spacerobot_ros 9\.9, and this"):
@@ -266,7 +266,7 @@ def test_a_task_of_lanes_leaves_what_others_fly_unless_all_of_it_is_asked_for() 
     """What is flown at once is sent back before flights that take long."""
     settings = {"planner.attitude_tolerance": 0.002, "planner.max_corrections": 3}
     made = campaign(flights=8, set=settings, disperse={"mass.*": {"norm": [1.0, 0.03]}}, seed=8)
-    task = workers.pack_campaign(made), __version__, list(Draws(made)), "lanes"
+    task = workers.serialise_campaign(made), __version__, list(Draws(made)), "lanes"
     part, whole = workers.fly_task(*task, False), workers.fly_task(*task, True)
     assert all(isinstance(each, Row) for each in whole)
     left = {each.draw.number: each.reason for each in part if isinstance(each, Fallback)}
@@ -294,7 +294,7 @@ def test_rows_flown_again_through_ros_are_the_same(tmp_path: Path, count: int) -
     chosen = np.random.default_rng(6).permutation(made.flights)[:count]
     for number in chosen.tolist():
         again = rerun_flight(tmp_path, number, tmp_path / f"{number}.mcap")
-        assert again.agrees, again.lines
+        assert again.agrees, again.report_lines
         assert again.deviation is not None
         assert again.deviation < RERUN_TOLERANCE
         assert again.row.draw.values["mass.mass_1"] != 1.0
@@ -302,7 +302,7 @@ def test_rows_flown_again_through_ros_are_the_same(tmp_path: Path, count: int) -
         few = tmp_path / "few"
         run_campaign(made, few, stopped=lambda: True)
         again = rerun_flight(few, 0, tmp_path / "again.mcap")
-        assert again.lines[-1] == "dataset     has no such flight yet"
+        assert again.report_lines[-1] == "dataset     has no such flight yet"
 
 
 @pytest.mark.slow
@@ -324,7 +324,7 @@ def test_the_stack_ends_flights_that_are_too_long(tmp_path: Path) -> None:
     assert (row["outcome"], row["duration_s"]) == ("interrupted", 4.0)
     again = rerun_flight(tmp_path, 0, tmp_path / "0.mcap")
     assert again.agrees
-    assert again.lines[-1].startswith("It was interrupted")
+    assert again.report_lines[-1].startswith("It was interrupted")
     assert 4.0 <= again.row.metrics["duration_s"] < 1000.0
     (there,) = RosEngine().fly(made, [_draw(made, 0)], lambda: False)
     assert there.outcome == "interrupted"

@@ -161,7 +161,7 @@ def test_the_target_weighs_otherwise(scenario: Scenario) -> None:
     for name, value in drawn.items():
         (target,) = targets_of(name, scenario)
         flight, units[name] = target.apply(flight, value), target.unit
-        assert target.sets == {name}
+        assert target.assigned_parameters == {name}
     assert units == {"target.mass": "1", "target.inertia": "1", "target.com.y": "m"}
     assert flight.has_target_masses
     found = load_target(flight.scenario.plant.target)

@@ -40,7 +40,9 @@ class Campaigns:
 
     def _fly(self, campaign: Any, folder: Path, **named: Any) -> running.Progress:
         self.flown.append({"campaign": campaign, "folder": folder, **named})
-        return running.Progress(done=4, total=campaign.flights, rate=2.5, seconds=1.0)
+        return running.Progress(
+            flown=4, total=campaign.flights, flights_per_second=2.5, seconds=1.0
+        )
 
     def _report(self, folder: Any, path: Path) -> list[str]:
         self.reported.append((folder, path))
@@ -48,7 +50,7 @@ class Campaigns:
 
     def _rerun(self, folder: Path, number: int, bag: Path) -> SimpleNamespace:
         self.rerun.append((folder, number, bag))
-        return SimpleNamespace(lines=["rerun"], agrees=number != 9)
+        return SimpleNamespace(report_lines=["rerun"], agrees=number != 9)
 
     def call(self, line: str) -> Result:
         return CliRunner().invoke(main, ["campaign", *line.split()])
@@ -71,14 +73,14 @@ def test_without_options(campaigns: Campaigns) -> None:
     assert "success 75 %" in result.output
     # The range of the numbers: of scipy's `uniform: [a, b]` the end is a + b.
     drawn = [line for line in result.output.splitlines() if line.startswith("drawn ")]
-    assert drawn == call["campaign"].lines
+    assert drawn == call["campaign"].description_lines
 
 
 def test_the_range_of_what_is_drawn_is_said(tmp_path: Path) -> None:
     file = tmp_path / "c.yaml"
     disperse = {"mass.*": {"uniform": [0.95, 1.05]}, "goal.position.x": {"uniform": [-0.01, 0.02]}}
     file.write_text(yaml.safe_dump({"campaign": section(**{**GIVEN, "disperse": disperse})}))
-    lines = sorted(load_campaign(file).lines, reverse=True)
+    lines = sorted(load_campaign(file).description_lines, reverse=True)
     assert lines[0].endswith(" more: 0.9605 to 1.99 in 98 % of the flights")
     assert lines[1:] == ["drawn       goal.position.x: -0.0098 to 0.0098 m in 98 % of the flights"]
 

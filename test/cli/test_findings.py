@@ -22,14 +22,21 @@ def workspaces(*rings: tuple[float, float], **given: Any) -> Workspaces:
     wanted: dict[str, Any] = {
         "link": "hand",
         "within_limits": True,
-        "reach": (0.25, 1.5),
+        "distance_range": (0.25, 1.5),
         "path_independent": ((0.0, 0.123456),),
         "path_dependent": rings,
         "dimensions": 2,
         "singular_shapes": 0,
     }
     wanted |= given
-    names = ("link", "within_limits", "reach", "path_dependent", "dimensions", "singular_shapes")
+    names = (
+        "link",
+        "within_limits",
+        "distance_range",
+        "path_dependent",
+        "dimensions",
+        "singular_shapes",
+    )
     made: Any = SimpleNamespace(**{name: wanted[name] for name in names})
     made.path_independent = wanted["path_independent"]
     return made
@@ -119,7 +126,7 @@ def distances(count: int, exact: bool = True, **ignored: str) -> list[str]:
     pairs = {f"'a' and 'b{k}'": 0.25 * k for k in range(count)}
     geometry = SimpleNamespace(
         distances_of_links=lambda shape: pairs if shape == "shape" else {},
-        ignored=ignored,
+        ignored_pairs=ignored,
         notes=["A note."],
         exact=exact,
     )

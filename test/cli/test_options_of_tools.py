@@ -313,7 +313,9 @@ def test_the_progress_of_a_campaign_is_shown_on_a_terminal(monkeypatch: pytest.M
         monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
         with campaign._progress_bar("flights") as show:
             for done, left in ((1, math.inf), (2, 3725.4), (2, 59.6), (1, 1.0), (4, 0.0)):
-                show(SimpleNamespace(done=done, total=4, rate=0.12345, seconds_left=left))  # type: ignore[arg-type]
+                now: Any = SimpleNamespace(flown=done, total=4, seconds_left=left)
+                now.flights_per_second = 0.12345
+                show(now)
 
     report(terminal=False)
     assert shown == []

@@ -22,7 +22,7 @@ from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.options import numbers
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.flight.second_opinion import SecondOpinion
+from spacerobot_ros.flight.second_opinion import EngineComparison
 from spacerobot_ros.flight.verification import Difference, Verification
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.planning import METHODS, BasePath, GaitSchedule, Goal, PoseError
@@ -387,7 +387,7 @@ def test_the_clearance_of_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     geometry = CollisionGeometry(load_robot(robot_file("three_joint_arm")))
     # All joints move together from one shape to the next.
     way = np.linspace(0, 1, 2001)[:, np.newaxis] * np.ones(3)
-    nearest = geometry.nearest_at(np.concatenate([way + k for k in range(3)]))[0].min()
+    nearest = geometry.nearest_along(np.concatenate([way + k for k in range(3)]))[0].min()
     assert nearest < 0
     said = re.fullmatch(r"clearance   links '\w+' and '\w+' touch, ([\d.]+) m deep", found)
     assert said is not None
@@ -543,9 +543,9 @@ def test_the_lines_of_a_verification(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_lines_of_a_second_opinion(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = SecondOpinion("MuJoCo 9.8", "by steps", 339, 2e-9, 3.2e-9, 9.8e-9, 17.5)
+    found = EngineComparison("MuJoCo 9.8", "by steps", 339, 2e-9, 3.2e-9, 9.8e-9, 17.5)
 
-    def told(other: SecondOpinion) -> Result:
+    def told(other: EngineComparison) -> Result:
         return verified(monkeypatch, "--engine", "mujoco", second_opinion=other)
 
     agrees = told(found)
@@ -554,7 +554,7 @@ def test_the_lines_of_a_second_opinion(monkeypatch: pytest.MonkeyPatch) -> None:
         "engine      MuJoCo 9.8, by steps",
         "deviates    2e-09 m, 3.2e-09 rad, joints 9.8e-09 m or rad, most at 17.5 s of 339 ticks",
     ]
-    note = told(replace(found, until="a joint is held")).stdout.splitlines()[-1]
+    note = told(replace(found, stop_reason="a joint is held")).stdout.splitlines()[-1]
     assert note == "note        compared until a joint is held"
     for other in (
         replace(found, position=1.1e-8),

@@ -84,7 +84,7 @@ def test_pairs_that_are_always_in_contact_do_not_count() -> None:
     wide = solid("visual", '<sphere radius="2.6"/>')
     geometry = CollisionGeometry(parse_robot(chain((wide,), (), (BALL,), (BALL,))))
     # c is always within 2 m of a; d comes out of it.
-    assert geometry.ignored == {LinkPair("a", "c"): "always in contact"}
+    assert geometry.ignored_pairs == {LinkPair("a", "c"): "always in contact"}
     assert [geometry.links_of(i) for i in range(len(geometry.pairs))] == [LinkPair("a", "d")]
 
 
@@ -98,11 +98,11 @@ def test_pairs_that_an_srdf_disables_do_not_count(tmp_path: Path) -> None:
     robot = parse_robot(chain((BALL,), (BALL,), (BALL,), (BALL,)))
     disabled = '<disable_collisions link1="c" link2="a" reason="Never"/>'
     geometry = CollisionGeometry(with_srdf(robot, srdf(tmp_path, disabled)))
-    assert geometry.ignored == {LinkPair("a", "c"): "disabled by the SRDF"}
+    assert geometry.ignored_pairs == {LinkPair("a", "c"): "disabled by the SRDF"}
     assert len(geometry.pairs) == 2
     quiet = '<disable_default_collisions link="d"/><enable_collisions link1="a" link2="d"/>'
     geometry = CollisionGeometry(with_srdf(robot, srdf(tmp_path, quiet)))
-    assert geometry.ignored == {LinkPair("b", "d"): "disabled by the SRDF"}
+    assert geometry.ignored_pairs == {LinkPair("b", "d"): "disabled by the SRDF"}
 
 
 def test_an_srdf_beside_the_urdf_is_read(tmp_path: Path) -> None:
@@ -229,8 +229,8 @@ def test_without_coal_distances_are_bounds(
     ]
     assert exact.exact
     # The box around the bus and that around the arm are always in contact.
-    assert set(exact.ignored) == set()
-    assert set(bounds.ignored) == {LinkPair("base_link", "upper_arm")}
+    assert set(exact.ignored_pairs) == set()
+    assert set(bounds.ignored_pairs) == {LinkPair("base_link", "upper_arm")}
     numbers = {tuple(pair): number for number, pair in enumerate(exact.pairs.tolist())}
     rng = np.random.default_rng(7)
     low, high = robot.limits("lower"), robot.limits("upper")

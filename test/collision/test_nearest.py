@@ -53,5 +53,5 @@ def test_no_pair_is_measured_in_vain(
 
 def test_links_touch_at_a_distance_of_zero() -> None:
     made, measured = pairs([0.0, -0.1, 1e-9, -0.2], [0.0, 1e-12, -1.0, -0.1])
-    assert made.touching(None, None, None) == {"pair 0", "pair 3"}
+    assert made.links_in_contact(None, None, None) == {"pair 0", "pair 3"}
     assert measured == [0, 1, 3]

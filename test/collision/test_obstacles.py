@@ -85,7 +85,7 @@ def test_the_nearest_approach_is_between_the_ticks(geometry: CollisionGeometry, 
         each.pair: each for each in PathCheck(geometry).approaches(shapes, np.full(3, 9), base)
     }
     assert found[pair].distance == pytest.approx(least, abs=3e-4)
-    place = found[pair].place
+    place = found[pair].place_on_obstacle
     assert place is not None
     assert place == pytest.approx(MIDDLE)
     assert "link 'left' and obstacle 'rock' come within" in str(found[pair])

@@ -43,7 +43,7 @@ def robot(origin: str = "0 0 0.2", rpy: str = "0 0 0", shape: str = "") -> Robot
 )
 def test_only_what_leaves_its_place_can_come_nearer(changes: dict[str, str], reach: float) -> None:
     geometry = CollisionGeometry(robot(**changes))
-    ((spin, slide),), _ = geometry.reaches(np.array([[0.0, 0.3], [50.0, -0.2]]))
+    ((spin, slide),), _ = geometry.largest_lever_arms(np.array([[0.0, 0.3], [50.0, -0.2]]))
     assert slide == 1.0
     assert spin == 0.0 if reach == 0.0 else spin > reach
 
@@ -67,7 +67,7 @@ def test_a_joint_that_moves_both_bodies_brings_none_nearer() -> None:
 </joint></robot>"""
     )
     geometry = CollisionGeometry(arm)
-    ((turn, lift, bend),), _ = geometry.reaches(np.zeros((1, 3)))
+    ((turn, lift, bend),), _ = geometry.largest_lever_arms(np.zeros((1, 3)))
     assert turn == 0.0
     assert lift > 0.5
     assert bend == 0.0, "a ball about its joint stays where it is"

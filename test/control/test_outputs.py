@@ -41,7 +41,7 @@ class Outputs:
 
     def __post_init__(self) -> None:
         z1 = self.vector
-        results = [z1.J_z, z1.bias, z1.z0dot, z1.error, z1.error_rate, z1.acceleration]
+        results = [z1.J_z, z1.bias_acceleration, z1.z0dot, z1.error, z1.error_rate, z1.acceleration]
         self._function = ca.Function("outputs", [z1.state, z1.reference], results)
 
     def __call__(self, state: ControlState, reference: Reference) -> list[Array]:

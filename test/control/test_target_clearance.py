@@ -90,7 +90,7 @@ def test_distances_are_those_of_balls(closes: int) -> None:
     """The hand counts up to the sample in which it closes in."""
     robot, body = parse_robot(ROBOT), parse_robot(BODY)
     clearance = TargetClearance(robot, "hand", body, body.frames["ring"][1], 0.07)
-    assert clearance.least == 0.07
+    assert clearance.min_distance == 0.07
     grapple, centers = along(4)
     found = clearance.nearest(BASE, SHAPES, grapple, closes)
     expected = {
@@ -115,7 +115,7 @@ def test_bodies_without_shapes_touch_nothing() -> None:
 class Answers:
     """Distances in the order in which they are asked for; the last one from then on."""
 
-    least = 0.05
+    min_distance = 0.05
 
     def __init__(self, *distances: float | None) -> None:
         self.distances, self.asked = list(distances), 0
@@ -138,7 +138,7 @@ def test_a_way_that_is_clear_is_taken_as_it_is() -> None:
     answers: Any = Answers(0.08, 0.06)
     found = plan(NEAR, clearance=answers)
     assert (answers.asked, found.distance) == (2, 0.06)
-    assert isinstance(found.outward, RelativePath)
+    assert isinstance(found.path_to_standoff, RelativePath)
     direct = plan(NEAR)
     assert (found.start, found.contact) == (direct.start, direct.contact)
     # Few samples first, then all; the hand counts until it leaves the standoff.
@@ -154,16 +154,15 @@ def test_a_body_in_the_way_is_gone_round() -> None:
     """First by a path in the world, then to standoffs farther away."""
     answers: Any = Answers(0.01, 0.2, 0.07)
     found = plan(NEAR, clearance=answers)
-    assert isinstance(found.outward, PathInWorld)
+    assert isinstance(found.path_to_standoff, PathInWorld)
     assert found.distance == 0.07
-    standoff = found.outward.at([found.outward.duration]).x[0]
+    standoff = found.path_to_standoff.at([found.path_to_standoff.duration]).x[0]
     np.testing.assert_allclose(standoff, OPTIONS.standoff)
     answers = Answers(0.01, 0.2, 0.04, 0.3)
     farther = plan(NEAR, clearance=answers)
-    np.testing.assert_allclose(
-        farther.outward.at([farther.outward.duration]).x[0], 2 * np.array(OPTIONS.standoff)
-    )
-    assert farther.closing.duration > found.closing.duration
+    outward = farther.path_to_standoff
+    np.testing.assert_allclose(outward.at([outward.duration]).x[0], 2 * np.array(OPTIONS.standoff))
+    assert farther.path_to_contact.duration > found.path_to_contact.duration
 
 
 def test_a_hand_in_motion_may_be_beside_the_target() -> None:
@@ -205,11 +204,11 @@ def test_a_path_in_the_world_joins_motion_and_standoff() -> None:
     path = PathInWorld(relative, motion, start, at_rest, np.array(OPTIONS.standoff))
     assert path.duration == T
     times = np.linspace(0.0, T, 4001)
-    moved = motion.grapple(start + times).carrying(path.at(times))
+    moved = motion.grapple(start + times).with_relative_motion(path.at(times))
     np.testing.assert_allclose(moved.r[0], HELD.position, atol=1e-12)
     np.testing.assert_allclose(moved.v[0], 0.0, atol=1e-12)
     np.testing.assert_allclose(moved.a[0], 0.0, atol=1e-12)
-    fixed = motion.grapple([start + T]).carrying(path.at([T]))
+    fixed = motion.grapple([start + T]).with_relative_motion(path.at([T]))
     for name in ("r", "v", "a"):
         np.testing.assert_allclose(getattr(moved, name)[-2], getattr(fixed, name)[0], atol=2e-3)
     # Velocity and acceleration are derivatives of the position.
@@ -217,7 +216,7 @@ def test_a_path_in_the_world_joins_motion_and_standoff() -> None:
     np.testing.assert_allclose(np.gradient(moved.r, h, axis=0)[1:-1], moved.v[1:-1], atol=1e-6)
     np.testing.assert_allclose(np.gradient(moved.v, h, axis=0)[1:-2], moved.a[1:-2], atol=1e-5)
     # It is shorter in W than the path relative to the frame that turns.
-    around = motion.grapple(start + times).carrying(relative.at(times))
+    around = motion.grapple(start + times).with_relative_motion(relative.at(times))
     lengths = [np.linalg.norm(np.diff(each.r, axis=0), axis=1).sum() for each in (moved, around)]
     assert lengths[0] < lengths[1]
     after = path.at([T + 1.0])
@@ -239,6 +238,6 @@ def test_the_clearance_of_a_controller_is_its_parameter() -> None:
         assert made._clearance(controller) is None
         measured.describe(body, "ring")
         found = made._clearance(controller)
-        assert (found.least if found else 0.0) == least
+        assert (found.min_distance if found else 0.0) == least
         measured.body = None
     assert ControllerConfig().target.clearance == 0.02

@@ -85,7 +85,7 @@ def test_rates_and_accelerations_of_a_path_beside_the_target_are_those_of_its_po
     begin = RelativeMotionOverTime.between(target.grapple([2.0]), FrameMotion.of_reference(held))
     path = RelativePath(begin, np.array([-0.3, 0.1, 0.05]), 7.0)
     times = np.array([time, time + h, time + 2 * h])
-    motion = target.grapple(2.0 + times).carrying(path.at(times))
+    motion = target.grapple(2.0 + times).with_relative_motion(path.at(times))
     v, omega, a, alpha = numerical(motion, h)
     np.testing.assert_allclose(motion.v[1], v, atol=1e-6)
     np.testing.assert_allclose(motion.omega[1], omega, atol=1e-6)
@@ -106,7 +106,7 @@ def test_a_path_begins_in_the_motion_of_the_held_pose_and_ends_with_the_grapple_
     begin = RelativeMotionOverTime.between(target.grapple([2.0]), FrameMotion.of_reference(held))
     standoff = np.array([-0.3, 0.1, 0.05])
     path = RelativePath(begin, standoff, 7.0)
-    first = target.grapple([2.0]).carrying(path.at([0.0]))
+    first = target.grapple([2.0]).with_relative_motion(path.at([0.0]))
     for name in (
         "position",
         "velocity",
@@ -120,7 +120,7 @@ def test_a_path_begins_in_the_motion_of_the_held_pose_and_ends_with_the_grapple_
     assert abs(first.reference().quaternion @ held.quaternion) == pytest.approx(1.0, abs=1e-14)
     for end in (7.0, 9.5):
         grapple = target.grapple([2.0 + end])
-        last = grapple.carrying(path.at([end]))
+        last = grapple.with_relative_motion(path.at([end]))
         np.testing.assert_allclose(last.R, grapple.R, atol=1e-14)
         np.testing.assert_allclose(last.omega, grapple.omega, atol=1e-14)
         np.testing.assert_allclose(last.r[0], grapple.r[0] + grapple.R[0] @ standoff, atol=1e-14)

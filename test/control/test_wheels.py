@@ -110,7 +110,7 @@ def test_a_torque_is_given_with_the_gyroscopic_torque_compensated() -> None:
     wheels, omega = control(), (0.02, -0.03, 0.01)
     observe(wheels, [20.0, -10.0, 15.0], omega)
     wanted = np.array([0.02, -0.01, 0.015])
-    given = wheels.give(wanted)
+    given = wheels.command_torque(wanted)
     assert given.tolist() == wanted.tolist()
     h = 0.03 * (WHEELS.axes_B.T @ omega + [20.0, -10.0, 15.0])
     demanded = -(wanted + np.cross(omega, WHEELS.axes_B @ h))
@@ -121,7 +121,7 @@ def test_what_wheels_do_not_give_is_told() -> None:
     wheels = control()
     observe(wheels, [0.0, 0.0, 0.0])
     wanted = np.array([5.0, -3.0, 1.0])
-    given = wheels.give(wanted)
+    given = wheels.command_torque(wanted)
     np.testing.assert_allclose(given, -WHEELS.axes_B @ wheels.torque)
     assert np.any(np.abs(wheels.torque) == WHEELS.torque)
     assert np.linalg.norm(wanted - given) < np.linalg.norm(wanted)
@@ -142,7 +142,7 @@ def test_excluded_wheels_give_no_torque() -> None:
     wheels = control(excluded="spin_a")
     assert wheels.rank == 2
     observe(wheels, [0.0, 0.0, 0.0])
-    wheels.give(np.array([0.01, 0.02, 0.03]))
+    wheels.command_torque(np.array([0.01, 0.02, 0.03]))
     assert wheels.torque[1] == 0.0
     assert np.all(wheels.torque[[0, 2]] != 0.0)
 
@@ -150,7 +150,7 @@ def test_excluded_wheels_give_no_torque() -> None:
 def test_coasting_wheels_have_no_torque() -> None:
     wheels = control()
     observe(wheels, [0.0, 0.0, 0.0])
-    wheels.give(np.array([0.01, 0.02, 0.03]))
+    wheels.command_torque(np.array([0.01, 0.02, 0.03]))
     wheels.thrust = np.ones(6)
     wheels.coast()
     assert not wheels.torque.any()
@@ -230,7 +230,7 @@ def test_momentum_is_dumped_on_request_until_the_wheels_rest() -> None:
     assert (event.kind, event.message, event.level, event.about) == (
         EventKind.DUMP_STARTED, "The momentum of the wheels is dumped on request.", 0, {},
     )  # fmt: skip
-    given = wheels.give(np.array([0.5, 0.5, 0.5]))
+    given = wheels.command_torque(np.array([0.5, 0.5, 0.5]))
     np.testing.assert_allclose(wheels.torque, -0.03 * np.array([10.0, -20.0, 4.1]) / 5.0)
     np.testing.assert_allclose(given, -WHEELS.axes_B @ wheels.torque)
     observe(wheels, [3.0, 6.1, 3.0])
@@ -250,7 +250,7 @@ def test_dumping_keeps_the_torques_of_motors_and_thrusters() -> None:
     for wheels in (strong, weak):
         observe(wheels, [150.0, -200.0, 50.0])
         wheels.request_dump()
-        wheels.give(np.zeros(3))
+        wheels.command_torque(np.zeros(3))
     shares = np.abs(strong.torque) / WHEELS.torque
     assert shares.max() == pytest.approx(1.0)
     assert np.linalg.norm(WHEELS.axes_B @ weak.torque) == pytest.approx(0.01)
@@ -309,7 +309,7 @@ def test_a_wheel_that_does_not_answer_is_taken_out_of_use(share: float) -> None:
         "thrusters are left."
     )
     assert wheels.rank == 2
-    wheels.give(np.array([0.01, 0.02, 0.03]))
+    wheels.command_torque(np.array([0.01, 0.02, 0.03]))
     assert wheels.torque[0] == 0.0
     wheels.reset()
     assert wheels.rank == 2, "it stays out of use"

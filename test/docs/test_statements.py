@@ -120,6 +120,6 @@ def test_the_scenarios_with_reference_bags_are_thirteen() -> None:
 
 def test_lanes_are_as_many_as_the_page_says() -> None:
     lanes = {"avx512f": 8, "avx2": 4, "sse2": 2}
-    assert {flag: unit.lanes for flag, unit in native.UNITS.items()} == lanes
+    assert {flag: unit.lanes for flag, unit in native.VECTOR_UNITS.items()} == lanes
     statement = "There are eight lanes with AVX-512, four with AVX2, two otherwise."
     assert statement in text_of("docs/theory/lanes.md")

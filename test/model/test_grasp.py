@@ -17,7 +17,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Inertia, Pose
 from spacerobot_ros.model.grasp import (
     BodyMotion,
-    Impact,
+    GraspImpact,
     Payload,
     RobotMotion,
     combined_momenta,
@@ -74,7 +74,7 @@ def body_energy(body: BodyMotion, inertia: Inertia) -> float:
     return float(p @ p / inertia.mass + L @ body.omega) / 2
 
 
-def after(motion: RobotMotion, impact: Impact) -> RobotMotion:
+def after(motion: RobotMotion, impact: GraspImpact) -> RobotMotion:
     return RobotMotion(motion.pose, impact.twist, motion.q, impact.qdot)
 
 

@@ -169,5 +169,5 @@ def test_an_arm_beside_its_base_turns_it_by_loops_elsewhere() -> None:
     assert float(str(schedule.notes["expected_cycles"])) < 200
     robot = load_robot(robot_file("servicer"))
     geometry = Clearance(robot, 0.02).geometry
-    start = geometry.nearest_at(schedule.positions[:1])[0][0]
-    assert geometry.nearest_at(schedule.positions)[0].min() >= min(0.02, start) - 1e-4
+    start = geometry.nearest_along(schedule.positions[:1])[0][0]
+    assert geometry.nearest_along(schedule.positions)[0].min() >= min(0.02, start) - 1e-4

@@ -77,7 +77,7 @@ def turning(rate: float) -> Array:
 
 
 def test_a_base_may_turn_at_its_bound_and_a_millionth_more() -> None:
-    bound = PathConstraints(base_rate=0.2)
+    bound = PathConstraints(base_rate_limit=0.2)
     shapes = np.zeros((3, 2))
     bound.check(shapes, turning(0.2 * (1 + 0.9e-6)), 0.5)
     with pytest.raises(UnusableCandidateError, match=r"^the base turns at 0\.2001 rad/s$"):
@@ -91,8 +91,10 @@ def test_an_axis_may_touch_its_cone() -> None:
     attitudes = Rotation.from_rotvec([[0, 0, 0.0], [0, 0, -0.9], [0, 0, -0.4]]).as_quat()
     shapes = np.zeros((3, 2))
     nearest = np.pi / 2 - 0.9
-    PathConstraints(axis_B=axis, direction_W=sun, cone=nearest).check(shapes, attitudes, 0.5)
-    wider = PathConstraints(axis_B=axis, direction_W=sun, cone=nearest + 1e-6)
+    PathConstraints(axis_B=axis, direction_W=sun, cone_half_angle=nearest).check(
+        shapes, attitudes, 0.5
+    )
+    wider = PathConstraints(axis_B=axis, direction_W=sun, cone_half_angle=nearest + 1e-6)
     with pytest.raises(UnusableCandidateError) as refusal:
         wider.check(shapes, attitudes, 0.5)
     assert str(refusal.value) == f"the axis comes within {nearest:.4g} rad of keep_direction"
@@ -100,7 +102,7 @@ def test_an_axis_may_touch_its_cone() -> None:
 
 def test_shapes_may_touch_a_box_and_its_first_entry_is_told() -> None:
     boxes = np.array([[[0.1, -0.5], [0.4, 0.5]]])
-    kept = PathConstraints(boxes=boxes)
+    kept = PathConstraints(keep_out_boxes=boxes)
     attitudes = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
     kept.check(np.array([[0.1, 0.0], [0.4, 0.0], [0.2, 0.5], [0.2, -0.5]]), attitudes, 0.5)
     inside = np.array([[0.0, 0.0], [0.05, 0.0], [0.2, 0.1], [0.3, 0.2]])
@@ -120,7 +122,7 @@ class Geometry:
         self._distances, self._bounds = distances, bounds or distances
         self.pairs = np.zeros((len(distances), 2))
         self.asked: list[int] = []
-        self.unread: tuple[Any, ...] = ()
+        self.unread_meshes: tuple[Any, ...] = ()
 
     def poses(self, shapes: Array, base: object = None) -> tuple[Array, Array]:
         return np.zeros((len(shapes), 1)), np.zeros((len(shapes), 1))

@@ -81,14 +81,18 @@ def test_the_next_solution_is_refined_where_it_may_be_the_better_one(
     boundary = BoundaryConditions(np.zeros(2), goal, np.zeros(2))
     stages = Stages.of(chain, np.eye(3)[2:], False, constraints)
     curvature = chain.function("curvature", compile=False)
-    guess = next(InitialGuesses(stages.turn, curvature, 20).generate(boundary, limits, np.zeros(2)))
+    guess = next(
+        InitialGuesses(stages.rotation_of_step, curvature, 20).generate(
+            boundary, limits, np.zeros(2)
+        )
+    )
     path = MultipleShooting(stages, 20).solve(
         boundary, limits, guess, StopRule(300), DurationBounds(0.1, 60.0)
     )
     assert path is not None
     solvers = {
-        INTERVALS: Scripted(INTERVALS, stages.turn, path, iter(fine)),
-        INTERVALS // 5: Scripted(INTERVALS // 5, stages.turn, path, iter(coarse)),
+        INTERVALS: Scripted(INTERVALS, stages.rotation_of_step, path, iter(fine)),
+        INTERVALS // 5: Scripted(INTERVALS // 5, stages.rotation_of_step, path, iter(coarse)),
     }
 
     class ScriptedSearch(ManoeuvreSearch):

@@ -77,7 +77,7 @@ def test_a_large_change_keeps_all_limits_as_another_solver_finds_it(
 
     def room(x: Array) -> Array:
         positions = with_change(x)
-        speed, turn = limits.shares(positions, PERIOD, before)
+        speed, turn = limits.limit_shares(positions, PERIOD, before)
         most = 1 - 1e-4
         return np.concatenate(
             [

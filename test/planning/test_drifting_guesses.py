@@ -21,7 +21,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     MotionLimits,
     Trajectory,
 )
-from spacerobot_ros.planning.methods.resolved_rate import LEAST_PROGRESS, ResolvedRateOptions
+from spacerobot_ros.planning.methods.resolved_rate import MIN_PROGRESS_RATE, ResolvedRateOptions
 
 Array = npt.NDArray[np.float64]
 
@@ -219,20 +219,20 @@ def test_the_progress_near_a_singularity_decides_the_share_of_a_twist(
         monkeypatch.setattr(follower, "_solution", solution)
 
     for share in (0.25, 0.8):
-        progress(LEAST_PROGRESS * (1 + share), LEAST_PROGRESS)
+        progress(MIN_PROGRESS_RATE * (1 + share), MIN_PROGRESS_RATE)
         found, reason = follower._wanted(twist, pose, q)
         np.testing.assert_allclose(found, share * rates, rtol=1e-9)
         assert reason.startswith("'end_effector' is near a dynamic singularity: it moves by ")
     # A thousandth of a radian of the joint that is fastest by its limit is looked ahead.
     weights = follower._weights
     np.testing.assert_allclose(asked[-1], q + 1e-3 * rates / np.abs(rates / weights).max())
-    progress(LEAST_PROGRESS * 0.5, LEAST_PROGRESS * 0.4)
+    progress(MIN_PROGRESS_RATE * 0.5, MIN_PROGRESS_RATE * 0.4)
     assert not np.any(follower._wanted(twist, pose, q)[0])
-    progress(LEAST_PROGRESS * 0.5, LEAST_PROGRESS * 0.6)
+    progress(MIN_PROGRESS_RATE * 0.5, MIN_PROGRESS_RATE * 0.6)
     found, reason = follower._wanted(twist, pose, q)
     np.testing.assert_array_equal(found, rates)
     assert not reason
-    progress(LEAST_PROGRESS * 2.0, 0.0)
+    progress(MIN_PROGRESS_RATE * 2.0, 0.0)
     assert not follower._wanted(twist, pose, q)[1]
     rates = np.zeros(3)
     progress(0.0, 1.0)

@@ -43,7 +43,7 @@ def test_six_edges_enclose_all_areas_at_once(areas: Array) -> None:
     # Each along one joint, every joint there and back.
     np.testing.assert_array_equal(np.count_nonzero(np.abs(steps) > 1e-12, axis=1), 1)
     np.testing.assert_allclose(steps[:3], -steps[3:], atol=1e-12)
-    assert path.excess == pytest.approx(np.abs(steps).max() / 100.0)
+    assert path.edge_ratio == pytest.approx(np.abs(steps).max() / 100.0)
 
 
 @given(areas=areas_of_either_sign, zeros=st.sets(st.integers(0, 2), min_size=1, max_size=2))
@@ -64,8 +64,8 @@ def test_scaled_by_its_excess_a_path_fits(areas: Array, longest: Array) -> None:
     path = edge_path(areas, longest)
     np.testing.assert_allclose(enclosed(path), areas, rtol=1e-9)
     worst = np.max(np.abs(edges(path)) / longest)
-    assert path.excess == pytest.approx(worst, rel=1e-9)
-    smaller = edge_path(areas * min(1.0, path.excess**-2), longest)
+    assert path.edge_ratio == pytest.approx(worst, rel=1e-9)
+    smaller = edge_path(areas * min(1.0, path.edge_ratio**-2), longest)
     assert np.all(np.abs(edges(smaller)) <= longest * (1 + 1e-9))
 
 
@@ -103,4 +103,4 @@ def test_rectangles_are_as_long_as_the_room_of_each_joint() -> None:
 
 def test_no_area_is_no_path() -> None:
     path = edge_path(np.zeros(3), LONG)
-    assert (path.kind, path.loops, path.excess) == ("nothing", (), 0.0)
+    assert (path.kind, path.loops, path.edge_ratio) == ("nothing", (), 0.0)

@@ -291,14 +291,14 @@ def test_the_turn_that_goes_with_given_joint_positions_is_found(
     boundary = kind.boundary_conditions(
         arm, request, OTHER, MotionLimits.of(arm, OptimalOptions()), np.array([0.0, 0.6, 0.8])
     )
-    assert (Rotation.from_quat(boundary.turn).inv() * X).magnitude() < 1e-9
-    np.testing.assert_array_equal(boundary.likely, OTHER)
+    assert (Rotation.from_quat(boundary.goal_rotation).inv() * X).magnitude() < 1e-9
+    np.testing.assert_array_equal(boundary.likely_final_shape, OTHER)
     assert boundary.final is OTHER
     assert boundary.center is None
     assert boundary.end_effectors.size == 0
     np.testing.assert_allclose(boundary.direction, ATTITUDE.inv().apply([0.0, 0.6, 0.8]))
-    (end,) = boundary.ends
-    np.testing.assert_array_equal(end.turn, boundary.turn)
+    (end,) = boundary.possible_ends
+    np.testing.assert_array_equal(end.base_rotation, boundary.goal_rotation)
 
 
 def test_joint_positions_that_contradict_the_goal_are_refused_by_their_error(
@@ -343,25 +343,25 @@ def test_possible_ends_are_at_the_goal_and_different_and_the_nearest_come_first(
     limits = MotionLimits.of(arm, OptimalOptions())
     request = PlanRequest(at_rest(ARM), goal, Tolerance(1e-6, 1e-6))
     boundary = kind.boundary_conditions(arm, request, None, limits, None)
-    assert 1 <= len(boundary.ends) <= 6
+    assert 1 <= len(boundary.possible_ends) <= 6
     assert boundary.final is None
-    np.testing.assert_array_equal(boundary.likely, boundary.ends[0].shape)
+    np.testing.assert_array_equal(boundary.likely_final_shape, boundary.possible_ends[0].shape)
     np.testing.assert_array_equal(boundary.direction, 0.0)
-    half = limits.span(ARM)[1]
+    half = limits.joint_ranges(ARM)[1]
     times = []
-    for k, end in enumerate(boundary.ends):
+    for k, end in enumerate(boundary.possible_ends):
         values, _, _ = kind.rows.evaluate(
-            end.turn[np.newaxis], end.shape[np.newaxis], boundary.end_effectors
+            end.base_rotation[np.newaxis], end.shape[np.newaxis], boundary.end_effectors
         )
         assert np.abs(values).max() <= 2e-3
         assert np.all((end.shape >= limits.lower) & (end.shape <= limits.upper))
         if fixed:
-            assert (Rotation.from_quat(end.turn).inv() * X).magnitude() < 1e-9
+            assert (Rotation.from_quat(end.base_rotation).inv() * X).magnitude() < 1e-9
         else:
             direct = kind.rows.turns_along_direct_path(ARM, end.shape[np.newaxis])[0]
-            np.testing.assert_allclose(end.turn, direct, atol=1e-12)
+            np.testing.assert_allclose(end.base_rotation, direct, atol=1e-12)
         times.append(np.abs((end.shape - ARM) / limits.velocity).max())
-        for other in boundary.ends[:k]:
+        for other in boundary.possible_ends[:k]:
             assert np.abs((end.shape - other.shape) / half).max() > 0.05
     assert times == sorted(times)
 

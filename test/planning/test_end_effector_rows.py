@@ -145,11 +145,11 @@ def test_ends_of_guesses_are_at_the_goal_and_the_soonest_is_first(arm: SpaceRobo
     assert times == sorted(times)
     half = (UPPER - LOWER) / 2
     for k, each in enumerate(ends):
-        r_CE, _ = hand_from_center(Rotation.from_quat(each.turn), each.shape)
+        r_CE, _ = hand_from_center(Rotation.from_quat(each.base_rotation), each.shape)
         assert np.abs(r_CE - parameters[:3]).max() <= 2e-3
         assert np.all((LOWER - 1e-12 <= each.shape) & (each.shape <= UPPER + 1e-12))
         exact = found.rows.turns_along_direct_path(ARM, each.shape[np.newaxis])[0]
-        np.testing.assert_allclose(each.turn, exact, atol=1e-12)
+        np.testing.assert_allclose(each.base_rotation, exact, atol=1e-12)
         for other in ends[:k]:
             assert np.max(np.abs(each.shape - other.shape) / half) > 0.05
     again = found._find_possible_ends(ARM, LIMITS, parameters, turn)
@@ -251,4 +251,4 @@ def test_more_than_the_joints_bring_about_is_counted(arm: SpaceRobot) -> None:
 def test_a_guess_begins_at_its_end() -> None:
     end = PossibleEnd(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.6, 0.0, 0.8]))
     assert end.shape.tolist() == [1.0, 2.0, 3.0]
-    assert end.turn.tolist() == [0.0, 0.6, 0.0, 0.8]
+    assert end.base_rotation.tolist() == [0.0, 0.6, 0.0, 0.8]

@@ -101,7 +101,7 @@ def test_ends_that_are_soonest_reached_come_first_and_same_ones_once() -> None:
     kinematics = Kinematics((shapes, [1e-3, 1.9e-3, 1e-9, 2e-3, 2.1e-3, 0.0]))
     found = ends_of(kinematics)
     assert [end.shape.tolist() for end in found] == [shapes[k] for k in (5, 1, 3, 0)]
-    assert [end.turn[0] for end in found] == [5.0, 1.0, 3.0, 0.0]
+    assert [end.base_rotation[0] for end in found] == [5.0, 1.0, 3.0, 0.0]
     assert len(kinematics.asked) == 1
 
 

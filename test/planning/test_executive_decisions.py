@@ -141,7 +141,7 @@ def test_a_goal_is_planned_for_without_the_joints_that_are_stuck(
     until(loop, Phase.PLANNING)
     assert requested == [PlanReason.STUCK_JOINTS]
     task = loop.held.tasks[-1]
-    assert dict(task.stuck) == {"slider_1": q[0]}
+    assert dict(task.stuck_joint_positions) == {"slider_1": q[0]}
     assert task.required == {"position"}
     assert not task.request.correction
     assert any("Stuck: slider_1." in notice for notice in loop.notices)
@@ -151,11 +151,11 @@ def test_a_goal_is_planned_for_without_the_joints_that_are_stuck(
     loop.held.release()
     loop.tick(2)
     until(loop, Phase.PLANNING)
-    assert not loop.held.tasks[-1].stuck
+    assert not loop.held.tasks[-1].stuck_joint_positions
     loop.held.release()
     until(loop, Phase.EVALUATING)
     until(loop, Phase.PLANNING)
-    assert dict(loop.held.tasks[-1].stuck) == {"slider_1": q[0]}
+    assert dict(loop.held.tasks[-1].stuck_joint_positions) == {"slider_1": q[0]}
 
 
 def test_the_next_goal_takes_the_result_of_a_refused_one_along() -> None:

@@ -103,11 +103,12 @@ def test_a_plan_in_between_goes_on_along_the_rest_of_the_path(
     method, goal = method_of(corner_tolerance=0.02), flown.goal
     progress = flown.progress
     assert isinstance(progress, PathProgress)
-    assert len(progress.along) == len(flown.positions)
-    assert progress.along[0] == 0.0
-    assert progress.along[-1] == pytest.approx(progress.route.along[-1])
-    assert np.all(np.diff(progress.along) >= -1e-9)
-    tick = int(np.searchsorted(progress.along, progress.route.along[2] + 0.02))
+    assert len(progress.travelled_lengths) == len(flown.positions)
+    assert progress.travelled_lengths[0] == 0.0
+    assert progress.travelled_lengths[-1] == pytest.approx(progress.route.lengths_at_poses[-1])
+    assert np.all(np.diff(progress.travelled_lengths) >= -1e-9)
+    corner = progress.route.lengths_at_poses[2] + 0.02
+    tick = int(np.searchsorted(progress.travelled_lengths, corner))
     # Braking came before the schedule: its shapes do not count.
     braked = replace(flown, positions=np.vstack([[9.0, 9.0, 9.0], flown.positions]))
     r, _ = poses("three_joint_arm", flown.positions[: tick + 1], HAND)[HAND]
@@ -115,7 +116,7 @@ def test_a_plan_in_between_goes_on_along_the_rest_of_the_path(
     request = PlanRequest(state, goal, NEAR, correction=True, previous=braked)
     route = method._route(request, 0.01)
     assert len(route.positions) == 3
-    done = progress.route.after(progress.along[tick]).positions
+    done = progress.route.remaining_after(progress.travelled_lengths[tick]).positions
     np.testing.assert_allclose(route.positions[1:], done, atol=1e-12)
     np.testing.assert_allclose(route.positions[-1], start + WAY[-1], atol=1e-12)
     at_end = replace(request, state=replace(state, q=flown.positions[-1]))
@@ -289,10 +290,10 @@ def test_a_path_is_followed_until_shortly_before_a_limit(start: Array) -> None:
     assert str(schedule.notes["stopped"]).count(" m of the ") == 1
     progress = schedule.progress
     assert isinstance(progress, PathProgress)
-    done, whole = float(progress.along[-1]), float(progress.route.along[-1])
-    assert progress.route.along[1] < done < whole
+    done, whole = float(progress.travelled_lengths[-1]), float(progress.route.lengths_at_poses[-1])
+    assert progress.route.lengths_at_poses[1] < done < whole
     end = poses("three_joint_arm", schedule.positions, HAND)[HAND][0]
-    wanted = progress.route.after(done).positions[0]
+    wanted = progress.route.remaining_after(done).positions[0]
     np.testing.assert_allclose(end, wanted, atol=1e-6)
     # From there the rest is refused with the same reason: the goal is given up.
     base = schedule.path

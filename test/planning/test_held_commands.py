@@ -129,7 +129,7 @@ def test_commands_end_on_the_goal_by_another_integration(
     boundary = BoundaryConditions(START, goal.as_quat(), final, final)
     held = holder._adjust_to_goal(positions, boundary, final, LIMITS, moves_end=False)
     np.testing.assert_array_equal(held.positions[[0, -1]], [START, final])
-    assert held.miss <= 1e-11
+    assert held.end_error <= 1e-11
     attitude = Rotation.identity()
     for q, q_next in zip(held.positions[:-1], held.positions[1:], strict=True):
         for k in range(10):
@@ -137,7 +137,7 @@ def test_commands_end_on_the_goal_by_another_integration(
             attitude *= Rotation.from_rotvec(-A @ (q_next - q) / 10)
     assert (attitude.inv() * goal).magnitude() < 1e-5
     far = turn * Rotation.from_rotvec([2.0, -1.0, 1.5])
-    unreached = replace(boundary, turn=far.as_quat())
+    unreached = replace(boundary, goal_rotation=far.as_quat())
     assert holder._adjust_to_goal(positions, unreached, final, LIMITS, moves_end=False) is None
 
 
@@ -270,7 +270,7 @@ def test_all_shapes_are_changed_where_waves_exceed_a_limit(
     held = holder.hold(trajectory, boundary, fast, fixed=True, before=before)
     assert held is not None
     assert len(held.positions) == 41
-    assert held.miss <= 1e-8
+    assert held.end_error <= 1e-8
     factor, overrun = fast.excess(held.positions, PERIOD, before)
     assert factor <= 1 + 1e-9
     assert overrun <= 1e-9

@@ -100,7 +100,7 @@ def test_possible_ends_take_turns_and_their_direct_ways_come_first(
     other = np.array([0.9, 0.1, -0.6])
     near = PossibleEnd(FINAL, direct.quaternions[-1])
     far = PossibleEnd(other, Rotation.from_rotvec([0.0, 0.5, 0.0]).as_quat())
-    boundary = BoundaryConditions(START, near.turn, FINAL, ends=(near, far))
+    boundary = BoundaryConditions(START, near.base_rotation, FINAL, possible_ends=(near, far))
     found = list(itertools.islice(guesses.generate(boundary, LIMITS, FINAL), 4))
     ends = [each.shapes[-1] for each in found]
     np.testing.assert_allclose(ends, [FINAL, other, FINAL, other], atol=1e-12)

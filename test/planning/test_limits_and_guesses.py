@@ -48,14 +48,14 @@ def arm() -> SpaceRobot:
 def test_speeds_and_accelerations_are_counted_as_shares_of_their_limits() -> None:
     """By hand: rates (0, -.5, 1.5, .5, 0) of the first joint at a period of 0.5 s."""
     positions = np.array([[0.0, 0, 0], [-0.25, 0, 0], [0.5, 0.125, -1.0], [0.75, 0.125, -1.0]])
-    speed, change = LIMITS.shares(positions, 0.5)
+    speed, change = LIMITS.limit_shares(positions, 0.5)
     np.testing.assert_allclose(speed[:, 0], np.array([0.0, 0.5, 1.5, 0.5, 0.0]) / 2.0)
     np.testing.assert_allclose(speed[:, 1], np.array([0.0, 0.0, 0.25, 0.0, 0.0]) / 0.5)
     np.testing.assert_allclose(change[:, 0], np.array([1.0, 4.0, 2.0, 1.0]) / 8.0)
     np.testing.assert_allclose(change[:, 2], np.array([0.0, 4.0, 4.0, 0.0]) / 2.0)
     assert LIMITS.excess(positions, 0.5) == pytest.approx((np.sqrt(2.0), 0.25))
     assert LIMITS.excess(positions - [0.25, 0, 0], 0.5)[1] == 0.0
-    moving, _ = LIMITS.shares(positions, 0.5, np.array([-1.0, 0.0, 8.0]))
+    moving, _ = LIMITS.limit_shares(positions, 0.5, np.array([-1.0, 0.0, 8.0]))
     assert moving[0].tolist() == [0.5, 0.0, 2.0]
     slow = LIMITS.excess(positions[:1], 0.5, np.array([1.0, 0.0, 0.0]))
     assert slow == pytest.approx((0.5, 0.0)), "it stops within a tick"
@@ -81,14 +81,14 @@ def test_margins_are_kept_except_where_a_shape_is_in_them(
 
 
 def test_the_span_of_guesses_is_finite_round_the_present_shape() -> None:
-    middle, half = LIMITS.span(np.array([0.0, 0.5, 7.0]))
+    middle, half = LIMITS.joint_ranges(np.array([0.0, 0.5, 7.0]))
     assert middle.tolist() == [-0.25, 0.25, 7.0]
     assert half == pytest.approx([0.75, 0.5, np.pi])
     wide = MotionLimits(np.array([-20.0]), np.array([10.0]), np.ones(1), np.ones(1))
-    middle, half = wide.span(np.array([9.0]))
+    middle, half = wide.joint_ranges(np.array([9.0]))
     assert (middle[0], half[0]) == pytest.approx(((9.0 - 2 * np.pi + 10.0) / 2, np.pi))
     one_end = MotionLimits(np.array([-1.0]), np.array([np.inf]), np.ones(1), np.ones(1))
-    middle, half = one_end.span(np.array([2.0]))
+    middle, half = one_end.joint_ranges(np.array([2.0]))
     assert (middle[0], half[0]) == pytest.approx((2.0, np.pi))
 
 
@@ -180,7 +180,7 @@ def test_constraints_that_make_no_sense_are_refused(
 
 def test_no_constraint_is_none(arm: SpaceRobot) -> None:
     none = PathConstraints.of(arm, OptimalOptions())
-    assert none.on_knots == 0
+    assert none.knot_inequality_count == 0
     assert none.symbolic(ca.SX.sym("q", 3), ca.SX.sym("x", 4), ca.SX.sym("d", 3)).shape[0] == 0
     none.check(np.zeros((2, 3)), np.tile(IDENTITY, (2, 1)), 0.5)
     guess = parabola(4, -3.0, 2.0)
@@ -211,7 +211,7 @@ def test_a_base_that_turns_too_fast_or_an_axis_too_near_is_refused(arm: SpaceRob
     inside = PathConstraints.of(arm, OptimalOptions(**cone, keep_angle=angle + 1e-6))
     with pytest.raises(UnusableCandidateError, match=r"comes within 0\.5236 rad of keep_direction"):
         inside.check(shapes, turning([0.0, np.pi / 3, 0.5]), 1.0)
-    assert (away.on_knots, away.base_rate) == (1, 0.0)
+    assert (away.knot_inequality_count, away.base_rate_limit) == (1, 0.0)
     q, x, d = ca.SX.sym("q", 3), ca.SX.sym("x", 4), ca.SX.sym("d", 3)
     value = ca.Function("value", [q, x, d], [away.symbolic(q, x, d)])
     assert away.direction_W is not None
@@ -225,7 +225,7 @@ def test_a_box_of_shapes_is_left_out_with_a_body_round_it(arm: SpaceRobot) -> No
     low, high = (-0.5, 0.25, -50.0), (0.5, 0.75, 50.0)
     constraints = PathConstraints.of(arm, OptimalOptions(keep_out=(*low, *high)))
     bounded = [i for i in range(3) if low[i] > arm.lower[i] or high[i] < arm.upper[i]]
-    assert constraints.bodies[0].joints == bounded
+    assert constraints.smooth_keep_out_bodies[0].joints == bounded
     assert 2 not in bounded
     outside = np.array([[0.0, 0.2, 0.0], [-0.5, 0.5, 0.0], [0.0, 0.75, 0.0]])
     constraints.check(outside, np.tile(IDENTITY, (3, 1)), 0.5)

@@ -150,12 +150,12 @@ def test_the_bound_holds_every_centre_of_mass(kind: str, seed: int) -> None:
     oracle = PinocchioOracle(urdf, robot.joint_names)
     reach = CenterReach.of(robot, *shape_box(robot))
     centres = [oracle.center_of_mass(some_shape(robot, rng)) for _ in range(20)]
-    assert max(reach.gap(center) for center in centres) < 1e-9
+    assert max(reach.distance_outside(center) for center in centres) < 1e-9
     # It is no empty claim: half again as far off is out of reach.
     far = np.array(centres) - reach.origin
-    spread = reach.radius + np.abs(reach.slots).sum() * 10
+    spread = reach.radius + np.abs(reach.slider_directions).sum() * 10
     outward = far[0] / max(float(np.linalg.norm(far[0])), 1e-9)
-    assert reach.gap(reach.origin + 1.5 * spread * outward) > 0.4 * reach.radius
+    assert reach.distance_outside(reach.origin + 1.5 * spread * outward) > 0.4 * reach.radius
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -172,9 +172,9 @@ def test_of_sliders_the_bound_is_exact(seed: int) -> None:
             for unit in np.eye(robot.n)
         ]
         corner = robot.center_of_mass(np.where(np.array(slots) > 0, upper, lower))
-        assert reach.gap(corner) < 1e-9
-        assert reach.gap(corner - 1e-6 * direction) < 1e-6
-        assert reach.gap(corner + 0.01 * direction) == pytest.approx(0.01, rel=1e-6)
+        assert reach.distance_outside(corner) < 1e-9
+        assert reach.distance_outside(corner - 1e-6 * direction) < 1e-6
+        assert reach.distance_outside(corner + 0.01 * direction) == pytest.approx(0.01, rel=1e-6)
 
 
 def test_a_proof_and_a_search_in_vain_are_two_things() -> None:

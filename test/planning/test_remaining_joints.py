@@ -30,7 +30,7 @@ from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorke
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
-from spacerobot_ros.simulation.actuators import FaultyPlant
+from spacerobot_ros.simulation.actuators import PlantWithFaults
 
 TICK = 0.05
 SERVICER = (share_directory() / "urdf" / "servicer.urdf").read_text("utf-8")
@@ -56,7 +56,7 @@ def gait(
     return Planner(without, Tolerance(1e-3, 1e-3))
 
 
-def state_of(plant: FaultyPlant) -> RobotState:
+def state_of(plant: PlantWithFaults) -> RobotState:
     return RobotState(plant.pose[:3].copy(), plant.pose[3:].copy(), plant.q.copy())
 
 
@@ -72,7 +72,7 @@ def test_an_arm_turns_its_base_without_its_elbow(options: dict[str, Any]) -> Non
     """The plant holds the joint; the flight ends where it does by its own equations."""
     elbow = 2
     inner = VelocityPlant(robot_of(SERVICER), TICK, InitialState(joint_positions=SHAPE))
-    plant = FaultyPlant(inner, ["joint_stuck elbow_pitch"], TICK, wrench=False)
+    plant = PlantWithFaults(inner, ["joint_stuck elbow_pitch"], TICK, wrench=False)
     method = gait(SERVICER, SHAPE, "elbow_pitch", k=0.5, **options)
     goal = Goal(np.zeros(3), Rotation.from_rotvec([0.01, 0.005, -0.01]).as_quat())
     for _ in range(30):
@@ -158,7 +158,7 @@ def test_a_shape_that_a_stuck_joint_is_not_in_is_refused() -> None:
 def test_a_chain_turns_its_base_by_the_one_pin_that_is_left() -> None:
     chain = (share_directory() / "urdf" / "planar_chain.urdf").read_text("utf-8")
     robot = robot_of(chain)
-    plant = FaultyPlant(VelocityPlant(robot, TICK), ["joint_stuck pin_1"], TICK, wrench=False)
+    plant = PlantWithFaults(VelocityPlant(robot, TICK), ["joint_stuck pin_1"], TICK, wrench=False)
     goal = Goal(np.zeros(3), Rotation.from_rotvec([0.0, 0.0, 0.1]).as_quat())
     method = gait(chain, plant.q, "pin_1", method="square_path")
     for rates in method.plan(state_of(plant), goal).velocities:

@@ -409,7 +409,7 @@ def test_paper_4_the_path_ends_at_the_singularity(
     path = method.path(request_b(state))
     assert not path.is_complete
     # Computed independently of this program, from the paper's Table I.
-    assert 1.583415 * path.shares[-1] == pytest.approx(1.194983, abs=2e-6)
+    assert 1.583415 * path.path_fractions[-1] == pytest.approx(1.194983, abs=2e-6)
     assert np.degrees(path.shapes[-1]) == pytest.approx([73.1295, 11.3449], abs=1e-4)
     turned = Rotation.from_quat(path.turns[-1]).as_rotvec(degrees=True)
     assert 21.0 + turned[2] == pytest.approx(-31.9510, abs=1e-4)
@@ -425,13 +425,13 @@ def test_a_singularity_is_not_stepped_over(
 ) -> None:
     robot, state = manipulator
     module = "spacerobot_ros.planning.methods.resolved_rate."
-    monkeypatch.setattr(module + "_STEP", first_step)
-    monkeypatch.setattr(module + "_MIN_STEPS", 2)
+    monkeypatch.setattr(module + "_TRACE_STEP", first_step)
+    monkeypatch.setattr(module + "_MIN_TRACE_STEPS", 2)
     monkeypatch.setattr(module + "_SINGULARITY_STEP_SHARE", 1.0)
     method = build_method("resolved_rate", robot, 0.01, 0.01, {})
     assert isinstance(method, ResolvedRateGait)
     path = method.path(request_b(state))
-    assert 1.583415 * path.shares[-1] == pytest.approx(1.194983, abs=0.01)
+    assert 1.583415 * path.path_fractions[-1] == pytest.approx(1.194983, abs=0.01)
 
 
 def test_paper_4_the_line_is_followed_until_shortly_before_the_singularity(

@@ -22,7 +22,7 @@ from spacerobot_ros.planning.methods.resolved_rate import (
     _LinkPath,
     _SmoothPath,
     _TimedPath,
-    _trace,
+    trace_joint_path,
 )
 
 Array = npt.NDArray[np.float64]
@@ -40,8 +40,8 @@ def test_a_way_through_points_is_a_natural_spline_by_the_lengths_of_its_chords()
     assert not way.is_straight
     spline = CubicSpline(np.array([0.0, 0.5, 1.7, 2.7]) / 2.7, points, bc_type="natural")
     for share in (0.0, 0.1, 0.4, 0.9, 1.0):
-        np.testing.assert_allclose(way.place(share), spline(share), atol=1e-12)
-        np.testing.assert_allclose(way.rate(share), spline(share, 1), atol=1e-12)
+        np.testing.assert_allclose(way.displacement(share), spline(share), atol=1e-12)
+        np.testing.assert_allclose(way.displacement_derivative(share), spline(share, 1), atol=1e-12)
 
 
 def test_points_that_come_twice_are_no_way_and_two_are_a_straight_one() -> None:
@@ -49,12 +49,12 @@ def test_points_that_come_twice_are_no_way_and_two_are_a_straight_one() -> None:
     way = _SmoothPath(points)
     assert way.is_straight
     assert way.length == pytest.approx(1.0)
-    np.testing.assert_allclose(way.place(0.25), [0.15, 0.0, -0.2], atol=1e-15)
-    np.testing.assert_allclose(way.rate(0.7), [0.6, 0.0, -0.8], atol=1e-14)
+    np.testing.assert_allclose(way.displacement(0.25), [0.15, 0.0, -0.2], atol=1e-15)
+    np.testing.assert_allclose(way.displacement_derivative(0.7), [0.6, 0.0, -0.8], atol=1e-14)
     none = _SmoothPath(points[:2])
     assert (none.is_straight, none.length) == (True, 0.0)
-    np.testing.assert_array_equal(none.place(0.5), 0.0)
-    np.testing.assert_array_equal(none.rate(0.5), 0.0)
+    np.testing.assert_array_equal(none.displacement(0.5), 0.0)
+    np.testing.assert_array_equal(none.displacement_derivative(0.5), 0.0)
     three = _SmoothPath(np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 0.2, 0]]))
     assert not three.is_straight
 
@@ -71,7 +71,7 @@ def test_the_error_of_a_link_is_seen_along_its_directions() -> None:
     )
     wanted = Rotation.from_rotvec(0.25 * turn) * Rotation.from_rotvec([0.3, 0.1, 0.0])
     off = Rotation.from_rotvec([0.0, 0.0, 0.05])
-    found = line.miss((off.inv() * wanted).as_matrix(), np.array([0.9, 0.1, 7.0]), 0.25)
+    found = line.tracking_error((off.inv() * wanted).as_matrix(), np.array([0.9, 0.1, 7.0]), 0.25)
     # At a quarter, 0.5 m and 0.25 m on: the y comes first, as the directions say.
     np.testing.assert_allclose(found, [-0.2 + 0.25 - 0.1, 0.5 + 0.5 - 0.9, 0.05], atol=1e-12)
 
@@ -87,7 +87,7 @@ class Arc:
 
     def __init__(self, length: float, radius: float = 1.0) -> None:
         self.length, self.radius = length, radius
-        self.weights, self.marks = np.array([1.0, 0.25]), np.zeros(0)
+        self.joint_scales, self.curvature_breaks = np.array([1.0, 0.25]), np.zeros(0)
         self.asked: list[float] = []
 
     def tangent(self, q: Array, X: Array, share: float) -> tuple[Array, Array, float]:
@@ -101,37 +101,37 @@ class Arc:
 
 def test_a_line_before_the_singularity_is_followed_to_its_end() -> None:
     arc: Any = Arc(0.5)
-    path = _trace(arc, np.array([0.0, 0.2]), NEVER)
+    path = trace_joint_path(arc, np.array([0.0, 0.2]), NEVER)
     assert path.is_complete
-    assert path.shares[-1] == 1.0
+    assert path.path_fractions[-1] == 1.0
     assert path.shapes[-1] == pytest.approx([math.asin(0.5), 0.2 + 0.5 * math.asin(0.5)], abs=1e-7)
-    assert path.length[-1] == pytest.approx(math.asin(0.5), abs=1e-7)
-    np.testing.assert_allclose(path.shares, 2 * np.sin(path.shapes[:, 0]), atol=1e-7)
-    np.testing.assert_allclose(path.progress, np.cos(path.shapes[:, 0]), atol=1e-12)
-    np.testing.assert_allclose(path.length, path.shapes[:, 0], atol=1e-9)
-    turned = [[0.0, 0.0, 0.4 * s] for s in path.length]
+    assert path.arc_length[-1] == pytest.approx(math.asin(0.5), abs=1e-7)
+    np.testing.assert_allclose(path.path_fractions, 2 * np.sin(path.shapes[:, 0]), atol=1e-7)
+    np.testing.assert_allclose(path.progress_rate, np.cos(path.shapes[:, 0]), atol=1e-12)
+    np.testing.assert_allclose(path.arc_length, path.shapes[:, 0], atol=1e-9)
+    turned = [[0.0, 0.0, 0.4 * s] for s in path.arc_length]
     expected = Rotation.from_rotvec(turned)
     assert (expected.inv() * Rotation.from_quat(path.turns)).magnitude().max() < 1e-7
     np.testing.assert_allclose(np.linalg.norm(path.turns, axis=1), 1.0, atol=1e-14)
-    np.testing.assert_allclose(np.diff(path.length)[:26], 0.02, atol=1e-12)
+    np.testing.assert_allclose(np.diff(path.arc_length)[:26], 0.02, atol=1e-12)
     assert max(arc.asked) <= 1.0
 
 
 def test_a_short_line_is_followed_in_twenty_steps() -> None:
-    path = _trace(Arc(0.3, radius=2.0), np.zeros(2), NEVER)  # type: ignore[arg-type]
-    np.testing.assert_allclose(np.diff(path.length)[:19], 0.3 / 20 / 2.0, atol=1e-12)
+    path = trace_joint_path(Arc(0.3, radius=2.0), np.zeros(2), NEVER)  # type: ignore[arg-type]
+    np.testing.assert_allclose(np.diff(path.arc_length)[:19], 0.3 / 20 / 2.0, atol=1e-12)
     assert path.is_complete
 
 
 def test_a_trace_ends_at_the_singularity_and_never_beyond() -> None:
     arc: Any = Arc(3.0, radius=1.5)
-    path = _trace(arc, np.array([0.1, 0.0]), NEVER)
+    path = trace_joint_path(arc, np.array([0.1, 0.0]), NEVER)
     assert not path.is_complete
     assert path.shapes[-1, 0] == pytest.approx(math.pi / 2, abs=1e-6)
     assert path.shapes[:, 0].max() <= math.pi / 2 + 1e-9
-    assert path.shares[-1] == pytest.approx((1.5 - 1.5 * math.sin(0.1)) / 3.0, abs=1e-7)
-    assert 0.0 <= path.progress[-1] <= 1e-8
-    steps = np.diff(path.length)
+    assert path.path_fractions[-1] == pytest.approx((1.5 - 1.5 * math.sin(0.1)) / 3.0, abs=1e-7)
+    assert 0.0 <= path.progress_rate[-1] <= 1e-8
+    steps = np.diff(path.arc_length)
     assert np.all(steps > 0)
     # On the way there no step is longer than a quarter of what is left.
     left = math.pi / 2 - path.shapes[:-1, 0]
@@ -142,8 +142,8 @@ def test_a_trace_ends_at_the_singularity_and_never_beyond() -> None:
 
 
 def test_the_path_up_to_a_place_has_that_place() -> None:
-    path = _trace(Arc(0.5), np.zeros(2), NEVER)  # type: ignore[arg-type]
-    part = path.until(3)
+    path = trace_joint_path(Arc(0.5), np.zeros(2), NEVER)  # type: ignore[arg-type]
+    part = path.truncated(3)
     assert [len(x) for x in vars(part).values()] == [4] * 5
     np.testing.assert_array_equal(part.shapes[-1], path.shapes[3])
     assert not part.is_complete
@@ -199,7 +199,7 @@ def test_shapes_at_ticks_are_those_of_the_fastest_motion() -> None:
     timed = _TimedPath.of(joint_path(0.9), limits)
     total = 0.3 + 0.3 + (0.9 - 0.18) / 0.6
     assert timed.time[-1] == pytest.approx(total, rel=2e-3)
-    assert timed.interval == pytest.approx(0.9 / 160)
+    assert timed.arc_length_step == pytest.approx(0.9 / 160)
     shapes, shares = timed.at_ticks(36)
     t = np.linspace(0.0, total, 37)
     r = np.minimum(t, total - t)
@@ -246,7 +246,9 @@ def obstacle(
         return "|det J*|", 10.0 + q[0]
 
     lines = SimpleNamespace(
-        place=lambda share: f"after {share:.3g}", measure=measure, is_straight=straight
+        position_text=lambda share: f"after {share:.3g}",
+        singularity_measure=measure,
+        is_straight=straight,
     )
     method: Any = SimpleNamespace(robot=robot)
     return ResolvedRateGait._find_obstacle(method, lines, path)  # type: ignore[arg-type]

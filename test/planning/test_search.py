@@ -406,7 +406,7 @@ def test_a_solution_without_convergence_is_flown_at_full_speed(model: ManoeuvreM
         found = Search(model)._solve_from_guess(progress(), solver, path(9.0), StopRule(9))  # type: ignore[arg-type]
         assert found is not None
         assert found.duration == pytest.approx(duration)
-    turns_slowly = replace(model, constraints=replace(model.constraints, base_rate=0.3))
+    turns_slowly = replace(model, constraints=replace(model.constraints, base_rate_limit=0.3))
     solver = Solver(20, iter([5.0]), converged=False)
     found = Search(turns_slowly)._solve_from_guess(progress(), solver, path(9.0), StopRule(9))  # type: ignore[arg-type]
     assert found is not None
@@ -432,7 +432,7 @@ def test_links_are_kept_apart_at_eighty_instants_at_least(
         def of(cls, *_: object, **__: object) -> Stages:
             return cls()
 
-        def keeping(self, rows: object, instants: int) -> str:
+        def with_distances(self, rows: object, instants: int) -> str:
             asked.append((rows, instants))
             return "kept apart"
 

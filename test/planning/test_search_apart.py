@@ -412,7 +412,7 @@ def test_commands_that_turn_the_base_a_little_too_fast_are_made_slower(
 ) -> None:
     """5 s times 1.04 and a reserve of 2 in 1000 are 5.21 s, in ticks of 0.05 s: 5.25 s."""
     search: Any = Search(model)
-    search._constraints = PathConstraints(base_rate=0.1)
+    search._constraints = PathConstraints(base_rate_limit=0.1)
 
     class Turning:
         def hold(self, trajectory: Trajectory, *_: object, **__: object) -> HeldCommands:
@@ -454,7 +454,7 @@ def test_the_aim_is_turned_by_the_difference_of_solution_and_commands() -> None:
     trajectory = Trajectory(0.5, shapes, shapes, ends)
     found = CommandHolder.corrected_end(holder, trajectory, boundary, 17)
     expected = goal * (reached.inv() * solved)
-    assert (Rotation.from_quat(found.turn).inv() * expected).magnitude() < 1e-12
+    assert (Rotation.from_quat(found.goal_rotation).inv() * expected).magnitude() < 1e-12
     assert asked[0] == 18
     np.testing.assert_array_equal(asked[1], IDENTITY)
     np.testing.assert_array_equal(asked[2], L_0)

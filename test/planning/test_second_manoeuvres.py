@@ -140,7 +140,7 @@ def test_a_second_stuck_joint_is_planned_without_beside_the_first() -> None:
     stuck(loop)
     first_at = loop.plant.q[0]
     until(loop, Phase.PLANNING)
-    assert dict(loop.held.tasks[-1].stuck) == {"slider_1": first_at}
+    assert dict(loop.held.tasks[-1].stuck_joint_positions) == {"slider_1": first_at}
     loop.held.release()
     until(loop, Phase.EXECUTING)
     # Let the first go on a little: it slips, and is found where it is then.
@@ -149,7 +149,7 @@ def test_a_second_stuck_joint_is_planned_without_beside_the_first() -> None:
     until(loop, Phase.PLANNING)
     q = loop.plant.q.copy()
     task = loop.held.tasks[-1]
-    assert dict(task.stuck) == {"slider_1": q[0], "slider_3": q[2]}
+    assert dict(task.stuck_joint_positions) == {"slider_1": q[0], "slider_3": q[2]}
     assert task.required == {"position"}
     loop.held.release()
     until(loop, Phase.EXECUTING)
@@ -165,7 +165,7 @@ def test_a_second_stuck_joint_is_planned_without_beside_the_first() -> None:
     loop.plant.hold(np.zeros(3, dtype=np.bool_))
     loop.propose_goal(OTHER)
     until(loop, Phase.PLANNING)
-    assert not loop.held.tasks[-1].stuck
+    assert not loop.held.tasks[-1].stuck_joint_positions
     assert not loop.held.tasks[-1].required
     loop.held.release()
     until(loop, Phase.EXECUTING)

@@ -129,22 +129,22 @@ def bounded(equations: _Equations) -> Any:
 def test_a_step_may_not_leave_the_bounds(bounded: Any) -> None:
     z = np.array([[-1.0, 0.9, 0.5, 9.0, -9.0, 0.0]] * 2)
     out, inside = np.array([-1.0, 1.0, 1, 1, -1, 1]), np.array([1.0, -1.0, -1, 1, -1, 1])
-    found = bounded._free(z, np.array([out, inside]))
+    found = bounded._free_coordinates(z, np.array([out, inside]))
     np.testing.assert_array_equal(found, [[0, 0, 1, 1, 1, 1], [1, 1, 1, 1, 1, 1]])
     near = z + np.array([2e-12, -2e-12, 0, 0, 0, 0])
-    np.testing.assert_array_equal(bounded._free(near, np.array([out, out])), 1.0)
+    np.testing.assert_array_equal(bounded._free_coordinates(near, np.array([out, out])), 1.0)
     at = z + np.array([0.5e-12, -0.5e-12, 0, 0, 0, 0])
-    np.testing.assert_array_equal(bounded._free(at, np.array([out, out]))[:, :2], 0.0)
+    np.testing.assert_array_equal(bounded._free_coordinates(at, np.array([out, out]))[:, :2], 0.0)
 
 
 def test_singular_shapes_are_solved_for_within_bounds(bounded: Any, equations: _Equations) -> None:
     rng = np.random.default_rng(3)
     shapes = rng.uniform([-1.0, -0.6, 0.2], [0.8, 0.9, 1.5], (12, 3))
-    z = bounded._solved(equations.starts(shapes), 40)
+    z = bounded._project_to_singular_shapes(equations.starts(shapes), 40)
     g = np.linalg.norm(equations.evaluate(z)[0], axis=1)
     assert np.all((z[:, :3] >= [-1.0, -0.6, 0.2]) & (z[:, :3] <= [0.8, 0.9, 1.5]))
     free = _Search(equations, np.full(3, -np.inf), np.full(3, np.inf))
-    anywhere = free._solved(equations.starts(shapes), 40)
+    anywhere = free._project_to_singular_shapes(equations.starts(shapes), 40)
     found = np.linalg.norm(equations.evaluate(anywhere)[0], axis=1) < 1e-9
     assert found.mean() > 0.8
     assert (g < 1e-9).mean() <= found.mean()
@@ -155,7 +155,7 @@ def test_singular_shapes_are_solved_for_within_bounds(bounded: Any, equations: _
     z = anywhere[found][:4]
     start = equations.evaluate(z)[2]
     for sign in (1.0, -1.0):
-        end = free._walk(z, sign)
+        end = free._follow_singular_curve(z, sign)
         after, missing = equations.evaluate(end)[2], equations.evaluate(end)[0]
         assert np.all(sign * (after - start) >= 0)
         assert np.max(sign * (after - start)) > 0.05

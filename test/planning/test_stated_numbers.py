@@ -210,4 +210,4 @@ def test_whether_a_plan_reaches_a_shape_is_told_by_where_it_ends() -> None:
         goal = replace(aim, joint_positions=shape)
         request = PlanRequest(state, goal, Tolerance(1e-6, 1e-6, 1e-3))
         schedule = replace(StubMethod().plan(request), controls=controls)
-        assert _MethodResult.of(StubMethod().robot, schedule, request).reaches is reaches
+        assert _MethodResult.of(StubMethod().robot, schedule, request).reaches_goal is reaches

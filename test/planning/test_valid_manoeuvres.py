@@ -212,7 +212,7 @@ def test_corrections_have_forty_intervals_at_most(correction: bool, given: int, 
 
 def test_limits_count_as_active_from_nineteen_twentieths_on() -> None:
     limits = SimpleNamespace(
-        shares=lambda *_: (np.array([[0.951, 0.9], [0.1, 0.949]]), np.array([[0.2, 1.0]]))
+        limit_shares=lambda *_: (np.array([[0.951, 0.9], [0.1, 0.949]]), np.array([[0.2, 1.0]]))
     )
     efforts = SimpleNamespace(shares=lambda *_: np.array([[-0.96, 0.0], [0.1, -1.0]]))
     made: Any = SimpleNamespace(
@@ -226,7 +226,7 @@ def test_limits_count_as_active_from_nineteen_twentieths_on() -> None:
     made._efforts = None
     assert OptimalGait._list_active_limits(made, shapes(3), 0.0).endswith("of knee")
     assert OptimalGait._list_active_limits(made, shapes(3)[:1], 0.0) == "nothing"
-    limits.shares = lambda *_: (np.zeros((2, 2)), np.zeros((2, 2)))
+    limits.limit_shares = lambda *_: (np.zeros((2, 2)), np.zeros((2, 2)))
     assert OptimalGait._list_active_limits(made, shapes(3), 0.0) == "nothing"
 
 

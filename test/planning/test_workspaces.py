@@ -108,12 +108,12 @@ def test_a_planar_pair_has_the_workspaces_of_its_determinant() -> None:
     ends = np.flatnonzero(np.diff(radii) > step)
     low, high = radii[np.append(0, ends + 1)], radii[np.append(ends, -1)]
     np.testing.assert_allclose(found.path_dependent, np.column_stack([low, high]), atol=step)
-    assert found.reach == pytest.approx((distance.min(), distance.max()), abs=step)
+    assert found.distance_range == pytest.approx((distance.min(), distance.max()), abs=step)
     assert not found.within_limits
     assert found.dimensions == 2
     # Together the two kinds of workspaces are the reach.
     both = sorted([*found.path_dependent, *found.path_independent])
-    assert [both[0][0], both[-1][1]] == pytest.approx(found.reach, abs=1e-9)
+    assert [both[0][0], both[-1][1]] == pytest.approx(found.distance_range, abs=1e-9)
     np.testing.assert_allclose([a for a, _ in both[1:]], [b for _, b in both[:-1]])
 
 
@@ -151,8 +151,8 @@ def test_limits_of_the_joints_leave_less_of_both() -> None:
     q = np.linspace(-1.9, 0.4, 300)
     distance, det = planar_pair(*np.meshgrid(q, q, indexing="ij"))
     crossed = det[:, 1:] * det[:, :-1] <= 0
-    assert limited.reach == pytest.approx((distance.min(), distance.max()), abs=1e-4)
-    assert limited.reach[0] > free.reach[0] + 0.1
+    assert limited.distance_range == pytest.approx((distance.min(), distance.max()), abs=1e-4)
+    assert limited.distance_range[0] > free.distance_range[0] + 0.1
     (only,) = limited.path_dependent
     ends = distance[:, 1:][crossed].min(), distance[:, 1:][crossed].max()
     assert only == pytest.approx(ends, abs=0.01)
@@ -162,12 +162,12 @@ def test_sliders_have_no_singular_shape_and_one_joint_has_no_other() -> None:
     sliders = SpaceRobot.from_file(FOLDER / "sliding_masses.urdf")
     (found,) = workspaces(sliders, "mass_1")
     assert found.path_dependent == ()
-    assert found.path_independent == (found.reach,)
+    assert found.path_independent == (found.distance_range,)
     one = urdf_of_pair().replace(
         '<joint name="elbow" type="continuous">', '<joint name="elbow" type="fixed">'
     )
     (alone,) = workspaces(SpaceRobot.from_urdf(one), "tool")
-    assert alone.path_dependent == (alone.reach,)
+    assert alone.path_dependent == (alone.distance_range,)
     assert alone.path_independent == ()
 
 

@@ -168,7 +168,7 @@ def test_a_robot_with_one_axis_turns_about_it() -> None:
 def test_a_robot_whose_joints_do_not_turn_it_has_no_first_flight(
     monkeypatch: pytest.MonkeyPatch, moves: bool, how: str
 ) -> None:
-    turning = SimpleNamespace(of=lambda robot: SimpleNamespace(axes=[], moves=moves))
+    turning = SimpleNamespace(of=lambda robot: SimpleNamespace(axes=[], turns_base=moves))
     monkeypatch.setattr(own_robot, "BaseRotations", turning)
     robot: Any = SimpleNamespace(description=SimpleNamespace(name="fixed"))
     with pytest.raises(PlanningError, match=f"'fixed' turn its base {how}"):
@@ -180,7 +180,7 @@ def test_the_tolerance_is_a_fiftieth_of_a_small_turn(
     monkeypatch: pytest.MonkeyPatch, degrees: float, tolerance: float
 ) -> None:
     axes = np.eye(3)
-    turning = SimpleNamespace(of=lambda robot: SimpleNamespace(axes=axes, moves=True))
+    turning = SimpleNamespace(of=lambda robot: SimpleNamespace(axes=axes, turns_base=True))
     monkeypatch.setattr(own_robot, "BaseRotations", turning)
     turn = np.array([0.6, 0.0, -0.8]) * degrees * DEG
     monkeypatch.setattr(own_robot, "first_turn", lambda robot, shape, axes: turn)

@@ -22,7 +22,7 @@ from spacerobot_ros.model.urdf import with_held_joints
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
+from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.capture import CapturePlant, GrappleMotion, capture_values
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import CaptureConfig, PlantConfig
@@ -74,22 +74,22 @@ SPATIAL: dict[str, Any] = {
 }
 
 
-def plant_of(values: dict[str, Any], **others: Any) -> FaultyPlant:
+def plant_of(values: dict[str, Any], **others: Any) -> PlantWithFaults:
     config = configured(PlantConfig, {**values, **others})
     return build_plant(SpaceRobot.from_file(robot_file(config.robot)), config)
 
 
-def capturing_of(plant: FaultyPlant) -> CapturePlant:
+def capturing_of(plant: PlantWithFaults) -> CapturePlant:
     assert plant.capturing is not None
     return plant.capturing
 
 
-def commands_of(plant: FaultyPlant, rates: Any = 0.0) -> list[Array]:
+def commands_of(plant: PlantWithFaults, rates: Any = 0.0) -> list[Array]:
     joints = np.zeros(plant.robot.n) + rates
     return [joints, np.zeros(6)] if plant.takes_wrench else [joints]
 
 
-def total_momentum(plant: FaultyPlant) -> Array:
+def total_momentum(plant: PlantWithFaults) -> Array:
     """Linear momentum, and angular momentum about the origin of W, summed over all bodies."""
     capturing = capturing_of(plant)
     robot, pose = capturing.present_robot, plant.pose

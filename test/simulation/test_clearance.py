@@ -93,7 +93,7 @@ def test_the_nearest_pair_is_that_of_all_distances(name: str) -> None:
     shapes = np.random.default_rng(5).uniform(low, high, (40, len(low)))
     R, r = geometry.poses(shapes)
     each = np.array([geometry.distances(p, (R, r)) for p in range(len(geometry.pairs))])
-    together, pairs = geometry.nearest_at(shapes)
+    together, pairs = geometry.nearest_along(shapes)
     np.testing.assert_allclose(together, each.min(axis=0), atol=1e-9)
     np.testing.assert_array_equal(pairs, each.argmin(axis=0))
     nearest, pose = (
@@ -105,7 +105,7 @@ def test_the_nearest_pair_is_that_of_all_distances(name: str) -> None:
         found, _ = nearest.nearest(poses[0], poses[1], pose)
         assert found == pytest.approx(together[k], abs=1e-9)
         touching = {geometry.links_of(p) for p in np.flatnonzero(each[:, k] <= 0).tolist()}
-        assert nearest.touching(poses[0], poses[1], pose) == touching
+        assert nearest.links_in_contact(poses[0], poses[1], pose) == touching
     assert (each.min(axis=0) < 0).any()
 
 

@@ -12,7 +12,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
+from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
@@ -28,7 +28,7 @@ SLIDERS = SpaceRobot.from_file(robot_file("sliding_masses"))
 LINK = SLIDERS.link_names[-1]
 
 
-def plant_with(*disturbances: str, **parameters: Any) -> FaultyPlant:
+def plant_with(*disturbances: str, **parameters: Any) -> PlantWithFaults:
     return build_plant(SLIDERS, PlantConfig(disturbances=disturbances, **parameters))
 
 

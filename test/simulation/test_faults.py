@@ -19,7 +19,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import (
-    FaultyPlant,
+    PlantWithFaults,
     build_plant,
     thrusters_in,
     with_thrusters,
@@ -45,9 +45,9 @@ def urdf(name: str) -> str:
     return (URDF / f"{name}.urdf").read_text("utf-8")
 
 
-def arm(*faults: str, seed: int = 0, tick: float = TICK) -> FaultyPlant:
+def arm(*faults: str, seed: int = 0, tick: float = TICK) -> PlantWithFaults:
     """Return the three-joint arm under velocity commands."""
-    return FaultyPlant(
+    return PlantWithFaults(
         VelocityPlant(robot_of(urdf("three_joint_arm")), tick),
         faults,
         tick,
@@ -56,11 +56,11 @@ def arm(*faults: str, seed: int = 0, tick: float = TICK) -> FaultyPlant:
     )
 
 
-def pushed(plant: Plant, *faults: str) -> FaultyPlant:
-    return FaultyPlant(plant, faults, TICK, wrench=True)
+def pushed(plant: Plant, *faults: str) -> PlantWithFaults:
+    return PlantWithFaults(plant, faults, TICK, wrench=True)
 
 
-def momenta(robot: str, plant: FaultyPlant) -> Array:
+def momenta(robot: str, plant: PlantWithFaults) -> Array:
     """Return linear over angular momentum (6,), world, by Pinocchio."""
     oracle = PinocchioOracle(robot, plant.robot.joint_names)
     oracle.set_configuration(plant.q, plant.pose[3:], plant.pose[:3])
@@ -294,7 +294,7 @@ def test_a_plant_without_faults_is_the_plant_within() -> None:
     robot = robot_of(urdf("three_joint_arm"))
     bare, wrapped = (
         VelocityPlant(robot, TICK),
-        FaultyPlant(VelocityPlant(robot, TICK), (), TICK, wrench=False),
+        PlantWithFaults(VelocityPlant(robot, TICK), (), TICK, wrench=False),
     )
     rng = np.random.default_rng(3)
     for _ in range(20):
@@ -312,7 +312,7 @@ def test_a_plant_without_faults_is_the_plant_within() -> None:
 def test_a_joint_that_jams_changes_no_momentum_and_gains_no_energy(seed: int) -> None:
     text = random_urdf(seed)
     robot, rng = robot_of(text), np.random.default_rng(seed)
-    plant = FaultyPlant(
+    plant = PlantWithFaults(
         EffortPlant(robot, 0.01, tumbling(robot, rng)),
         [f"joint_stuck {robot.joint_names[1]} at 0.2 until 0.4"],
         0.01,
@@ -335,7 +335,7 @@ def test_energy_is_lost_when_a_moving_joint_jams() -> None:
     text = random_urdf(4)
     robot = robot_of(text)
     start = tumbling(robot, np.random.default_rng(4))
-    plant = FaultyPlant(EffortPlant(robot, 0.001, start), (), 0.001, wrench=True)
+    plant = PlantWithFaults(EffortPlant(robot, 0.001, start), (), 0.001, wrench=True)
     rest = np.zeros(robot.n)
     plant.step(rest)
     before = plant.momentum.copy()
@@ -438,7 +438,7 @@ def test_the_momentum_is_what_the_faulty_thrusters_gave(
 
 def test_nozzles_stay_open_closed_and_weak() -> None:
     robot = robot_of(urdf("servicer"))
-    plant = FaultyPlant(
+    plant = PlantWithFaults(
         with_thrusters(EffortPlant(robot, 0.1), 0.1, "urdf", ""),
         [
             "nozzle_open plus_x_1",

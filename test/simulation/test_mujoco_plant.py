@@ -22,7 +22,7 @@ from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
+from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.config import PlantConfig
 
 pytest.importorskip("mujoco")
@@ -64,12 +64,12 @@ def pucks(effort: float = 30.0, upper: float = 0.45) -> SpaceRobot:
     return SpaceRobot(parse_robot(PUCKS.format(sliders=sliders)))
 
 
-def plant(model: SpaceRobot | None = None, **values: Any) -> FaultyPlant:
+def plant(model: SpaceRobot | None = None, **values: Any) -> PlantWithFaults:
     config = configured(PlantConfig, {"engine": "mujoco", **values})
     return build_plant(model or SpaceRobot.from_file(robot_file(config.robot)), config)
 
 
-def state_of(flown: FaultyPlant) -> Array:
+def state_of(flown: PlantWithFaults) -> Array:
     return np.concatenate([flown.pose, flown.twist, flown.q, flown.qdot])
 
 

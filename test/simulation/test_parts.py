@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot, parse_robot
-from spacerobot_ros.model.grasp import BodyMotion, Impact
+from spacerobot_ros.model.grasp import BodyMotion, GraspImpact
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import capture, effort_plant, sensors, status
@@ -131,7 +131,7 @@ def test_a_status_is_pairs_of_words() -> None:
         *(PlantState.RESTING, "", "timeout", "hot", 0.25, 3, 4, ("a", "b"), ("c", "d"), 5, 0.0, "x")
     )
     values = whole.to_values()
-    assert values["faults"].split(status._SEPARATOR) == ["a", "b"]
+    assert values["faults"] == "a; b"
     assert {name: values[name] for name in ("rearms", "resets", "timeouts", "payload")} == {
         **{"rearms": "3", "resets": "4", "timeouts": "5", "payload": "x"}
     }
@@ -296,7 +296,7 @@ def test_wheels_at_their_largest_rate_are_made_no_faster() -> None:
 # -- captures ------------------------------------------------------------------------------------
 
 
-IMPACT = Impact(
+IMPACT = GraspImpact(
     twist=np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]),
     qdot=np.array([0.7, -0.8]),
     impulse=np.array([2.0, -3.0, 6.0, 1.0, 2.0, -2.0]),

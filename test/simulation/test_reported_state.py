@@ -125,7 +125,7 @@ def test_a_new_topic_is_an_entry_in_the_table_and_a_quantity(
         "std_msgs/msg/Float64MultiArray",
         ("plant",),
         "kinetic energy (J)",
-        state=(StateField("data", "kinetic_energy", entries=("kinetic_energy",)),),
+        state=(StateField("data", "kinetic_energy", array_entry_names=("kinetic_energy",)),),
     )
     monkeypatch.setitem(TOPICS, "energy", entry)
     quantities = ReportedState._quantities

@@ -14,7 +14,7 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
-from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
+from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
 from spacerobot_ros.simulation.sensors import Sensors
 
@@ -33,7 +33,7 @@ class Flight:
 
     def __init__(self, config: SensorConfig, *faults: str, ticks: int, moving: bool = True) -> None:
         inner = VelocityPlant(robot_of(URDF), TICK, START)
-        self.plant = FaultyPlant(inner, faults, TICK, wrench=False)
+        self.plant = PlantWithFaults(inner, faults, TICK, wrench=False)
         self.sensors = Sensors(self.plant, config, TICK)
         self.dropouts: list[bool] = []
         measured: list[Array] = []
@@ -206,7 +206,7 @@ def test_a_delay_that_begins_in_flight_holds_the_present_pose_and_follows_it(
     config: SensorConfig, tick: float, delay: float
 ) -> None:
     """Whatever quotients round to, a delay of three ticks lasts three; a bias does not add up."""
-    plant = FaultyPlant(VelocityPlant(robot_of(URDF), tick, START), (), tick, wrench=False)
+    plant = PlantWithFaults(VelocityPlant(robot_of(URDF), tick, START), (), tick, wrench=False)
     sensors = Sensors(plant, config, tick)
     bias = np.array(config.position_bias)
     true, measured = [], []

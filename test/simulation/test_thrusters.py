@@ -16,7 +16,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.simulation import EffortPlant, InitialState
 from spacerobot_ros.simulation.actuators import (
-    FaultyPlant,
+    PlantWithFaults,
     ThrusterPlant,
     thrusters_in,
     with_thrusters,
@@ -178,7 +178,7 @@ def test_where_thrusters_come_from(tmp_path: Path) -> None:
     thrusters = with_thrusters(plant, TICK, str(table))
     assert isinstance(thrusters, ThrusterPlant)
     assert "negative force along x" in thrusters.missing
-    assert thrusters_in(FaultyPlant(thrusters, (), TICK, wrench=True)) is thrusters
+    assert thrusters_in(PlantWithFaults(thrusters, (), TICK, wrench=True)) is thrusters
     with pytest.raises(ParameterError, match="no thruster 'nose'"):
         with_thrusters(plant, TICK, str(table), "nose")
     bare = SERVICER.replace("<thruster", "<!--").replace("</thruster>", "-->")
@@ -190,7 +190,7 @@ def test_faults_of_the_wrench_act_on_the_thrusters_and_not_on_what_is_asked_of_t
     """A component that is stuck, off or weak is so in every tick, whatever pulses begin."""
     faults = ("thruster_stuck force_y 3.5", "thruster_off torque_x", "thruster_weak force_x 0.5")
     sound, inner = flying(), flying()
-    broken = FaultyPlant(inner, faults, TICK, wrench=True)
+    broken = PlantWithFaults(inner, faults, TICK, wrench=True)
     rng = np.random.default_rng(4)
     for _ in range(40):
         command = wanted(rng)

@@ -91,7 +91,9 @@ def guesses() -> dict[str, Any]:
     sequence = source.generate(boundary, LIMITS, FINAL)
     found["to one end"] = [_trajectory(next(sequence)) for _ in range(6)]
     ends = (PossibleEnd(FINAL, TURN), PossibleEnd(-FINAL / 2, np.array([0.6, 0.0, 0.0, 0.8])))
-    sequence = source.generate(BoundaryConditions(START, TURN, FINAL, ends=ends), LIMITS, FINAL)
+    sequence = source.generate(
+        BoundaryConditions(START, TURN, FINAL, possible_ends=ends), LIMITS, FINAL
+    )
     found["to two ends"] = [_trajectory(next(sequence)) for _ in range(5)]
     instants = np.linspace(0.0, 1.0, 31)
     for name in ("_trigonometric_loop", "_three_frequency_loop", "_square_loop"):
@@ -189,7 +191,7 @@ def held() -> dict[str, Any]:
     """Return held commands of smooth trajectories of an arm, with and without a last shape."""
     robot = SpaceRobot.from_file(robot_file("three_joint_arm"))
     stages = Stages.of(robot, np.eye(3), False, PathConstraints.of(robot, OptimalOptions()))
-    source = InitialGuesses(stages.turn, robot.function("curvature", compile=False), 60)
+    source = InitialGuesses(stages.rotation_of_step, robot.function("curvature", compile=False), 60)
     way = BoundaryConditions(START, TURN, FINAL, FINAL)
     sequence = source.generate(way, WITHIN, FINAL)
     found: dict[str, Any] = {}

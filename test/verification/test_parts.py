@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.flight import second_opinion, verification
-from spacerobot_ros.flight.second_opinion import EngineFlight, SecondOpinion
+from spacerobot_ros.flight.second_opinion import EngineComparison, EngineFlight
 from spacerobot_ros.flight.verification import Difference, _PublishedTopic, _Resimulation
 from spacerobot_ros.simulation.mujoco_engine import EFFORT_STEP, VELOCITY_STEP
 from spacerobot_ros.topics import TOPICS
@@ -311,7 +311,7 @@ def engine_flight(*, effort: bool) -> Any:
 def test_an_engine_is_compared_at_the_ticks_that_both_have() -> None:
     made = engine_flight(effort=False)
     for _ in range(3):
-        made.follow()
+        made.fly_next_tick()
     assert made._engine.asked == [("velocities", 0.1)] * 3
     # Momenta go on from those after the tick before.
     np.testing.assert_allclose(made._engine.momenta, np.outer([0.0, 0.1, 0.2], np.ones(6)))
@@ -320,8 +320,8 @@ def test_an_engine_is_compared_at_the_ticks_that_both_have() -> None:
     poses[2, :3], poses[3, 3:] = [0.001, 0.002, -0.002], turned
     shapes = 0.1 * np.outer(np.arange(-1.0, 4.0), [0.1, -0.3])
     shapes[4, 1] += 0.004
-    found = made.compared(np.array([4, 5, 6, 7, 8]), poses, shapes)
-    assert found == cast(Any, SecondOpinion)(
+    found = made.comparison(np.array([4, 5, 6, 7, 8]), poses, shapes)
+    assert found == cast(Any, EngineComparison)(
         engine="engine 1",
         integrator=f"Runge-Kutta 4 with steps of at most {VELOCITY_STEP:g} s",
         ticks=3,
@@ -331,18 +331,18 @@ def test_an_engine_is_compared_at_the_ticks_that_both_have() -> None:
         time=pytest.approx(0.7),
     )
     # Beyond the last tick of the engine nothing is compared.
-    assert made.compared(np.array([5, 9]), poses[:2], shapes[1:3]).ticks == 0
+    assert made.comparison(np.array([5, 9]), poses[:2], shapes[1:3]).ticks == 0
     under_efforts = engine_flight(effort=True)
-    one = under_efforts.compared(np.array([5]), poses[:1], np.zeros((1, 2)))
+    one = under_efforts.comparison(np.array([5]), poses[:1], np.zeros((1, 2)))
     assert one.integrator.endswith(f"at most {EFFORT_STEP:g} s")
     assert EFFORT_STEP != VELOCITY_STEP
 
 
 def test_an_engine_agrees_within_a_bound_in_each_quantity() -> None:
-    at = second_opinion.AGREEMENT
-    same = SecondOpinion("e", "i", 1, at, at, at, 0.0)
+    at = second_opinion.AGREEMENT_TOLERANCE
+    same = EngineComparison("e", "i", 1, at, at, at, 0.0)
     assert same.agrees
-    assert same.until == ""
+    assert same.stop_reason == ""
     for name in ("position", "attitude", "joints"):
         assert not replace(same, **cast(Any, {name: at * 1.001})).agrees
 
@@ -364,7 +364,7 @@ def test_an_engine_flies_no_further_than_it_knows_the_forces(
 ) -> None:
     made = engine_flight(effort=True)
     vars(made._plant).update(change)
-    made.follow()
+    made.fly_next_tick()
     assert made._until == until
     assert made._engine.asked == ([] if until else [("efforts", 0.1)])
     assert len(made._poses) == len(made._shapes) == (1 if until else 2)
@@ -373,9 +373,9 @@ def test_an_engine_flies_no_further_than_it_knows_the_forces(
     vars(made._plant).update(loads=None, active=())
     if "limit_counts" not in change:
         made._until = ""
-        made.follow()
+        made.fly_next_tick()
         assert bool(made._until) is bool(until)
     if until:
         made._until = until
-        made.follow()
+        made.fly_next_tick()
         assert not made._engine.asked[1:]

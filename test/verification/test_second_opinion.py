@@ -16,12 +16,12 @@ from support.slow import some_fast
 from spacerobot_ros import fly
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.flight.second_opinion import EngineFlight, SecondOpinion
+from spacerobot_ros.flight.second_opinion import EngineComparison, EngineFlight
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.resources import resource_names, robot_file
 from spacerobot_ros.simulation import mujoco_engine
-from spacerobot_ros.simulation.actuators import FaultyPlant
+from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.loads import Surroundings
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
@@ -34,7 +34,7 @@ LARGEST = {"reach": 2e-10, "two_hands": 5e-11}
 """Errors of the position, m, by steps of 10 ms in fast motions; all others are below 2e-11."""
 
 
-def opinion_of(path: Path) -> SecondOpinion:
+def opinion_of(path: Path) -> EngineComparison:
     found = verify_bag(path, mujoco=True)
     assert found.difference is None
     assert found.second_opinion is not None
@@ -56,7 +56,7 @@ CAPTURES = ("capture", "servicing")
 def test_mujoco_flies_reference_bags_to_the_same_states(name: str) -> None:
     path = BAGS / f"{name}.mcap"
     found = opinion_of(path)
-    assert (found.agrees, found.until) == (True, "")
+    assert (found.agrees, found.stop_reason) == (True, "")
     assert max(found.position, found.attitude, found.joints) <= LARGEST.get(name, 2e-11)
     assert found.ticks == verify_bag(path).ticks
     assert found.engine.startswith("MuJoCo ")
@@ -125,7 +125,7 @@ def test_faults_are_flown_and_held_joints_end_the_comparison(tmp_path: Path) -> 
 def test_external_loads_are_flown(tmp_path: Path, plant: dict[str, Any]) -> None:
     path = flown(tmp_path, 0.5, **plant)
     found = opinion_of(path)
-    assert (found.until, found.ticks) == ("", 51)
+    assert (found.stop_reason, found.ticks) == ("", 51)
     assert max(found.position, found.attitude, found.joints) < 1e-10
 
 
@@ -149,7 +149,7 @@ def test_external_loads_are_flown_under_velocities(surroundings: Surroundings) -
         angular_momentum=np.array([0.2, -0.3, 0.1]),
     )
     period, pushed = 0.013, [f"{robot.link_names[2]} force 0 2 0.5 at 0.1"]
-    plant = FaultyPlant(
+    plant = PlantWithFaults(
         VelocityPlant(robot, period, start),
         (),
         period,
@@ -161,11 +161,11 @@ def test_external_loads_are_flown_under_velocities(surroundings: Surroundings) -
     poses, shapes = [plant.pose.copy()], [plant.q.copy()]
     for tick in range(30):
         plant.step(0.2 * np.cos(np.arange(robot.n) + 0.1 * tick))
-        flight.follow()
+        flight.fly_next_tick()
         poses.append(plant.pose.copy())
         shapes.append(plant.q.copy())
-    found = flight.compared(np.arange(31), np.array(poses), np.array(shapes))
-    assert (found.until, found.ticks) == ("", 30)
+    found = flight.comparison(np.arange(31), np.array(poses), np.array(shapes))
+    assert (found.stop_reason, found.ticks) == ("", 30)
     assert np.linalg.norm(plant.momentum[:3]) > 0.1
     assert max(found.position, found.attitude, found.joints) < 1e-10
 
@@ -173,7 +173,7 @@ def test_external_loads_are_flown_under_velocities(surroundings: Surroundings) -
 def test_a_joint_at_its_stop_ends_the_comparison(tmp_path: Path) -> None:
     pushed = ["actuator_bias elbow 20 at 0"]
     found = opinion_of(flown(tmp_path, 1.2, faults=pushed, initial_joint_positions=[-1.0, 2.78]))
-    assert found.until.startswith("joint 'elbow' is at its stop at ")
+    assert found.stop_reason.startswith("joint 'elbow' is at its stop at ")
     assert found.ticks > 20
     assert found.joints < 1e-8
 

@@ -105,7 +105,7 @@ class ModelBasedLaw(ControlLaw):
         xi = pull - damping * z1.z0dot + symbols["singular_damping"]
         a = z1.acceleration + symbols["kd"] * z1.error_rate + symbols["kp"] * z1.error
         a += symbols["integral"]
-        acceleration = a - z1.bias - z1.J_z @ xi
+        acceleration = a - z1.bias_acceleration - z1.J_z @ xi
         mobility = z1.J_z @ mobility
         J_actuators = z1.J_z @ z1.J_q_inverse
         other = z1.J_q_inverse.T @ z1.without_force(H @ xi + C)

@@ -41,7 +41,7 @@ from spacerobot_ros.nodes.plant.publisher import (
     TransformPublisher,
 )
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.actuators import FaultyPlant, build_plant
+from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.capture import CapturePlant, CaptureReport, ReleaseReport
 from spacerobot_ros.simulation.commands import CommandValidator, PublisherTracker
 from spacerobot_ros.simulation.config import PlantConfig
@@ -332,7 +332,7 @@ class PlantNode(FlightNode):
             )
         return state
 
-    def _resumed_plant(self, robot: SpaceRobot, state: LastState) -> FaultyPlant:
+    def _resumed_plant(self, robot: SpaceRobot, state: LastState) -> PlantWithFaults:
         """Return the plant in the last state of a bag."""
         # Servos hold the rates that they are commanded: only motors leave joints moving.
         moving = self.config.actuation == "effort"

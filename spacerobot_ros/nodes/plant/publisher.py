@@ -35,7 +35,7 @@ from spacerobot_ros.nodes.common.messages import (
 )
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.streams import RawOutput
-from spacerobot_ros.simulation.actuators import FaultyPlant, ThrusterPlant, thrusters_in
+from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant, thrusters_in
 from spacerobot_ros.simulation.clearance import ClearanceMonitor
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.config import PlantConfig
@@ -77,7 +77,7 @@ class PlantReport:
     def __init__(
         self,
         node: Node,
-        plant: FaultyPlant,
+        plant: PlantWithFaults,
         commands: CommandValidator,
         real_time: RealTime | None,
     ) -> None:
@@ -519,7 +519,7 @@ class LinkMarkers:
     With poses in the world frame a viewer needs no transforms.
     """
 
-    def __init__(self, node: FlightNode, plant: FaultyPlant, world_frame: str) -> None:
+    def __init__(self, node: FlightNode, plant: PlantWithFaults, world_frame: str) -> None:
         self._plant, self._world_frame = plant, world_frame
         self._publisher: Any = node.create_publisher(MarkerArray, "markers", STREAM)
         self._drawn: set[tuple[str, int]] = set()

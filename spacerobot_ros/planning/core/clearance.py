@@ -88,7 +88,7 @@ class Clearance:
     def geometry(self) -> CollisionGeometry:
         """The solids of the robot; meshes that cannot be read are named in the log."""
         geometry = CollisionGeometry(self._robot)
-        for each in geometry.unread:
+        for each in geometry.unread_meshes:
             _LOG.warning("%s", each.note)
         return geometry
 
@@ -155,9 +155,13 @@ class Clearance:
         """
         robot = self._robot
         names = {link.name for link in robot.links}
-        for each in self.geometry.unread:
+        for each in self.geometry.unread_meshes:
             pairs = {frozenset({each.link, other}) for other in names - {each.link}}
-            if each.declared and each.link in names and not pairs <= robot.disabled_collisions:
+            if (
+                each.is_collision_shape
+                and each.link in names
+                and not pairs <= robot.disabled_collisions
+            ):
                 raise PlanningError(
                     f"Link '{each.link}' cannot be kept clear of others: {each.reason} Or have an "
                     "SRDF disable its pairs (planner.srdf), or set planner.clearance to 0."
@@ -251,7 +255,7 @@ class Clearance:
         """
         found = self.approaches(shape[np.newaxis], required, base)
         if found:
-            subject = "shape" if found[0].place is None else "pose"
+            subject = "shape" if found[0].place_on_obstacle is None else "pose"
             raise UnreachableError(
                 f"The {subject} of the goal is in collision: {found[0]}; planner.clearance is "
                 f"{self.distance:g} m.",

@@ -28,7 +28,7 @@ from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.planning.core.controllability import sample_shapes, shape_box
 
 _SEED = 20
-_SHAPES = 48
+_SAMPLED_SHAPES = 48
 """Shapes from which singular ones are sought, and shapes that are examined for the reach."""
 
 _EXTREME_STARTS = 3
@@ -38,7 +38,7 @@ _NEWTON_STEPS, _LONGEST_NEWTON_STEP = 40, 0.5
 _WALK_STEPS, _LONGEST_STEP, _SHORTEST_STEP = 60, 0.25, 1e-4
 """Steps along curves of singular shapes, rad (or m) of the joint that moves most."""
 
-_ZERO = 1e-9
+_ZERO_RESIDUAL = 1e-9
 """Error of the equations of a singular shape that counts as zero; they are without units."""
 
 _ZERO_RATE = 1e-6
@@ -61,7 +61,7 @@ class Workspaces:
         The link.
     within_limits
         Whether the joints keep their limits; else those that turn have none.
-    reach
+    distance_range
         The smallest and the largest distance.
     path_dependent
         Closed intervals of distances at which a singular shape puts the link, in ascending order.
@@ -73,7 +73,7 @@ class Workspaces:
 
     link: str
     within_limits: bool
-    reach: Interval
+    distance_range: Interval
     path_dependent: tuple[Interval, ...]
     dimensions: int
     singular_shapes: int
@@ -81,9 +81,10 @@ class Workspaces:
     @property
     def path_independent(self) -> tuple[Interval, ...]:
         """The intervals of the reach between the path-dependent ones, in ascending order."""
-        ends = [self.reach[0], *np.ravel(self.path_dependent).tolist(), self.reach[1]]
+        nearest, farthest = self.distance_range
+        ends = [nearest, *np.ravel(self.path_dependent).tolist(), farthest]
         gaps = zip(ends[::2], ends[1::2], strict=True)
-        smallest = _MAX_CLOSED_GAP * self.reach[1]
+        smallest = _MAX_CLOSED_GAP * farthest
         return tuple((low, high) for low, high in gaps if high - low > smallest)
 
 
@@ -107,7 +108,7 @@ def workspaces(robot: SpaceRobot, link: str) -> tuple[Workspaces, ...]:
     limited = _search(robot, link, equations, within_limits=True)
     # Singular shapes within the limits are some without them, too.
     intervals = np.array([*free.path_dependent, *limited.path_dependent]).reshape(-1, 2)
-    joined = _union(intervals, _MAX_CLOSED_GAP * free.reach[1])
+    joined = _union(intervals, _MAX_CLOSED_GAP * free.distance_range[1])
     return replace(free, path_dependent=tuple(joined)), limited
 
 
@@ -122,13 +123,13 @@ def _search(
     box = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
     if within_limits:
         box = shape_box(robot)
-    shapes = np.random.default_rng(_SEED).uniform(*box, (_SHAPES, robot.n))
+    shapes = np.random.default_rng(_SEED).uniform(*box, (_SAMPLED_SHAPES, robot.n))
     # Where a distance is extreme, rates of the joints do not change it.
     starts = np.vstack([shapes, extremes])
     curves, count = _Search(equations, lower, upper).intervals(starts)
     ends = [*reach, *np.ravel(curves)]
     reach = float(min(ends)), float(max(ends))
-    return replace(found, reach=reach, path_dependent=tuple(curves), singular_shapes=count)
+    return replace(found, distance_range=reach, path_dependent=tuple(curves), singular_shapes=count)
 
 
 def _bounds(robot: SpaceRobot, within_limits: bool) -> tuple[Array, Array]:
@@ -178,7 +179,7 @@ class _Equations:
         r_CE = r[:, index] - robot.function("center_of_mass", compile=False)(q)
         J = (J[:, 6:] - J[:, 3:6] @ A[3:, :])[:3, :]
         of_samples = ca.Function("samples", [q], [ca.densify(J), ca.densify(r_CE)])
-        samples = sample_shapes(robot, _SHAPES)
+        samples = sample_shapes(robot, _SAMPLED_SHAPES)
         found, places = (x.full() for x in of_samples(samples.T))
         largest = float(np.linalg.norm(places, axis=0).max())
         directions, values, _ = np.linalg.svd(found, full_matrices=False)
@@ -257,16 +258,18 @@ class _Search:
         """Return the intervals of distances of the singular shapes to which shapes (K, n) lead, and
         the number of these.
         """
-        z = self._solved(self._equations.starts(shapes), _NEWTON_STEPS)
+        z = self._project_to_singular_shapes(self._equations.starts(shapes), _NEWTON_STEPS)
         g, _, _, _ = self._equations.evaluate(z)
-        z = z[np.linalg.norm(g, axis=1) < _ZERO]
+        z = z[np.linalg.norm(g, axis=1) < _ZERO_RESIDUAL]
         if not len(z):
             return [], 0
-        ends = [self._walk(z, sign) for sign in (-1.0, 1.0)]
+        ends = [self._follow_singular_curve(z, sign) for sign in (-1.0, 1.0)]
         radii = [self._equations.evaluate(end)[2] for end in ends]
-        return self._refined(ends, radii), len(z)
+        return self._refine_interval_ends(ends, radii), len(z)
 
-    def _refined(self, ends: Sequence[Array], radii: Sequence[Array]) -> list[Interval]:
+    def _refine_interval_ends(
+        self, ends: Sequence[Array], radii: Sequence[Array]
+    ) -> list[Interval]:
         """Return the union of the intervals of curves, with its ends at extreme distances."""
         largest = float(radii[1].max())
         found = []
@@ -306,19 +309,19 @@ class _Search:
         is_better = sign * (distance - value) > 0
         return value if missed < _ZERO_RATE and is_better else distance
 
-    def _solved(self, z: Array, steps: int) -> Array:
+    def _project_to_singular_shapes(self, z: Array, steps: int) -> Array:
         """Return the singular shapes nearest to z (K, n + m), by Gauss-Newton within bounds."""
         z = z.copy()
         moving = np.arange(len(z))
         for _ in range(steps):
             here = z[moving]
             g, by_z, _, _ = self._equations.evaluate(here)
-            missing = np.abs(g).max(axis=1) > _ZERO / 10
+            missing = np.abs(g).max(axis=1) > _ZERO_RESIDUAL / 10
             if not missing.any():
                 break
             moving, here, g, by_z = moving[missing], here[missing], g[missing], by_z[missing]
             step = _least_solution(by_z, g, np.ones(here.shape))
-            free = self._free(here, -step)
+            free = self._free_coordinates(here, -step)
             if not free.all():
                 step = _least_solution(by_z, g, free)
             size = np.abs(step).max(axis=1, keepdims=True)
@@ -326,12 +329,12 @@ class _Search:
             z[moving] = np.clip(here - step, self._lower, self._upper)
         return z
 
-    def _free(self, z: Array, step: Array) -> Array:
+    def _free_coordinates(self, z: Array, step: Array) -> Array:
         """Return zeros (K, n + m) where a step would leave the bounds, and ones elsewhere."""
         low, high = z <= self._lower + 1e-12, z >= self._upper - 1e-12
         return np.asarray(1.0 - ((low & (step < 0)) | (high & (step > 0))))
 
-    def _walk(self, z: Array, sign: float) -> Array:
+    def _follow_singular_curve(self, z: Array, sign: float) -> Array:
         """Return the ends of curves of singular shapes from z to larger (1) or smaller (-1)
         distances.
         """
@@ -346,14 +349,16 @@ class _Search:
             for _ in range(2):
                 along = sign * ascent * free
                 along -= _least_solution(by_z, np.einsum("kij,kj->ki", by_z, along), free)
-                free = free * self._free(here, along)
+                free = free * self._free_coordinates(here, along)
             along *= free
             size = np.abs(along).max(axis=1, keepdims=True)
             step = length[walking, np.newaxis] * along / np.maximum(size, 1e-12)
-            there = self._solved(np.clip(here + step, self._lower, self._upper), 5)
+            there = self._project_to_singular_shapes(
+                np.clip(here + step, self._lower, self._upper), 5
+            )
             g, _, after, _ = self._equations.evaluate(there)
             near = np.abs(there - here).max(axis=1) <= 3 * length[walking]
-            better = (np.linalg.norm(g, axis=1) < _ZERO) & near & (sign * (after - r) > 0)
+            better = (np.linalg.norm(g, axis=1) < _ZERO_RESIDUAL) & near & (sign * (after - r) > 0)
             z[walking[better]] = there[better]
             length[walking] = np.where(
                 better, np.minimum(1.5 * length[walking], _LONGEST_STEP), length[walking] / 2

@@ -54,15 +54,15 @@ from spacerobot_ros.planning.execution.status import (
 from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFollower
 from spacerobot_ros.planning.execution.tracker import Setpoint, TakeOver, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import (
-    OffPathJob,
+    PlanFromRestJob,
     PlanJob,
     Planned,
     PlanningTask,
     PlanningWorker,
     PlanReason,
+    PlanWithBrakingJob,
     ReadyPlan,
     Refused,
-    RemainingJob,
     TakeOverJob,
 )
 from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateGait, ResolvedRateOptions
@@ -255,8 +255,10 @@ class _PlannedRest:
         """Return the task of a plan that begins with the rest, in control periods, s."""
         ticks, state = math.ceil(self.duration / period - 1e-9), self.planned.request.state
         shapes = np.tile(state.q, (ticks + 1, 1))
-        if self.planned.rates is not None:
-            shapes += period * np.arange(ticks + 1)[:, np.newaxis] * self.planned.rates
+        if self.planned.rates_after_braking is not None:
+            shapes += (
+                period * np.arange(ticks + 1)[:, np.newaxis] * self.planned.rates_after_braking
+            )
         return replace(self.planned, braking=shapes)
 
 
@@ -792,7 +794,7 @@ class Executive:
                 return
             off = describe_remaining_error(error, controls)
             self._count_correction(active, f"The remaining motion is planned: {off}.")
-        self._request_plan(RemainingJob(active.identified, active.next_plan, error), state)
+        self._request_plan(PlanFromRestJob(active.identified, active.next_plan, error), state)
 
     # -- in motion: EXECUTING and BRAKING -----------------------------------------------------
 
@@ -880,7 +882,7 @@ class Executive:
             self._report_path_correction(active, error)
             self._brake_for_replan(Event.TRACKING_ERROR)
         else:
-            job = OffPathJob(active.identified, PlanReason.TRACKING_ERROR, error)
+            job = PlanWithBrakingJob(active.identified, PlanReason.TRACKING_ERROR, error)
             self._request_plan(job, state)
 
     def _can_replan(self) -> bool:
@@ -1011,9 +1013,13 @@ class Executive:
         reason = job.reason.value
         message = f"A plan is made: {reason}."
         self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
-        task = PlanningTask(request, braking=braking, rates=rates, take_over=take_over)
+        task = PlanningTask(
+            request, braking=braking, rates_after_braking=rates, take_over=take_over
+        )
         if active is not None:
-            task = replace(task, stuck=active.stuck_positions, required=active.required)
+            task = replace(
+                task, stuck_joint_positions=active.stuck_positions, required=active.required
+            )
         self._pending_plan, self._coasting = job, None
         at_rest = braking is None and take_over is None
         if at_rest and self._worker.plans_in_background and self._worker.drifts(state):
@@ -1087,17 +1093,17 @@ class Executive:
                 message = f"The remaining motion is not planned again: {reason}"
                 self._add_notice(Severity.INFO, message)
                 self._change_phase(Event.REFUSED, Phase.EXECUTING)
-            case OffPathJob(error=error), Planned(schedule=schedule):
+            case PlanWithBrakingJob(error=error), Planned(schedule=schedule):
                 assert active is not None
                 self._report_path_correction(active, error)
                 self._execute_schedule(schedule)
-            case OffPathJob(error=error), Refused(reason=reason):
+            case PlanWithBrakingJob(error=error), Refused(reason=reason):
                 message = f"{error}, and the remaining motion cannot be planned again: {reason}"
                 self._add_notice(Severity.WARNING, message)
                 self._change_phase(Event.REFUSED, self._phase_without_plan())
-            case RemainingJob(error=remaining), Planned(schedule=schedule):
+            case PlanFromRestJob(error=remaining), Planned(schedule=schedule):
                 self._execute_schedule(schedule, remaining)
-            case RemainingJob(error=remaining), Refused(reason=reason):
+            case PlanFromRestJob(error=remaining), Refused(reason=reason):
                 assert active is not None
                 self._fail_goal(active, remaining, f", and {reason}", Event.REFUSED)
             case _, Planned(schedule=schedule):

@@ -29,9 +29,9 @@ from spacerobot_ros.planning.methods.optimal.end_effectors import (
 )
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
-from spacerobot_ros.planning.methods.resolved_rate import LEAST_PROGRESS, ResolvedRateOptions
+from spacerobot_ros.planning.methods.resolved_rate import MIN_PROGRESS_RATE, ResolvedRateOptions
 
-_SLOW_PROGRESS = 2 * LEAST_PROGRESS
+_SLOW_PROGRESS_RATE = 2 * MIN_PROGRESS_RATE
 """Progress below which the end-effector slows down before a singularity."""
 
 _LOOK_AHEAD = 1e-3
@@ -155,7 +155,7 @@ class TwistFollower:
         self._required: Array | None = None
         """Distances (P,) that pairs of bodies keep from the first shape on, m."""
         turning = BaseRotations.of(robot)
-        axes = turning.axes if turning.loops else np.zeros((0, 3))
+        axes = turning.axes if turning.loops_turn_base else np.zeros((0, 3))
         (directions,) = EndEffectorRows(robot, [(link, True)], axes).directions
         self._displacements, self._rotations = directions.displacements, directions.rotations
         kept = len(axes) if self._keeps_attitude else 0
@@ -223,10 +223,12 @@ class TwistFollower:
             return np.zeros(len(q)), ""
         rates, progress = self._solution(q, motion)
         factor, reason = 1.0, ""
-        if progress < _SLOW_PROGRESS and not self._moves_away_from_singularity(
+        if progress < _SLOW_PROGRESS_RATE and not self._moves_away_from_singularity(
             q, motion, rates, progress
         ):
-            factor = max(0.0, (progress - LEAST_PROGRESS) / (_SLOW_PROGRESS - LEAST_PROGRESS))
+            factor = max(
+                0.0, (progress - MIN_PROGRESS_RATE) / (_SLOW_PROGRESS_RATE - MIN_PROGRESS_RATE)
+            )
             reason = (
                 f"'{self.link}' is near a dynamic singularity: it moves by {progress:.3g} of its "
                 "reach for a radian of the fastest joint."

@@ -441,7 +441,7 @@ class TrajectoryTracker:
 _STUCK_SHARE = 0.05
 """Share of the commanded range below which the motion of a joint counts as stuck."""
 
-_FOLLOWS_SHARE = 0.5
+_MIN_FOLLOWED_SHARE = 0.5
 """Share of the commanded range above which a joint counts as following its commands. In between it
 is slow, or noise hides its motion."""
 
@@ -529,7 +529,7 @@ class StuckJointWatch:
         if none_moves and self._window[due].max() < self._max_window:
             # Joints do not all jam at once: perhaps commands do not arrive for a while.
             stuck[:] = False
-        follows = due & (measured >= _FOLLOWS_SHARE * commanded)
+        follows = due & (measured >= _MIN_FOLLOWED_SHARE * commanded)
         # Joints between both shares are watched for a window twice as long.
         self._window[due] *= 2
         self._restart_joints(follows | stuck, q)

@@ -59,14 +59,14 @@ class PlanJob:
 
 
 @dataclass(frozen=True)
-class RemainingJob(PlanJob):
+class PlanFromRestJob(PlanJob):
     """A plan from rest for the active goal, from which the robot is off by ``error``."""
 
     error: PoseError
 
 
 @dataclass(frozen=True)
-class OffPathJob(PlanJob):
+class PlanWithBrakingJob(PlanJob):
     """A plan for the active goal that begins with braking, because the base is off its path."""
 
     error: TrackingError
@@ -96,14 +96,14 @@ class PlanningTask:
     ----------
     request
         The request, from the measured state.
-    stuck
+    stuck_joint_positions
         Positions of the joints to plan without, m or rad, by name.
     required
         Parts of the goal that a plan without them must control.
     braking
         (K + 1, n) shapes at the ticks, m or rad, in which the joints brake before the gait, or rest
         while the base drifts; None: the gait begins at once.
-    rates
+    rates_after_braking
         (n,) velocities that are held from there on, m/s or rad/s: those of reaction wheels; None:
         zero.
     take_over
@@ -112,10 +112,10 @@ class PlanningTask:
     """
 
     request: PlanRequest
-    stuck: Mapping[str, float] = field(default_factory=dict)
+    stuck_joint_positions: Mapping[str, float] = field(default_factory=dict)
     required: frozenset[Controlled] = frozenset()
     braking: Array | None = None
-    rates: Array | None = None
+    rates_after_braking: Array | None = None
     take_over: TakeOver | None = None
 
 
@@ -223,8 +223,8 @@ class PlanningWorker:
         if job is None or not job.done:
             return None
         self._job = None
-        if job.defect is not None and not job.cancellation.requested:
-            raise job.defect
+        if job.exception is not None and not job.cancellation.requested:
+            raise job.exception
         return None if job.cancellation.requested else job.result
 
     def cancel(self) -> None:
@@ -255,21 +255,26 @@ class PlanningWorker:
             return method.plan(replace(task.request, state=state, motion=motion), cancellation)
         if task.braking is None:
             return method.plan(task.request, cancellation)
-        return self._plan_with_braking(task.braking, task.request, method, cancellation, task.rates)
+        return self._plan_with_braking(
+            task.braking, task.request, method, cancellation, task.rates_after_braking
+        )
 
     def _choose_method(self, task: PlanningTask) -> GaitMethod:
-        if not task.stuck:
+        if not task.stuck_joint_positions:
             return self._method
         if self._remaining_joints is not None:
             earlier, method = self._remaining_joints
-            if (earlier.stuck, earlier.required) == (task.stuck, task.required):
+            if (earlier.stuck_joint_positions, earlier.required) == (
+                task.stuck_joint_positions,
+                task.required,
+            ):
                 return method
         config = self._config
         method = RemainingJointsGait(
             self._robot,
             config.control_period,
             config.integration_step,
-            stuck=task.stuck,
+            stuck=task.stuck_joint_positions,
             method=config.method,
             options=config.method_options,
             required=task.required,
@@ -327,7 +332,7 @@ class _PlanThread(Thread):
         super().__init__(daemon=True)
         self.cancellation = Cancellation()
         self.result: Planned | Refused | None = None
-        self.defect: BaseException | None = None
+        self.exception: BaseException | None = None
         self.done = False
         self._worker, self._task = worker, task
 
@@ -342,5 +347,5 @@ class _PlanThread(Thread):
         except PlanningError as refusal:
             self.result = Refused(str(refusal), time.perf_counter() - began)
         except BaseException as defect:
-            self.defect = defect
+            self.exception = defect
         self.done = True

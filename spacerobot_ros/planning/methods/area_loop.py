@@ -241,7 +241,7 @@ class AreaLoopGait(GaitMethod):
         """
         S = self.options.k * np.linalg.solve(nominal.M, left).astype(float)
         # Edges scale with the square root of areas.
-        return S, min(1.0, edge_path(S, nominal.longest).excess ** -2)
+        return S, min(1.0, edge_path(S, nominal.longest).edge_ratio ** -2)
 
     def _add_cycle(
         self,
@@ -440,12 +440,12 @@ class EdgePath:
     loops
         Each (V, 3): the vertices in the order of travel, the first again at the end; the middle of
         the box that holds them is the origin.
-    excess
+    edge_ratio
         Largest ratio of an edge to the longest that is allowed.
     """
 
     loops: tuple[Array, ...]
-    excess: float
+    edge_ratio: float
 
     @property
     def kind(self) -> str:
@@ -466,7 +466,7 @@ def edge_path(areas: Array, longest: Array) -> EdgePath:
     rectangles = _rectangle_path(areas, longest)
     if np.all(areas != 0.0):
         cube = _cube_path(areas, longest)
-        if cube.excess <= max(1.0, rectangles.excess):
+        if cube.edge_ratio <= max(1.0, rectangles.edge_ratio):
             return cube
     return rectangles
 

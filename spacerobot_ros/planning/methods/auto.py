@@ -177,13 +177,13 @@ class _MethodResult:
         Its schedule.
     parts
         The parts of the goal that it controls.
-    reaches
+    reaches_goal
         Whether it is predicted to end on the goal, by itself or with the schedules after it.
     """
 
     schedule: GaitSchedule
     parts: frozenset[Controlled]
-    reaches: bool
+    reaches_goal: bool
 
     @classmethod
     def of(cls, robot: SpaceRobot, schedule: GaitSchedule, request: PlanRequest) -> _MethodResult:
@@ -196,14 +196,14 @@ class _MethodResult:
 
     def rank(self, others: Collection[_MethodResult]) -> tuple[bool, bool, float]:
         """Return the key to sort by: the better one of two results has the smaller key."""
-        less = any(self.parts < other.parts and other.reaches for other in others)
-        return not self.reaches, less, self.schedule.expected_duration
+        less = any(self.parts < other.parts and other.reaches_goal for other in others)
+        return not self.reaches_goal, less, self.schedule.expected_duration
 
     @property
     def message(self) -> str:
         """The duration of the schedule as a message, with a reason against the schedule, if any."""
         about = "about " if self.schedule.partial else ""
-        off = "" if self.reaches else ", which ends off the goal"
+        off = "" if self.reaches_goal else ", which ends off the goal"
         return f"{about}{self.schedule.expected_duration:.6g} s{off}"
 
 

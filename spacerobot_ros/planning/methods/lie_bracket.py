@@ -236,7 +236,7 @@ class LieBracketGait(GaitMethod):
         least = 0 if request.correction else self.options.cycles
         best = self._refine_turn(wanted, brackets, triple, z_f, least, enough)
         while (
-            best.miss > enough
+            best.rotation_error > enough
             and 2 * best.cycles * self.ticks_a_cycle * self.control_period <= self.options.longest
         ):
             # The error of the first-order theory decreases as 1/sqrt(n).
@@ -251,7 +251,7 @@ class LieBracketGait(GaitMethod):
                 "alpha": [float(x) for x in best.alpha],
                 "cycles": float(best.cycles),
                 "amplitudes": [float(x) for x in best.amplitudes],
-                "predicted_attitude_error": best.miss,
+                "predicted_attitude_error": best.rotation_error,
             },
         )
 
@@ -276,11 +276,11 @@ class LieBracketGait(GaitMethod):
             least = turn.cycles
             reached = turn.cycles * self._cycle_rotation(turn.shapes)
             miss = attitude_error(quaternion_from_rotvec(reached), target)
-            turn = replace(turn, miss=float(np.linalg.norm(miss)))
-            if best is None or turn.miss < best.miss:
+            turn = replace(turn, rotation_error=float(np.linalg.norm(miss)))
+            if best is None or turn.rotation_error < best.rotation_error:
                 best = turn
             omega_d = omega_d + wanted - reached
-            if turn.miss <= enough or np.linalg.norm(omega_d) > 4 * np.pi:
+            if turn.rotation_error <= enough or np.linalg.norm(omega_d) > 4 * np.pi:
                 break
         assert best is not None
         return best
@@ -398,10 +398,10 @@ class LieBracketGait(GaitMethod):
 
 @dataclass(frozen=True)
 class _TurnStep:
-    """The chosen step 3; ``miss`` is its remaining error, rad."""
+    """The chosen step 3; ``rotation_error`` is its remaining error, rad."""
 
     shapes: Array
     cycles: int
     alpha: Array
     amplitudes: Array
-    miss: float = math.inf
+    rotation_error: float = math.inf

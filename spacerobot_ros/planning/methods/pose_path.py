@@ -55,7 +55,7 @@ class PosePath:
     quaternions: Array
 
     @classmethod
-    def through(cls, positions: Array, quaternions: Array) -> PosePath:
+    def from_poses(cls, positions: Array, quaternions: Array) -> PosePath:
         """Return the path through poses, of which equal ones in succession count as one."""
         path = cls(positions, quaternions)
         kept = np.append(True, path.lengths > _SAME_POSE)
@@ -80,24 +80,28 @@ class PosePath:
         return np.asarray(np.linalg.norm(self.chords, axis=1) + np.linalg.norm(self.turns, axis=1))
 
     @cached_property
-    def along(self) -> Array:
+    def lengths_at_poses(self) -> Array:
         """(K,) length of the path up to each pose, metres and radians together."""
         return np.append(0.0, np.cumsum(self.lengths))
 
-    def after(self, length: float) -> PosePath:
+    def remaining_after(self, length: float) -> PosePath:
         """Return the rest of the path after some of its length; at its end it is one pose."""
-        length = min(max(length, 0.0), float(self.along[-1]))
+        length = min(max(length, 0.0), float(self.lengths_at_poses[-1]))
         if len(self.positions) == 1:
             return self
         i = int(
-            np.clip(np.searchsorted(self.along, length, side="right") - 1, 0, len(self.chords) - 1)
+            np.clip(
+                np.searchsorted(self.lengths_at_poses, length, side="right") - 1,
+                0,
+                len(self.chords) - 1,
+            )
         )
-        share = (length - self.along[i]) / self.lengths[i]
+        share = (length - self.lengths_at_poses[i]) / self.lengths[i]
         r = self.positions[i] + share * self.chords[i]
         turned = quaternion_multiply(
             quaternion_from_rotvec(share * self.turns[i]), self.quaternions[i]
         )
-        return PosePath.through(
+        return PosePath.from_poses(
             np.vstack([r, self.positions[i + 1 :]]), np.vstack([turned, self.quaternions[i + 1 :]])
         )
 
@@ -134,7 +138,9 @@ class PosePath:
     def _distances_from_line(self, first: int, last: int) -> Array:
         """Return how far the poses between two of them are off the line of these, m or rad."""
         inner = slice(first + 1, last)
-        shares = (self.along[inner] - self.along[first]) / (self.along[last] - self.along[first])
+        shares = (self.lengths_at_poses[inner] - self.lengths_at_poses[first]) / (
+            self.lengths_at_poses[last] - self.lengths_at_poses[first]
+        )
         r = self.positions[first] + shares[:, np.newaxis] * (
             self.positions[last] - self.positions[first]
         )
@@ -149,7 +155,7 @@ class PosePath:
         off = np.linalg.norm(self.positions[inner] - r, axis=1)
         return np.asarray(np.maximum(off, np.linalg.norm(left, axis=1)))
 
-    def pieces(self, tolerance: float) -> Iterator[PosePath]:
+    def split_at_reversals(self, tolerance: float) -> Iterator[PosePath]:
         """Yield the parts between stops: at sharp corners, and without a tolerance at each."""
         directions = np.hstack([self.chords, self.turns])
         size = np.linalg.norm(directions, axis=1)
@@ -168,7 +174,7 @@ class RoundedPath:
         The path, of two poses or more.
     tolerance
         Largest distance of the way from the lines, m, and of its attitudes, rad.
-    before, whole
+    before, total_length
         Metres before its start, and of the whole path, for messages.
 
     Attributes
@@ -177,42 +183,42 @@ class RoundedPath:
         Of the lines together, m.
     is_straight
         Whether it is one straight line.
-    marks
+    curvature_breaks
         Shares of the way at which its curvature changes.
     """
 
     def __init__(
         self, path: PosePath, tolerance: float, before: float = 0.0, whole: float | None = None
     ) -> None:
-        self._path, self._total = path, float(path.along[-1])
-        self._metres = np.append(0.0, np.cumsum(np.linalg.norm(path.chords, axis=1)))
-        self.length = float(self._metres[-1])
-        self._before, self.whole = before, self.length if whole is None else whole
+        self._path, self._total = path, float(path.lengths_at_poses[-1])
+        self._metres_at_poses = np.append(0.0, np.cumsum(np.linalg.norm(path.chords, axis=1)))
+        self.length = float(self._metres_at_poses[-1])
+        self._length_before, self.total_length = before, self.length if whole is None else whole
         self.is_straight = len(path.positions) == 2
         near = np.minimum(path.lengths[1:], path.lengths[:-1]) / 2
         self._blends = np.concatenate([[0.0], np.minimum(near, 4 * tolerance), [0.0]])
         """(K,) distances from the corners at which their blends begin and end."""
         parts = np.linspace(-1.0, 1.0, _BLEND_PARTS + 1)
         inner = slice(1, -1)
-        marks = path.along[inner, np.newaxis] + np.outer(self._blends[inner], parts)
-        self.marks = np.unique(marks) / self._total
+        marks = path.lengths_at_poses[inner, np.newaxis] + np.outer(self._blends[inner], parts)
+        self.curvature_breaks = np.unique(marks) / self._total
 
-    def place(self, share: float) -> Array:
+    def displacement(self, share: float) -> Array:
         """Return the displacement (3,) after a share of the way, m."""
-        base, before, after, a, b, _, _ = self._at(share)
+        base, before, after, a, b, _, _ = self._blend_at(share)
         chords, start = self._path.chords, self._path.positions[0]
         place = self._path.positions[base] - start
         return np.asarray(place - a * chords[before] + b * chords[after])
 
-    def rate(self, share: float) -> Array:
+    def displacement_derivative(self, share: float) -> Array:
         """Return the derivative (3,) of the displacement by the share."""
-        _, before, after, _, _, a_rate, b_rate = self._at(share)
+        _, before, after, _, _, a_rate, b_rate = self._blend_at(share)
         chords = self._path.chords
         return np.asarray(b_rate * chords[after] - a_rate * chords[before])
 
-    def turned(self, share: float) -> Array:
+    def rotation(self, share: float) -> Array:
         """Return the turn (4,) since the start after a share of the way."""
-        base, before, after, a, b, _, _ = self._at(share)
+        base, before, after, a, b, _, _ = self._blend_at(share)
         path = self._path
         to_base = quaternion_multiply(
             path.quaternions[base], quaternion_inverse(path.quaternions[0])
@@ -220,22 +226,24 @@ class RoundedPath:
         back = quaternion_multiply(quaternion_from_rotvec(-a * path.turns[before]), to_base)
         return quaternion_multiply(quaternion_from_rotvec(b * path.turns[after]), back)
 
-    def spin(self, share: float) -> Array:
+    def rotation_derivative(self, share: float) -> Array:
         """Return the angular velocity (3,) by the share, rad."""
-        _, before, after, _, b, a_rate, b_rate = self._at(share)
+        _, before, after, _, b, a_rate, b_rate = self._blend_at(share)
         turns = self._path.turns
         carried = matrix_from_quaternion(quaternion_from_rotvec(b * turns[after]))
         return np.asarray(b_rate * turns[after] - a_rate * (carried @ turns[before]))
 
-    def travelled(self, share: float) -> float:
+    def travelled_length(self, share: float) -> float:
         """Return the metres of the whole path after a share of the way."""
-        return self._before + float(np.interp(share * self._total, self._path.along, self._metres))
+        return self._length_before + float(
+            np.interp(share * self._total, self._path.lengths_at_poses, self._metres_at_poses)
+        )
 
-    def _at(self, share: float) -> tuple[int, int, int, float, float, float, float]:
+    def _blend_at(self, share: float) -> tuple[int, int, int, float, float, float, float]:
         """Return a pose, the lines to and from it, the shares ``a`` of the first that are left and
         ``b`` of the second that are done, and the derivatives of both by the share of the way.
         """
-        along, lengths, total = self._path.along, self._path.lengths, self._total
+        along, lengths, total = self._path.lengths_at_poses, self._path.lengths, self._total
         s = share * total
         i = int(np.clip(np.searchsorted(along, s, side="right") - 1, 0, len(lengths) - 1))
         corner = i + 1 if s > along[i + 1] - self._blends[i + 1] else i

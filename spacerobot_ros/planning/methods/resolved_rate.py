@@ -56,17 +56,17 @@ from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotat
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
 from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 
-_STEP = 0.02
+_TRACE_STEP = 0.02
 """Longest step along a path of the joints, rad of the fastest one."""
 
-_MIN_STEPS = 20
+_MIN_TRACE_STEPS = 20
 """Smallest number of steps along a path."""
 
-LEAST_PROGRESS = 0.01
+MIN_PROGRESS_RATE = 0.01
 """Progress on the line below which a singularity is near: the line in reaches of the end-effector,
 for a motion of the joints by one radian of the fastest one."""
 
-_ZERO_PROGRESS = 1e-8
+_ZERO_PROGRESS_RATE = 1e-8
 """Progress below which the path has come to the singularity itself."""
 
 _SINGULARITY_STEP_SHARE = 0.25
@@ -81,19 +81,19 @@ _ZERO_DISTANCE = 1e-10
 _SAMPLED_SHAPES = 8
 """Shapes in general position at which the freedom of the joints is examined."""
 
-_LENGTH_SAMPLES = 200
+_PATH_LENGTH_SAMPLES = 200
 """Places of a curved way from which its scaled length is estimated."""
 
-_INTERVALS = 160
+_TIMING_INTERVALS = 160
 """Intervals of the linear program."""
 
-_MOST_INTERVALS = 1600
+_MAX_TIMING_INTERVALS = 1600
 """Largest number of intervals, for ways with many corners."""
 
-_USED_ACCELERATION = 0.99
+_USED_ACCELERATION_SHARE = 0.99
 """Share of the limits of acceleration for the path; corrections of the ticks may use the rest."""
 
-_ITERATIONS = 8
+_MAX_CORRECTION_ITERATIONS = 8
 """Newton steps at a tick, and attempts to keep the limits with more ticks."""
 
 _LIMIT_ROUNDING = 1e-9
@@ -149,15 +149,15 @@ class _SmoothPath:
 
     Attributes
     ----------
-    length, whole
+    length, total_length
         Of the chords together, m.
     is_straight
         Whether it is a straight line.
-    marks
+    curvature_breaks
         Shares of the way at which its curvature jumps: none.
     """
 
-    marks = np.zeros(0)
+    curvature_breaks = np.zeros(0)
 
     def __init__(self, points: Array, turn: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
         from scipy.interpolate import CubicSpline
@@ -167,30 +167,30 @@ class _SmoothPath:
         kept = np.flatnonzero(np.append(np.inf, chords) > _ZERO_DISTANCE)
         along = np.append(0.0, np.cumsum(chords))[kept]
         self.is_straight = len(kept) <= 2
-        self.length = self.whole = float(along[-1])
+        self.length = self.total_length = float(along[-1])
         self._turn = np.asarray(turn, dtype=float)
         if len(kept) == 1:
             along, kept = np.array([0.0, 1.0]), np.array([0, 0])
         self._place = CubicSpline(along / along[-1], points[kept], bc_type="natural")
         self._rate = self._place.derivative()
 
-    def place(self, share: float) -> Array:
+    def displacement(self, share: float) -> Array:
         """Return the displacement (3,) after a share of the way."""
         return np.asarray(self._place(share))
 
-    def rate(self, share: float) -> Array:
+    def displacement_derivative(self, share: float) -> Array:
         """Return the derivative (3,) of the displacement by the share."""
         return np.asarray(self._rate(share))
 
-    def turned(self, share: float) -> Array:
+    def rotation(self, share: float) -> Array:
         """Return the turn (4,) since the start after a share of the way."""
         return quaternion_from_rotvec(share * self._turn)
 
-    def spin(self, share: float) -> Array:
+    def rotation_derivative(self, share: float) -> Array:
         """Return the angular velocity (3,) by the share, rad."""
         return self._turn
 
-    def travelled(self, share: float) -> float:
+    def travelled_length(self, share: float) -> float:
         """Return the metres of the way after a share of it."""
         return share * self.length
 
@@ -205,27 +205,28 @@ class _LinkPath:
         Name of the link.
     displacements, rotations
         (k, 3) and (l, 3) directions in which the joints move and turn it, and in which it follows.
-    r_CE, quaternion
+    start_position, start_attitude
         (3,) and (4,) of its pose at the start.
-    way
+    path_from_start
         The way from the start to the goal.
     """
 
     link: str
     displacements: Array
     rotations: Array
-    r_CE: Array
-    quaternion: Array
-    way: _SmoothPath | RoundedPath
+    start_position: Array
+    start_attitude: Array
+    path_from_start: _SmoothPath | RoundedPath
 
-    def miss(self, R: Array, r: Array, progress: float) -> Array:
+    def tracking_error(self, R: Array, r: Array, progress: float) -> Array:
         """Return the errors (k + l,) of a pose to that after a share ``progress`` of the line."""
-        target = quaternion_multiply(self.way.turned(progress), self.quaternion)
+        target = quaternion_multiply(self.path_from_start.rotation(progress), self.start_attitude)
         found = quaternion_inverse(quaternion_from_matrix(R))
         rotation = rotvec_from_quaternion(quaternion_multiply(target, found))
         return np.concatenate(
             [
-                self.displacements @ (self.r_CE + self.way.place(progress) - r),
+                self.displacements
+                @ (self.start_position + self.path_from_start.displacement(progress) - r),
                 self.rotations @ rotation,
             ]
         )
@@ -239,11 +240,11 @@ class _LinkPaths:
 
     Attributes
     ----------
-    weights
+    joint_scales
         (n,) motion of each joint while the fastest one moves by a radian, m or rad.
     length
         Length of the lines together, scaled.
-    marks
+    curvature_breaks
         Shares of the lines at which their curvature jumps.
     """
 
@@ -251,26 +252,33 @@ class _LinkPaths:
         self._robot, self._lines = robot, tuple(lines)
         fastest = float(limits.velocity.max())
         ones = np.ones(robot.n)
-        self.weights = limits.velocity / fastest if math.isfinite(fastest) else ones
+        self.joint_scales = limits.velocity / fastest if math.isfinite(fastest) else ones
         scales = []
         for line in lines:
             reach = 1.0
             if len(line.displacements):
                 reach = reach_of_end_effector(robot, limits.lower, limits.upper, line.link)
             scales += [1 / reach] * len(line.displacements) + [1.0] * len(line.rotations)
-        self._scales = np.array(scales)
-        self.is_straight = all(line.way.is_straight for line in lines)
-        self.marks = np.unique(np.concatenate([line.way.marks for line in lines]))
-        shares = np.linspace(0.0, 1.0, 2 if self.is_straight else _LENGTH_SAMPLES)
-        self.length = float(np.mean([np.linalg.norm(self._rate(share)) for share in shares]))
+        self._row_scales = np.array(scales)
+        self.is_straight = all(line.path_from_start.is_straight for line in lines)
+        self.curvature_breaks = np.unique(
+            np.concatenate([line.path_from_start.curvature_breaks for line in lines])
+        )
+        shares = np.linspace(0.0, 1.0, 2 if self.is_straight else _PATH_LENGTH_SAMPLES)
+        self.length = float(
+            np.mean([np.linalg.norm(self._scaled_derivative(share)) for share in shares])
+        )
 
-    def _rate(self, share: float) -> Array:
+    def _scaled_derivative(self, share: float) -> Array:
         """Return the scaled derivative (m,) of the rows by the share of the lines."""
         rates = [
-            np.append(x.displacements @ x.way.rate(share), x.rotations @ x.way.spin(share))
+            np.append(
+                x.displacements @ x.path_from_start.displacement_derivative(share),
+                x.rotations @ x.path_from_start.rotation_derivative(share),
+            )
             for x in self._lines
         ]
-        return np.asarray(np.concatenate(rates) * self._scales)
+        return np.asarray(np.concatenate(rates) * self._row_scales)
 
     def jacobian(self, q: Array, X: Array) -> Array:
         """Return the rows (m, n) of J* in B_0, for a shape and a turn (4,) of the base."""
@@ -283,18 +291,18 @@ class _LinkPaths:
 
     def scaled_jacobian(self, q: Array, X: Array) -> Array:
         """Return :meth:`jacobian` in radians of the fastest joint."""
-        return np.asarray(self._scales[:, np.newaxis] * self.jacobian(q, X) * self.weights)
+        return np.asarray(self._row_scales[:, np.newaxis] * self.jacobian(q, X) * self.joint_scales)
 
-    def correction(self, q: Array, X: Array, progress: float) -> tuple[Array, float]:
+    def least_correction(self, q: Array, X: Array, progress: float) -> tuple[Array, float]:
         """Return the least motion (n,) of the joints to the lines, and the scaled error."""
         R_X, missing = matrix_from_quaternion(X), []
         r_BC = self._robot.center_of_mass(q)
         for line in self._lines:
             R, r = self._robot.link_pose(line.link, q)
-            missing.append(line.miss(R_X @ R, R_X @ (r - r_BC), progress))
-        miss = np.concatenate(missing) * self._scales
+            missing.append(line.tracking_error(R_X @ R, R_X @ (r - r_BC), progress))
+        miss = np.concatenate(missing) * self._row_scales
         least = np.linalg.lstsq(self.scaled_jacobian(q, X), miss, rcond=None)[0]
-        return self.weights * least, float(np.linalg.norm(miss))
+        return self.joint_scales * least, float(np.linalg.norm(miss))
 
     def tangent(self, q: Array, X: Array, share: float) -> tuple[Array, Array, float]:
         """Return the path's tangent: (n,) of the shape, (4,) of the turn, and the progress.
@@ -302,18 +310,20 @@ class _LinkPaths:
         It is of unit length with the joints scaled, the shortest way of the joints, and makes a
         progress that is never negative.
         """
-        M = np.column_stack([self.scaled_jacobian(q, X), -self._rate(share) / self.length])
+        M = np.column_stack(
+            [self.scaled_jacobian(q, X), -self._scaled_derivative(share) / self.length]
+        )
         # Of the null space, the unit vector of most progress: the projection of the last axis.
         basis = np.linalg.qr(M.T, mode="complete")[0][:, len(M) :]
         progress = float(np.linalg.norm(basis[-1]))
-        if progress < _ZERO_PROGRESS / 100:  # The joints cannot move without leaving the line.
+        if progress < _ZERO_PROGRESS_RATE / 100:  # The joints cannot move without leaving the line.
             return np.zeros(len(q)), np.zeros(4), 0.0
-        u = self.weights * (basis @ basis[-1])[:-1] / progress
+        u = self.joint_scales * (basis @ basis[-1])[:-1] / progress
         omega = -self._robot.connection(q)[3:] @ u
         X_rate = quaternion_multiply(X, np.append(omega, 0.0)) / 2
         return u, X_rate, progress
 
-    def measure(self, q: Array, X: Array) -> tuple[str, float]:
+    def singularity_measure(self, q: Array, X: Array) -> tuple[str, float]:
         """Return the number that becomes zero at a singularity, with its name."""
         J = self.jacobian(q, X)
         if J.shape[0] == J.shape[1]:
@@ -321,14 +331,17 @@ class _LinkPaths:
         value = np.linalg.svd(self.scaled_jacobian(q, X), compute_uv=False)[-1]
         return "the smallest singular value of J* (scaled)", float(value)
 
-    def place(self, share: float) -> str:
+    def position_text(self, share: float) -> str:
         """Return a share of the lines in words."""
         line = self._lines[0]
-        way, kind = line.way.whole, "line" if line.way.is_straight else "path"
+        way, kind = (
+            line.path_from_start.total_length,
+            "line" if line.path_from_start.is_straight else "path",
+        )
         if way > _ZERO_DISTANCE:
-            done = line.way.travelled(share)
+            done = line.path_from_start.travelled_length(share)
             return f"after {done:.6g} of {way:.6g} m of the {kind} of '{line.link}'"
-        turn = float(np.linalg.norm(line.way.spin(share)))
+        turn = float(np.linalg.norm(line.path_from_start.rotation_derivative(share)))
         return f"after {share * turn:.6g} of {turn:.6g} rad of the turn of '{line.link}'"
 
 
@@ -338,36 +351,36 @@ class JointPath:
 
     Attributes
     ----------
-    length
+    arc_length
         (K,) length of the path of the joints so far, rad of the fastest joint.
     shapes
         (K, n) shapes, m or rad.
     turns
         (K, 4) attitudes of the base in that at the start.
-    shares
+    path_fractions
         (K,) shares of the lines, 0 to 1.
-    progress
+    progress_rate
         (K,) progress on the lines a length of the path of the joints; zero at a singularity.
     """
 
-    length: Array
+    arc_length: Array
     shapes: Array
     turns: Array
-    shares: Array
-    progress: Array
+    path_fractions: Array
+    progress_rate: Array
 
     @property
     def is_complete(self) -> bool:
         """Whether the path leads to the ends of the lines."""
-        return bool(self.shares[-1] == 1.0)
+        return bool(self.path_fractions[-1] == 1.0)
 
-    def until(self, last: int) -> JointPath:
+    def truncated(self, last: int) -> JointPath:
         """Return the path up to and with one of its places."""
         parts = {each.name: getattr(self, each.name)[: last + 1] for each in fields(self)}
         return JointPath(**parts)
 
 
-def _trace(lines: _LinkPaths, q: Array, cancellation: Cancellation) -> JointPath:
+def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) -> JointPath:
     """Follow lines from a shape (n,) to their ends, or to a singularity (Runge-Kutta 4)."""
     n, total = len(q), lines.length
     y = np.concatenate([q, [0.0, 0.0, 0.0, 1.0, 0.0]])
@@ -379,12 +392,16 @@ def _trace(lines: _LinkPaths, q: Array, cancellation: Cancellation) -> JointPath
 
     k = rate(y)
     lengths, states, progress = [0.0], [y], [float(k[-1])]
-    longest = min(_STEP, total / _MIN_STEPS / max(progress[0], _ZERO_PROGRESS))
+    longest = min(_TRACE_STEP, total / _MIN_TRACE_STEPS / max(progress[0], _ZERO_PROGRESS_RATE))
     step = longest
-    while progress[-1] > _ZERO_PROGRESS:
+    while progress[-1] > _ZERO_PROGRESS_RATE:
         cancellation.raise_if_requested()
         left = total - y[-1]
-        ahead = lines.marks[lines.marks * total > y[-1] + _KNOT_TOLERANCE * total] * total - y[-1]
+        ahead = (
+            lines.curvature_breaks[lines.curvature_breaks * total > y[-1] + _KNOT_TOLERANCE * total]
+            * total
+            - y[-1]
+        )
         # Steps end where the curvature of the way jumps.
         step = min(longest, left / progress[-1], *ahead[:1] / progress[-1])
         if len(progress) > 1 and (falls := progress[-2] - progress[-1]) > 0:
@@ -398,9 +415,9 @@ def _trace(lines: _LinkPaths, q: Array, cancellation: Cancellation) -> JointPath
         at_end = rate(there)
         # A singularity is a turning point of the path, which no step may go beyond: there the
         # tangent is the other way round, as progress is never negative.
-        if min(float(x[:n] @ (k[:n] / lines.weights**2)) for x in (k2, k3, k4, at_end)) < 0:
+        if min(float(x[:n] @ (k[:n] / lines.joint_scales**2)) for x in (k2, k3, k4, at_end)) < 0:
             longest = step / 4
-            if longest < _ZERO_PROGRESS**2:
+            if longest < _ZERO_PROGRESS_RATE**2:
                 progress[-1] = 0.0
             continue
         y, k = there, at_end
@@ -436,7 +453,7 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
     fastest = np.minimum(fastest / unit, 1e6)
     fastest[[0, -1]] = 0.0
     rows, columns, values = [], [], []
-    bound = np.tile(_USED_ACCELERATION * limits.acceleration / unit, 2 * K)
+    bound = np.tile(_USED_ACCELERATION_SHARE * limits.acceleration / unit, 2 * K)
     intervals, joints = np.arange(K)[:, np.newaxis], np.arange(n)
     for end in (0, 1):  # Both ends of each interval, in which x' is constant.
         at = slopes[end : K + end] / (2 * interval), bends[end : K + end]
@@ -465,21 +482,23 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
 class _TimedPath:
     """A path in time, as fast as velocities and accelerations allow.
 
-    ``time`` (K + 1,) at lengths that are ``interval`` apart, ``speed`` (K + 1,) there.
+    ``time`` (K + 1,) at lengths that are ``arc_length_step`` apart, ``speed`` (K + 1,) there.
     """
 
     path: JointPath
     time: Array
     speed: Array
-    interval: float
+    arc_length_step: float
 
     @classmethod
-    def of(cls, path: JointPath, limits: MotionLimits, intervals: int = _INTERVALS) -> _TimedPath:
+    def of(
+        cls, path: JointPath, limits: MotionLimits, intervals: int = _TIMING_INTERVALS
+    ) -> _TimedPath:
         """Return a path at its fastest."""
         from scipy.interpolate import CubicSpline
 
-        shape = CubicSpline(path.length, path.shapes)
-        places, interval = np.linspace(0.0, path.length[-1], intervals + 1, retstep=True)
+        shape = CubicSpline(path.arc_length, path.shapes)
+        places, interval = np.linspace(0.0, path.arc_length[-1], intervals + 1, retstep=True)
         slopes, bends = shape(places, 1), shape(places, 2)
         speed = np.sqrt(_fastest_speeds(slopes, bends, limits, float(interval)))
         time = np.cumsum(np.append(0.0, 2 * interval / (speed[1:] + speed[:-1])))
@@ -493,12 +512,14 @@ class _TimedPath:
         k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
         since, duration = t - self.time[k], self.time[k + 1] - self.time[k]
         change = (self.speed[k + 1] - self.speed[k]) / duration
-        length = k * self.interval + self.speed[k] * since + change * since**2 / 2
+        length = k * self.arc_length_step + self.speed[k] * since + change * since**2 / 2
         path = self.path
-        of_length = CubicSpline(path.length, np.column_stack([path.shapes, path.shares]))
-        found = of_length(np.minimum(length, path.length[-1]))
+        of_length = CubicSpline(
+            path.arc_length, np.column_stack([path.shapes, path.path_fractions])
+        )
+        found = of_length(np.minimum(length, path.arc_length[-1]))
         shares = np.clip(found[:, -1], 0.0, 1.0)
-        shares[-1] = path.shares[-1]
+        shares[-1] = path.path_fractions[-1]
         return found[:, :-1], shares
 
 
@@ -510,20 +531,22 @@ class PathProgress:
     ----------
     route
         The path in W, from where the end-effector was.
-    along
+    travelled_lengths
         (M + 1,) length of the route that is done at the last M + 1 ticks, metres and radians.
     """
 
     route: PosePath
-    along: Array
+    travelled_lengths: Array
 
-    def rest(self, positions: Array, q: Array) -> PosePath:
+    def remaining_route(self, positions: Array, q: Array) -> PosePath:
         """Return the part of the route that is ahead in a shape (n,).
 
         ``positions`` (N + 1, n) are the shapes at the ticks of the schedule.
         """
-        nearest = int(np.argmin(np.linalg.norm(positions[-len(self.along) :] - q, axis=1)))
-        return self.route.after(float(self.along[nearest]))
+        nearest = int(
+            np.argmin(np.linalg.norm(positions[-len(self.travelled_lengths) :] - q, axis=1))
+        )
+        return self.route.remaining_after(float(self.travelled_lengths[nearest]))
 
 
 class ResolvedRateGait(GaitMethod):
@@ -574,10 +597,10 @@ class ResolvedRateGait(GaitMethod):
         at_goal = Tolerance(_ZERO_DISTANCE, _ZERO_DISTANCE).admits(error, self.controls)
         if at_goal and not len(waypoints):
             return self._schedule(state, goal, q[np.newaxis], {})
-        lines = self._lines(state, goal, request.tolerance, waypoints)
+        lines = self._link_paths(state, goal, request.tolerance, waypoints)
         if lines.length < _ZERO_DISTANCE:
             return self._schedule(state, goal, q[np.newaxis], {})
-        positions, _, notes = self._follow(lines, state, cancellation)
+        positions, _, notes = self._trace_without_contact(lines, state, cancellation)
         return self._schedule(state, goal, positions, notes)
 
     def _plan_along_path(self, request: PlanRequest, cancellation: Cancellation) -> GaitSchedule:
@@ -588,14 +611,14 @@ class ResolvedRateGait(GaitMethod):
         positions, along, metres = [now.q[np.newaxis]], [np.zeros(1)], 0.0
         notes: Notes = {}
         least = math.inf
-        for piece in route.pieces(tolerance) if len(route.positions) > 1 else ():
+        for piece in route.split_at_reversals(tolerance) if len(route.positions) > 1 else ():
             way = (piece, metres, whole)
-            lines = self._lines(now, goal, request.tolerance, piece.positions[1:-1], way)
-            shapes, shares, found = self._follow(lines, now, cancellation)
+            lines = self._link_paths(now, goal, request.tolerance, piece.positions[1:-1], way)
+            shapes, shares, found = self._trace_without_contact(lines, now, cancellation)
             least = min(least, float(str(found["least"])))
             notes = {**found, **notes, "least": least}
             positions.append(shapes[1:])
-            along.append(along[-1][-1] + shares[1:] * piece.along[-1])
+            along.append(along[-1][-1] + shares[1:] * piece.lengths_at_poses[-1])
             if "stopped" in found:
                 break
             metres += float(np.linalg.norm(piece.chords, axis=1).sum())
@@ -624,7 +647,7 @@ class ResolvedRateGait(GaitMethod):
         )
         before = request.previous
         if before is not None and isinstance(before.progress, PathProgress):
-            rest = before.progress.rest(before.positions, state.q)
+            rest = before.progress.remaining_route(before.positions, state.q)
         else:
             points = aim.path_values[-1:] if request.correction else aim.path_values
             # Without an attitude any will do: it does not turn.
@@ -632,13 +655,13 @@ class ResolvedRateGait(GaitMethod):
             rest = PosePath(points[:, :3], any_ if aim.quaternion is None else points[:, 3:])
         if aim.quaternion is None:
             quaternion = rest.quaternions[0]
-        route = PosePath.through(
+        route = PosePath.from_poses(
             np.vstack([r, rest.positions]), np.vstack([quaternion, rest.quaternions])
         )
         is_fresh = before is None or not isinstance(before.progress, PathProgress)
         return route.simplified(tolerance) if is_fresh else route
 
-    def _follow(
+    def _trace_without_contact(
         self, lines: _LinkPaths, state: RobotState, cancellation: Cancellation
     ) -> tuple[Array, Array, Notes]:
         """Return shapes (N + 1, n) and shares of the lines (N + 1,) at ticks, with notes.
@@ -648,7 +671,7 @@ class ResolvedRateGait(GaitMethod):
         PlanningError
             The lines meet a singularity or a limit; :meth:`plan` says when they are refused.
         """
-        path = _trace(lines, state.q, cancellation)
+        path = trace_joint_path(lines, state.q, cancellation)
         notes: Notes = {}
         obstacle = self._find_obstacle(lines, path)
         if self.options.as_far_as_possible:
@@ -657,15 +680,16 @@ class ResolvedRateGait(GaitMethod):
             last, reason = obstacle
             if not (self.options.as_far_as_possible and last > 0):
                 raise PlanningError(reason)
-            path, notes = path.until(last), {"stopped": reason}
-        intervals = _INTERVALS
-        if len(lines.marks):
-            intervals = min(max(_INTERVALS, len(path.length) - 1), _MOST_INTERVALS)
+            path, notes = path.truncated(last), {"stopped": reason}
+        intervals = _TIMING_INTERVALS
+        if len(lines.curvature_breaks):
+            intervals = min(max(_TIMING_INTERVALS, len(path.arc_length) - 1), _MAX_TIMING_INTERVALS)
         timed = _TimedPath.of(path, self._limits, intervals)
         positions = self._held_commands(lines, state, timed)
-        name, first = lines.measure(state.q, path.turns[0])
+        name, first = lines.singularity_measure(state.q, path.turns[0])
         least = min(
-            lines.measure(shape, X)[1] for shape, X in zip(path.shapes, path.turns, strict=True)
+            lines.singularity_measure(shape, X)[1]
+            for shape, X in zip(path.shapes, path.turns, strict=True)
         )
         notes |= {"singularity_measure": name, "at_start": first, "least": least}
         return positions, timed.at_ticks(len(positions) - 1)[1], notes
@@ -710,8 +734,8 @@ class ResolvedRateGait(GaitMethod):
         goal = request.goal.for_robot(self.robot.description)
         self._require_goal_of_end_effectors(goal)
         waypoints = self._waypoints(request, goal)
-        lines = self._lines(request.state, goal, request.tolerance, waypoints)
-        return _trace(lines, request.state.q, cancellation)
+        lines = self._link_paths(request.state, goal, request.tolerance, waypoints)
+        return trace_joint_path(lines, request.state.q, cancellation)
 
     def _waypoints(self, request: PlanRequest, goal: Goal) -> Array:
         """Return the waypoints (K, 3) of a request, in the world: none of a correction."""
@@ -737,7 +761,7 @@ class ResolvedRateGait(GaitMethod):
                 f"asks for {part}, too: optimal plans for both."
             )
 
-    def _lines(
+    def _link_paths(
         self,
         state: RobotState,
         goal: Goal,
@@ -757,7 +781,7 @@ class ResolvedRateGait(GaitMethod):
         """
         robot = self.robot
         turning = BaseRotations.of(robot)
-        axes = turning.axes if turning.loops else np.zeros((0, 3))
+        axes = turning.axes if turning.loops_turn_base else np.zeros((0, 3))
         goals = list(goal.end_effectors)
         if self.options.keep_attitude:
             goals.append(EndEffectorGoal(robot.base_link, state.position, state.quaternion))
@@ -821,19 +845,20 @@ class ResolvedRateGait(GaitMethod):
         robot = self.robot
         beyond = np.maximum(robot.lower - path.shapes, path.shapes - robot.upper)
         outside = np.flatnonzero(beyond.max(axis=1) > _LIMIT_ROUNDING)
-        slow = np.flatnonzero(path.progress < LEAST_PROGRESS)
+        slow = np.flatnonzero(path.progress_rate < MIN_PROGRESS_RATE)
         if len(outside) and (not len(slow) or outside[0] < slow[0]):
             k = int(outside[0])
             joint = robot.description.movable_joints[int(np.argmax(beyond[k]))]
             return k - 1, (
-                f"Joint '{joint.name}' is at its limit {lines.place(path.shares[k])}: optimal may "
-                "reach the goal off the line, as may a line from another shape."
+                f"Joint '{joint.name}' is at its limit "
+                f"{lines.position_text(path.path_fractions[k])}: optimal may reach the goal off "
+                "the line, as may a line from another shape."
             )
         if not len(slow):
             return None
-        nearest = int(np.argmin(path.progress))
-        name, value = lines.measure(path.shapes[nearest], path.turns[nearest])
-        first = lines.measure(path.shapes[0], path.turns[0])[1]
+        nearest = int(np.argmin(path.progress_rate))
+        name, value = lines.singularity_measure(path.shapes[nearest], path.turns[nearest])
+        first = lines.singularity_measure(path.shapes[0], path.turns[0])[1]
         shape = ", ".join(f"{x:.6g}" for x in path.shapes[nearest])
         meets, least, there = "meets", "zero", "no rates of the joints lead on"
         if path.is_complete:
@@ -842,9 +867,9 @@ class ResolvedRateGait(GaitMethod):
         line = "straight line" if lines.is_straight else "path through the waypoints"
         return int(slow[0]) - 1, (
             f"The {line} {meets} a dynamic singularity "
-            f"{lines.place(path.shares[nearest])}: {name} falls from {first:.6g} to {least} at the "
-            f"shape ({shape}), where {there}. optimal may reach the goal off the line, as may a "
-            "line from another shape."
+            f"{lines.position_text(path.path_fractions[nearest])}: {name} falls from "
+            f"{first:.6g} to {least} at the shape ({shape}), where {there}. optimal may reach "
+            "the goal off the line, as may a line from another shape."
         )
 
     def _held_commands(self, lines: _LinkPaths, state: RobotState, timed: _TimedPath) -> Array:
@@ -857,7 +882,7 @@ class ResolvedRateGait(GaitMethod):
         """
         period = self.control_period
         ticks = max(1, math.ceil(timed.time[-1] / period - 1e-9))
-        for _ in range(_ITERATIONS):
+        for _ in range(_MAX_CORRECTION_ITERATIONS):
             positions = self._shapes_on_lines(lines, state, *timed.at_ticks(ticks))
             factor, overrun = self._limits.excess(positions, period)
             if overrun > _LIMIT_ROUNDING:
@@ -879,10 +904,10 @@ class ResolvedRateGait(GaitMethod):
         positions[0] = state.q
         for k in range(1, len(shapes)):
             q = shapes[k] + (positions[k - 1] - shapes[k - 1])
-            for _ in range(_ITERATIONS):
+            for _ in range(_MAX_CORRECTION_ITERATIONS):
                 between = np.vstack([positions[k - 1], q])
                 turned = self._prediction.attitudes(between, X, at_rest)[-1]
-                step, miss = lines.correction(q, turned, float(shares[k]))
+                step, miss = lines.least_correction(q, turned, float(shares[k]))
                 if miss < _ZERO_DISTANCE / 100:
                     break
                 q = q + step

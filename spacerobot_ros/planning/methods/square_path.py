@@ -249,12 +249,12 @@ class _SquareFamily:
     plane: PhasePlane
     centres: Array
     sides: Array
-    phases: Array
+    geometric_phases: Array
 
     @property
     def largest(self) -> float:
         """The largest turn of the base by one loop, rad."""
-        return float(np.abs(self.phases).max())
+        return float(np.abs(self.geometric_phases).max())
 
 
 class SquareSearch:
@@ -345,7 +345,7 @@ class SquareSearch:
             if candidates is largest or candidates.largest >= target
         ]
         for candidates, row, side in sorted(solved, key=lambda square: square[2]):
-            clockwise = candidates.phases[row] * wanted < 0
+            clockwise = candidates.geometric_phases[row] * wanted < 0
             corners = np.tile(psi_e, (4, 1))
             squares = square_corners(candidates.centres[[row]], np.array([side]))
             corners[:, candidates.pair] = squares[0]
@@ -411,10 +411,10 @@ class SquareSearch:
         ``wanted`` is the turn of one loop in either sense, rad, at most the largest there is.
         """
         # The slack keeps rounding from excluding the largest square.
-        enough = np.abs(candidates.phases) >= min(wanted, candidates.largest)
+        enough = np.abs(candidates.geometric_phases) >= min(wanted, candidates.largest)
         row = int(np.argmax(enough))
         centre, side = candidates.centres[[row]], float(candidates.sides[row])
-        sign = math.copysign(1.0, candidates.phases[row])
+        sign = math.copysign(1.0, candidates.geometric_phases[row])
 
         def excess(z: float) -> float:
             return (

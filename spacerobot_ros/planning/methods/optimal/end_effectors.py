@@ -351,7 +351,7 @@ class EndEffectorSpecification:
         links = [(each.link, each.quaternion is not None) for each in goal.end_effectors]
         if position:
             links.append((robot.base_link, False))
-        axes = base.turning.axes if base.turning.loops else np.zeros((0, 3))
+        axes = base.base_rotations.axes if base.base_rotations.loops_turn_base else np.zeros((0, 3))
         shape = goal.joint_positions is not None
         return cls(EndEffectorRows(robot, links, axes), base, attitude, position, shape)
 
@@ -376,7 +376,7 @@ class EndEffectorSpecification:
         """Directions (m, 3) in the base along which its attitude is to be reached."""
         if self.shape:
             return self.rows.axes
-        return self.base.turning.axes if self.attitude else np.zeros((0, 3))
+        return self.base.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
     @property
     def rows_at_end(self) -> EndEffectorRows | None:
@@ -439,7 +439,7 @@ class EndEffectorSpecification:
             None,
             direction,
             end_effectors=np.zeros(0) if self.shape else parameters,
-            ends=tuple(ends),
+            possible_ends=tuple(ends),
         )
 
     def _turn_with_shape(
@@ -506,7 +506,7 @@ class EndEffectorSpecification:
         """
         given = turn if self.attitude else None
         rng = np.random.default_rng(0)
-        middle, half = limits.span(start)
+        middle, half = limits.joint_ranges(start)
         speed = np.where(np.isfinite(limits.velocity), limits.velocity, half)
         nearest = np.inf
         for count, follows in ((_STARTS, True), (_STARTS, False), (_ADDITIONAL_STARTS, False)):

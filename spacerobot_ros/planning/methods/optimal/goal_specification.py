@@ -90,14 +90,14 @@ class GoalSpecification:
         Whether these are parts of it.
     same_shape
         Whether goals without a shape of their own end in the one that they start from.
-    turning
+    base_rotations
         How the joints turn the base.
     """
 
     position: bool
     attitude: bool
     same_shape: bool
-    turning: BaseRotations
+    base_rotations: BaseRotations
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> GoalSpecification:
@@ -125,7 +125,7 @@ class GoalSpecification:
     @property
     def axes(self) -> Array:
         """Directions (m, 3) in the base along which the attitude is to be reached."""
-        return self.turning.axes if self.attitude else np.zeros((0, 3))
+        return self.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
     def require_suitable(self, robot: SpaceRobot) -> None:
         """Refuse a robot that can reach no goal in the controlled parts.
@@ -138,7 +138,7 @@ class GoalSpecification:
         name = robot.description.name
         if robot.n == 0:
             raise PlanningError(f"Robot '{name}' has no joints that could move its base.")
-        if self.attitude and self.turning.moves and not len(self.turning.axes):
+        if self.attitude and self.base_rotations.turns_base and not len(self.base_rotations.axes):
             raise PlanningError(
                 f"The attitude of robot '{name}' is uncontrollable: whatever its joints do, its "
                 "base only turns to and fro along one curve of attitudes; with "
@@ -181,11 +181,11 @@ class GoalSpecification:
         if self.attitude:
             self.require_turning_with_drift(robot, state)
             self.require_reachable_turn(robot, turn, tolerance.attitude)
-            if robot.n == 1 and len(self.turning.axes):
+            if robot.n == 1 and len(self.base_rotations.axes):
                 _require_within_one_joint(
-                    robot, limits, state.q, self.turning.axes[0], turn, tolerance.attitude
+                    robot, limits, state.q, self.base_rotations.axes[0], turn, tolerance.attitude
                 )
-            if shape is not None and len(self.axes) and not self.turning.loops:
+            if shape is not None and len(self.axes) and not self.base_rotations.loops_turn_base:
                 turn = self._turn_on_way_to_shape(robot, turn, state.q, shape, tolerance.attitude)
                 # With one joint, the goal attitude fixes the final shape.
                 shape = shape if robot.n > 1 else None
@@ -234,14 +234,14 @@ class GoalSpecification:
             return
         size = float(np.linalg.norm(L_W))
         drifts = f"Robot '{name}' drifts, with an angular momentum of {size:.3g} kg m^2/s"
-        if not self.turning.loops:
+        if not self.base_rotations.loops_turn_base:
             raise PlanningError(
                 f"{drifts}, and loops of its joints do not turn its base: optimal plans for robots "
                 "that drift only where they do. With optimal.base_attitude 0 the attitude of the "
                 "goal is ignored."
             )
-        if len(self.turning.axes) == 1:
-            axis = self.turning.axes[0]
+        if len(self.base_rotations.axes) == 1:
+            axis = self.base_rotations.axes[0]
             D = robot.function("locked_inertia", compile=False)(state.q)[0].full()
             turned = matrix_from_quaternion(state.quaternion).T @ L_W / size
             off = max(np.linalg.norm(np.cross(axis, x)) for x in (turned, D @ axis / D.max()))
@@ -254,7 +254,7 @@ class GoalSpecification:
 
     def require_reachable_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
         """Refuse attitudes that the joints cannot reach."""
-        axes, name = self.turning.axes, robot.description.name
+        axes, name = self.base_rotations.axes, robot.description.name
         tilt = swing_angle(turn, axes)
         if tilt > max(tolerance, _ZERO_ROTATION_ANGLE):
             if not len(axes):
@@ -275,7 +275,7 @@ class GoalSpecification:
         UnreachableError
             It is not the turn of the goal.
         """
-        axis, way = self.turning.axes[0], shape - start
+        axis, way = self.base_rotations.axes[0], shape - start
         nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
         rates = [-axis @ robot.connection(start + (1 + node) / 2 * way)[3:] @ way for node in nodes]
         angle = float(weights @ np.array(rates)) / 2
@@ -300,32 +300,32 @@ class BaseRotations:
         (m, 3) in base components: one unit vector for a planar robot, the unit matrix where all
         attitudes can be reached, none where the joints do not turn the base or only to and fro
         along one curve of attitudes.
-    moves
+    turns_base
         Whether they turn it at all.
-    loops
+    loops_turn_base
         Whether closed loops of the shape turn it.
     """
 
     axes: Array
-    moves: bool
-    loops: bool
+    turns_base: bool
+    loops_turn_base: bool
 
     @classmethod
     def of(cls, robot: SpaceRobot) -> BaseRotations:
         """Test a robot at a few shapes in general position."""
         none = np.zeros((0, 3))
         if robot.n == 0:
-            return cls(none, moves=False, loops=False)
+            return cls(none, turns_base=False, loops_turn_base=False)
         shapes = sample_shapes(robot, _SAMPLED_SHAPE_COUNT)
         A = robot.function("connection", compile=False)(shapes.T).full()[3:]
         U, sizes, _ = np.linalg.svd(A, full_matrices=False)
         if sizes[0] <= _MIN_BASE_TURN:
-            return cls(none, moves=False, loops=False)
+            return cls(none, turns_base=False, loops_turn_base=False)
         loops = bool(np.abs(curvatures(robot, shapes)).max() > _SINGULAR_VALUE_TOLERANCE * sizes[0])
         if np.sum(sizes > _SINGULAR_VALUE_TOLERANCE * sizes[0]) == 1:
             axis = U[:, 0] * np.sign(U[np.argmax(np.abs(U[:, 0])), 0])
-            return cls(axis[np.newaxis], moves=True, loops=loops)
-        return cls(np.eye(3) if loops else none, moves=True, loops=loops)
+            return cls(axis[np.newaxis], turns_base=True, loops_turn_base=loops)
+        return cls(np.eye(3) if loops else none, turns_base=True, loops_turn_base=loops)
 
 
 def _require_within_one_joint(
@@ -397,7 +397,7 @@ def shape_for_center(
     lower, upper = limits.lower, limits.upper
     # The solver needs lower bounds below upper bounds.
     room = 1e-9 * (1 + np.abs(start))
-    middle, half = limits.span(start)
+    middle, half = limits.joint_ranges(start)
     from scipy.optimize import least_squares  # Slow to import, and few goals need it.
 
     rng = np.random.default_rng(0)
@@ -458,7 +458,7 @@ def _unreachable_center_error(
 ) -> UnreachableError | NotFoundError:
     """Return the reason why no shape puts the base at ``wanted``; ``near`` (n,) came nearest."""
     name, distance = robot.description.name, _distance_to_center(robot, near, wanted)
-    gap = CenterReach.of(robot, limits.lower, limits.upper).gap(wanted)
+    gap = CenterReach.of(robot, limits.lower, limits.upper).distance_outside(wanted)
     if gap <= _POSITION_TOLERANCE:
         return NotFoundError(
             f"No shape of '{name}' that puts the base at the goal position was found from "
@@ -481,7 +481,7 @@ def _unreachable_center_error(
             f"{limits.upper[worst]:.4g}] {joint.unit}."
         )
         if np.abs(free).max() < _MAX_REPORTED_RANGE_FACTOR * (
-            1 + np.abs(limits.span(near)[1]).max()
+            1 + np.abs(limits.joint_ranges(near)[1]).max()
         ):
             return UnreachableError(message, Proof.LIMITS)
     return UnreachableError(
@@ -503,7 +503,7 @@ class CenterReach:
     ----------
     origin
         (3,) m, base components.
-    slots
+    slider_directions
         (3, s) motion of the centre of mass with each slider of fixed direction, m/m.
     lower, upper
         (s,) ends of their ranges, m.
@@ -512,7 +512,7 @@ class CenterReach:
     """
 
     origin: Array
-    slots: Array
+    slider_directions: Array
     lower: Array
     upper: Array
     radius: float
@@ -528,12 +528,12 @@ class CenterReach:
         slots = np.zeros((3, len(lower)))
         places = [_FrameBounds(np.zeros(3), np.eye(3), (), 0.0)]
         for joint, body in enumerate(bodies[1:]):
-            place = places[body.parent].next(joint, body, lower[joint], upper[joint])
+            place = places[body.parent].of_child(joint, body, lower[joint], upper[joint])
             places.append(place)
             mass, com = body.inertia.mass, body.inertia.com
             if place.R is None:
                 origin = origin + mass * place.r
-                radius += mass * (place.around + float(np.linalg.norm(com)))
+                radius += mass * (place.radius + float(np.linalg.norm(com)))
             else:
                 origin = origin + mass * (place.r + place.R @ com)
             for slider, axis in place.sliders:
@@ -543,16 +543,20 @@ class CenterReach:
         slots = slots[:, sliders] / total
         return cls(origin / total, slots, lower[sliders], upper[sliders], radius / total)
 
-    def gap(self, point: Array) -> float:
+    def distance_outside(self, point: Array) -> float:
         """Return the distance of a point (3,) from the set, m: no shape comes nearer."""
         if not np.isfinite(self.radius):
             return 0.0
         beside = point - self.origin
-        if self.slots.size:
+        if self.slider_directions.size:
             from scipy.optimize import lsq_linear  # Slow to import, and few goals need it.
 
             bounds = self.lower - _MIN_SLIDER_RANGE, self.upper + _MIN_SLIDER_RANGE
-            beside = beside - self.slots @ lsq_linear(self.slots, beside, bounds, method="bvls").x
+            beside = (
+                beside
+                - self.slider_directions
+                @ lsq_linear(self.slider_directions, beside, bounds, method="bvls").x
+            )
         return max(0.0, float(np.linalg.norm(beside)) - self.radius)
 
 
@@ -569,24 +573,24 @@ def moving_joint_ranges(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[
 class _FrameBounds:
     """Bounds on the frame of a body for all shapes.
 
-    It is within ``around`` m of ``r`` (3,), displaced by the ``sliders``: pairs of an index and a
+    It is within ``radius`` m of ``r`` (3,), displaced by the ``sliders``: pairs of an index and a
     direction (3,). ``R`` (3, 3) is its attitude in the base, None if that depends on the shape.
     """
 
     r: Array
     R: Array | None
     sliders: tuple[tuple[int, Array], ...]
-    around: float
+    radius: float
 
-    def next(self, index: int, body: Body, lower: float, upper: float) -> _FrameBounds:
+    def of_child(self, index: int, body: Body, lower: float, upper: float) -> _FrameBounds:
         """Return the place of a body behind this one, which a joint with these limits carries."""
         assert body.joint is not None
         slides = body.joint.kind is JointKind.PRISMATIC
         if self.R is None:
             travel = max(abs(lower), abs(upper)) if slides else 0.0
-            around = self.around + float(np.linalg.norm(body.origin.r)) + travel
+            around = self.radius + float(np.linalg.norm(body.origin.r)) + travel
             return _FrameBounds(self.r, None, self.sliders, around)
         r, R = self.r + self.R @ body.origin.r, self.R @ body.origin.R
         if slides:
-            return _FrameBounds(r, R, (*self.sliders, (index, R @ body.joint.axis)), self.around)
-        return _FrameBounds(r, None, self.sliders, self.around)
+            return _FrameBounds(r, R, (*self.sliders, (index, R @ body.joint.axis)), self.radius)
+        return _FrameBounds(r, None, self.sliders, self.radius)

@@ -91,12 +91,12 @@ _FADING_ZONE = 0.02
 @dataclass(frozen=True)
 class HeldCommands:
     """Shapes ``positions`` (N + 1, n) at the ticks, attitudes ``quaternions`` (N + 1, 4) that they
-    cause, from the starting one, and the angle ``miss`` (rad) that is left to the goal.
+    cause, from the starting one, and the angle ``end_error`` (rad) that is left to the goal.
     """
 
     positions: Array
     quaternions: Array
-    miss: float
+    end_error: float
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,7 @@ class CommandHolder:
         """
         reached = self._attitudes(trajectory.at_ticks(ticks), boundary)[-1]
         error = quaternion_from_rotvec(attitude_error(reached, trajectory.quaternions[-1]))
-        return replace(boundary, turn=quaternion_multiply(boundary.turn, error))
+        return replace(boundary, goal_rotation=quaternion_multiply(boundary.goal_rotation, error))
 
     def _adjust_to_goal(
         self,
@@ -381,7 +381,7 @@ class CommandHolder:
 
     def _speeds_and_half_ranges(self, q: Array, limits: MotionLimits) -> tuple[Array, Array]:
         """Return a speed (n,) of every joint, and half of its range round q (n,)."""
-        half = limits.span(q)[1]
+        half = limits.joint_ranges(q)[1]
         return np.where(np.isfinite(limits.velocity), limits.velocity, half), half
 
     def _end_error(
@@ -391,7 +391,7 @@ class CommandHolder:
 
         With it, derivatives of the rows of end-effectors by turn (m', 3) and last shape (m', n).
         """
-        error = self._axes @ attitude_error(quaternions[-1], boundary.turn)
+        error = self._axes @ attitude_error(quaternions[-1], boundary.goal_rotation)
         if self._end_effectors is None:
             return np.asarray(error), None, None
         rows, by_turn, by_shape = self._end_effectors.evaluate(
@@ -547,7 +547,7 @@ def least_change(
     count = N - 1 + moves_end
     if count < 1:
         return None
-    _, half = limits.span(positions[0])
+    _, half = limits.joint_ranges(positions[0])
     # Unknowns are shares of a tick at full speed.
     scale = np.where(np.isfinite(limits.velocity), limits.velocity, half) * period
     scaled = (rows[:, moving] * scale).reshape(len(rows), -1)

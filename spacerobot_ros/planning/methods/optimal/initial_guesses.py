@@ -101,20 +101,20 @@ class InitialGuesses:
     ) -> Iterator[Trajectory]:
         """Yield guesses that end in the shape ``final`` (n,), or in all possible ends in turn."""
         rng = np.random.default_rng(1)
-        half = limits.span(boundary.start)[1]
-        ends = boundary.ends or (PossibleEnd(final, boundary.turn),)
+        half = limits.joint_ranges(boundary.start)[1]
+        ends = boundary.possible_ends or (PossibleEnd(final, boundary.goal_rotation),)
         sizes = []
         for end in ends:
             (direct,) = self._build_trajectories(
                 self._direct_path(boundary.start, end.shape)[np.newaxis], limits
             )
-            missing = attitude_error(direct.quaternions[-1], end.turn)
+            missing = attitude_error(direct.quaternions[-1], end.base_rotation)
             sizes.append(min(1.0, self._loop_size(end.shape, half, float(np.linalg.norm(missing)))))
         for number in itertools.count():
             around, place = divmod(number, len(ends))
-            final, turn = ends[place].shape, ends[place].turn
+            final, turn = ends[place].shape, ends[place].base_rotation
             # The direct way to an end may be all that it takes, and is no guess twice.
-            size = max(sizes[place], _MIN_LOOP_SIZE if boundary.ends and around else 0.0)
+            size = max(sizes[place], _MIN_LOOP_SIZE if boundary.possible_ends and around else 0.0)
             loop = _LOOPS[around % len(_LOOPS)]
             rounds = [
                 size * rng.uniform(0.3, 1.5) * loop(rng, self._instants, len(half))
@@ -141,8 +141,8 @@ class InitialGuesses:
         other joints go to their last shape, later with loops on the way; and the wheels have the
         rates that momentum asks for.
         """
-        direct = self._direct_path(boundary.start, boundary.likely)
-        loops = self.generate(boundary, limits, boundary.likely)
+        direct = self._direct_path(boundary.start, boundary.likely_final_shape)
+        loops = self.generate(boundary, limits, boundary.likely_final_shape)
         for number in itertools.count():
             shapes = next(loops).shapes if number else direct
             found = self._turned_by_wheels(wheels, boundary, limits, robot, shapes)
@@ -214,10 +214,10 @@ class InitialGuesses:
             u, L_0 = step * velocities, self._angular_momentum
             parts = shapes[:-1], u[:-1], u[1:]
             forwards = self._integrate_drift(*parts, np.asarray(step), L_0)
-            L_f = L_0 @ matrix_from_quaternion(boundary.turn)
+            L_f = L_0 @ matrix_from_quaternion(boundary.goal_rotation)
             parts = shapes[:0:-1], -u[:0:-1], -u[-2::-1]
             backwards = self._integrate_drift(*parts, np.asarray(step), -L_f)[::-1]
-        backwards = quaternion_multiply(boundary.turn, backwards)
+        backwards = quaternion_multiply(boundary.goal_rotation, backwards)
         between = rotvecs_from_quaternions(
             quaternion_multiply(quaternion_inverse(forwards), backwards)
         )
@@ -253,7 +253,7 @@ class InitialGuesses:
     def _add_loops(self, rounds: Array, start: Array, final: Array, limits: MotionLimits) -> Array:
         """Return shapes (K, N + 1, n) of the direct path with loops added, in half ranges."""
         direct = self._direct_path(start, final)
-        middle, half = limits.span(start)
+        middle, half = limits.joint_ranges(start)
         # Shapes stay within most of the joint range, or within the extent of the direct path.
         room = np.maximum(_MAX_RANGE_SHARE * half, np.abs(direct - middle))
         shapes = np.clip(direct + half * rounds, middle - room, middle + room)
@@ -475,10 +475,10 @@ class SolutionLibrary:
 
     def nearest(self, boundary: BoundaryConditions, limits: MotionLimits) -> Iterator[Array]:
         """Yield the shapes (M, n) of manoeuvres with the nearest ends, moved to these ends."""
-        half = limits.span(boundary.start)[1]
+        half = limits.joint_ranges(boundary.start)[1]
         half = np.where(half > 0, half, 1.0)
         # The angle between two turns, and the distances of the shapes at both ends.
-        apart = 2 * np.arccos(np.clip(np.abs(self.turns @ boundary.turn), 0.0, 1.0))
+        apart = 2 * np.arccos(np.clip(np.abs(self.turns @ boundary.goal_rotation), 0.0, 1.0))
         begins = np.linalg.norm((self.shapes[:, 0] - boundary.start) / half, axis=1)
         distance = apart + begins
         if boundary.final is not None:

@@ -91,7 +91,7 @@ class DistanceLibrary:
         if boundary.final is not None:
             base = None
             if turn_is_known:
-                end, turn = boundary.final[np.newaxis], boundary.turn[np.newaxis]
+                end, turn = boundary.final[np.newaxis], boundary.goal_rotation[np.newaxis]
                 base = self.base_poses(boundary, end, turn)
             self.clearance.require_shape(boundary.final, required, base)
         return KeptDistances(self, boundary, required, turn_is_known=turn_is_known)
@@ -207,7 +207,7 @@ class KeptDistances:
         ends, turns = [self._boundary.start], [_NO_TURN]
         if self._boundary.final is not None:
             ends.append(self._boundary.final)
-            turns.append(self._boundary.turn)
+            turns.append(self._boundary.goal_rotation)
         known = len(ends) if self._turn_is_known else 1
         shapes, turned = np.array(ends).T, np.hstack([ends, turns])[:known].T
         least, world = [], np.zeros(0)

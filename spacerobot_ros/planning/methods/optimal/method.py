@@ -363,7 +363,7 @@ class OptimalGait(GaitMethod):
                     "which its wheels take up as its attitude at the end asks for: give the goal "
                     "an attitude of the base (with optimal.base_attitude 1)."
                 )
-            L_B = matrix_from_quaternion(boundary.turn).T @ L_B
+            L_B = matrix_from_quaternion(boundary.goal_rotation).T @ L_B
         try:
             end[wheels.index] = wheels.rates_for(L_B, near, limit[wheels.index])
         except UnreachableError as clause:
@@ -460,7 +460,7 @@ class OptimalGait(GaitMethod):
         boundary = replace(boundary, state=state, angular_momentum=L_0)
         boundary = self._with_wheels(boundary, request)
         # A manoeuvre ends within the margin if its goal does.
-        limits = self._limits.within(margin, q, boundary.likely)
+        limits = self._limits.within(margin, q, boundary.likely_final_shape)
         if request.motion is not None:
             return self._plan_in_motion(
                 request, request.motion, boundary, limits, cancellation, duration
@@ -617,7 +617,9 @@ class OptimalGait(GaitMethod):
     ) -> list[int]:
         """Return the ticks at which the coasting base passes the goal, the closest pass first."""
         grid = np.arange(0, len(coast.shapes), step)
-        turns = np.array([self._later(request, boundary, coast, int(k))[1].turn for k in grid])
+        turns = np.array(
+            [self._later(request, boundary, coast, int(k))[1].goal_rotation for k in grid]
+        )
         # The cosine of half the angle that is left.
         near = np.abs(turns[:, 3])
         passes = 1 + np.flatnonzero((near[1:-1] > near[:-2]) & (near[1:-1] >= near[2:]))
@@ -649,7 +651,7 @@ class OptimalGait(GaitMethod):
         at_rest = replace(aimed, angular_momentum=np.zeros(3))
         few = replace(chosen, starts=min(chosen.starts, _STARTS_PER_COASTING_END))
         free = self._begin_now(there, at_rest, limits, few, cancellation)
-        guess = SolutionLibrary("", at_rest.turn[np.newaxis], free.positions[np.newaxis])
+        guess = SolutionLibrary("", at_rest.goal_rotation[np.newaxis], free.positions[np.newaxis])
         takes = len(free.positions) - 1
         begin = max(0, end - takes)
         later, aimed = self._later(request, boundary, coast, begin)
@@ -824,7 +826,7 @@ class OptimalGait(GaitMethod):
         """Return the active limits of held commands, with the joints at each limit."""
         if len(positions) < 2:
             return "nothing"
-        speed, change = self._limits.shares(positions, self.control_period, velocity, after)
+        speed, change = self._limits.limit_shares(positions, self.control_period, velocity, after)
         shares = {"velocity": speed, "acceleration": change}
         if self._efforts is not None:
             shares["effort"] = np.abs(self._efforts.shares(positions, velocity, L_B, after))
@@ -938,7 +940,7 @@ class OptimalGait(GaitMethod):
         if factor > 1 + _LIMIT_ROUNDING or overrun > _LIMIT_ROUNDING:
             raise UnusableCandidateError("it exceeds a limit of the joints")
         kind = self._kind_of(request.goal)
-        aim = quaternion_multiply(state.quaternion, boundary.turn)
+        aim = quaternion_multiply(state.quaternion, boundary.goal_rotation)
         aim = aim if request.goal.end_effectors else request.goal.quaternion
         error = attitude_error(attitudes[-1], aim)
         if np.linalg.norm(kind.specification.axes @ error) > _MAX_CACHED_END_ERROR:

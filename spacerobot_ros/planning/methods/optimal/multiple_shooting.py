@@ -124,7 +124,7 @@ class MultipleShooting:
         self.intervals = intervals
         self.iterations, self.converged = 0, False
         """Number of the solver's steps for its last solution, and whether the solver converged."""
-        self.turn = stages.turn
+        self.turn = stages.rotation_of_step
         self._drifting = stages.drifting
         self._program = program(stages, intervals)
         # The solver's matrices are small: threads of its linear algebra would wait for each other.
@@ -260,7 +260,13 @@ def _pack_parameters(
     center = np.zeros(3) if boundary.center is None else boundary.center
     return np.concatenate(
         [
-            *(boundary.start, boundary.turn, boundary.direction, center, boundary.end_effectors),
+            *(
+                boundary.start,
+                boundary.goal_rotation,
+                boundary.direction,
+                center,
+                boundary.end_effectors,
+            ),
             *(typical, weights),
             boundary.angular_momentum if drifting else np.zeros(0),
             *(limits.distances, limits.world),

@@ -175,10 +175,10 @@ class UnusableCandidateError(PlanningError):
 
 @dataclass(frozen=True)
 class PossibleEnd:
-    """An end of a guess: a ``shape`` (n,), and the ``turn`` (4,) of the base since the start."""
+    """An end of a guess: a ``shape`` (n,), and the ``base_rotation`` (4,) since the start."""
 
     shape: Array
-    turn: Array
+    base_rotation: Array
 
 
 @dataclass(frozen=True)
@@ -189,9 +189,9 @@ class BoundaryConditions:
     ----------
     start
         (n,) first shape, m or rad.
-    turn
+    goal_rotation
         (4,) quaternion of the goal attitude in the starting one.
-    likely
+    likely_final_shape
         (n,) last shape for all that is known before the search.
     final
         (n,) last shape; None: any. That of a reaction wheel is not a number: any.
@@ -205,7 +205,7 @@ class BoundaryConditions:
         (n,) velocities that the joints keep from the end on, likewise.
     end_effectors
         (7 k,) goals of k links (:meth:`.EndEffectorRows.pack`).
-    ends
+    possible_ends
         Ends of the guesses, in turn; none: the likely shape, and the turn.
     state
         The state at the start.
@@ -214,15 +214,15 @@ class BoundaryConditions:
     """
 
     start: Array
-    turn: Array
-    likely: Array
+    goal_rotation: Array
+    likely_final_shape: Array
     final: Array | None = None
     center: Array | None = None
     direction: Array = field(default_factory=lambda: np.zeros(3))
     velocity: Array | float = 0.0
     final_velocity: Array | float = 0.0
     end_effectors: Array = field(default_factory=lambda: np.zeros(0))
-    ends: tuple[PossibleEnd, ...] = ()
+    possible_ends: tuple[PossibleEnd, ...] = ()
     state: RobotState | None = None
     angular_momentum: Array = field(default_factory=lambda: np.zeros(3))
 
@@ -317,7 +317,7 @@ class MotionLimits:
             self, lower=np.maximum(lower, self.lower), upper=np.minimum(upper, self.upper)
         )
 
-    def span(self, q: Array) -> tuple[Array, Array]:
+    def joint_ranges(self, q: Array) -> tuple[Array, Array]:
         """Return middle and half width (n,) of the range, finite round ``q`` (n,)."""
         lower = np.maximum(self.lower, q - 2 * _UNLIMITED_HALF_RANGE)
         upper = np.minimum(self.upper, q + 2 * _UNLIMITED_HALF_RANGE)
@@ -338,12 +338,12 @@ class MotionLimits:
         velocities and accelerations keep their limits; the overrun is the farthest that a joint is
         beyond its limits, m or rad.
         """
-        speed, change = self.shares(positions, period, velocity, after)
+        speed, change = self.limit_shares(positions, period, velocity, after)
         beyond = np.maximum(self.lower - positions, positions - self.upper)
         factor = max(float(speed.max(initial=0.0)), float(np.sqrt(change.max(initial=0.0))))
         return factor, float(beyond.max(initial=0.0))
 
-    def shares(
+    def limit_shares(
         self,
         positions: Array,
         period: float,
@@ -404,12 +404,12 @@ class Trajectory:
 class _SmoothBody:
     """A smooth body of shapes round a box, through its corners.
 
-    ``middle`` and ``half`` are the box's, of the ``joints`` that it bounds.
+    ``box_center`` and ``box_half_sizes`` are the box's, of the ``joints`` that it bounds.
     """
 
     joints: list[int]
-    middle: Array
-    half: Array
+    box_center: Array
+    box_half_sizes: Array
 
     @classmethod
     def of(cls, robot: SpaceRobot, lower: Array, upper: Array) -> _SmoothBody:
@@ -434,23 +434,24 @@ class PathConstraints:
 
     Attributes
     ----------
-    base_rate
+    base_rate_limit
         Fastest turn of the base, rad/s; 0: any.
-    axis_B, direction_W, cone
+    axis_B, direction_W, cone_half_angle
         The direction ``axis_B`` (3,), fixed in the base, stays out of the cone of half angle
-        ``cone`` (rad) round ``direction_W`` (3,), as an instrument that must not see the Sun.
-    boxes
+        ``cone_half_angle`` (rad) round ``direction_W`` (3,), as an instrument that must not see the
+        Sun.
+    keep_out_boxes
         (K, 2, n) lower and upper corners of boxes of shapes that the joints must not enter.
-    bodies
+    smooth_keep_out_bodies
         The smooth bodies that replace the boxes in the program.
     """
 
-    base_rate: float = 0.0
+    base_rate_limit: float = 0.0
     axis_B: Array | None = None
     direction_W: Array | None = None
-    cone: float = 0.0
-    boxes: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
-    bodies: tuple[_SmoothBody, ...] = ()
+    cone_half_angle: float = 0.0
+    keep_out_boxes: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    smooth_keep_out_bodies: tuple[_SmoothBody, ...] = ()
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> PathConstraints:
@@ -483,9 +484,9 @@ class PathConstraints:
         return cls(options.max_base_rate, axis, direction, options.keep_angle, corners, bodies)
 
     @property
-    def on_knots(self) -> int:
+    def knot_inequality_count(self) -> int:
         """Number of inequalities that :meth:`symbolic` returns."""
-        return len(self.boxes) + (self.axis_B is not None)
+        return len(self.keep_out_boxes) + (self.axis_B is not None)
 
     def symbolic(self, q: ca.SX, quaternion: ca.SX, direction: ca.SX) -> ca.SX:
         """Return the inequality constraints, not negative, at a shape and an attitude.
@@ -493,13 +494,13 @@ class PathConstraints:
         ``direction`` (3,) is the kept direction in the frame that the quaternion refers to.
         """
         rows = [ca.SX(0, 1)]
-        for body in self.bodies:
-            x = (q[body.joints] - body.middle) / body.half
+        for body in self.smooth_keep_out_bodies:
+            x = (q[body.joints] - body.box_center) / body.box_half_sizes
             rows.append(ca.log(ca.sum1(x**_SMOOTH_BODY_EXPONENT) / len(body.joints) + 1e-3))
         if self.axis_B is not None:
             R_WB = symbolic_rotations.matrix_from_quaternion(quaternion)
             seen = ca.dot(R_WB @ ca.DM(self.axis_B), direction)
-            rows.append(np.cos(min(self.cone * (1 + _CONSTRAINT_RESERVE), np.pi)) - seen)
+            rows.append(np.cos(min(self.cone_half_angle * (1 + _CONSTRAINT_RESERVE), np.pi)) - seen)
         return ca.vertcat(*rows)
 
     def check(self, positions: Array, quaternions: Array, period: float) -> None:
@@ -510,7 +511,7 @@ class PathConstraints:
         CandidateError
             It violates a constraint.
         """
-        for box in self.boxes:
+        for box in self.keep_out_boxes:
             inside = np.all((positions > box[0]) & (positions < box[1]), axis=1)
             if inside.any():
                 raise UnusableCandidateError(
@@ -522,29 +523,29 @@ class PathConstraints:
                 for x in quaternions
             ]
             angle = np.arccos(np.clip(np.max(seen), -1.0, 1.0))
-            if angle < self.cone - 1e-9:
+            if angle < self.cone_half_angle - 1e-9:
                 raise UnusableCandidateError(
                     f"the axis comes within {angle:.4g} rad of keep_direction"
                 )
-        if self.base_rate > 0:
+        if self.base_rate_limit > 0:
             rate = _largest_base_rate(quaternions, period)
-            if rate > self.base_rate * (1 + 1e-6):
+            if rate > self.base_rate_limit * (1 + 1e-6):
                 raise UnusableCandidateError(f"the base turns at {rate:.4g} rad/s")
 
     @property
     def imposed_base_rate(self) -> float:
         """The bound on the base rate at the steps of a solution, rad/s."""
-        return self.base_rate * (1 - _CONSTRAINT_RESERVE)
+        return self.base_rate_limit * (1 - _CONSTRAINT_RESERVE)
 
     def excess_rate(self, quaternions: Array, period: float) -> float:
         """Return the largest base rate between attitudes (N + 1, 4) over the bound; 0: none."""
-        if self.base_rate == 0:
+        if self.base_rate_limit == 0:
             return 0.0
-        return _largest_base_rate(quaternions, period) / self.base_rate
+        return _largest_base_rate(quaternions, period) / self.base_rate_limit
 
     def slowed(self, guess: Trajectory) -> Trajectory:
         """Return a guess slowed to the bound on the base rate."""
-        if self.base_rate == 0:
+        if self.base_rate_limit == 0:
             return guess
         fastest = _largest_base_rate(guess.quaternions, guess.step)
         return guess.stretched(max(1.0, fastest / self.imposed_base_rate))

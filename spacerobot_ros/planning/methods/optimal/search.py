@@ -532,7 +532,7 @@ class ManoeuvreSearch:
         """Return manoeuvres from at most ``starts`` guesses on a grid; none where none is found."""
         guesses = _build_guesses(self._robot, grid, progress.boundary)
         boundary, limits = progress.boundary, progress.limits
-        of_boundary = guesses.generate(boundary, limits, boundary.likely)
+        of_boundary = guesses.generate(boundary, limits, boundary.likely_final_shape)
         if len(self._wheels) and len(self._axes):
             of_boundary = guesses.generate_with_wheels(self._wheels, boundary, limits, self._robot)
         if progress.library is not None:
@@ -659,7 +659,7 @@ class ManoeuvreSearch:
             )
         if not pairs or self._distances is None:
             return self._stages[key]
-        return self._stages[key].keeping(self._distances.of(pairs), instants)
+        return self._stages[key].with_distances(self._distances.of(pairs), instants)
 
     def _solve_from_guess(
         self,
@@ -687,7 +687,7 @@ class ManoeuvreSearch:
         else:
             duration = DurationBounds(shortest, options.longest)
             solution = solver.solve(boundary, limits, guess, stop, duration)
-            if solution is None or solver.converged or self._constraints.base_rate > 0:
+            if solution is None or solver.converged or self._constraints.base_rate_limit > 0:
                 return solution
             # A solution without convergence is not yet as fast as possible.
             return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest), boundary)
@@ -995,7 +995,7 @@ class MotionSearch:
         guesses = _build_guesses(self._robot, solver, boundary)
         if len(remaining) > 1:
             yield guesses.from_ticks(remaining, velocity, self._period)
-        for guess in guesses.generate(boundary, limits, boundary.likely):
+        for guess in guesses.generate(boundary, limits, boundary.likely_final_shape):
             yield guesses.with_initial_velocity(guess, velocity, limits)
 
 

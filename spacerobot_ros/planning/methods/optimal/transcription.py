@@ -126,9 +126,9 @@ class Stages:
         n.
     beginning, interval, end
         Rows of the first knot, of two neighbouring knots, and of the last one.
-    path
+    path_row_count
         Rows of the interval that are inequalities, ``>= 0``: the last ones of it.
-    turn
+    rotation_of_step
         The rotation vector (3,) of a step (:func:`turn_function`).
     distances
         Distances of pairs of links, and of links and obstacles, in an interval, less the smallest
@@ -139,8 +139,8 @@ class Stages:
     beginning: ConstraintBlock
     interval: ConstraintBlock
     end: ConstraintBlock
-    path: int
-    turn: ca.Function
+    path_row_count: int
+    rotation_of_step: ca.Function
     distances: ConstraintBlock | None = None
 
     @property
@@ -196,7 +196,7 @@ class Stages:
         turn = turn_function(robot, drifting=drifting)
         return cls(n, begins, interval, ends, path, turn)
 
-    def keeping(self, rows: Sequence[DistanceRows], instants: int) -> Stages:
+    def with_distances(self, rows: Sequence[DistanceRows], instants: int) -> Stages:
         """Return the problem in which pairs of links keep distances, too, at a number of instants
         in each interval.
         """
@@ -381,7 +381,7 @@ def _path_constraint_rows(
         z, np.cumsum([0, 1, 4, n, n, n, 4, n, n]).tolist()
     )
     rows = [ca.SX(0, 1), constraints.symbolic(s - h * v / 2, X, direction)]
-    if constraints.base_rate > 0:
+    if constraints.base_rate_limit > 0:
         # Rates change steadily within an interval and are largest at its ends.
         fastest = h * constraints.imposed_base_rate
         first, second = rates
@@ -578,11 +578,11 @@ def program(stages: Stages, intervals: int) -> Program:
     zero = np.zeros((N, 1), dtype=np.int64)
 
     first = stages.beginning.rows
-    dynamics = stages.interval.rows - stages.path
+    dynamics = stages.interval.rows - stages.path_row_count
     of_intervals = first + np.arange(N * dynamics).reshape(N, dynamics)
     of_end = first + N * dynamics + np.arange(stages.end.rows)[np.newaxis]
     equalities = first + N * dynamics + stages.end.rows
-    of_path = equalities + np.arange(N * stages.path).reshape(N, stages.path)
+    of_path = equalities + np.arange(N * stages.path_row_count).reshape(N, stages.path_row_count)
     placed = [
         _PlacedBlock(
             stages.beginning,
@@ -603,9 +603,9 @@ def program(stages: Stages, intervals: int) -> Program:
             ca.vertcat(p["turn"], p["center"], p["end_effectors"]),
         ),
     ]
-    rows = equalities + N * (stages.path + kept)
+    rows = equalities + N * (stages.path_row_count + kept)
     if stages.distances is not None:
-        of_distances = equalities + N * stages.path + np.arange(N * kept).reshape(N, kept)
+        of_distances = equalities + N * stages.path_row_count + np.arange(N * kept).reshape(N, kept)
         variables = np.hstack([zero, X[:-1], s[:-1], v[:-1], X[1:], v[1:]])
         placed.append(_PlacedBlock(stages.distances, variables, of_distances, p["distances"]))
     change = ca.reshape(x[a.ravel().tolist()], n, N) / ca.repmat(p["typical"], 1, N)
