@@ -894,7 +894,8 @@ def test_what_is_said_of_a_signal() -> None:
 
 
 @pytest.mark.parametrize(
-    "package", ["spacerobot_ros", "spacerobot_ros.nodes", "spacerobot_ros.planning"]
+    "package",
+    ["spacerobot_ros", "spacerobot_ros.nodes", "spacerobot_ros.planning", "spacerobot_ros.control"],
 )
 def test_packages_have_the_names_that_they_list(package: str) -> None:
     """Names are imported when they are used first; others are refused as by any module."""
@@ -911,5 +912,5 @@ def test_a_plant_node_imports_no_planner_and_no_page() -> None:
     found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     loaded = set(found.stdout.split())
     assert "spacerobot_ros.simulation.velocity_plant" in loaded
-    for module in ("planning.methods", "planning.execution", "viewer", "bag", "commanding"):
+    for module in ("planning", "control.laws", "control.outputs", "viewer", "bag", "commanding"):
         assert f"spacerobot_ros.{module}" not in loaded

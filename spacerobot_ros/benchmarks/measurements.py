@@ -179,9 +179,7 @@ def report_figures(rows: int) -> dict[str, float]:
     ``rows`` of the dataset; ``report_peak_MB``, the largest memory of the process that makes the
     report, MB; ``report_cpu_s``, its CPU time, s.
     """
-    import pyarrow as arrow
-    import pyarrow.parquet as parquet
-
+    arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
     with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
         file, out = Path(folder, "open_loop.yaml"), Path(folder, "out")
         count = min(rows, _FLOWN_ROWS)

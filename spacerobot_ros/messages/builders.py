@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,11 @@ from spacerobot_ros.messages.layout import (
 from spacerobot_ros.messages.readers import ODOMETRY, JointReader, TemplateReader
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, Frames
-from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
 from spacerobot_ros.times import LATEST_NS, SECOND
 from spacerobot_ros.topics import Topic
+
+if TYPE_CHECKING:
+    from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
 
 TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 TRANSFORMS, STATIC_TRANSFORMS = "/tf", "/tf_static"

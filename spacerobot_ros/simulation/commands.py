@@ -19,9 +19,6 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
-from spacerobot_ros.control.laws.law import Gains
-from spacerobot_ros.control.state import ControlState, JointReference, Reference
 from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -498,6 +495,10 @@ class _JointBrakes:
     """
 
     def __init__(self, plant: Plant, control_period: float) -> None:
+        # Plants with servos need no law.
+        from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
+        from spacerobot_ros.control.laws.law import Gains
+
         robot: SpaceRobot = plant.robot
         rate = min(_BRAKING_RATE, _MAX_RATE_PER_TICK / control_period)
         self._braked: slice | npt.NDArray[np.int64] = slice(None)
@@ -512,6 +513,8 @@ class _JointBrakes:
 
     def efforts(self) -> Array:
         """Return the efforts (n,) of the next tick, N or N m, before limits."""
+        from spacerobot_ros.control.state import ControlState, JointReference, Reference
+
         plant = self._plant
         if self._law is None:
             return self._efforts

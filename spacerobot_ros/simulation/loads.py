@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spacerobot_ros.control.outputs import plane_normal
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction
@@ -97,6 +96,8 @@ class Surroundings:
         """
         if not self.on_table:
             return
+        from spacerobot_ros.control.outputs import plane_normal  # Few robots are on a table.
+
         normal = plane_normal(robot.description)
         if normal is None:
             raise ParameterError(

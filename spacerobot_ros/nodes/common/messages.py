@@ -6,7 +6,7 @@ import importlib
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -29,9 +29,11 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.model.visuals import solid_mesh
-from spacerobot_ros.planning import BasePath, Goal
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.times import SECOND, set_stamp
+
+if TYPE_CHECKING:
+    from spacerobot_ros.planning import BasePath, Goal
+    from spacerobot_ros.planning.core.goal import EndEffectorGoal
 
 _MARKER_TYPES = {
     "box": Marker.CUBE,
@@ -163,10 +165,14 @@ def _line_marker(namespace: str, number: int, places: Array, frame: str) -> Mark
 
 def goal_message(goal: Goal, frame: str, time_ns: int) -> PoseStamped:
     """Return the pose of a goal in ``frame`` as a message."""
+    return _pose_message(goal.position, goal.quaternion, frame, time_ns)
+
+
+def _pose_message(position: Array, quaternion: Array, frame: str, time_ns: int) -> PoseStamped:
     message = PoseStamped()
     message.header.frame_id = frame
     set_stamp(message.header.stamp, time_ns)
-    set_pose(message.pose, goal.position, goal.quaternion)
+    set_pose(message.pose, position, quaternion)
     return message
 
 
@@ -176,7 +182,7 @@ def path_message(poses: Array, frame: str, time_ns: int) -> Path:
     """
     quaternions = poses[:, 3:] if poses.shape[1] == 7 else np.zeros((len(poses), 4))
     given = zip(poses[:, :3], quaternions, strict=True)
-    message = Path(poses=[goal_message(Goal(r, x), frame, time_ns) for r, x in given])
+    message = Path(poses=[_pose_message(r, x, frame, time_ns) for r, x in given])
     message.header.frame_id = frame
     set_stamp(message.header.stamp, time_ns)
     return message
@@ -227,6 +233,8 @@ def goal_of(
     PlanningError
         It is in another frame, or no pose; ``what`` names it.
     """
+    from spacerobot_ros.planning import Goal  # A plant takes no goals.
+
     pose = _pose_of_frame(message.header.frame_id, frame, what, pose_of)
     p, o = message.pose.position, message.pose.orientation
     goal = Goal.checked([p.x, p.y, p.z], [o.x, o.y, o.z, o.w], shape)
@@ -250,6 +258,8 @@ def end_effector_goal(
     PlanningError
         It is no pose, or in a frame that is not known; ``what`` names it.
     """
+    from spacerobot_ros.planning.core.goal import EndEffectorGoal
+
     given = message.pose
     o = given.orientation
     any_attitude = not any((o.x, o.y, o.z, o.w))
