@@ -128,7 +128,7 @@ class _Guard:
         os.close(self._reader)
         os.close(self._writer)
 
-    def noticed(self) -> bool:
+    def signal_received(self) -> bool:
         """Return whether a signal has come; the caller then completes its work."""
         if self.number is not None:
             self._notice_by = None
@@ -281,7 +281,7 @@ def ended_on_request(
             raise Terminated(guard.number)
         before, guard.request = guard.request, _Request(main, at_once)
         try:
-            yield guard.noticed
+            yield guard.signal_received
         finally:
             guard.request = before
 

@@ -64,11 +64,11 @@ SQUARE_ROOT_OFFSET = 1e-10
 class SmoothForm:
     """The form of a solid in rows: a rounded box in the frame of its link, and balls in it.
 
-    ``balls`` are the middles (K, 3), m, in the frame of the link, of balls of ``radius``.
+    ``ball_centers`` are the middles (K, 3), m, in the frame of the link, of balls of ``radius``.
     """
 
     box: RoundedBox
-    balls: Array
+    ball_centers: Array
     radius: float
 
     @property
@@ -119,7 +119,7 @@ class SmoothForm:
         points[:, longest] = np.linspace(-half, half, count + 1) if count else 0.0
         return cls(box, _moved(box.pose, points), box.radius)
 
-    def field(self, x: ca.SX) -> ca.SX:
+    def smooth_distance(self, x: ca.SX) -> ca.SX:
         """Return the approximate distance of a point (3,) in the frame of the link, m."""
         local = ca.sparsify(ca.DM(self.box.pose.R.T)) @ (x - ca.DM(self.box.pose.r))
         half = self.box.half
@@ -157,8 +157,8 @@ class DistanceRows:
         ``(q, lambda) -> `` the Hessian (n, n) of ``lambda' d``.
     is_of_obstacle
         Whether one of each pair is an obstacle: the functions then take ``y = [q; X]`` (n + 4) in
-        place of q, with a quaternion X of any norm, and the numbers ``w`` (:func:`world_values`)
-        after that.
+        place of q, with a quaternion X of any norm, and the numbers ``w``
+        (:func:`world_pose_parameters`) after that.
     """
 
     values: ca.Function
@@ -213,7 +213,7 @@ class DistanceRows:
         )
 
 
-def world_values(R_0W: Array, r_0W: Array) -> Array:
+def world_pose_parameters(R_0W: Array, r_0W: Array) -> Array:
     """Return the numbers (12,) of a pose of the world, seen from the centre of mass at the start:
     ``R_0W`` (3, 3), column after column, and ``r_0W`` (3,), m.
     """
@@ -233,16 +233,16 @@ def _smooth_distance(
     for balls, field in ball_and_field_roles(*forms):
         R_a, r_a = poses[balls]
         R_b, r_b = poses[field]
-        for point in forms[balls].balls:
+        for point in forms[balls].ball_centers:
             x = R_b.T @ (r_a + R_a @ ca.DM(point) - r_b)
-            values.append(forms[field].field(x) - forms[balls].radius)
+            values.append(forms[field].smooth_distance(x) - forms[balls].radius)
     return _smooth_minimum(ca.vertcat(*values), SHARPNESS_OF_MINIMUM)
 
 
 def ball_and_field_roles(first: SmoothForm, second: SmoothForm) -> list[tuple[int, int]]:
     """Return which of two forms are balls and which are fields."""
     if first.is_rod and second.is_rod:
-        return [(0, 1)] if len(first.balls) <= len(second.balls) else [(1, 0)]
+        return [(0, 1)] if len(first.ball_centers) <= len(second.ball_centers) else [(1, 0)]
     if first.is_rod or second.is_rod:
         return [(0, 1)] if first.is_rod else [(1, 0)]
     # An edge of either may be inside the other.
@@ -308,7 +308,7 @@ typedef struct { int first_role, roles; } Pair;
 
 
 @dataclass(frozen=True)
-class _Step:
+class _JointStep:
     """A joint on the way from a field to balls, and the fixed pose behind it.
 
     Attributes
@@ -322,8 +322,8 @@ class _Step:
     """
 
     index: int
-    forward: bool
-    behind: Pose
+    is_outward: bool
+    fixed_pose_after_joint: Pose
 
 
 class CompiledRows:
@@ -412,22 +412,22 @@ class _Tables:
         self, solid: Solid, form: SmoothForm, field_solid: Solid, field: SmoothForm
     ) -> None:
         first, way = _joints_between_links(self._robot, field_solid, field, solid)
-        places = [len(self._steps), len(way), len(self._balls), len(form.balls)]
+        places = [len(self._steps), len(way), len(self._balls), len(form.ball_centers)]
         numbers = [field.box.radius + form.radius, *field.box.half, *first.R.ravel(), *first.r]
         self._roles.append(_structure([int(field.is_rod), *places], numbers))
         self._steps += [self._step(each) for each in way]
-        self._balls += [_structure([], each) for each in form.balls]
+        self._balls += [_structure([], each) for each in form.ball_centers]
         self._most_steps = max(self._most_steps, len(way))
-        self._most_balls = max(self._most_balls, len(form.balls))
+        self._most_balls = max(self._most_balls, len(form.ball_centers))
 
-    def _step(self, step: _Step) -> str:
+    def _step(self, step: _JointStep) -> str:
         joint, (G, b) = self._robot.bodies[step.index].joint, self._robot.coupling
         assert joint is not None
-        row, sign = step.index - 1, 1.0 if step.forward else -1.0
+        row, sign = step.index - 1, 1.0 if step.is_outward else -1.0
         coordinate = int(np.argmax(np.abs(G[row])))
         slides = joint.kind is JointKind.PRISMATIC
         moved = [sign * G[row, coordinate], sign * b[row], *joint.axis]
-        behind = [*step.behind.R.ravel(), *step.behind.r]
+        behind = [*step.fixed_pose_after_joint.R.ravel(), *step.fixed_pose_after_joint.r]
         return _structure([coordinate, int(slides)], [*moved, *behind])
 
     def text(self) -> str:
@@ -460,7 +460,7 @@ def _structure(integers: Sequence[int], numbers: Iterable[float] = ()) -> str:
 
 def _joints_between_links(
     robot: RobotDescription, field_solid: Solid, field: SmoothForm, solid: Solid
-) -> tuple[Pose, list[_Step]]:
+) -> tuple[Pose, list[_JointStep]]:
     """Return the way from the frame of a field to the link of a solid: a pose, and the joints."""
     pose_of_field = robot.frames[field_solid.link][1] @ field.box.pose
     way = _joints_between(robot, field_solid.body, solid.body)
@@ -475,7 +475,7 @@ def _joints_between_links(
             fixed.append(_inverse(origin))
     fixed[-1] = fixed[-1] @ robot.frames[solid.link][1]
     steps = [
-        _Step(index, forward, behind)
+        _JointStep(index, forward, behind)
         for (index, forward), behind in zip(way, fixed[1:], strict=True)
     ]
     return fixed[0], steps

@@ -107,7 +107,7 @@ class PlannerCommander(Commander):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__(config, host, (BASE_GOAL_KEY,), pose_required=False, clock=clock)
-        self._method, self._long_work = method, long_work
+        self._method, self._on_long_work = method, long_work
         self._last_goal: IdentifiedGoal | None = None
         """The goal that was accepted last."""
         self._status: PlannerStatus | None = None
@@ -156,7 +156,7 @@ class PlannerCommander(Commander):
         described = robot.description
         if self._obstacles is not None:
             described = with_obstacles_around(described, self._world)
-        return PlanningWorker(robot, self.config, method, self._long_work, described)
+        return PlanningWorker(robot, self.config, method, self._on_long_work, described)
 
     def end_schedule(self, end: TrajectoryEnd) -> None:
         """End the present schedule: the controller that follows it has ended it."""
@@ -183,7 +183,7 @@ class PlannerCommander(Commander):
         executive, robot = self.executive, self.robot
         if executive is not None and robot is not None:
             method = self._method if robot is self._described else None
-            with self._long_work():
+            with self._on_long_work():
                 executive.use_obstacles(lambda: self._make_worker(robot, method))
             self._forward_outputs()
 
@@ -191,7 +191,7 @@ class PlannerCommander(Commander):
         assert self.executive is not None
         # A given method is one for the robot without its payload.
         method = self._method if robot is self._described else None
-        with self._long_work():
+        with self._on_long_work():
             worker = self._make_worker(robot, method)
         self.executive.use_robot(robot, worker)
         self._forward_outputs()
@@ -249,7 +249,7 @@ class PlannerCommander(Commander):
                 raise PlanningError("There is no robot on robot_description yet.")
             world = self.config.world_frame
             twist = TwistCommand.checked(self.robot, link, linear, angular, frame, world)
-            with self._long_work():
+            with self._on_long_work():
                 self.executive.propose_twist(twist)
         except PlanningError as refusal:
             self._log_fault("twist", f"{twist_topic(link)}: {refusal}")

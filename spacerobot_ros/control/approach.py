@@ -269,7 +269,7 @@ def plan_approach(
                 motion = grapple.between_samples(first, last, every).with_relative_motion(
                     plan.relative(times)
                 )
-                excess, sentence = _excess(motion, limits, axes)
+                excess, sentence = _largest_limit_share(motion, limits, axes)
                 if excess > 1.0:
                     break
             failure.note(excess, sentence)
@@ -327,7 +327,9 @@ def _outward_durations() -> Iterator[float]:
         duration *= _PATH_RATIO
 
 
-def _excess(motion: FrameMotion, limits: MotionLimits, axes: tuple[str, ...]) -> tuple[float, str]:
+def _largest_limit_share(
+    motion: FrameMotion, limits: MotionLimits, axes: tuple[str, ...]
+) -> tuple[float, str]:
     """Return the largest share of a limit that a motion takes, and a clause about it."""
     linear = any(not axis.startswith("r") for axis in axes)
     angular = any(axis.startswith("r") for axis in axes)

@@ -395,7 +395,7 @@ class ControlExecutive:
         result = self.controller.command(time, measured, q, qdot)
         if wheels is None:
             return result
-        excess = Actuation(result.excess.wrench_B, wheels.shape(result.excess.tau))
+        excess = Actuation(result.excess.wrench_B, wheels.shape_with_wheels(result.excess.tau))
         return Saturated(wheels.actuation(result.realised), excess)
 
     def dump_momentum(self) -> tuple[bool, str]:
@@ -601,7 +601,7 @@ class ControlExecutive:
         goal, selection = self.controller.goal, self.controller.law.outputs.selection
         shape = goal.joints.q if goal.joints is not None and selection.joints else None
         if shape is not None and self.controller.wheels is not None:
-            shape = self.controller.wheels.shape(shape)
+            shape = self.controller.wheels.shape_with_wheels(shape)
         poses = {BASE_GOAL_KEY: goal.base, END_EFFECTOR: goal.end_effector}
         return {
             key: IdentifiedGoal(

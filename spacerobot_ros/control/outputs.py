@@ -211,7 +211,7 @@ class _OutputGroup:
     J: ca.SX
     bias_acceleration: ca.SX
 
-    def rows(self, chosen: list[int]) -> _OutputGroup:
+    def selected_rows(self, chosen: list[int]) -> _OutputGroup:
         return _OutputGroup(
             self.error[chosen],
             self.error_rate[chosen],
@@ -286,17 +286,19 @@ class OutputVector:
             target = ca.SX.sym("base_reference", _POSE_REFERENCE_SIZE)
             references.append(target)
             pose = self._pose_group(J_base, r_WB, self._quaternion, target)
-            groups.append(pose.rows([AXES.index(axis) for axis in selection.base]))
+            groups.append(pose.selected_rows([AXES.index(axis) for axis in selection.base]))
         if selection.end_effector:
             target = ca.SX.sym("end_effector_reference", _POSE_REFERENCE_SIZE)
             references.append(target)
             pose = self._end_effector_group(r_WB, target)
-            groups.append(pose.rows([AXES.index(axis) for axis in selection.end_effector]))
+            groups.append(pose.selected_rows([AXES.index(axis) for axis in selection.end_effector]))
         if selection.joints:
             target = ca.SX.sym("joint_reference", 3 * n)
             references.append(target)
             shape = self._joint_group(target)
-            groups.append(shape.rows([robot.joint_names.index(name) for name in selection.joints]))
+            groups.append(
+                shape.selected_rows([robot.joint_names.index(name) for name in selection.joints])
+            )
         self.reference = ca.vertcat(*references)
         self.error = ca.vertcat(*(group.error for group in groups))
         self.error_rate = ca.vertcat(*(group.error_rate for group in groups))

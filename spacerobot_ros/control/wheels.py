@@ -236,7 +236,7 @@ class WheelControl:
         joints = type(reference.joints)(*(part[self.wheels.other] for part in parts))
         return replace(reference, joints=joints)
 
-    def shape(self, q: Array) -> Array:
+    def shape_with_wheels(self, q: Array) -> Array:
         """Return the shape of the robot with the joints (n - k,) of the gyrostat."""
         whole = np.zeros(len(self.wheels) + len(self.wheels.other))
         whole[self.wheels.other] = q
@@ -244,7 +244,7 @@ class WheelControl:
 
     def actuation(self, realised: Actuation) -> Actuation:
         """Return the wrench of the thrusters, and the efforts of all joints."""
-        tau = self.shape(realised.tau)
+        tau = self.shape_with_wheels(realised.tau)
         tau[self.wheels.index] = self.torque
         return Actuation(self.thrust.copy(), tau)
 

@@ -42,7 +42,7 @@ _FLAGS = ("-O2", "-fno-math-errno", "-fno-trapping-math")
 _TRIAL = "vector_machine_trial"
 
 
-class _Tape:
+class _OperationList:
     """The operations of a function of SX, as ``vector_machine.c`` takes them.
 
     Raises
@@ -95,39 +95,39 @@ def mapped(function: ca.Function, count: int) -> ca.Function:
     """
     if count == 1 or not function.is_a("SXFunction"):
         return function.map(count)
-    run = _runner(compilation_settings())
+    run = _compiled_runner(compilation_settings())
     if run is None:
         return function.map(count)
-    tape = _tape_of(function)
+    tape = _operation_list_of(function)
     return function.map(count) if tape is None else _MappedFunction(function, tape, run, count)
 
 
-_tapes: dict[int, tuple[ca.Function, _Tape | None]] = {}
+_tape_by_function: dict[int, tuple[ca.Function, _OperationList | None]] = {}
 """The tapes of the functions that were mapped last, by their identity."""
 
 _MAX_TAPES = 24
 
 
-def _tape_of(function: ca.Function) -> _Tape | None:
+def _operation_list_of(function: ca.Function) -> _OperationList | None:
     """Return the operations of a function, read once; None where one is not known."""
     key = function.__hash__()
-    if key in _tapes:
-        return _tapes[key][1]
+    if key in _tape_by_function:
+        return _tape_by_function[key][1]
     try:
-        tape: _Tape | None = _Tape(function)
+        tape: _OperationList | None = _OperationList(function)
     except ValueError:
         tape = None
     # The function is kept too: another one could have its identity.
-    _tapes[key] = function, tape
-    if len(_tapes) > _MAX_TAPES:
-        del _tapes[next(iter(_tapes))]
+    _tape_by_function[key] = function, tape
+    if len(_tape_by_function) > _MAX_TAPES:
+        del _tape_by_function[next(iter(_tape_by_function))]
     return tape
 
 
 class _MappedFunction(ca.Callback):
     """A function at several places, run by ``vector_machine.c``."""
 
-    def __init__(self, function: ca.Function, tape: _Tape, run: Any, count: int) -> None:
+    def __init__(self, function: ca.Function, tape: _OperationList, run: Any, count: int) -> None:
         ca.Callback.__init__(self)
         self._function, self._tape, self._run, self._count = function, tape, run, count
         self.construct(f"{function.name()}_at_{count}", {})
@@ -182,7 +182,7 @@ def _pointers(memories: Sequence[memoryview | None]) -> Any:
 
 
 @lru_cache
-def _runner(settings: tuple[str, ...]) -> Any:
+def _compiled_runner(settings: tuple[str, ...]) -> Any:
     """Return ``run_at_places`` for a compiler and cache (``settings``); None without a compiler."""
     if c_compiler() is None:
         return None
@@ -212,7 +212,7 @@ def _trial_function() -> ca.Function:
 
 def _source(trial: ca.Function) -> str:
     """Return C of ``run_at_places``, and a function with CasADi's interface that runs a trial."""
-    tape = _Tape(trial)
+    tape = _OperationList(trial)
     numbers = ", ".join(map(str, tape.steps.ravel().tolist()))
     constants = ", ".join(map(float.hex, [*tape.constants.tolist(), 0.0]))
     operations = _known_operations()

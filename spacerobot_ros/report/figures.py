@@ -45,7 +45,7 @@ WIDTH = 9.6
 _NARROW_WIDTH = 6.0
 """Width of a figure below which it is drawn for one column of a paper, inches."""
 
-COLUMNS = 960
+TRACE_TIME_SLICES = 960
 """Slices of time across a figure in which a dense trace is summed up."""
 
 LARGEST_VALUE_SLICES = 240
@@ -420,7 +420,7 @@ def draw_traces(
     if not len(signal):
         # A close-up without samples.
         return False
-    columns = max(int(COLUMNS * share), 20)
+    columns = max(int(TRACE_TIME_SLICES * share), 20)
     low, high = axes.get_ylim()
     dense = False
     for index, tint in enumerate(colours):

@@ -25,13 +25,13 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.report.events import EVENT_STRIP_HEIGHT, draw_events
 from spacerobot_ros.report.figures import (
-    COLUMNS,
     LARGEST_VALUE_SLICES,
     LIMIT,
     LINE_COLOUR,
     PALETTE,
     SECONDARY_COLOUR,
     TEXT_COLOUR,
+    TRACE_TIME_SLICES,
     ReportFigure,
     TraceGroup,
     colour,
@@ -207,7 +207,7 @@ def time_figure(
 
 def _draw_rows(axes: Axes, flight: FlightReport, group: TraceGroup, share: float) -> bool:
     """Draw each trace as a band in a row of its own, the first on top."""
-    columns = max(int(COLUMNS * share), 20)
+    columns = max(int(TRACE_TIME_SLICES * share), 20)
     count, signal = len(group.names), group.signal
     dense = len(signal) > 2 * columns
     for index, tint in enumerate(group.colours):

@@ -15,11 +15,11 @@ from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.report.figures import (
-    COLUMNS,
     GHOST_COLOUR,
     PALETTE,
     SECONDARY_COLOUR,
     TEXT_COLOUR,
+    TRACE_TIME_SLICES,
     ReportFigure,
     angle_unit,
     colour,
@@ -162,7 +162,7 @@ def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Lin
     limits = axes.axis()
     if float(np.ptp(path, axis=0).max()) > 0.0:
         flat = view(path)
-        dense = len(path) > 2 * COLUMNS
+        dense = len(path) > 2 * TRACE_TIME_SLICES
         axes.plot(flat[:, 0], flat[:, 1], color=TEXT_COLOUR, lw=0.8, zorder=5, rasterized=dense)
         keys.append(legend_entry(TEXT_COLOUR, "path of the base"))
     if flight.goal is not None and flight.drawn is not None:
@@ -233,7 +233,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     places = [axes for row in panels for axes in row]
     for axes, (title, (i, j)) in zip(places, views.items(), strict=True):
         for path, tint in paths:
-            dense = len(path) > 2 * COLUMNS
+            dense = len(path) > 2 * TRACE_TIME_SLICES
             axes.plot(path[:, i], path[:, j], color=tint, lw=0.9, rasterized=dense)
             axes.plot(*path[0, [i, j]], "o", color=tint, mfc="white", ms=5, zorder=4)
             axes.plot(*path[-1, [i, j]], "o", color=tint, ms=5, zorder=4)
@@ -306,7 +306,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
         axes.set_visible(False)
     for axes, (i, j) in zip(places[: len(pairs)], pairs, strict=True):
         x, y = part.values[:, i], part.values[:, j]
-        axes.plot(x, y, color=colour(0), rasterized=len(part) > 4 * COLUMNS)
+        axes.plot(x, y, color=colour(0), rasterized=len(part) > 4 * TRACE_TIME_SLICES)
         axes.plot(x[:1], y[:1], "o", color=colour(0), mfc="white", ms=5, zorder=4)
         axes.plot(x[-1:], y[-1:], "o", color=colour(0), ms=2.5, zorder=4)
         set_range(axes, y)

@@ -48,10 +48,10 @@ from spacerobot_ros.report.solids import MAX_MESH_FACES, SolidRobot, Solids, obs
 from spacerobot_ros.scenario import COMMANDERS
 from spacerobot_ros.times import SECOND
 
-_BUDGET_STATES = 2000
+_MAX_BUDGET_STATES = 2000
 """States of a flight at which the momentum budget is evaluated."""
 
-_LINK_STATES = 2000
+_MAX_LINK_ERROR_STATES = 2000
 """States of a flight at which the errors of links are evaluated."""
 
 
@@ -231,7 +231,7 @@ class FlightReport:
         robot, captured = self.robot, self.flight.capture.get("captured", False)
         if robot is None or not (robot.wheel_names or captured):
             return Signal.empty(len(BUDGET_PARTS))
-        found = momentum_budget_over_time(self.flight, _BUDGET_STATES)
+        found = momentum_budget_over_time(self.flight, _MAX_BUDGET_STATES)
         return _shift_time(found, self.bag.began)
 
     @cached_property
@@ -440,14 +440,14 @@ class FlightReport:
         links = {each.link for target in self._all_targets for each in target.goal.end_effectors}
         if self.robot is None or self.hidden_links_text or not links:
             return {}
-        rows, kinematics = self.samples(_LINK_STATES), ForwardKinematics(self.robot)
+        rows, kinematics = self.samples(_MAX_LINK_ERROR_STATES), ForwardKinematics(self.robot)
         base = np.hstack([self.position.values[rows], self.quaternion[rows]])
         R_WL, r_WL = kinematics.poses_in_world(base, self.joints[rows])
         numbers = {link: k for k, link in enumerate(kinematics.links) if link in links}
         return {link: (R_WL[:, k], r_WL[:, k]) for link, k in numbers.items()}
 
     def _errors_of_link(self, link: str, targets: Sequence[GoalSpan]) -> LinkErrors:
-        time = self.position.time[self.samples(_LINK_STATES)]
+        time = self.position.time[self.samples(_MAX_LINK_ERROR_STATES)]
         R_WL, r_WL = self._link_poses[link]
         distances, angles = [Signal.empty(1)], [Signal.empty(1)]
         for target in targets:

@@ -262,7 +262,9 @@ class MultiProcessStack(Stack):
         """
         for name, process in self.processes.items():
             if process.poll() is not None and name not in self._timeline.away:
-                raise SpaceRobotError(f"{self._end_message(name)}{self._restarts.note(name)}")
+                raise SpaceRobotError(
+                    f"{self._end_message(name)}{self._restarts.count_restart(name)}"
+                )
 
     def kill(self, name: str) -> None:
         """Kill a node, as a crash would."""
@@ -438,7 +440,7 @@ class RestartLimit:
         self._restarted[name] = [*recent, now] if allowed else recent
         return allowed
 
-    def note(self, name: str) -> str:
+    def count_restart(self, name: str) -> str:
         """Return a sentence about the restarts of a process, with a space before it."""
         count = len(self._restarted.get(name, ()))
         if not count:

@@ -257,11 +257,11 @@ class InProcessStack(Stack):
             self._nodes.append(self.client.node)
             running = {name: node for name, node in nodes.items() if name != "recorder"}
             for node in running.values():
-                node.require(node.trigger_configure)
+                node.require_transition(node.trigger_configure)
             if self._recorder is not None:
                 # The recorder comes last, when every topic has its publisher.
                 self._recorder.watch(running.values())
-                self._recorder.require(self._recorder.trigger_configure)
+                self._recorder.require_transition(self._recorder.trigger_configure)
                 for title, values in scenario.records(list(running)).items():
                     self._recorder.describe(title, values)
             for node in self._nodes:

@@ -103,7 +103,7 @@ class Viewer:
         """End the viewer; a line reports if it had ended before."""
         if self._announced and self.process.poll() is not None:
             with suppress(OSError):
-                self._show(f"{self._end_message()}{self._restarts.note('viewer')}")
+                self._show(f"{self._end_message()}{self._restarts.count_restart('viewer')}")
         end_child(self.process, {signal.SIGINT: _LONGEST_END})
 
     def _end_message(self) -> str:

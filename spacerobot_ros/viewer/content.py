@@ -639,7 +639,7 @@ class History:
         """Add a row; rows of this time or later are dropped first (time may run back)."""
         self._rows.add(time_s, np.concatenate([[time_s], np.asarray(values, float)]))
 
-    def columns(self) -> tuple[Array, ...]:
+    def arrays(self) -> tuple[Array, ...]:
         """Return time (k,) and each number (k,); one row of zeros if there is none yet."""
         if not self._rows.items:
             # A plot without numbers has no scale.

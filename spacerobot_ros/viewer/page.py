@@ -432,7 +432,7 @@ class _Plot:
         end = {"pad": 0.1, "mode": 1}
         ends = {"min": end | {"soft": -least if signed else 0.0}, "max": end | {"soft": least}}
         self.handle: Any = gui.add_uplot(
-            self.history.columns(),
+            self.history.arrays(),
             tuple(series),
             title=title,
             scales={"x": {"time": False}, "y": {"range": ends}},
@@ -447,7 +447,7 @@ class _Plot:
 
     def draw(self) -> None:
         """Send the curves to browsers."""
-        self.handle.data = self.history.columns()
+        self.handle.data = self.history.arrays()
 
 
 class LogPanel:
@@ -605,7 +605,7 @@ class Page:
             "Follow the robot", initial_value=False, hint="All cameras move with the base."
         )
         self._setting: Any = gui.add_dropdown(
-            "Setting", tuple(each.value for each in scene.Setting)
+            "Setting", tuple(each.value for each in scene.Backdrop)
         )
         with gui.add_folder("Layers", expand_by_default=False):
             self._layers: dict[str, Any] = {
@@ -705,7 +705,7 @@ class Page:
             self._around.show_paths(visible=shown["Paths"])
             self._around.show_world(visible=shown["Frames"])
             self._around.plume_lines.show(visible=shown["Plumes"])
-            self._around.show_setting(scene.Setting(self._setting.value))
+            self._around.show_backdrop(scene.Backdrop(self._setting.value))
 
     def end(self) -> None:
         """Say that the viewer has ended, in browsers that go on showing the page."""

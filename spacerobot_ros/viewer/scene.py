@@ -312,7 +312,7 @@ def plume_lines(table: ThrusterTable, names: tuple[str, ...], duty: Array, lengt
     return np.array(segments, float).reshape(-1, 2, 3)
 
 
-class Setting(Enum):
+class Backdrop(Enum):
     """The surroundings that a robot is shown in."""
 
     SPACE = "Space"
@@ -393,16 +393,16 @@ class Surroundings:
         fill = self._scene.add_light_ambient("/skylight", intensity=_SKY_INTENSITY)
         return [stars, sun, light, fill]
 
-    def show_setting(self, setting: Setting) -> None:
+    def show_backdrop(self, setting: Backdrop) -> None:
         """Show the sky, lit by the Sun alone, or the grid."""
-        indoors = setting is Setting.GRID
+        indoors = setting is Backdrop.GRID
         self._scene.configure_default_lights(enabled=indoors)
         self._scene.configure_environment_map("city" if indoors else None)
         # Space is dark on light pages too.
         self._scene.set_background_image(None if indoors else _SPACE)
-        self._grid.visible = setting is Setting.GRID
+        self._grid.visible = setting is Backdrop.GRID
         for each in self._sky:
-            each.visible = setting is Setting.SPACE
+            each.visible = setting is Backdrop.SPACE
 
     def show_world(self, *, visible: bool) -> None:
         """Show or hide the axes of the world."""

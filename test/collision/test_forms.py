@@ -28,7 +28,7 @@ def form(kind: str, *size: float, half: Any = None, radius: float = 0.0) -> Smoo
 
 def local(found: SmoothForm) -> list[list[float]]:
     """Return the balls in the axes of the solid."""
-    here = TURN.inv().apply(found.balls - POSE.r)
+    here = TURN.inv().apply(found.ball_centers - POSE.r)
     return sorted(np.round(here, 9).tolist())
 
 
@@ -40,7 +40,7 @@ def test_a_long_cylinder_is_a_rod_whose_last_balls_cover_its_rims() -> None:
     wanted = [[0.0, 0.0, z] for z in np.round(np.linspace(-0.39, 0.39, 9), 9)]
     np.testing.assert_allclose(local(found), wanted, atol=1e-9)
     # However long, at most twelve.
-    assert len(form("cylinder", 0.1, 9.0).balls) == 12
+    assert len(form("cylinder", 0.1, 9.0).ball_centers) == 12
 
 
 def test_a_short_cylinder_is_its_box_and_one_at_the_border_a_rod() -> None:
@@ -73,13 +73,13 @@ def test_a_slender_box_of_square_section_is_a_rod() -> None:
 def test_a_box_has_balls_on_its_faces_more_along_its_longer_edges() -> None:
     """Edges of 2, 1 and 0.8 m: three, two and two points, all of them on faces."""
     found = form("box", 1.0, 0.5, 0.4)
-    assert (found.radius, len(found.balls)) == (0.0, 12)
+    assert (found.radius, len(found.ball_centers)) == (0.0, 12)
     assert local(found) == sorted(
         [x, y, z] for x in (-1.0, 0.0, 1.0) for y in (-0.5, 0.5) for z in (-0.4, 0.4)
     )
     # Three along each edge of a longer one leave the middle out.
     cube = form("box", 0.8, 0.9, 1.0)
-    assert len(cube.balls) == 26
+    assert len(cube.ball_centers) == 26
     assert [0.0, 0.0, 0.0] not in local(cube)
 
 

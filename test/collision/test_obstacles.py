@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from support.crossing import RADII, URDF
 
 from spacerobot_ros.collision import BasePoses, CollisionGeometry, ObstaclePair, PathCheck
-from spacerobot_ros.collision.rows import DistanceRows, world_values
+from spacerobot_ros.collision.rows import DistanceRows, world_pose_parameters
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.model import SpaceRobot, parse_robot
@@ -101,7 +101,7 @@ def test_rows_follow_the_turn_of_the_base(geometry: CollisionGeometry) -> None:
     shapes, base = moving(7)
     start = Rotation.from_quat(base.quaternion[0])
     r_WC = base.position[0] + start.apply(robot.center_of_mass(shapes[0]))
-    w = world_values(start.inv().as_matrix(), -start.inv().apply(r_WC))
+    w = world_pose_parameters(start.inv().as_matrix(), -start.inv().apply(r_WC))
     rng = np.random.default_rng(3)
     for q, x in zip(shapes, rng.normal(size=(7, 4)), strict=True):
         R_WB = start * Rotation.from_quat(x)

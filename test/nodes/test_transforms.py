@@ -83,12 +83,12 @@ def record_states(
         **plant,
     }
     node = harness.make(PlantNode, values, autostart=False)
-    node.require(node.trigger_configure)
+    node.require_transition(node.trigger_configure)
     recorder = harness.make(RecorderNode, {"bag": str(bag), **recorded}, autostart=False)
     recorder.watch([node])
     recorder.start()
     harness.spin_until(lambda: {"/odom", "/joint_states", "/robot_description"} <= recorder.topics)
-    node.require(node.trigger_activate)
+    node.require_transition(node.trigger_activate)
     harness.spin_until(lambda: node.tick > 25)
     node.trigger_deactivate()
     recorder.trigger_deactivate()

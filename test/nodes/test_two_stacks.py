@@ -48,13 +48,13 @@ class NamedStack:
 
     def start(self) -> None:
         for node in (self.plant, self.planner, self.recorder):
-            node.require(node.trigger_configure)
+            node.require_transition(node.trigger_configure)
         topics = {"odom", "joint_states", "joint_commands", "momentum", "goal_pose"}
         wanted = {self.plant.resolve_topic_name(topic) for topic in ("/clock", *topics)}
         self.harness.spin_until(lambda: wanted <= self.recorder.topics, "the recorder's topics")
         self.harness.connect()
         for node in (self.recorder, self.planner):
-            node.require(node.trigger_activate)
+            node.require_transition(node.trigger_activate)
 
     def fly(self) -> Callable[[], bool]:
         """Begin a flight to a goal 1 cm ahead; return whether it is decided."""
@@ -63,7 +63,7 @@ class NamedStack:
         goal.pose.position.x = ROBOTS[self.name or "one"].get("initial_position", [0.0])[0] + 0.01
         goal.pose.orientation.w = 1.0
         self.goals.publish(goal)
-        self.plant.require(self.plant.trigger_activate)
+        self.plant.require_transition(self.plant.trigger_activate)
         return self.is_decided
 
     def is_decided(self) -> bool:

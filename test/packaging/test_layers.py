@@ -196,7 +196,7 @@ MUTABLE = {
     "spacerobot_ros.control.goal_monitor.GoalMonitor",
     "spacerobot_ros.planning.execution.executive.ActiveGoal",
     "spacerobot_ros.planning.execution.executive.Teleoperation",
-    "spacerobot_ros.planning.methods.optimal.search._Progress",
+    "spacerobot_ros.planning.methods.optimal.search._SearchState",
     "spacerobot_ros.report.solids.Solids",
     "spacerobot_ros.simulation.trials.MethodRecord",
     "spacerobot_ros.flight.verification._Resimulation",

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.collision.rows import world_values
+from spacerobot_ros.collision.rows import world_pose_parameters
 from spacerobot_ros.planning import RobotState
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary, KeptDistances
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
@@ -149,7 +149,9 @@ def test_rows_of_obstacles_are_asked_where_the_turn_is_known(
     point = np.array([0.7, -1.1, 0.4])
     seen = R_0W.apply(point - r_WC)
     r_0W = -R_0W.apply(r_WC)
-    np.testing.assert_allclose(world[:, 0], world_values(R_0W.as_matrix(), r_0W), atol=1e-14)
+    np.testing.assert_allclose(
+        world[:, 0], world_pose_parameters(R_0W.as_matrix(), r_0W), atol=1e-14
+    )
     np.testing.assert_allclose(R_0W.apply(point) + r_0W, seen)
     np.testing.assert_allclose(found.world, world[:, 0])
     # Of links the shapes at both ends count all the same.

@@ -38,7 +38,7 @@ from spacerobot_ros.planning.methods.optimal.search import (
     ManoeuvreSearch,
     MotionSearch,
     _durations_agree,
-    _Progress,
+    _SearchState,
 )
 from spacerobot_ros.resources import robot_file
 
@@ -293,9 +293,9 @@ def test_three_solutions_within_three_thousandths_end_a_search(
     assert found.starts == starts
 
 
-def progress(**changes: Any) -> _Progress:
+def progress(**changes: Any) -> _SearchState:
     options = replace(OPTIONS, **changes)
-    return _Progress(BOUNDARY, LIMITS, IDENTITY, options, NEVER, None, gentle=False)
+    return _SearchState(BOUNDARY, LIMITS, IDENTITY, options, NEVER, None, gentle=False)
 
 
 def test_solutions_agree_by_number_and_two_are_enough_with_a_library() -> None:

@@ -48,7 +48,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 from spacerobot_ros.planning.methods.optimal.search import (
     Manoeuvre,
-    _Progress,
+    _SearchState,
 )
 from spacerobot_ros.resources import robot_file
 
@@ -146,7 +146,7 @@ def made(duration: float) -> Manoeuvre:
 
 def progress(kept: Kept, boundary: BoundaryConditions = BOUNDARY, **changes: Any) -> Any:
     options = replace(OPTIONS, **changes)
-    asked = _Progress(boundary, LIMITS, IDENTITY, options, NEVER, None, gentle=False)
+    asked = _SearchState(boundary, LIMITS, IDENTITY, options, NEVER, None, gentle=False)
     asked.kept = kept  # type: ignore[assignment]
     return asked
 

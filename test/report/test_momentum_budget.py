@@ -26,7 +26,7 @@ BAGS = Path(__file__).parents[2] / "bags"
 def _few_states() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SPACEROBOT_COMPILE", "0")
-        patch.setattr(report_flight, "_BUDGET_STATES", 30)
+        patch.setattr(report_flight, "_MAX_BUDGET_STATES", 30)
         yield
 
 

@@ -372,17 +372,17 @@ def test_faults_are_written_for_the_plant() -> None:
 
 def test_history_keeps_the_last_minutes_and_forgets_a_time_that_comes_again() -> None:
     history = History(1, span_s=100.0, most=50)
-    assert [column.tolist() for column in history.columns()] == [[0.0], [0.0]]
+    assert [column.tolist() for column in history.arrays()] == [[0.0], [0.0]]
     for k in range(1000):
         history.add(0.5 * k, [float(k)])
-    time, values = history.columns()
+    time, values = history.arrays()
     assert len(time) <= 50
     assert time[-1] == 499.5
     assert time[0] >= 399.5
     np.testing.assert_array_equal(values, 2 * time)
     assert np.all(np.diff(time) > 0)
     history.add(450.0, [-1.0])
-    time, values = history.columns()
+    time, values = history.arrays()
     assert (time[-1], values[-1]) == (450.0, -1.0)
     assert np.all(np.diff(time) > 0)
 

@@ -259,14 +259,14 @@ class GoalActions:
         for kind in (FlyToAction, NavigateToPoseAction):
             found = action_class(kind.package, kind.type_name)
             if found is not None:
-                self._servers.append(self._serve(kind(found)))
+                self._servers.append(self._create_server(kind(found)))
         if not self._servers:
             node.get_logger().info(
                 "Goals come by topics alone: neither spacerobot_msgs nor nav2_msgs is installed, "
                 "whose actions bring them, too."
             )
 
-    def _serve(self, action: GoalAction) -> _Server:
+    def _create_server(self, action: GoalAction) -> _Server:
         node = self._node
 
         def on_request(_: Any) -> GoalResponse:
@@ -283,7 +283,7 @@ class GoalActions:
 
         def on_cancel(handle: ServerGoalHandle) -> CancelResponse:
             # The state of the goal changes after this callback, before its result may come.
-            self._later(lambda: node.commander.cancel_fly_to(_goal_id(handle)))
+            self._run_in_executor(lambda: node.commander.cancel_fly_to(_goal_id(handle)))
             return CancelResponse.ACCEPT
 
         server = _Server(
@@ -298,7 +298,7 @@ class GoalActions:
         )
         return server
 
-    def _later(self, act: Callable[[], None]) -> None:
+    def _run_in_executor(self, act: Callable[[], None]) -> None:
         """Call a function once from the executor."""
 
         def once() -> None:

@@ -147,10 +147,10 @@ class FlightNode(LifecycleNode):
         SpaceRobotError
             A transition failed; the message says why.
         """
-        self.require(self.trigger_configure)
-        self.require(self.trigger_activate)
+        self.require_transition(self.trigger_configure)
+        self.require_transition(self.trigger_activate)
 
-    def require(self, trigger: Callable[[], TransitionCallbackReturn]) -> None:
+    def require_transition(self, trigger: Callable[[], TransitionCallbackReturn]) -> None:
         """Take a transition (``trigger_configure``, ...) that must succeed.
 
         Raises

@@ -403,7 +403,7 @@ class Listener:
         begin = stamp_to_ns(message.header.stamp)
         complete = len(whole) == len(kept) > 1
         self._path = _PlannedPath(begin, times, np.array(whole)) if complete else None
-        self._combine()
+        self._combine_path_and_schedule()
 
     def _on_schedule(self, message: JointTrajectory) -> None:
         self._last_schedule = message
@@ -417,9 +417,9 @@ class Listener:
             since = [stamp_to_ns(point.time_from_start) for point in message.points]
             times = (np.array(since) + begin) / SECOND
             self._schedule = _Schedule(begin, times, np.array(positions)[:, places])
-        self._combine()
+        self._combine_path_and_schedule()
 
-    def _combine(self) -> None:
+    def _combine_path_and_schedule(self) -> None:
         """Combine path and schedule if they are of one plan."""
         path, schedule = self._path, self._schedule
         self._motion = None

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from spacerobot_ros.collision import Approach, BasePoses
-from spacerobot_ros.collision.rows import CompiledRows, DistanceRows, world_values
+from spacerobot_ros.collision.rows import CompiledRows, DistanceRows, world_pose_parameters
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
@@ -109,12 +109,12 @@ class DistanceLibrary:
         return self._prediction.poses(boundary.state, shapes, attitudes)
 
     def world(self, boundary: BoundaryConditions) -> Array:
-        """Return the numbers (12,) of the pose of the world (:func:`.world_values`)."""
+        """Return the numbers (12,) of the pose of the world (:func:`.world_pose_parameters`)."""
         state = boundary.state
         assert state is not None
         R_0W = matrix_from_quaternion(state.quaternion).T
         r_WC = state.position + R_0W.T @ self._robot.center_of_mass(state.q)
-        return world_values(R_0W, -R_0W @ r_WC)
+        return world_pose_parameters(R_0W, -R_0W @ r_WC)
 
 
 class KeptDistances:

@@ -253,7 +253,7 @@ class MotionLimits:
     """Bounds (n,) of the joints: ``lower`` and ``upper`` in m or rad, ``velocity`` a second,
     ``acceleration`` a second squared; ``distances`` (K,) are the smallest ones, m, of the pairs of
     links that a solver keeps apart. Where one of a pair is an obstacle, ``world`` (12,) is the pose
-    of the world (:func:`.world_values`).
+    of the world (:func:`.world_pose_parameters`).
     """
 
     lower: Array

@@ -198,7 +198,7 @@ class Manoeuvre:
 
 
 @dataclass
-class _Progress:
+class _SearchState:
     """One search: its problem and its progress.
 
     Attributes
@@ -328,7 +328,7 @@ class ManoeuvreSearch:
                 f"more than optimal.longest = {options.longest:g} s."
             )
         kept = self._begin(boundary)
-        progress = _Progress(
+        progress = _SearchState(
             boundary, limits, quaternion, options, cancellation, library, gentle, max_failed_starts
         )
         found = self._search_on_grids(progress, intervals)
@@ -349,7 +349,7 @@ class ManoeuvreSearch:
         durations = [one.duration for one in found]
         return replace(best, starts=progress.starts, solutions=durations, cut_short=cut_short)
 
-    def _search_on_grids(self, progress: _Progress, intervals: int) -> list[Manoeuvre]:
+    def _search_on_grids(self, progress: _SearchState, intervals: int) -> list[Manoeuvre]:
         """Return manoeuvres with a number of intervals, from guesses on a coarse grid first."""
         options = progress.options
         full = self._get_solver(progress, intervals)
@@ -373,7 +373,7 @@ class ManoeuvreSearch:
         return self._search_from_guesses(progress, full, full, options.starts)
 
     def _keep_clear(
-        self, progress: _Progress, found: list[Manoeuvre], intervals: int
+        self, progress: _SearchState, found: list[Manoeuvre], intervals: int
     ) -> list[Manoeuvre]:
         """Return manoeuvres that keep clear: those that were found, if the fastest one does, or
         others near to them, or others from new guesses; none where none is found.
@@ -401,7 +401,9 @@ class ManoeuvreSearch:
         progress.limits = kept.within(progress.limits)
         return self._search_on_grids(progress, intervals)
 
-    def _make_clear(self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int) -> Manoeuvre:
+    def _make_clear(
+        self, progress: _SearchState, manoeuvre: Manoeuvre, intervals: int
+    ) -> Manoeuvre:
         """Return a manoeuvre near to one that comes too near; itself, if it keeps clear.
 
         Raises
@@ -432,7 +434,7 @@ class ManoeuvreSearch:
         return min(refined, clear, key=lambda one: one.duration)
 
     def _clear_on_grid(
-        self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int, tolerance: float
+        self, progress: _SearchState, manoeuvre: Manoeuvre, intervals: int, tolerance: float
     ) -> Manoeuvre:
         """Return a manoeuvre near to another one that keeps clear, solved for on a grid.
 
@@ -457,7 +459,7 @@ class ManoeuvreSearch:
         raise UnusableCandidateError(kept.message(near[0], self._period))
 
     def _shorten_with_less_clearance(
-        self, progress: _Progress, manoeuvre: Manoeuvre, intervals: int
+        self, progress: _SearchState, manoeuvre: Manoeuvre, intervals: int
     ) -> Manoeuvre:
         """Return a faster manoeuvre near to one that keeps clear by more than it needs to, as rows
         are not exact; that one, where none is found.
@@ -486,7 +488,7 @@ class ManoeuvreSearch:
 
     def _solve_with_separation(
         self,
-        progress: _Progress,
+        progress: _SearchState,
         trajectory: Trajectory,
         intervals: int,
         tolerance: float = TOLERANCE,
@@ -515,7 +517,7 @@ class ManoeuvreSearch:
         return solution
 
     def _get_solver(
-        self, progress: _Progress, intervals: int, tolerance: float = TOLERANCE
+        self, progress: _SearchState, intervals: int, tolerance: float = TOLERANCE
     ) -> MultipleShooting:
         pairs = progress.kept.pairs if progress.kept is not None else ()
         return self.solver(
@@ -527,7 +529,7 @@ class ManoeuvreSearch:
         )
 
     def _search_from_guesses(
-        self, progress: _Progress, grid: MultipleShooting, full: MultipleShooting, starts: int
+        self, progress: _SearchState, grid: MultipleShooting, full: MultipleShooting, starts: int
     ) -> list[Manoeuvre]:
         """Return manoeuvres from at most ``starts`` guesses on a grid; none where none is found."""
         guesses = _build_guesses(self._robot, grid, progress.boundary)
@@ -570,7 +572,7 @@ class ManoeuvreSearch:
 
     def _refine_solutions(
         self,
-        progress: _Progress,
+        progress: _SearchState,
         solutions: list[Trajectory],
         grid: MultipleShooting,
         full: MultipleShooting,
@@ -663,7 +665,7 @@ class ManoeuvreSearch:
 
     def _solve_from_guess(
         self,
-        progress: _Progress,
+        progress: _SearchState,
         solver: MultipleShooting,
         guess: Trajectory,
         stop: StopRule,
@@ -703,7 +705,9 @@ class ManoeuvreSearch:
         """Return the trajectory, slowed to the effort limits of the joints."""
         return trajectory if self._efforts is None else self._efforts.slowed(trajectory, boundary)
 
-    def _make_held_commands(self, progress: _Progress, trajectory: Trajectory | None) -> Manoeuvre:
+    def _make_held_commands(
+        self, progress: _SearchState, trajectory: Trajectory | None
+    ) -> Manoeuvre:
         """Return a solution as held commands.
 
         Raises
@@ -732,7 +736,7 @@ class ManoeuvreSearch:
         return Manoeuvre(held, duration, trajectory)
 
     def _hold_in_whole_ticks(
-        self, progress: _Progress, trajectory: Trajectory
+        self, progress: _SearchState, trajectory: Trajectory
     ) -> HeldCommands | None:
         """Return a solution whose duration matters as held commands; None where that fails.
 
