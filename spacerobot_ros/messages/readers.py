@@ -86,30 +86,56 @@ class MessageTemplate:
     def __init__(self, type_name: str, prototype: bytes) -> None:
         self._buffer = bytearray(prototype)
         self._leaves = layout_of(prototype, type_name, elements=True).leaves
-        self._feeds: list[tuple[slice, memoryview]] = []
+        self._feeds: dict[int, memoryview] = {}
+        """Fed arrays by their place."""
         self._times = [
-            slice(leaf.offset, leaf.offset + 8)
+            leaf.offset
             for path, leaf in self._leaves.items()
             if path in ("header.stamp.sec", "clock.sec") or path.endswith(".header.stamp.sec")
         ]
+        self._viewed = False
+        """Whether bytes that are not fed may change."""
+        self._parts: list[bytes | memoryview] = []
+        """What the message is joined of: fed arrays, stamps, and the bytes between them."""
+        self._places_of_stamps: list[int] = []
+        """Indices of the stamps among the parts."""
 
     def floats(self, path: str, count: int) -> Array:
         """Return a writable view of the ``count`` float64 values from ``path`` on."""
+        self._viewed, self._parts = True, []
         return np.frombuffer(self._buffer, np.float64, count, self._leaves[path].offset)
 
     def feed(self, path: str, source: Array) -> None:
         """Copy ``source``, a contiguous array that stays in place, to ``path`` in every message."""
-        start = self._leaves[path].offset
-        self._feeds.append((slice(start, start + source.nbytes), source.data.cast("B")))
+        self._feeds[self._leaves[path].offset] = source.data.cast("B")
+        self._parts = []
 
     def serialised(self, stamp: bytes) -> bytes:
         """Return the message as it is now, with ``stamp`` (:func:`stamp_bytes`) in every header."""
-        buffer = self._buffer
-        for place, source in self._feeds:
-            buffer[place] = source
-        for place in self._times:
-            buffer[place] = stamp
-        return bytes(buffer)
+        parts = self._parts or self._make_parts()
+        for place in self._places_of_stamps:
+            parts[place] = stamp
+        # To join takes a third of the time of writing into a copy.
+        return b"".join(parts)
+
+    def _make_parts(self) -> list[bytes | memoryview]:
+        self._parts, self._places_of_stamps, end = [], [], 0
+        whole = memoryview(self._buffer)
+        for place in sorted([*self._feeds, *self._times]):
+            self._add_part(whole[end:place])
+            if place in self._feeds:
+                self._parts.append(self._feeds[place])
+                end = place + len(self._feeds[place])
+            else:
+                self._places_of_stamps.append(len(self._parts))
+                self._parts.append(b"")
+                end = place + HEADER_STAMP.stop - HEADER_STAMP.start
+        self._add_part(whole[end:])
+        return self._parts
+
+    def _add_part(self, between: memoryview) -> None:
+        if between:
+            self._parts.append(between if self._viewed else bytes(between))
 
 
 def joint_template(joint_names: Sequence[str]) -> MessageTemplate:
