@@ -40,7 +40,7 @@ def frames_of(flight: Flight) -> list[Image.Image]:
     robot = SolidRobot(flight.required_robot(), meshes)
     rows = np.linspace(0, len(flight.time) - 1, _FRAMES).round().astype(int)
     bodies = [robot.at(flight.q[row], _pose(flight, row)) for row in rows]
-    points = _VIEW(np.concatenate([body.points() for body in bodies]))
+    points = _VIEW(np.concatenate([body.corner_points() for body in bodies]))
     middle, extent = (points.max(axis=0) + points.min(axis=0)) / 2, np.ptp(points, axis=0)
     scale = _MARGIN * float((extent / _SIZE).max())
     low, high = (middle + side * scale * np.array(_SIZE) / 2 for side in (-1, 1))

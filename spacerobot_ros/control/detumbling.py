@@ -56,7 +56,7 @@ def shortest_detumbling(momentum: float, torque: float) -> float:
     return momentum / torque if torque > 0.0 else math.inf
 
 
-def largest_share(start: Array, change: Array, limit: float) -> float:
+def largest_feasible_share(start: Array, change: Array, limit: float) -> float:
     """Return the largest share ``s`` in [0, 1] with ``|start + s change| <= limit``.
 
     Where there is none, the share with the least norm.
@@ -75,14 +75,14 @@ def largest_share(start: Array, change: Array, limit: float) -> float:
 
 
 @dataclass(frozen=True)
-class GraspLoad:
+class GraspWrenchModel:
     """The wrench of a grasp on the body that it holds."""
 
     payload: Payload
     function: BufferedFunction
 
     @classmethod
-    def of(cls, robot: SpaceRobot, payload: Payload) -> GraspLoad:
+    def of(cls, robot: SpaceRobot, payload: Payload) -> GraspWrenchModel:
         """Return the load of the grasp of a robot, whose model has the body."""
         return cls(payload, BufferedFunction(_grasp_wrench(robot, payload)))
 
@@ -154,7 +154,7 @@ class Detumbling:
         self._robot, self._rate = robot, decay_rate(control_period)
         self._force, self.torque = force, torque
         self._limit = torque_limit or math.inf
-        self._grasp = None if payload is None else GraspLoad.of(robot, payload)
+        self._grasp = None if payload is None else GraspWrenchModel.of(robot, payload)
         self.largest_grasp_torque = 0.0
         """Largest torque of the grasp that a command asked for, N m."""
 
@@ -179,7 +179,7 @@ class Detumbling:
         to_cm = J[:3, 3:6].T
         n = _limit_norm(-r * self.angular_momentum(state), self.torque)
         f = _limit_norm(-r * robot.total_mass * v_cm, self._force)
-        f = f * largest_share(n, -(to_cm @ f), self.torque) if f.any() else f
+        f = f * largest_feasible_share(n, -(to_cm @ f), self.torque) if f.any() else f
         wanted = np.concatenate([f, n, -r * state.qdot])
 
         def accelerations(share: float) -> Array:
@@ -192,7 +192,9 @@ class Detumbling:
         if self._grasp is not None:
             free = self._grasp.wrench(state, z, accelerations(0.0))[3:].copy()
             change = self._grasp.wrench(state, z, accelerations(1.0))[3:] - free
-            share = largest_share(free, change, self._limit) if self._limit < math.inf else 1.0
+            share = (
+                largest_feasible_share(free, change, self._limit) if self._limit < math.inf else 1.0
+            )
             loaded = float(np.linalg.norm(free + share * change))
             self.largest_grasp_torque = max(self.largest_grasp_torque, loaded)
         zdot = accelerations(share)

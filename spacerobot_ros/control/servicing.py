@@ -367,7 +367,7 @@ class Servicing:
         self.target = MeasuredTarget()
         self.payload: Payload | None = None
         """The body that the robot holds."""
-        self._left: list[Task] = []
+        self._remaining_tasks: list[Task] = []
         self._present: ApproachTask | DetumblingTask | None = None
         self._events: list[Event] = []
 
@@ -378,12 +378,14 @@ class Servicing:
     @property
     def task(self) -> Task | None:
         """The present task."""
-        return self._left[0] if self._left else None
+        return self._remaining_tasks[0] if self._remaining_tasks else None
 
     @property
     def needs_target(self) -> bool:
         """Whether measurements of the target are used, or will be."""
-        return Task.APPROACH in (self._left or self.before_goals) and self.payload is None
+        return (
+            Task.APPROACH in (self._remaining_tasks or self.before_goals) and self.payload is None
+        )
 
     @property
     def message(self) -> str:
@@ -392,7 +394,7 @@ class Servicing:
 
     def begin(self, tasks: Sequence[Task]) -> None:
         """Begin with the first task at the next state."""
-        self._left, self._present = list(tasks), None
+        self._remaining_tasks, self._present = list(tasks), None
 
     def restart(self) -> None:
         """Begin the present task anew."""
@@ -400,7 +402,7 @@ class Servicing:
 
     def end(self) -> None:
         """Give up the tasks that are left."""
-        self._left, self._present = [], None
+        self._remaining_tasks, self._present = [], None
 
     def hold(self, payload: Payload | None) -> None:
         """Take over the body that the robot holds from now on."""
@@ -411,16 +413,16 @@ class Servicing:
         self, time: float, state: ControlState, controller: CoordinatedController
     ) -> TaskProgress:
         """Work on the present task; DONE with the last one."""
-        while self._left:
+        while self._remaining_tasks:
             if self.task is not Task.APPROACH or self.payload is None:
                 if self._present is None:
-                    self._present = self._made(self._left[0])
+                    self._present = self._build_task(self._remaining_tasks[0])
                 progress = self._present.step(time, state, controller)
                 self._events += self._present.events
                 self._present.events.clear()
                 if progress.state is not TaskState.DONE:
                     return progress
-            self._left, self._present = self._left[1:], None
+            self._remaining_tasks, self._present = self._remaining_tasks[1:], None
             controller.follow(Reference())
             controller.hold_here(time, state)
         return _DONE
@@ -430,7 +432,7 @@ class Servicing:
         events, self._events = self._events, []
         return events
 
-    def _made(self, task: Task) -> ApproachTask | DetumblingTask:
+    def _build_task(self, task: Task) -> ApproachTask | DetumblingTask:
         if task is Task.APPROACH:
             return ApproachTask(self.target, self._config)
         return DetumblingTask(self.payload, self._config)

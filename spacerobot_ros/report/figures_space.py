@@ -63,7 +63,7 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     sizes = {"bottom": 0.15, "left": 0.2, "gap": 0.42}
     height = 2.0 if narrow() else 2.9 if across > 2 else 3.9
     figure, panels = sheet(rows, [height] * len(rows), **sizes)
-    points = np.concatenate([scene.points() for scene in scenes])
+    points = np.concatenate([scene.corner_points() for scene in scenes])
     view = view_of(flight)
     places = [axes for row in panels for axes in row]
     for axes in places[len(indices) :]:

@@ -338,7 +338,7 @@ def _visible_points(flight: FlightReport, drawn: SolidRobot) -> Array:
     """Return points (N, 3) of robot, paths, goals and target in W, m, which are to be seen."""
     clouds = [flight.position.values, flight.tool.values[:, :3]]
     for index in flight.samples(12):
-        clouds.append(drawn.at(flight.joints[index], flight.base_at(index)).points())
+        clouds.append(drawn.at(flight.joints[index], flight.base_at(index)).corner_points())
     targets = flight.targets if flight.position_counts else []
     clouds += [t.goal.position[np.newaxis] for t in (*targets, *flight.tool_targets)]
     clouds += [goal.position[np.newaxis] for goal in flight.link_goals.values()]

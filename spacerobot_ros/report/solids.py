@@ -52,15 +52,17 @@ class View:
 
     def __init__(self, azimuth: float = -58.0, elevation: float = 24.0) -> None:
         a, e = math.radians(azimuth), math.radians(elevation)
-        self.toward = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+        self.viewing_direction = np.array(
+            [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)]
+        )
         right = np.array([-math.sin(a), math.cos(a), 0.0])
-        self.paper = np.array([right, np.cross(self.toward, right)])
-        light = self.toward + np.array([0.35, -0.1, 0.9])
+        self.paper_axes = np.array([right, np.cross(self.viewing_direction, right)])
+        light = self.viewing_direction + np.array([0.35, -0.1, 0.9])
         self._light = light / np.linalg.norm(light)
 
     def __call__(self, points: Array) -> Array:
         """Return points (..., 3) on the paper (..., 2)."""
-        return np.asarray(points @ self.paper.T)
+        return np.asarray(points @ self.paper_axes.T)
 
     def shade(self, face: Face) -> Array:
         """Return the colour of a face under the light of this view."""
@@ -92,7 +94,7 @@ class Canvas:
     def draw(self, faces: list[Face], edges: list[Edge]) -> None:
         """Draw faces, and over them the edges that no face hides."""
         for face in faces:
-            if face.normal @ self._view.toward > _MIN_FACING_COSINE:
+            if face.normal @ self._view.viewing_direction > _MIN_FACING_COSINE:
                 self._fill_face(face)
         for edge in edges:
             self._draw_edge(edge)
@@ -109,7 +111,7 @@ class Canvas:
     def _to_pixels(self, points: Array) -> Array:
         """World points (k, 3) to column, row and nearness (k, 3)."""
         at = (self._view(points) - self._low) * self._scale
-        return np.column_stack([at, points @ self._view.toward])
+        return np.column_stack([at, points @ self._view.viewing_direction])
 
     def _fill_face(self, face: Face) -> None:
         corners = self._to_pixels(face.corners)
@@ -140,10 +142,10 @@ class Canvas:
 
     def _face_depth(self, face: Face, x: npt.NDArray[Any], y: npt.NDArray[Any]) -> Array:
         """Nearness of the plane of a face at places in pixels."""
-        across, up = self._view.paper @ face.normal
+        across, up = self._view.paper_axes @ face.normal
         offset = float(face.normal @ face.corners[0]) - self._low @ (across, up)
         depth = offset - (across * x + up * y) / self._scale
-        return np.asarray(depth / float(face.normal @ self._view.toward))
+        return np.asarray(depth / float(face.normal @ self._view.viewing_direction))
 
     def _draw_edge(self, edge: Edge) -> None:
         at = self._to_pixels(edge.line)
@@ -155,7 +157,7 @@ class Canvas:
         for k in range(len(at) - 1):
             if (
                 len(edge.normals)
-                and not (edge.normals[k] @ self._view.toward > _MIN_FACING_COSINE).any()
+                and not (edge.normals[k] @ self._view.viewing_direction > _MIN_FACING_COSINE).any()
             ):
                 continue
             count = max(2, math.ceil(float(np.abs(at[k + 1, :2] - at[k, :2]).max())) + 1)
@@ -187,7 +189,7 @@ class Solids:
         """Return the faces and edges of both."""
         return Solids(self.faces + other.faces, self.edges + other.edges)
 
-    def points(self) -> Array:
+    def corner_points(self) -> Array:
         """All corners (k, 3)."""
         return np.concatenate([f.corners for f in self.faces] + [e.line for e in self.edges])
 

@@ -256,7 +256,7 @@ def _overview_figure(flight: FlightReport) -> Figure:
         size = _ROBOT_PANEL_WIDTH - 0.15
         axes = panel(figure, WIDTH - size - 0.1, 0.2, size, up - 1.0)
         view = view_of(flight)
-        draw_robot(axes, robot, robot.points(), view)
+        draw_robot(axes, robot, robot.corner_points(), view)
         legend_above(axes, draw_goal_and_path(axes, flight, view))
     title = ": ".join(filter(None, (flight.scenario, flight.flight.scenario.description)))
     figure.text(0.1 / WIDTH, 1 - 0.24 / up, title, size=10.5, weight="bold")

@@ -289,7 +289,7 @@ class MultiProcessStack(Stack):
         for name in self.scenario.commanders:
             if self.processes[name].poll() is None or name in self._timeline.away:
                 continue
-            if not self._restarts.allows(name, time.monotonic()):
+            if not self._restarts.allows_restart(name, time.monotonic()):
                 continue
             message = f"{self._end_message(name)} It is started again."
             self.launch(name, autostart=True)
@@ -433,7 +433,7 @@ class RestartLimit:
         self.most = most
         self._restarted: dict[str, list[float]] = {}
 
-    def allows(self, name: str, now: float) -> bool:
+    def allows_restart(self, name: str, now: float) -> bool:
         """Return whether a process may be started again at a wall time, s; it then counts."""
         recent = [each for each in self._restarted.get(name, ()) if now - each < _RESTART_PERIOD]
         allowed = len(recent) < self.most

@@ -91,7 +91,9 @@ class Viewer:
 
     def supervise(self) -> None:
         """Start the viewer again if it has died, as long as the limit allows it."""
-        if self.process.poll() is None or not self._restarts.allows("viewer", time.monotonic()):
+        if self.process.poll() is None or not self._restarts.allows_restart(
+            "viewer", time.monotonic()
+        ):
             return
         message = self._end_message()
         end_child(self.process, {})

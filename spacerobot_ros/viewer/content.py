@@ -682,6 +682,6 @@ class Trail:
         """The points (k, 3), m."""
         return np.array(self._points).reshape(-1, 3)
 
-    def until(self, time_s: float) -> Array:
+    def points_until(self, time_s: float) -> Array:
         """Return the points (k, 3) until a time, m."""
         return self.points[: bisect_right(self._times, time_s)]

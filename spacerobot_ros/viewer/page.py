@@ -815,11 +815,11 @@ class Page:
 
     def _draw_paths(self, state: StackState, around: scene.Surroundings, until: float) -> None:
         """Draw the planned paths, and those flown until a time."""
-        around.flown.draw(self._trail.until(until))
+        around.flown.draw(self._trail.points_until(until))
         path = state.planned_path
         around.planned.draw(np.zeros((0, 3)) if path is None else path)
         for part, trail in self._end_effector_trails.items():
-            around.draw_end_effector(part, trail.until(until))
+            around.draw_end_effector(part, trail.points_until(until))
         assert self._robot is not None
         assert self._kinematics is not None
         if self._planned[0] is not state.planned_motion:

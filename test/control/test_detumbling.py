@@ -10,7 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spacerobot_ros.control import ControlState
-from spacerobot_ros.control.detumbling import Detumbling, largest_share, shortest_detumbling
+from spacerobot_ros.control.detumbling import (
+    Detumbling,
+    largest_feasible_share,
+    shortest_detumbling,
+)
 from spacerobot_ros.control.limits import decay_rate
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.description import Array, Inertia
@@ -58,7 +62,7 @@ def test_motion_decays_at_two_a_second_or_slower_with_long_periods() -> None:
 def test_the_largest_share_of_a_change(
     start: list[float], change: list[float], limit: float, share: float
 ) -> None:
-    assert largest_share(np.array(start), np.array(change), limit) == pytest.approx(share)
+    assert largest_feasible_share(np.array(start), np.array(change), limit) == pytest.approx(share)
 
 
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-3, 3)] * 3), st.floats(0.1, 4.0))
@@ -66,7 +70,7 @@ def test_no_larger_share_is_within_the_limit(
     start: tuple[float, ...], change: tuple[float, ...], limit: float
 ) -> None:
     first, more = np.array(start), np.array(change)
-    share = largest_share(first, more, limit)
+    share = largest_feasible_share(first, more, limit)
     sizes = np.linalg.norm(first + np.linspace(0, 1, 201)[:, None] * more, axis=1)
     size = float(np.linalg.norm(first + share * more))
     if sizes.min() < limit:

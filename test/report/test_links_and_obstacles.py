@@ -280,7 +280,7 @@ def test_a_flight_without_obstacles_says_nothing_of_them(hands: FlightReport) ->
 def test_pictures_of_configurations_have_the_obstacles(strut: FlightReport) -> None:
     assert strut.drawn is not None
     around = strut.drawn.surroundings
-    center = around.points().mean(axis=0)
+    center = around.corner_points().mean(axis=0)
     np.testing.assert_allclose(center, [1.6, 0.1, 0.0], atol=1e-9)
     fills = np.array([face.fill for face in around.faces])
     np.testing.assert_allclose(fills - [0.6, 0.6, 0.65], 0.0, atol=0.003)

@@ -19,14 +19,20 @@ from spacerobot_ros.report.solids import Canvas, Edge, Face, View
 
 def test_what_is_behind_is_hidden() -> None:
     view = View()
-    right, up = view.paper
+    right, up = view.paper_axes
 
     def square(nearness: float, half: float, fill: tuple[float, float, float]) -> Face:
         corners = [x * right + y * up for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-        return Face(half * np.array(corners) + nearness * view.toward, view.toward, fill)
+        return Face(
+            half * np.array(corners) + nearness * view.viewing_direction,
+            view.viewing_direction,
+            fill,
+        )
 
     near, far = square(1.0, 0.5, (1.0, 0.0, 0.0)), square(0.0, 1.0, (0.0, 0.0, 1.0))
-    backwards = Face(near.corners + view.toward, -view.toward, (0.0, 1.0, 0.0))
+    backwards = Face(
+        near.corners + view.viewing_direction, -view.viewing_direction, (0.0, 1.0, 0.0)
+    )
     behind = Edge(np.array([-right, right]) * 0.9, np.empty((0, 2, 3)), (0.0, 0.0, 0.0))
     canvas = Canvas(view, np.full(2, -2.0), np.full(2, 2.0), 80)
     canvas.draw([near, far, backwards], [behind])

@@ -479,13 +479,13 @@ def square(x: float, y: float, z: float, size: float, fill: tuple[float, float, 
 
 
 def test_views() -> None:
-    np.testing.assert_allclose(ABOVE.paper, [[1, 0, 0], [0, 1, 0]], atol=1e-12)
-    np.testing.assert_allclose(ABOVE.toward, [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(ABOVE.paper_axes, [[1, 0, 0], [0, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(ABOVE.viewing_direction, [0, 0, 1], atol=1e-12)
     ahead = View(0.0, 0.0)
-    np.testing.assert_allclose(ahead.paper, [[0, 1, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(ahead.paper_axes, [[0, 1, 0], [0, 0, 1]], atol=1e-12)
     a, e = np.radians([-58.0, 24.0])
     expected = [np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]
-    np.testing.assert_allclose(View().toward, expected)
+    np.testing.assert_allclose(View().viewing_direction, expected)
     light = np.array([0.35, -0.1, 1.9])
     face = square(0, 0, 0, 1, (1.0, 0.5, 0.25))
     shade = 0.72 + 0.28 * 1.9 / np.linalg.norm(light)

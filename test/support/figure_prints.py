@@ -147,7 +147,7 @@ class _RecordingCanvas:
     found: ClassVar[list[str]] = []
 
     def __init__(self, view: View, low: Any, high: Any, width: int) -> None:
-        self.found.append(f"{_numbers(view.paper)} {_numbers(low)} {_numbers(high)} {width}")
+        self.found.append(f"{_numbers(view.paper_axes)} {_numbers(low)} {_numbers(high)} {width}")
 
     def draw(self, faces: list[Face], edges: list[Edge]) -> None:
         for parts in (

@@ -109,11 +109,13 @@ class PathCheck:
         self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
         self._stamp_slack = round(schedule.control_period * 0.5e9)
         self._next_pose = 0
-        self._path_counts = config.drift_position > 0 or config.drift_attitude > 0 or average > 0
+        self._checks_base_path = (
+            config.drift_position > 0 or config.drift_attitude > 0 or average > 0
+        )
 
     def due(self, stamp_ns: int) -> bool:
         """Whether the path has a predicted pose at a stamp."""
-        if not self._path_counts:
+        if not self._checks_base_path:
             return False
         stamps = self._stamps
         while (

@@ -157,7 +157,7 @@ class AreaLoopGait(GaitMethod):
             return self._build_schedule(gait, request, notes, progress)
         chosen = self._nominal.at(state.q, None if progress is None else progress.nominal)
         if progress is None:
-            chosen = self._shape_with_room(request, final, chosen, cancellation)
+            chosen = self._nominal_shape_with_clearance(request, final, chosen, cancellation)
         nominal = self._nominal.move_to_nearest_turn(chosen, state.q)
         flown = 0 if progress is None else progress.cycles
         gait = self._add_legs(gait, [(nominal.shape, self.options.edge_time)])
@@ -184,7 +184,7 @@ class AreaLoopGait(GaitMethod):
         progress = AreaLoopProgress(chosen, flown)
         return self._build_schedule(gait, request, notes, progress, remaining)
 
-    def _shape_with_room(
+    def _nominal_shape_with_clearance(
         self,
         request: PlanRequest,
         final: Array | None,
