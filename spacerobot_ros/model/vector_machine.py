@@ -105,7 +105,7 @@ def mapped(function: ca.Function, count: int) -> ca.Function:
 _tape_by_function: dict[int, tuple[ca.Function, _OperationList | None]] = {}
 """The tapes of the functions that were mapped last, by their identity."""
 
-_MAX_TAPES = 24
+_MAX_OPERATION_LISTS = 24
 
 
 def _operation_list_of(function: ca.Function) -> _OperationList | None:
@@ -119,7 +119,7 @@ def _operation_list_of(function: ca.Function) -> _OperationList | None:
         tape = None
     # The function is kept too: another one could have its identity.
     _tape_by_function[key] = function, tape
-    if len(_tape_by_function) > _MAX_TAPES:
+    if len(_tape_by_function) > _MAX_OPERATION_LISTS:
         del _tape_by_function[next(iter(_tape_by_function))]
     return tape
 

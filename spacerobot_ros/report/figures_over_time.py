@@ -665,7 +665,7 @@ def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
     return time_figure(flight, "momentum_budget", "Momentum budget", caption, [group])
 
 
-_CLEARANCE_STATES = 2000
+_MAX_CLEARANCE_SAMPLES = 2000
 """States of a flight whose smallest distances are drawn."""
 
 
@@ -674,7 +674,7 @@ def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
     clearance = flight.clearance
     if clearance is None:
         return None
-    time, distances = clearance.over_time(_CLEARANCE_STATES)
+    time, distances = clearance.over_time(_MAX_CLEARANCE_SAMPLES)
     signal = Signal(time, distances[:, np.newaxis])
     touching = bool(distances.min() <= 0)
     group = TraceGroup(

@@ -254,15 +254,15 @@ def test_flights_are_drawn_about_the_robot(actuation: str) -> None:
     flights = case.flights(400, 3)
     kind = HeldCommands if actuation == "effort" else FollowedSchedule
     assert isinstance(flights.program, kind)
-    np.testing.assert_allclose(flights.starts.position.std(axis=0), 0.01, rtol=0.2)
-    assert np.abs(flights.starts.position.mean(axis=0)).max() < 0.002
+    np.testing.assert_allclose(flights.initial_states.position.std(axis=0), 0.01, rtol=0.2)
+    assert np.abs(flights.initial_states.position.mean(axis=0)).max() < 0.002
     shares = flights.inertial.masses / SLIDERS.inertial.masses
     assert shares.min() == pytest.approx(0.95, abs=0.002)
     assert shares.max() == pytest.approx(1.05, abs=0.002)
     assert (flights.control_period, flights.ticks, flights.actuation) == (0.01, 4, actuation)
     again, other = case.flights(400, 3), case.flights(400, 4)
-    np.testing.assert_array_equal(flights.starts.position, again.starts.position)
-    assert np.any(flights.starts.position != other.starts.position)
+    np.testing.assert_array_equal(flights.initial_states.position, again.starts.position)
+    assert np.any(flights.initial_states.position != other.starts.position)
 
 
 @pytest.mark.parametrize("actuation", ["velocity", "effort"])
@@ -272,7 +272,7 @@ def test_a_case_is_measured(actuation: str, monkeypatch: pytest.MonkeyPatch) -> 
     asked: dict[str, Any] = {}
 
     def fly(flights: Any) -> Any:
-        counts.append(len(flights.starts.position))
+        counts.append(len(flights.initial_states.position))
         result = fly_one_by_one(flights)
         result.q[0, -1, 1] += 3e-6
         return result

@@ -39,7 +39,7 @@ _SRDF_REMEDY = ", or have an SRDF disable the pair (planner.srdf)"
 _DISTANCE_ERROR = 1e-6
 """Error of a distance, m."""
 
-_LOOP_ROOM_FACTOR = 5.0
+_CLEARANCE_FACTOR_FOR_LOOPS = 5.0
 """Smallest distance of links in the centre shape of loops, in clearances."""
 
 _MIN_START_SHARE = 0.5
@@ -181,7 +181,7 @@ class Clearance:
 
     def is_roomy(self, shapes: Array) -> npt.NDArray[np.bool_]:
         """Return for shapes (N, n) whether all links are far enough for loops (N,)."""
-        geometry, room = self.geometry, _LOOP_ROOM_FACTOR * self.distance
+        geometry, room = self.geometry, _CLEARANCE_FACTOR_FOR_LOOPS * self.distance
         roomy = np.ones(len(shapes), dtype=np.bool_)
         if not len(geometry.pairs):
             return roomy
