@@ -156,13 +156,13 @@ def test_work_is_told_at_once_and_has_five_seconds_to_notice(
 ) -> None:
     told: list[float] = []
     guard.request = termination._Request(lambda: None, lambda: told.append(time.now))
-    assert not guard.noticed()
-    look = guard.noticed if notices else None
+    assert not guard.signal_received()
+    look = guard.signal_received if notices else None
     events = [(1.0, [INT]), (0.25, None), (0.5, look), (4.0, None), (0.375, None)]
     first, waits = [None, 5000.0, 4750.0], [None] * 3 if notices else [4250.0, 250.0]
     assert watch(monkeypatch, guard, time, events) == ([*first, *waits], not notices)
     assert told == [41.0] == guard.killed
-    assert guard.noticed()
+    assert guard.signal_received()
 
 
 def test_a_signal_is_raised_once_or_handed_to_what_has_asked_for_it(guard: Any) -> None:

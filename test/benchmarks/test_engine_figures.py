@@ -261,8 +261,8 @@ def test_flights_are_drawn_about_the_robot(actuation: str) -> None:
     assert shares.max() == pytest.approx(1.05, abs=0.002)
     assert (flights.control_period, flights.ticks, flights.actuation) == (0.01, 4, actuation)
     again, other = case.flights(400, 3), case.flights(400, 4)
-    np.testing.assert_array_equal(flights.initial_states.position, again.starts.position)
-    assert np.any(flights.initial_states.position != other.starts.position)
+    np.testing.assert_array_equal(flights.initial_states.position, again.initial_states.position)
+    assert np.any(flights.initial_states.position != other.initial_states.position)
 
 
 @pytest.mark.parametrize("actuation", ["velocity", "effort"])
