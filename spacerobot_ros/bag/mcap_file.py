@@ -7,6 +7,7 @@ recorder would slow a simulation down.
 
 from __future__ import annotations
 
+import array
 import errno
 import fcntl
 import io
@@ -16,14 +17,15 @@ import re
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from textwrap import indent
-from typing import Any
+from typing import Any, TypeAlias
 
 import lz4.frame
+import numpy as np
 import yaml
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -310,6 +312,15 @@ def _compression_function(compression: str) -> Callable[[bytes | bytearray], byt
     return lz4.frame.compress if compression == "lz4" else bytes
 
 
+Entries: TypeAlias = "array.array[int]"
+"""Log time in nanoseconds and offset in the chunk of each message of a channel, unsigned."""
+
+
+def no_entries() -> Entries:
+    """Return entries without a message."""
+    return array.array("Q")
+
+
 class BagExistsError(RecordingError):
     """The bag file exists and must not be overwritten."""
 
@@ -421,15 +432,15 @@ class McapFile:
         if problem:
             raise RecordingError(f"The bag {self.path} is lost while it is written: {problem}.")
 
-    def append_chunk(self, records: bytearray, entries: dict[int, list[int]]) -> None:
+    def append_chunk(self, records: bytearray, entries: Mapping[int, Entries]) -> None:
         """Append a chunk of encoded records and the indexes of its messages.
 
         ``entries`` are, of each channel, for each of its messages, log time in nanoseconds and
         offset in ``records``, one after the other.
         """
-        entries = {channel: entry for channel, entry in entries.items() if entry}
-        times = [entry[::2] for entry in entries.values()]
-        start, end = min(map(min, times)), max(map(max, times))
+        given = {channel: np.array(entry, "<u8") for channel, entry in entries.items() if entry}
+        times = [entry[::2] for entry in given.values()]
+        start, end = (int(f([f(each) for each in times])) for f in (np.min, np.max))
         data = self._compress(records)
         chunk = encode(
             Chunk(
@@ -442,10 +453,10 @@ class McapFile:
             )
         )
         parts, offsets, position = [chunk], {}, self._size + len(chunk)
-        for channel, entry in entries.items():
+        for channel, entry in given.items():
             size = 8 * len(entry)
             header = _MESSAGE_INDEX_HEADER.pack(Opcode.MESSAGE_INDEX, 6 + size, channel, size)
-            parts += header, struct.pack(f"<{len(entry)}Q", *entry)
+            parts += header, entry.tobytes()
             offsets[channel] = position
             position += len(header) + size
         index = ChunkIndex(
@@ -461,7 +472,7 @@ class McapFile:
         )
         self._append(b"".join(parts))
         self._chunk_indexes.append(encode(index))
-        for channel, entry in entries.items():
+        for channel, entry in given.items():
             self.message_counts[channel] += len(entry) // 2
         self.start_ns = start if self.start_ns is None else min(start, self.start_ns)
         self.end_ns = end if self.end_ns is None else max(end, self.end_ns)

@@ -18,10 +18,12 @@ from mcap.writer import MCAP0_MAGIC
 
 from spacerobot_ros.bag.mcap_file import (
     METADATA_NAME,
+    Entries,
     McapFile,
     QosProfile,
     RecordedTopic,
     encode,
+    no_entries,
 )
 from spacerobot_ros.bag.mcap_reading import (
     DAMAGE_ERRORS,
@@ -196,7 +198,7 @@ class _SalvagedBag:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._records_in_chunk = bytearray()
-        self._entries: dict[int, list[int]] = {}
+        self._entries: dict[int, Entries] = {}
 
     def add(self, opcode: int, body: bytes) -> None:
         """Add a record; an unreadable record is left out."""
@@ -231,12 +233,12 @@ class _SalvagedBag:
             return
         if channel_id not in self._entries:
             # Streaming readers need schema and channel before the message.
-            self._entries[channel_id] = []
+            self._entries[channel_id] = no_entries()
             channel = self._channels[channel_id]
             if channel.schema_id in self._schemas:
                 self._records_in_chunk += encode(self._schemas[channel.schema_id])
             self._records_in_chunk += encode(channel)
-        self._entries[channel_id] += log_time_ns, len(self._records_in_chunk)
+        self._entries[channel_id].extend((log_time_ns, len(self._records_in_chunk)))
         self._records_in_chunk += RECORD_HEADER.pack(Opcode.MESSAGE, len(body)) + body
         if len(self._records_in_chunk) >= _CHUNK_SIZE:
             self._flush()
@@ -246,7 +248,7 @@ class _SalvagedBag:
             self._file.append_chunk(self._records_in_chunk, self._entries)
             self._records_in_chunk = bytearray()
             for entries in self._entries.values():
-                entries.clear()
+                del entries[:]
 
     def _append_rosbag2_metadata(self) -> None:
         topics = []

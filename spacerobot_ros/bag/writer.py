@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from spacerobot_ros.bag.mcap_file import (
     BagExistsError,
+    Entries,
     McapFile,
     QosProfile,
     RecordedTopic,
     encode,
+    no_entries,
 )
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.messages.definitions import message_definition, type_hash
@@ -120,7 +122,7 @@ class BagWriter:
         self._chunk = bytearray()
         # For each channel: log time of each message and its offset in the chunk. Empty as soon as
         # nothing more can be written, so that `write` needs no test of its own for that.
-        self._entries: dict[int, list[int]] = {}
+        self._entries: dict[int, Entries] = {}
         self._topics: dict[str, tuple[int, str, QosProfile]] = {}
         self._schema_ids: dict[str, int] = {}
         self._refusal: str | None = None
@@ -205,7 +207,7 @@ class BagWriter:
         self._chunk += encode(channel)
         self._file.channels.append(channel)
         self._topics[name] = channel.id, type_name, profile
-        self._entries[channel.id] = []
+        self._entries[channel.id] = no_entries()
         return channel.id
 
     def write(self, channel_id: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
@@ -242,7 +244,7 @@ class BagWriter:
         except (KeyError, struct.error):
             raise self._explain_refusal(channel_id) from None
         record = header + data
-        entries += log_time_ns, len(chunk)
+        entries.extend((log_time_ns, len(chunk)))
         chunk += record
         if len(chunk) >= self._chunk_size:
             self._finish_chunk()
@@ -291,7 +293,7 @@ class BagWriter:
             for channel in dict.fromkeys(channel_ids[first:last]):
                 if channel not in self._entries:
                     raise self._explain_refusal(channel)
-                self._entries[channel] += entries[within == channel].ravel().tolist()
+                self._entries[channel].frombytes(entries[within == channel].tobytes())
             self._chunk += b"".join(pieces[2 * first : 2 * last])
             if len(self._chunk) >= self._chunk_size:
                 self._finish_chunk()
@@ -377,7 +379,7 @@ class BagWriter:
             self._file.append_chunk(self._chunk, self._entries)
         self._chunk = bytearray()
         for entries in self._entries.values():
-            entries.clear()
+            del entries[:]
         if not self._closed and self._is_full():
             with self._refusing_after_failure():
                 self._begin_next_file()
