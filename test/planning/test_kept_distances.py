@@ -55,8 +55,8 @@ def kept(library: Any, *, final: Array | None = FINAL, turn_is_known: bool = Tru
     return KeptDistances(library, boundary, REQUIRED, turn_is_known=turn_is_known)
 
 
-def near(pair: int, distance: float) -> Any:
-    return SimpleNamespace(pair=pair, distance=distance)
+def near(pair: int, distance: float, shape: Array = FINAL) -> Any:
+    return SimpleNamespace(pair=pair, distance=distance, shape=shape)
 
 
 def test_pairs_get_room_and_more_by_what_they_lacked() -> None:
@@ -79,9 +79,23 @@ def test_pairs_get_room_and_more_by_what_they_lacked() -> None:
     assert kept(library(), turn_is_known=False).copy()._turn_is_known is False
 
 
+def test_a_new_pair_has_room_for_the_error_of_its_row() -> None:
+    """A row that is less than the distance already keeps more than is asked for."""
+    rows = Rows(0.01), Rows(0.01), Rows(1.0, is_of_obstacle=True)
+    pairs = kept(library(*rows))
+    # The rows say 0.01 * (0.7 + 0.4) = 0.011, where the pairs are 0.015 and 0.004 m apart.
+    shape = np.array([0.7, 0.4])
+    pairs.add([near(0, 0.015, shape), near(1, 0.004, shape), near(2, 9.0, shape)])
+    assert pairs._room == pytest.approx({0: 0.002 - 0.004, 1: 0.002, 2: 0.002})
+    # From then on the margin increases by what the pair lacks of 0.01 m.
+    pairs.add([near(0, 0.007, shape)])
+    assert pairs._room[0] == pytest.approx(-0.002 + 0.003 + 0.002)
+
+
 def test_pairs_that_rows_underestimate_spend_room() -> None:
     """Where rows say less than the distance is, they need less room by as much."""
     among = library(Rows(0.01), Rows(0.1), Rows(0.02), Rows(1.0, is_of_obstacle=True), Rows(1.0))
+    among.clearance.geometry = SimpleNamespace(with_obstacles=np.arange(5) == 3)
     required = np.array([0.01, 0.02, 0.03, 0.04, 0.05])
     boundary = BoundaryConditions(START, TURN.as_quat(), START, FINAL, state=STATE)
     pairs: Any = KeptDistances(among, boundary, required, turn_is_known=True)
@@ -121,10 +135,10 @@ def test_limits_are_the_required_distances_and_their_room_but_at_the_ends() -> N
     assert found.world.size == 0
     assert found.velocity is LIMITS.velocity
     only_start = kept(library(Rows(-1.0), Rows(0.2)), final=None)
-    only_start.add([near(0, 0.0)])
+    only_start.add([near(0, -1.0)])
     np.testing.assert_allclose(only_start.within(LIMITS).distances, [-0.1 - 1e-4])
     both = kept(library(Rows(-1.0), Rows(0.2)))
-    both.add([near(0, 0.0)])
+    both.add([near(0, -1.0)])
     np.testing.assert_allclose(both.within(LIMITS).distances, [-0.9 - 1e-4])
 
 
@@ -155,7 +169,7 @@ def test_rows_of_obstacles_are_asked_where_the_turn_is_known(
     np.testing.assert_allclose(R_0W.apply(point) + r_0W, seen)
     np.testing.assert_allclose(found.world, world[:, 0])
     # Of links the shapes at both ends count all the same.
-    assert of_links.asked[0][0].shape == (2, 1 if final is None else 2)
+    assert of_links.asked[-1][0].shape == (2, 1 if final is None else 2)
 
 
 def test_poses_of_the_base_count_among_obstacles_alone() -> None:

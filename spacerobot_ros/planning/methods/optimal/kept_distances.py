@@ -177,10 +177,19 @@ class KeptDistances:
     def add(self, near: Sequence[Approach]) -> None:
         """Add pairs that have come too near; pairs that are kept already get a larger margin."""
         for each in near:
-            lacking = self._required[each.pair] - each.distance if each.pair in self._room else 0.0
-            self._room[each.pair] = (
-                self._room.get(each.pair, 0.0) + max(lacking, 0.0) + _INITIAL_MARGIN
-            )
+            if each.pair in self._room:
+                lacking = max(self._required[each.pair] - each.distance, 0.0)
+                self._room[each.pair] += lacking + _INITIAL_MARGIN
+            else:
+                self._room[each.pair] = min(self._row_error(each), 0.0) + _INITIAL_MARGIN
+
+    def _row_error(self, approach: Approach) -> float:
+        """Return the row of a pair less its distance, m; zero for an obstacle."""
+        (rows,) = self._library.of([approach.pair])
+        if rows.is_of_obstacle:
+            return 0.0
+        value = float(rows.values(approach.shape[:, np.newaxis]).full().min())
+        return value - approach.distance
 
     def reduce_margins(self, positions: Array, turns: Array) -> bool:
         """Set margins to the errors of the rows where pairs are nearest along held
@@ -193,11 +202,9 @@ class KeptDistances:
         ):
             if each.pair not in self._room:
                 continue
-            (rows,) = library.of([each.pair])
-            if rows.is_of_obstacle:
+            if library.clearance.geometry.with_obstacles[each.pair]:
                 continue
-            value = float(rows.values(each.shape[:, np.newaxis]).full().min())
-            room = value - each.distance + _INITIAL_MARGIN
+            room = self._row_error(each) + _INITIAL_MARGIN
             if room < self._room[each.pair] - _INITIAL_MARGIN:
                 self._room[each.pair], spent = room, True
         return spent

@@ -45,8 +45,12 @@ _IPOPT_OPTIONS = {
 }
 
 
-_WARM_OPTIONS = {"ipopt.mu_init": 1e-3, "ipopt.bound_push": 1e-4, "ipopt.bound_frac": 1e-4}
+_WARM_OPTIONS = {"ipopt.mu_init": 3e-3, "ipopt.bound_push": 1e-3, "ipopt.bound_frac": 1e-3}
 """With distances: the guess is a solution without some of them, which is not to be left far."""
+
+_WARM_STRETCH = 1.5
+"""With distances: factor of the time of the guess. At full speed velocities and accelerations are
+at their limits, which leaves the solver no room to go round."""
 
 _CONTINUED_OPTIONS = {
     "ipopt.mu_init": 1e-6,
@@ -167,7 +171,8 @@ class MultipleShooting:
         """Return the fastest trajectory near ``guess``; None if none.
 
         With distances, the solver continues at its own last solution, where that is the guess:
-        then it takes a few steps. Where that fails, it begins there as at any guess.
+        then it takes a few steps. Where that fails, it begins there as at any guess: at the same
+        path in more time.
 
         In a fixed time it is the one of least effort: of the least mean square of the
         accelerations, over the joints' speeds.
@@ -200,9 +205,13 @@ class MultipleShooting:
         )
         self._monitor.begin(stop)
         solver = self._solver
-        begin: Mapping[str, Array | ca.DM] = {"x0": self._initial_variables(guess)}
+        begin: Mapping[str, Array | ca.DM]
         if self._last is not None and guess is self._last.trajectory:
             solver, begin = self._continuing_solver, self._last.variables
+        else:
+            slower = self._has_distances and not duration.fixed and not boundary.is_timed
+            first = guess.stretched(_WARM_STRETCH) if slower else guess
+            begin = {"x0": self._initial_variables(first)}
         self._last = None
         result = solver(
             **begin,

@@ -95,6 +95,13 @@ coarse grid underestimates some costs by more than others."""
 _MAX_SEPARATION_ITERATIONS = 80
 """Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most."""
 
+_MAX_CLEARING_ITERATIONS = 200
+"""Steps of the solver from a manoeuvre in collision, or from a guess, to one that keeps clear at
+most: those that come to an end take fewer."""
+
+_MAX_CLEAR_STARTS, _CLEAR_ANSWERS = 16, 4
+"""Guesses of a search that keeps clear from the beginning at most, and solutions that end it."""
+
 _MAX_SHORTENING_ROUNDS = 3
 """Solutions by which a manoeuvre is made to keep no more distance than is asked for."""
 
@@ -239,6 +246,11 @@ class _SearchState:
             )
         last = deadline if found else last_call
         return StopRule(self.options.iterations, self.cancellation, deadline, last)
+
+    def with_iterations(self, most: int) -> _SearchState:
+        """Return the same with at most so many steps of the solver from a guess."""
+        iterations = min(self.options.iterations, most)
+        return replace(self, options=replace(self.options, iterations=iterations))
 
     def cut_short(self, *, found: bool) -> bool:
         """Whether the wall time is used up."""
@@ -399,6 +411,13 @@ class ManoeuvreSearch:
         if freed or progress.cut_short(found=False) or progress.boundary.drifts:
             return freed
         progress.limits = kept.within(progress.limits)
+        options = progress.options
+        progress.options = replace(
+            options,
+            starts=min(options.starts, _MAX_CLEAR_STARTS),
+            answers=min(options.answers, _CLEAR_ANSWERS),
+            iterations=min(options.iterations, _MAX_CLEARING_ITERATIONS),
+        )
         return self._search_on_grids(progress, intervals)
 
     def _make_clear(
@@ -416,11 +435,11 @@ class ManoeuvreSearch:
         near = kept.approaches(manoeuvre.held.positions, manoeuvre.held.quaternions)
         if not near:
             return manoeuvre
+        progress = progress.with_iterations(_MAX_CLEARING_ITERATIONS)
         coarser = intervals // _COARSE_GRID_RATIO
         # On a coarse grid the attitude of a robot that drifts is too far off.
         on_full_grid = progress.boundary.drifts or coarser < _MIN_COARSE_INTERVALS
-        iterations = min(progress.options.iterations, _MAX_SEPARATION_ITERATIONS)
-        brief = replace(progress, options=replace(progress.options, iterations=iterations))
+        brief = progress.with_iterations(_MAX_SEPARATION_ITERATIONS)
         if near[0].distance > _DEEP_CONTACT or on_full_grid:
             clear = self._clear_on_grid(progress, manoeuvre, intervals, TOLERANCE)
             return self._shorten_with_less_clearance(brief, clear, intervals)
@@ -585,11 +604,13 @@ class ManoeuvreSearch:
         found: list[Manoeuvre] = []
         costs: list[float] = []
         solutions_agree = progress.solutions_agree(solutions)
+        brief, most = progress, _MAX_REFINED_SOLUTIONS
+        if progress.kept is not None:
+            # A step with many pairs takes long, and solutions that keep clear are near to the end.
+            brief, most = progress.with_iterations(_MAX_SEPARATION_ITERATIONS), 1
         for solution in sorted(solutions, key=progress.cost):
             cost = progress.cost(solution)
-            if found and (
-                len(found) == _MAX_REFINED_SOLUTIONS or cost > _MAX_REFINED_COST_RATIO * costs[0]
-            ):
+            if found and (len(found) == most or cost > _MAX_REFINED_COST_RATIO * costs[0]):
                 break
             least = min((one.solution_time for one in found), default=math.inf)
             if solutions_agree and solution.duration > (1 - _SAME_COST_TOLERANCE) * least:
@@ -600,12 +621,12 @@ class ManoeuvreSearch:
                 refined: Trajectory | None = solution
                 if grid is not full:
                     guess = _build_guesses(self._robot, full, progress.boundary).resample(solution)
-                    stop = progress.stop_rule(found=bool(found))
-                    refined = self._solve_from_guess(progress, full, guess, stop)
+                    stop = brief.stop_rule(found=bool(found))
+                    refined = self._solve_from_guess(brief, full, guess, stop)
                     progress.cancellation.raise_if_requested()
-                manoeuvre = self._make_held_commands(progress, refined)
-                if progress.kept is not None:
-                    near = replace(progress, kept=progress.kept.copy())
+                manoeuvre = self._make_held_commands(brief, refined)
+                if brief.kept is not None:
+                    near = replace(brief, kept=brief.kept.copy())
                     manoeuvre = self._make_clear(near, manoeuvre, full.intervals)
                 found.append(manoeuvre)
                 costs.append(cost)
