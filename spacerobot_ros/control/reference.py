@@ -141,9 +141,10 @@ class QuinticReference(ReferenceProfile):
 
     def at(self, time: float) -> Reference:
         """Return the reference ``time`` s after its start; before it, that at the start."""
+        time = max(time, 0.0)
         if time >= self.duration:
             return self.goal
-        s, rate, acceleration = _quintic(max(time, 0.0) / self.duration, self.duration)
+        s, rate, acceleration = _quintic(time / self.duration, self.duration)
         joints = None
         if self.start.joints is not None and self.goal.joints is not None:
             d = self._joints
@@ -193,7 +194,9 @@ def profile_expression(
     """
     sizes = _profile_sizes(base, end_effector, n)
     duration, *rest = ca.vertsplit(numbers, np.cumsum([0, *sizes]).tolist())
-    s, rate, acceleration = _quintic(ca.fmax(time, 0) / duration, duration)
+    # The time of a plant that begins again is before the start, even of a profile of no duration.
+    time = ca.fmax(time, 0)
+    s, rate, acceleration = _quintic(time / duration, duration)
     moving, resting = [], []
     for k in range(base + end_effector):
         r, d, quaternion, half_turn, turn_W, angle, goal, attitude = rest[8 * k : 8 * k + 8]
