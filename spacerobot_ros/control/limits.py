@@ -165,7 +165,8 @@ class ActuatorLimits:
         return Saturated.of(commanded, Actuation(wrench, tau))
 
     def _keeps(self, commanded: Actuation) -> bool:
-        """Whether a command is within the limits, in Python's numbers, which few take less time."""
+        """Whether a command is within the limits."""
+        # In Python's numbers: numpy takes longer for so few.
         wrench = commanded.wrench_B.tolist()
         if not (math.hypot(*wrench[:3]) <= self.force and math.hypot(*wrench[3:]) <= self.torque):
             return False

@@ -358,10 +358,10 @@ class ControlLaw(ABC):
 
     def largest_error_share(self, bounds: Array) -> float:
         """Return the largest error at the last command as a share of its bound (m,), > 0."""
-        largest = 0.0
-        for error, bound in zip(self._out["error"].tolist(), bounds.tolist(), strict=True):
-            largest = max(largest, abs(error / bound))
-        return largest
+        errors = self._out["error"].tolist()
+        shares = [abs(e / bound) for e, bound in zip(errors, bounds.tolist(), strict=True)]
+        # The largest of some numbers may hide one that is none: it must not count as reached.
+        return math.nan if math.isnan(sum(shares)) else max(shares, default=0.0)
 
     @property
     def error_rate(self) -> Array:
