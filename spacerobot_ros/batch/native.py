@@ -14,7 +14,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,7 @@ from spacerobot_ros.model.compilation import (
     vector_source,
 )
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions
+from spacerobot_ros.model.vector_machine import VectorUnit, vector_unit
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.simulation import effort_plant, velocity_plant
 
@@ -38,51 +38,6 @@ _SOURCE_FOLDER = Path(__file__).resolve().parent
 
 _CASADI_SELECTION = re.compile(r"\((\w+|\(\*\w+\+\+\))\?(\w+(?:\[i\])?):0\)")
 """CasADi's texts for a number, alone or in a loop, that is zero unless a condition holds."""
-
-
-@dataclass(frozen=True)
-class VectorUnit:
-    """Vector registers of a processor.
-
-    Attributes
-    ----------
-    name
-        For people.
-    lanes
-        Numbers of 64 bits in a register.
-    flags
-        Options of the compiler.
-    libmvec
-        Letter of its functions in the vector library of the C library; empty: none.
-    """
-
-    name: str
-    lanes: int
-    flags: tuple[str, ...]
-    libmvec: str
-
-
-VECTOR_UNITS: dict[str, VectorUnit] = {
-    "avx512f": VectorUnit("AVX-512", 8, ("-mavx512f", "-mprefer-vector-width=512"), "e"),
-    "avx2": VectorUnit("AVX2", 4, ("-mavx2",), "d"),
-    "sse2": VectorUnit("SSE2", 2, ("-msse2",), "b"),
-}
-"""Vector registers by the name of the processor's flag, the widest first."""
-
-_PORTABLE_UNIT = VectorUnit("two at a time", 2, (), "")
-"""The vector unit of other processors, whose registers the compiler chooses."""
-
-
-@lru_cache(maxsize=1)
-def vector_unit() -> VectorUnit:
-    """Return the widest registers that this processor and its kernel support."""
-    try:
-        text = Path("/proc/cpuinfo").read_text("utf-8", errors="replace")
-    except OSError:
-        return _PORTABLE_UNIT
-    found = re.search(r"^flags\s*:(.*)$", text, re.MULTILINE)
-    flags = found[1].split() if found else []
-    return next((unit for flag, unit in VECTOR_UNITS.items() if flag in flags), _PORTABLE_UNIT)
 
 
 class Program(IntEnum):

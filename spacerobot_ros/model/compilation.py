@@ -64,6 +64,10 @@ _MAX_COMPARED_RESULT = 1e9
 
 _MAX_FUNCTIONS_IN_MEMORY = 12
 
+_EVALUATIONS_BEFORE_COMPILING = 10_000
+"""Evaluations in the virtual machine that take as long as compiling, whatever the function: both
+take longer in proportion to its operations."""
+
 _functions_in_memory: dict[tuple[str, ...], ca.Function] = {}
 """The latest used functions of the cache, by name, key and folder of the cache."""
 
@@ -98,37 +102,55 @@ class BufferedFunction:
     beside the computation itself.
 
     ``held`` are the numbers of a last argument that stays the same: it is not among ``inputs``.
+
+    ``often`` returns the same function compiled, with the same numbers, bit for bit. It is called
+    after so many evaluations that compiling pays.
     """
 
-    def __init__(self, function: ca.Function, held: Array | None = None) -> None:
-        self.function = function
-        self._buffer, self.evaluate = function.buffer()
-        self.inputs: tuple[Array, ...] = tuple(
-            self._attach_buffers(
-                function.size_in(i), function.sparsity_in(i), i, self._buffer.set_arg
-            )
-            for i in range(function.n_in())
+    evaluate: Callable[[], None]
+    """Computes the outputs."""
+
+    def __init__(
+        self,
+        function: ca.Function,
+        held: Array | None = None,
+        often: Callable[[], ca.Function] | None = None,
+    ) -> None:
+        of_inputs = [(function.size_in(i), function.sparsity_in(i)) for i in range(function.n_in())]
+        of_outputs = [
+            (function.size_out(i), function.sparsity_out(i)) for i in range(function.n_out())
+        ]
+        self.inputs, self.outputs = (
+            tuple(_dense_memory(size, sparsity) for size, sparsity in each)
+            for each in (of_inputs, of_outputs)
         )
+        self._memories = self.inputs, self.outputs
         if held is not None:
             *inputs, last = self.inputs
-            last[:], self.inputs, self._held = held, tuple(inputs), last
-        self.outputs: tuple[Array, ...] = tuple(
-            self._attach_buffers(
-                function.size_out(i), function.sparsity_out(i), i, self._buffer.set_res
-            )
-            for i in range(function.n_out())
-        )
+            last[:], self.inputs = held, tuple(inputs)
+        self._bind(function)
+        if often is not None:
+            self._interpret, self.evaluate = self.evaluate, self._interpret_and_count
+            self._often, self._evaluations = often, 0
 
-    @staticmethod
-    def _attach_buffers(
-        size: tuple[int, int], sparsity: ca.Sparsity, index: int, setter: Callable[..., None]
-    ) -> Array:
-        if not sparsity.is_dense():
-            raise ValueError("a buffered function has dense arguments and results")
-        memory = np.zeros(size[0] * size[1])
-        setter(index, memory.data)
-        # CasADi stores matrices by columns.
-        return memory if size[1] == 1 else memory.reshape(size, order="F")
+    def _bind(self, function: ca.Function) -> None:
+        """Have a function read and write the memory."""
+        self.function = function
+        self._buffer, self.evaluate = function.buffer()
+        for memories, setter in zip(
+            self._memories, (self._buffer.set_arg, self._buffer.set_res), strict=True
+        ):
+            for i, memory in enumerate(memories):
+                # CasADi stores matrices by columns.
+                setter(i, memory.ravel(order="K").data)
+
+    def _interpret_and_count(self) -> None:
+        """Evaluate in the virtual machine; once that has been done often, in compiled code."""
+        self._evaluations += 1
+        if self._evaluations > _EVALUATIONS_BEFORE_COMPILING:
+            self._bind(self._often())
+            self._interpret = self.evaluate
+        self._interpret()
 
     def __call__(self, *arguments: Array | float) -> tuple[Array, ...]:
         """Evaluate at the given arguments and return copies of the results.
@@ -148,6 +170,14 @@ class BufferedFunction:
             memory[...] = value
         self.evaluate()
         return tuple(output.copy() for output in self.outputs)
+
+
+def _dense_memory(size: tuple[int, int], sparsity: ca.Sparsity) -> Array:
+    """Return zeros for an argument or a result; of vectors 1-D, of matrices by columns."""
+    if not sparsity.is_dense():
+        raise ValueError("a buffered function has dense arguments and results")
+    memory = np.zeros(size[0] * size[1])
+    return memory if size[1] == 1 else memory.reshape(size, order="F")
 
 
 def dense_function(

@@ -106,6 +106,10 @@ class ModelFunctions:
             self._compiled[key] = compiled(build())
         return self._compiled[key]
 
+    def is_compiled(self, name: str) -> bool:
+        """Whether a function of the model is there compiled."""
+        return (name, *compilation_settings()) in self._compiled
+
     @property
     def total_mass(self) -> float:
         """Mass of the system, kg; the model has constants."""

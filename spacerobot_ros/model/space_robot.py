@@ -7,6 +7,7 @@ period takes a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and wo
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Hashable
 from functools import cached_property
 from pathlib import Path
@@ -63,6 +64,7 @@ class SpaceRobot:
         self.effort_limit = description.limits("effort")
         self._model, self._p = self._chosen_model(build)
         self._buffers: dict[str, BufferedFunction] = {}
+        self._compiles_on_demand = False
         self._require_positive_inertia()
 
     @classmethod
@@ -266,7 +268,22 @@ class SpaceRobot:
 
     def buffered(self, name: str) -> BufferedFunction:
         """Return a function with input and output buffers of its own, for one caller."""
-        return BufferedFunction(self._model.function(name), self._p)
+        model = self._model
+        if self._compiles_on_demand and not model.is_compiled(name):
+            interpreted = model.function(name, compile=False)
+            return BufferedFunction(interpreted, self._p, lambda: model.function(name))
+        return BufferedFunction(model.function(name), self._p)
+
+    @cached_property
+    def compiled_on_demand(self) -> SpaceRobot:
+        """The same robot for callers with few calls: a function runs in CasADi's virtual machine,
+        with the same numbers, bit for bit, until it was called so often that compiling pays.
+        """
+        if self._compiles_on_demand:
+            return self
+        robot = copy.copy(self)
+        robot._buffers, robot._compiles_on_demand = {}, True
+        return robot
 
     def velocity_step(self, substeps: int) -> BufferedFunction:
         """Return the step under held joint velocities ``(x, qdot, L_W, h) -> x``.

@@ -7,13 +7,9 @@
 #include <math.h>
 #include <stdlib.h>
 
-#define GROUP 8
-
-#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)
-/* One copy for each kind of registers; the loader takes the widest that the processor has. */
-#define CLONES __attribute__((target_clones("avx512f", "avx2", "default")))
-#else
-#define CLONES
+/* The numbers in a register of the processor: more would go through memory. */
+#ifndef GROUP
+#define GROUP 2
 #endif
 
 typedef double Vector __attribute__((vector_size(GROUP * sizeof(double))));
@@ -34,10 +30,10 @@ typedef struct {
 
 /* Returns 0, or 1 where memory is short. `sizes` are the nonzeros of the arguments and results at a
  * place; the numbers of a place stand together. Results may be NULL. */
-CLONES int run_at_places(const Step *steps, long long step_count, const double *constants,
-                     long long memory_size, const double *const *arguments,
-                     const long long *argument_sizes, double *const *results,
-                     const long long *result_sizes, long long places) {
+int run_at_places(const Step *steps, long long step_count, const double *constants,
+                  long long memory_size, const double *const *arguments,
+                  const long long *argument_sizes, double *const *results,
+                  const long long *result_sizes, long long places) {
   void *block = malloc((size_t)(memory_size + 1) * sizeof(Vector) + sizeof(Vector));
   Vector *memory;
   long long begin, k;

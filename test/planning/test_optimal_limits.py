@@ -13,7 +13,7 @@ from planning.test_optimal import ARM_START, FOLDER, QUICK, assert_within
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import ParameterError, PlanningError
-from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model import SpaceRobot, compilation, model_functions
 from spacerobot_ros.planning import GaitSchedule, plan
 from spacerobot_ros.planning.methods.optimal import multiple_shooting, search
 from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions, PathConstraints
@@ -157,12 +157,32 @@ def test_a_plan_is_the_same_on_a_busy_machine(
 def test_a_plan_is_the_same_with_compiled_functions_and_without(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """From an empty cache, from one that is filled, and in the virtual machine."""
+    """From an empty cache, from one that is filled, and in the virtual machine; and with functions
+    of the model that are compiled at their first call.
+    """
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
     asked: dict[str, Any] = {"rotvec": [0, 0, 2.5], "cache": 0, "intervals": 40}
     plans = [plan("planar_chain", **asked).positions.tobytes() for _ in range(2)]
+    assert not list(tmp_path.glob("velocity_step*.so"))
+    with monkeypatch.context() as at_once:
+        at_once.setattr(compilation, "_EVALUATIONS_BEFORE_COMPILING", 0)
+        plans.append(plan("planar_chain", **asked).positions.tobytes())
+    assert list(tmp_path.glob("velocity_step*.so"))
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    assert plan("planar_chain", **asked).positions.tobytes() == plans[0] == plans[1]
+    assert plans == [plan("planar_chain", **asked).positions.tobytes()] * 3
+
+
+def test_a_plan_waits_for_no_compiler_of_its_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, Any] = {"rotvec": [0, 0, 0.4], "cache": 0, "intervals": 20}
+    expected = plan("planar_chain", **asked).positions
+
+    def refuse(function: ca.Function) -> ca.Function:
+        raise AssertionError(f"{function.name()} is compiled")
+
+    monkeypatch.setattr(model_functions, "compiled", refuse)
+    model_functions._model_of_key.cache_clear()
+    np.testing.assert_array_equal(plan("planar_chain", **asked).positions, expected)
 
 
 @pytest.mark.usefixtures("ticking")

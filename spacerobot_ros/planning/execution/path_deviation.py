@@ -101,7 +101,9 @@ class PathCheck:
         sensitivity: Array | None = None,
         masses: MassEstimate | None = None,
     ) -> None:
-        self._robot, self._path, self._positions = robot, schedule.path, schedule.positions
+        # No compiler in flight.
+        self._robot = robot.compiled_on_demand
+        self._path, self._positions = schedule.path, schedule.positions
         self._period, self._deadband = schedule.control_period, config.shape_deadband
         self._deviation = PathDeviation(schedule.path, average, sensitivity, masses)
         self._max_distance = config.drift_position or np.inf
@@ -310,7 +312,7 @@ class PathSensitivity:
     """
 
     def __init__(self, robot: SpaceRobot) -> None:
-        self._robot = robot
+        self._robot = robot.compiled_on_demand
         self.count = 2 * len(robot.description.bodies)
 
     @cached_property

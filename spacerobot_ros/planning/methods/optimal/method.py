@@ -200,7 +200,9 @@ class OptimalGait(GaitMethod):
     options: OptimalOptions
 
     def _setup(self) -> None:
-        robot, chosen = self.robot, self.options
+        # A plan calls the model's functions a few times each.
+        self.robot = robot = self.robot.compiled_on_demand
+        chosen = self.options
         self._specification = GoalSpecification.of(robot, chosen)
         self.controls = self._specification.controls
         self._limits = MotionLimits.of(robot, chosen)
