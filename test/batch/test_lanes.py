@@ -21,7 +21,7 @@ from spacerobot_ros.batch import (
     fly_one_by_one,
     native,
 )
-from spacerobot_ros.model import InertialParameters, SpaceRobot, load_robot
+from spacerobot_ros.model import InertialParameters, SpaceRobot, load_robot, vector_machine
 from spacerobot_ros.model.compilation import cxx_compiler
 from spacerobot_ros.resources import share_directory
 
@@ -182,22 +182,22 @@ def test_the_widest_registers_that_there_are_are_chosen(monkeypatch: pytest.Monk
         ("fpu sse2", "SSE2"),
         ("asimd", "two at a time"),
     ):
-        native.vector_unit.cache_clear()
+        vector_machine.vector_unit.cache_clear()
         text = f"model name : avx512f\nflags\t\t: {flags}\n"
         monkeypatch.setattr(Path, "read_text", lambda *_, text=text, **__: text)
-        assert native.vector_unit().name == name
+        assert vector_machine.vector_unit().name == name
     monkeypatch.undo()
-    native.vector_unit.cache_clear()
+    vector_machine.vector_unit.cache_clear()
 
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("unit", [*native.VECTOR_UNITS, "plain"])
+@pytest.mark.parametrize("unit", [*vector_machine.VECTOR_UNITS, "plain"])
 def test_narrower_registers_give_the_same_flights(
     robots: dict[str, SpaceRobot], monkeypatch: pytest.MonkeyPatch, unit: str
 ) -> None:
-    widest = native.vector_unit()
-    chosen = native._PORTABLE_UNIT if unit == "plain" else native.VECTOR_UNITS[unit]
+    widest = vector_machine.vector_unit()
+    chosen = vector_machine._PORTABLE_UNIT if unit == "plain" else vector_machine.VECTOR_UNITS[unit]
     if chosen.lanes > widest.lanes:
         pytest.skip(f"this processor has no {chosen.name}")
     monkeypatch.setattr(native, "vector_unit", lambda: chosen)

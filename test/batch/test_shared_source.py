@@ -13,6 +13,7 @@ import pytest
 
 from spacerobot_ros.batch import native
 from spacerobot_ros.batch.native import Job, Pending, Program, RowLayout, VectorUnit
+from spacerobot_ros.model import vector_machine
 from spacerobot_ros.model.compilation import NoLibraryError, cxx_compiler
 
 ROWS = RowLayout({"alive": 1, "state": 7, "measured": 3})
@@ -150,21 +151,21 @@ def test_registers_of_64_bits_by_the_options_of_compilers(
 ) -> None:
     """A register of 512 bits has eight numbers; the options are those that GCC knows."""
     bits = {"avx512f": 512, "avx2": 256, "sse2": 128}
-    assert {flag: 64 * unit.lanes for flag, unit in native.VECTOR_UNITS.items()} == bits
-    assert [unit.flags[0] for unit in native.VECTOR_UNITS.values()] == [
+    assert {flag: 64 * unit.lanes for flag, unit in vector_machine.VECTOR_UNITS.items()} == bits
+    assert [unit.flags[0] for unit in vector_machine.VECTOR_UNITS.values()] == [
         f"-m{flag}" for flag in bits
     ]
-    assert [unit.libmvec for unit in native.VECTOR_UNITS.values()] == ["e", "d", "b"]
-    assert (native._PORTABLE_UNIT.lanes, native._PORTABLE_UNIT.libmvec) == (2, "")
+    assert [unit.libmvec for unit in vector_machine.VECTOR_UNITS.values()] == ["e", "d", "b"]
+    assert (vector_machine._PORTABLE_UNIT.lanes, vector_machine._PORTABLE_UNIT.libmvec) == (2, "")
 
     def refuse(*_: Any, **__: Any) -> str:
         raise OSError("no such file")
 
     monkeypatch.setattr(Path, "read_text", refuse)
-    native.vector_unit.cache_clear()
-    assert native.vector_unit() is native._PORTABLE_UNIT
+    vector_machine.vector_unit.cache_clear()
+    assert vector_machine.vector_unit() is vector_machine._PORTABLE_UNIT
     monkeypatch.setattr(Path, "read_text", lambda *_, **__: "no processor\n")
-    native.vector_unit.cache_clear()
-    assert native.vector_unit() is native._PORTABLE_UNIT
+    vector_machine.vector_unit.cache_clear()
+    assert vector_machine.vector_unit() is vector_machine._PORTABLE_UNIT
     monkeypatch.undo()
-    native.vector_unit.cache_clear()
+    vector_machine.vector_unit.cache_clear()

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from spacerobot_ros.batch import native
-from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model import SpaceRobot, vector_machine
 from spacerobot_ros.resources import resource_names, robot_file
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -120,6 +119,6 @@ def test_the_scenarios_with_reference_bags_are_thirteen() -> None:
 
 def test_lanes_are_as_many_as_the_page_says() -> None:
     lanes = {"avx512f": 8, "avx2": 4, "sse2": 2}
-    assert {flag: unit.lanes for flag, unit in native.VECTOR_UNITS.items()} == lanes
+    assert {flag: unit.lanes for flag, unit in vector_machine.VECTOR_UNITS.items()} == lanes
     statement = "There are eight lanes with AVX-512, four with AVX2, two otherwise."
     assert statement in text_of("docs/theory/lanes.md")

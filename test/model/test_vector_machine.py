@@ -47,6 +47,29 @@ def test_the_numbers_are_those_of_the_virtual_machine(
         np.testing.assert_array_equal(here.nonzeros(), there.nonzeros())
 
 
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [*vector_machine.VECTOR_UNITS, "plain"])
+def test_narrower_registers_give_the_same_numbers(
+    unit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
+    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path))
+    units = {**vector_machine.VECTOR_UNITS, "plain": vector_machine._PORTABLE_UNIT}
+    chosen = units[unit]
+    if chosen.lanes > vector_machine.vector_unit().lanes:
+        pytest.skip(f"this processor has no {chosen.name}")
+    monkeypatch.setattr(vector_machine, "vector_unit", lambda: chosen)
+    x, p = ca.SX.sym("x", 4), ca.SX.sym("p")
+    function = ca.Function("rows", [x, p], [rows_of(x, p)])
+    rng = np.random.default_rng(30)
+    given = [ca.DM(3 * rng.normal(size=(4, 21))), ca.DM(rng.normal(size=(1, 21)))]
+    at_all = mapped(function, 21)
+    assert isinstance(at_all, vector_machine._MappedFunction)
+    (here,), (there,) = at_all.call(given), function.map(21).call(given)
+    np.testing.assert_array_equal(here.nonzeros(), there.nonzeros())
+
+
 def test_without_a_compiler_the_virtual_machine_takes_over(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
     x = ca.SX.sym("x")
