@@ -388,8 +388,8 @@ _TOO_FAR = 2.0
 def refusals(urdf: str, case: str, count: int, seed: int) -> dict[str, list[Any]]:
     """Plan for goals that cannot be reached, and return the CPU time and message of each refusal.
 
-    Half of them are goals of a case that are to be reached in half of their plan's time, half are
-    the same goals moved out of reach.
+    Goals of a case are to be reached within half of their plan's time, then in that time exactly,
+    and then moved out of reach.
 
     Returns
     -------
@@ -423,6 +423,7 @@ def refusals(urdf: str, case: str, count: int, seed: int) -> dict[str, list[Any]
         method = gait()
         duration = method.plan(request).duration
         refuse(gait(longest=_TOO_SHORT * duration), request)
+        refuse(gait(duration=_TOO_SHORT * duration), request)
         position = request.goal.position + np.array([_TOO_FAR, 0.0, 0.0])
         moved = Goal.checked(position, request.goal.quaternion)
         refuse(method, PlanRequest(request.state, moved, request.tolerance))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import statistics
 import tempfile
 from collections.abc import Callable, Mapping
@@ -19,6 +20,9 @@ _GOAL_SEED = 7
 
 _DURATION_RATIO_BOUNDS = (1.01, 1.02, 1.03)
 """Bounds of duration ratios; goals with ratios below each bound are counted."""
+
+_BOUND = re.compile(r"takes less than \S+ s|no nearer than \S+ m")
+"""The bound in a refusal: of the duration, or of the distance."""
 
 _LARGE_ROBOTS = ("seven_joint_arm", "quadruped", "dual_arm")
 """Robots with 7, 12 and 14 joints in the benchmark of first plans."""
@@ -101,7 +105,8 @@ def refusals_benchmark(
     Parameters
     ----------
     goals
-        Number of goals of each robot: each is asked for in too short a time, and out of reach.
+        Number of goals of each robot: each is asked for in too short a time, as the longest and as
+        the wanted duration, and out of reach.
     other
         Folder of a checkout that plans for the same goals; None: no comparison.
     show
@@ -110,7 +115,8 @@ def refusals_benchmark(
     Returns
     -------
     By the name of the robot, of each goal: ``cpu_s``, ``sign_s`` and ``reason`` of
-    :func:`.measurements.refusals`; ``there``: the same of the other checkout.
+    :func:`.measurements.refusals`; ``bound``, the bound that the reason names, if it names one;
+    ``there``: the same of the other checkout.
 
     Raises
     ------
@@ -122,14 +128,20 @@ def refusals_benchmark(
     for name in CASES:
         urdf = str(robot_file(name))
         given: dict[str, Any] = {"urdf": urdf, "case": name, "count": goals, "seed": _GOAL_SEED}
-        found = figures[name] = ours.measure("refusals", **given)
+        found = figures[name] = _with_bounds(ours.measure("refusals", **given))
         show(f"{name}: {_refusals_text(found)}")
         if theirs is not None:
-            found["there"] = theirs.measure("refusals", **given)
+            found["there"] = _with_bounds(theirs.measure("refusals", **given))
             show(f"... there {_refusals_text(found['there'])}")
         for reason in dict.fromkeys(filter(None, found["reason"])):
             show(f"... {reason}")
     return figures
+
+
+def _with_bounds(found: dict[str, Any]) -> dict[str, Any]:
+    """Return figures of refusals with the bound in each reason, or an empty text."""
+    matches = [_BOUND.search(reason) for reason in found["reason"]]
+    return {**found, "bound": [match[0] if match else "" for match in matches]}
 
 
 def _refusals_text(found: Mapping[str, Any]) -> str:
@@ -141,7 +153,7 @@ def _refusals_text(found: Mapping[str, Any]) -> str:
     slowest, sign = (max(found[name][k] for k in refused) for name in ("cpu_s", "sign_s"))
     return (
         f"{len(refused)} of {count} goals refused, the slowest after {slowest:.2f} s of CPU time, "
-        f"a first line after {sign:.2f} s at most"
+        f"a first line after {sign:.2f} s at most, {sum(map(bool, found['bound']))} with a bound"
     )
 
 

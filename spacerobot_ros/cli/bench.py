@@ -196,8 +196,9 @@ def planning(
 def refusals(goals: int, against: Path | None, json_file: Path | None) -> None:
     """Plan for goals out of reach of four robots by optimal.
 
-    Each of GOALS [3] is asked for in half of the time that its plan takes, and moved out of reach.
-    The CPU time to the refusal, and to the first line about the search, is measured.
+    Each of GOALS [3] is asked for in half of the time that its plan takes, as optimal.longest and
+    as optimal.duration, and moved out of reach. The CPU time to the refusal, and to the first line
+    about the search, is measured, and refusals that name a bound are counted.
     """
     from spacerobot_ros.benchmarks.planning import refusals_benchmark
 

@@ -40,7 +40,8 @@ class Checkout:
         self.asked.append((name, arguments))
         if name == "refusals":
             cpu, sign = ([self.factor * x for x in each] for each in ((2, 9, 1), (0.2, 8, 0.4)))
-            reasons = ["far", "", "far"] if arguments["case"] != "planar_chain" else [""] * 3
+            far = f"no nearer than {self.factor} m to it."
+            reasons = [far, "", "far"] if arguments["case"] != "planar_chain" else [""] * 3
             return {"cpu_s": cpu, "sign_s": sign, "reason": reasons}
         if name == "first_plan":
             first = len(self.asked) % 4 == 1
@@ -152,22 +153,23 @@ def test_refusals_here_and_there(monkeypatch: pytest.MonkeyPatch) -> None:
     lines: list[str] = []
     figures = planning.refusals_benchmark(2, Path("there"), lines.append)
     assert tuple(figures) == CASES
-    assert lines[:5] == [
+    assert lines[:4] == [
         "planar_chain: none of 3 goals refused",
         "... there none of 3 goals refused",
         "sliding_masses: 2 of 3 goals refused, the slowest after 2.00 s of CPU time, a first line "
-        "after 0.40 s at most",
+        "after 0.40 s at most, 1 with a bound",
         "... there 2 of 3 goals refused, the slowest after 6.00 s of CPU time, a first line after "
-        "1.20 s at most",
-        "... far",
+        "1.20 s at most, 1 with a bound",
     ]
-    assert len(lines) == 11
+    assert lines[4:6] == ["... no nearer than 1.0 m to it.", "... far"]
+    assert len(lines) == 14
+    assert figures["sliding_masses"]["there"]["bound"] == ["no nearer than 3.0 m", "", ""]
     about = {"urdf": str(robot_file("servicer")), "case": "servicer", "count": 2, "seed": 7}
     assert ours.asked[-1] == theirs.asked[-1] == ("refusals", about)
     assert figures["servicer"]["there"]["cpu_s"] == [6.0, 27.0, 3.0]
     lines.clear()
     assert "there" not in planning.refusals_benchmark(2, None, lines.append)["servicer"]
-    assert len(lines) == 7
+    assert len(lines) == 10
 
 
 def test_goals_and_starts_are_within_their_bounds() -> None:
@@ -394,7 +396,8 @@ def test_a_refusal_is_timed_to_its_end_and_to_the_first_line(
 
         def plan(self, request: Any) -> Any:
             self.requests.append(request)
-            if self.options.longest > 100.0 and len(self.requests) == 1:
+            asked = self.options.duration > 0 or self.options.longest < 100.0
+            if not asked and len(self.requests) == 1:
                 return named(duration=12.0)
             for count in (1, 2):
                 clock.advance(0.25)
@@ -408,12 +411,13 @@ def test_a_refusal_is_timed_to_its_end_and_to_the_first_line(
     longest = OptimalOptions().longest
     assert longest > 100.0
     found = measurements.refusals(urdf, "sliding_masses", 2, 7)
-    assert found["cpu_s"] == pytest.approx([1.5] * 4)
-    assert found["sign_s"] == pytest.approx([0.25] * 4)
-    assert found["reason"] == ["6 s", f"{longest:g} s"] * 2
-    easy, short, *_ = Refusing.made
+    assert found["cpu_s"] == pytest.approx([1.5] * 6)
+    assert found["sign_s"] == pytest.approx([0.25] * 6)
+    assert found["reason"] == ["6 s", f"{longest:g} s", f"{longest:g} s"] * 2
+    easy, short, timed, *_ = Refusing.made
+    assert (timed.options.duration, short.options.duration) == (6.0, 0.0)
     reached, moved = easy.requests
-    assert short.requests == [reached]
+    assert short.requests == timed.requests == [reached]
     shift = moved.goal.position - reached.goal.position
     np.testing.assert_allclose(shift, [2.0, 0.0, 0.0], atol=1e-12)
     assert (easy.options.cache, short.options.cache) == (0, 0)

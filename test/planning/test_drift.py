@@ -265,7 +265,7 @@ def test_a_goal_that_is_never_in_reach_has_the_refusal_of_the_whole_search(
     few = len(calls)
     with pytest.raises(NotFoundError) as refusal:
         plan(arm, rotvec=goal, start=START, base_position=2, **QUICK)
-    assert str(refusal.value) == f"Nothing was found by search {len(calls)}."
+    assert str(refusal.value).startswith(f"Nothing was found by search {len(calls)}. It is proved")
     omega = arm.base_twist(ATTITUDE, ARM_START, np.zeros(3), L_W=START.angular_momentum)[1]
     assert calls[-1][4].longest == pytest.approx(8 * np.pi / np.linalg.norm(omega))
     assert len(calls[-1]) == 6, "it is not to end early"

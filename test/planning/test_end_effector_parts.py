@@ -21,10 +21,8 @@ from spacerobot_ros.planning.methods.optimal.end_effectors import (
     EndEffectorSpecification,
     reach_of_end_effector,
 )
-from spacerobot_ros.planning.methods.optimal.goal_specification import (
-    GoalSpecification,
-    moving_joint_ranges,
-)
+from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
+from spacerobot_ros.planning.methods.optimal.motion_bounds import moving_joint_ranges
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, OptimalOptions
 from spacerobot_ros.resources import robot_file
 

@@ -45,10 +45,8 @@ from spacerobot_ros.planning.core.goal import (
     end_effector_pose,
 )
 from spacerobot_ros.planning.core.method import PlanRequest
-from spacerobot_ros.planning.methods.optimal.goal_specification import (
-    GoalSpecification,
-    moving_joint_ranges,
-)
+from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
+from spacerobot_ros.planning.methods.optimal.motion_bounds import moving_joint_ranges
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,

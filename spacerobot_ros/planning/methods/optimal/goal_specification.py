@@ -4,13 +4,6 @@ At zero momentum ``omega_WB_B = F(q) qdot``. Where all columns of F are along on
 turns about that axis only, by an angle. Otherwise the brackets of the columns fill up the
 rotations, provided that the curvature of the connection is not zero everywhere (paper 1,
 section 4).
-
-:class:`CenterReach` bounds the centre of mass in the base, a proof for goals beyond. Without thrust
-the centre of mass rests in the world, so a pose of the base determines it in the base. Sliders
-whose directions are fixed in the base move it along straight slots, exactly. Everything that turns
-is in a ball round the first joint that turns it (triangle inequality over the links behind that
-joint). The sum of both is a convex set that holds the centre of mass in all shapes; for robots that
-have only such sliders it is the set of all centres of mass.
 """
 
 from __future__ import annotations
@@ -22,7 +15,7 @@ import numpy as np
 
 from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, Body, JointKind
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_from_rotvec,
@@ -41,6 +34,7 @@ from spacerobot_ros.planning.core.controllability import (
 )
 from spacerobot_ros.planning.core.goal import POSITION_SLACK, Controlled, RobotState
 from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.methods.optimal.motion_bounds import CenterReach
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -489,108 +483,3 @@ def _unreachable_center_error(
         f"and the joints of '{name}' put the base no nearer than {gap:.3g} m to it.",
         Proof.LIMITS,
     )
-
-
-_MIN_SLIDER_RANGE = 1e-12
-"""Bounds of a slider differ at least by this, m: the solver wants room between them."""
-
-
-@dataclass(frozen=True)
-class CenterReach:
-    """The set ``origin + slots z + ball``, ``lower <= z <= upper``.
-
-    Attributes
-    ----------
-    origin
-        (3,) m, base components.
-    slider_directions
-        (3, s) motion of the centre of mass with each slider of fixed direction, m/m.
-    lower, upper
-        (s,) ends of their ranges, m.
-    radius
-        Of the ball, m.
-    """
-
-    origin: Array
-    slider_directions: Array
-    lower: Array
-    upper: Array
-    radius: float
-
-    @classmethod
-    def of(cls, robot: SpaceRobot, lower: Array, upper: Array) -> CenterReach:
-        """Return the set of a robot whose joints keep to ``lower`` and ``upper`` (n,)."""
-        bodies = robot.description.bodies
-        if robot.description.has_mimic_joints:
-            lower, upper = moving_joint_ranges(robot, lower, upper)
-        base = bodies[0].inertia
-        origin, radius = base.mass * base.com, 0.0
-        slots = np.zeros((3, len(lower)))
-        places = [_FrameBounds(np.zeros(3), np.eye(3), (), 0.0)]
-        for joint, body in enumerate(bodies[1:]):
-            place = places[body.parent].of_child(joint, body, lower[joint], upper[joint])
-            places.append(place)
-            mass, com = body.inertia.mass, body.inertia.com
-            if place.R is None:
-                origin = origin + mass * place.r
-                radius += mass * (place.radius + float(np.linalg.norm(com)))
-            else:
-                origin = origin + mass * (place.r + place.R @ com)
-            for slider, axis in place.sliders:
-                slots[:, slider] += mass * axis
-        sliders = np.flatnonzero(slots.any(axis=0))
-        total = robot.total_mass
-        slots = slots[:, sliders] / total
-        return cls(origin / total, slots, lower[sliders], upper[sliders], radius / total)
-
-    def distance_outside(self, point: Array) -> float:
-        """Return the distance of a point (3,) from the set, m: no shape comes nearer."""
-        if not np.isfinite(self.radius):
-            return 0.0
-        beside = point - self.origin
-        if self.slider_directions.size:
-            from scipy.optimize import lsq_linear  # Slow to import, and few goals need it.
-
-            bounds = self.lower - _MIN_SLIDER_RANGE, self.upper + _MIN_SLIDER_RANGE
-            beside = (
-                beside
-                - self.slider_directions
-                @ lsq_linear(self.slider_directions, beside, bounds, method="bvls").x
-            )
-        return max(0.0, float(np.linalg.norm(beside)) - self.radius)
-
-
-def moving_joint_ranges(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return ranges (m,) of all moving joints, each by itself: a larger set than that of (n,)."""
-    G, offsets = robot.description.coupling
-    leaders = np.argmax(np.abs(G), axis=1)
-    factors = G[np.arange(len(G)), leaders]
-    ends = factors * lower[leaders] + offsets, factors * upper[leaders] + offsets
-    return np.minimum(*ends), np.maximum(*ends)
-
-
-@dataclass(frozen=True)
-class _FrameBounds:
-    """Bounds on the frame of a body for all shapes.
-
-    It is within ``radius`` m of ``r`` (3,), displaced by the ``sliders``: pairs of an index and a
-    direction (3,). ``R`` (3, 3) is its attitude in the base, None if that depends on the shape.
-    """
-
-    r: Array
-    R: Array | None
-    sliders: tuple[tuple[int, Array], ...]
-    radius: float
-
-    def of_child(self, index: int, body: Body, lower: float, upper: float) -> _FrameBounds:
-        """Return the place of a body behind this one, which a joint with these limits carries."""
-        assert body.joint is not None
-        slides = body.joint.kind is JointKind.PRISMATIC
-        if self.R is None:
-            travel = max(abs(lower), abs(upper)) if slides else 0.0
-            around = self.radius + float(np.linalg.norm(body.origin.r)) + travel
-            return _FrameBounds(self.r, None, self.sliders, around)
-        r, R = self.r + self.R @ body.origin.r, self.R @ body.origin.R
-        if slides:
-            return _FrameBounds(r, R, (*self.sliders, (index, R @ body.joint.axis)), self.radius)
-        return _FrameBounds(r, None, self.sliders, self.radius)

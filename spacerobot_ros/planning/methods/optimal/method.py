@@ -36,6 +36,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.controllability import sliders_of
 from spacerobot_ros.planning.core.goal import (
     Controlled,
     Goal,
@@ -62,6 +63,7 @@ from spacerobot_ros.planning.methods.optimal.initial_guesses import (
 )
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
+from spacerobot_ros.planning.methods.optimal.motion_bounds import ConnectionBounds, DurationBound
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -124,6 +126,13 @@ _MAX_DURATION_RATIO = 2.5
 
 _MAX_DURATION_FACTOR, _LONGEST_ADDITIONAL_TICKS = 1.25, 20
 """Longest duration of held commands: a factor of optimal.longest, and additional ticks."""
+
+_STARTS_BEFORE_FASTEST = 2
+"""Guesses without a manoeuvre in the asked time after which the fastest one is looked for."""
+
+_MAX_FASTEST_RATIO = 1.25
+"""Largest ratio of the fastest manoeuvre that is found to the asked time at which the search goes
+on: there may be a faster one, but none so much faster."""
 
 _LIMIT_ROUNDING = 1e-8
 """Largest excess of a cached manoeuvre over a limit, relative or in joint coordinates."""
@@ -484,12 +493,22 @@ class OptimalGait(GaitMethod):
         if duration is not None:
             chosen = replace(chosen, duration=duration)
         searched = request, boundary, limits, chosen, cancellation
+        bound = self._require_enough_time(
+            request, boundary, chosen, final_is_given=shape is not None or same_shape
+        )
         # The clearance of a base that coasts on among obstacles is not checked.
         coasts = boundary.drifts and not len(self._wheels)
-        if coasts and chosen.duration == 0 and not self._has_obstacles:
-            found = self._begin_now_or_coast(*searched)
-        else:
-            found = self._begin_now(*searched)
+        try:
+            if coasts and chosen.duration == 0 and not self._has_obstacles:
+                found = self._begin_now_or_coast(*searched)
+            elif correction or boundary.is_timed or chosen.time_budget > 0:
+                found = self._begin_now(*searched)
+            else:
+                found = self._begin_in_asked_time(*searched)
+        except NotFoundError as refusal:
+            if bound.seconds == 0:
+                raise
+            raise NotFoundError(f"{refusal} It is proved that {bound}.") from None
         schedule = self._build_schedule(
             state, goal, found.positions, found.notes, boundary.velocity, end
         )
@@ -503,6 +522,89 @@ class OptimalGait(GaitMethod):
             kept_plan = _CachedPlan(schedule.positions, found.notes)
             self._cache.store(archive_name(key), key, kept_plan.to_bytes())
         return schedule
+
+    @cached_property
+    def _connection_bounds(self) -> ConnectionBounds:
+        return ConnectionBounds.of(self.robot, self._specification.base_rotations.axes)
+
+    def _require_enough_time(
+        self,
+        request: PlanRequest,
+        boundary: BoundaryConditions,
+        chosen: OptimalOptions,
+        *,
+        final_is_given: bool,
+    ) -> DurationBound:
+        """Return a bound of the duration of all manoeuvres from rest to the goal.
+
+        ``final_is_given``: the goal has the last shape of the boundary conditions.
+
+        Raises
+        ------
+        PlanningError
+            It is longer than the time that the options give.
+        """
+        robot = self.robot
+        # The slots of three sliders determine the shape.
+        only_sliders = self._specification.position and len(sliders_of(robot)) == robot.n == 3
+        bound = DurationBound.of(
+            robot,
+            boundary,
+            self._limits,
+            self.control_period,
+            self._kind_of(request.goal).specification.axes,
+            self._connection_bounds,
+            final_is_given=final_is_given or only_sliders,
+            base_rate_limit=chosen.max_base_rate,
+        )
+        name, given = _asked_time(chosen)
+        if bound.seconds > given + self.control_period / 2:
+            raise PlanningError(
+                f"The goal cannot be reached within optimal.{name} = {given:g} s: {bound}. Allow "
+                "more time."
+            )
+        return bound
+
+    def _begin_in_asked_time(
+        self,
+        request: PlanRequest,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        chosen: OptimalOptions,
+        cancellation: Cancellation,
+    ) -> _PlanResult:
+        """Return a manoeuvre from rest that takes no longer than the options ask for.
+
+        Raises
+        ------
+        NotFoundError
+            None was found; where a longer one was found, the message has its duration.
+        """
+        searched = request, boundary, limits
+        unlimited = replace(chosen, duration=0.0, longest=OptimalOptions().longest)
+        name, given = _asked_time(chosen)
+        if given >= unlimited.longest:
+            return self._begin_now(*searched, chosen, cancellation)
+        with suppress(NotFoundError):
+            return self._begin_now(*searched, chosen, cancellation, _STARTS_BEFORE_FASTEST)
+        fastest = math.inf
+        with suppress(NotFoundError):
+            found = self._begin_now(*searched, unlimited, cancellation)
+            fastest = found.manoeuvre.duration
+            if chosen.duration == 0 and fastest <= given:
+                return found
+        refusal = ""
+        if not _MAX_FASTEST_RATIO * given < fastest < math.inf:
+            try:
+                return self._begin_now(*searched, chosen, cancellation)
+            except NotFoundError as reason:
+                if fastest == math.inf:
+                    raise
+                refusal = f" {reason}"
+        raise NotFoundError(
+            f"No manoeuvre to the goal was found within optimal.{name} = {given:g} s: the fastest "
+            f"that was found takes {fastest:.6g} s. Allow more time.{refusal}"
+        )
 
     def _begin_now(
         self,
@@ -955,6 +1057,13 @@ class OptimalGait(GaitMethod):
         self._constraints.check(positions, attitudes, period)
         if too_near := self._too_near(positions, self._base_poses(state, positions, attitudes)):
             raise UnusableCandidateError(too_near)
+
+
+def _asked_time(chosen: OptimalOptions) -> tuple[str, float]:
+    """Return the option that limits the duration of a manoeuvre, and its value, s."""
+    if chosen.duration > 0:
+        return "duration", chosen.duration
+    return "longest", chosen.longest
 
 
 def _momenta_in_base(state: RobotState, attitudes: Array) -> Array | None:

@@ -1,0 +1,421 @@
+"""Bounds that are proved before a search: where the base can be, and how long a manoeuvre takes.
+
+:class:`CenterReach` bounds the centre of mass in the base, a proof for goals beyond. Without thrust
+the centre of mass rests in the world, so a pose of the base determines it in the base. Sliders
+whose directions are fixed in the base move it along straight slots, exactly. Everything that turns
+is in a ball round the first joint that turns it (triangle inequality over the links behind that
+joint). The sum of both is a convex set that holds the centre of mass in all shapes; for robots that
+have only such sliders it is the set of all centres of mass.
+
+:class:`ConnectionBounds` bounds the motion of the base by each joint. While one joint moves and the
+others rest, the robot is two rigid bodies of masses ``m_P`` and ``m_D``, before and behind the
+joint. With the locked inertia ``H`` about the centre of mass, and the angular momentum about it
+``h_i`` that the joint causes at unit rate while the base rests, the base turns at ``-H^-1 h_i``.
+The distances of the centres of mass from the joint bound ``|h_i|`` in all shapes, and the least
+principal moments of all bodies bound ``H`` from below. The energy is another bound: what the base
+takes up by its motion is missing behind the joint, ``omega . (H + I_base) omega <= M_ii``. The
+smaller bound counts.
+
+:class:`DurationBound` follows from both, and from the longest way of a joint in a given time. No
+shape is sampled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array, Body, JointKind
+from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
+    MotionLimits,
+)
+
+_BOUND_ROUNDING = 1e-6
+"""Relative rounding error of a bound: manoeuvres end beside their goals by less than that."""
+
+_BISECTIONS = 60
+
+_PARALLEL = 1e-12
+"""Sine of the angle between two directions below which they are the same."""
+
+_MIN_SLIDER_RANGE = 1e-12
+"""Bounds of a slider differ at least by this, m: the solver wants room between them."""
+
+
+@dataclass(frozen=True)
+class CenterReach:
+    """The set ``origin + slots z + ball``, ``lower <= z <= upper``.
+
+    Attributes
+    ----------
+    origin
+        (3,) m, base components.
+    slider_directions
+        (3, s) motion of the centre of mass with each slider of fixed direction, m/m.
+    lower, upper
+        (s,) ends of their ranges, m.
+    radius
+        Of the ball, m.
+    """
+
+    origin: Array
+    slider_directions: Array
+    lower: Array
+    upper: Array
+    radius: float
+
+    @classmethod
+    def of(cls, robot: SpaceRobot, lower: Array, upper: Array) -> CenterReach:
+        """Return the set of a robot whose joints keep to ``lower`` and ``upper`` (n,)."""
+        bodies = robot.description.bodies
+        if robot.description.has_mimic_joints:
+            lower, upper = moving_joint_ranges(robot, lower, upper)
+        base = bodies[0].inertia
+        origin, radius = base.mass * base.com, 0.0
+        slots = np.zeros((3, len(lower)))
+        places = [_FrameBounds(np.zeros(3), np.eye(3), (), 0.0)]
+        for joint, body in enumerate(bodies[1:]):
+            place = places[body.parent].of_child(joint, body, lower[joint], upper[joint])
+            places.append(place)
+            mass, com = body.inertia.mass, body.inertia.com
+            if place.R is None:
+                origin = origin + mass * place.r
+                radius += mass * (place.radius + float(np.linalg.norm(com)))
+            else:
+                origin = origin + mass * (place.r + place.R @ com)
+            for slider, axis in place.sliders:
+                slots[:, slider] += mass * axis
+        sliders = np.flatnonzero(slots.any(axis=0))
+        total = robot.total_mass
+        slots = slots[:, sliders] / total
+        return cls(origin / total, slots, lower[sliders], upper[sliders], radius / total)
+
+    def distance_outside(self, point: Array) -> float:
+        """Return the distance of a point (3,) from the set, m: no shape comes nearer."""
+        if not np.isfinite(self.radius):
+            return 0.0
+        beside = point - self.origin
+        if self.slider_directions.size:
+            from scipy.optimize import lsq_linear  # Slow to import, and few goals need it.
+
+            bounds = self.lower - _MIN_SLIDER_RANGE, self.upper + _MIN_SLIDER_RANGE
+            beside = (
+                beside
+                - self.slider_directions
+                @ lsq_linear(self.slider_directions, beside, bounds, method="bvls").x
+            )
+        return max(0.0, float(np.linalg.norm(beside)) - self.radius)
+
+
+def moving_joint_ranges(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return ranges (m,) of all moving joints, each by itself: a larger set than that of (n,)."""
+    G, offsets = robot.description.coupling
+    leaders = np.argmax(np.abs(G), axis=1)
+    factors = G[np.arange(len(G)), leaders]
+    ends = factors * lower[leaders] + offsets, factors * upper[leaders] + offsets
+    return np.minimum(*ends), np.maximum(*ends)
+
+
+@dataclass(frozen=True)
+class _FrameBounds:
+    """Bounds on the frame of a body for all shapes.
+
+    It is within ``radius`` m of ``r`` (3,), displaced by the ``sliders``: pairs of an index and a
+    direction (3,). ``R`` (3, 3) is its attitude in the base, None if that depends on the shape.
+    """
+
+    r: Array
+    R: Array | None
+    sliders: tuple[tuple[int, Array], ...]
+    radius: float
+
+    def of_child(self, index: int, body: Body, lower: float, upper: float) -> _FrameBounds:
+        """Return the place of a body behind this one, which a joint with these limits carries."""
+        assert body.joint is not None
+        slides = body.joint.kind is JointKind.PRISMATIC
+        if self.R is None:
+            travel = max(abs(lower), abs(upper)) if slides else 0.0
+            around = self.radius + float(np.linalg.norm(body.origin.r)) + travel
+            return _FrameBounds(self.r, None, self.sliders, around)
+        r, R = self.r + self.R @ body.origin.r, self.R @ body.origin.R
+        if slides:
+            return _FrameBounds(r, R, (*self.sliders, (index, R @ body.joint.axis)), self.radius)
+        return _FrameBounds(r, None, self.sliders, self.radius)
+
+
+@dataclass(frozen=True)
+class ConnectionBounds:
+    """Bounds of the motion of the base at zero momentum, for all shapes within the joint limits.
+
+    Attributes
+    ----------
+    turn
+        (n,) largest turn of the base with each joint, rad per rad or m; infinite: not known.
+    center
+        (n,) largest displacement of the centre of mass in the base, m per rad or m.
+    inertia
+        Smallest moment of inertia of the robot with its joints locked, kg m^2; of planar robots,
+        about the axis that they turn about.
+    """
+
+    turn: Array
+    center: Array
+    inertia: float
+
+    @classmethod
+    def of(cls, robot: SpaceRobot, axes: Array) -> ConnectionBounds:
+        """Return the bounds of a robot whose base turns about ``axes`` (m, 3), base components."""
+        tree = _Tree.of(robot)
+        least, base = sum(tree.least_moments), tree.least_moments[0]
+        if len(axes) == 1:
+            about = float(axes[0] @ tree.bodies[0].inertia.about_com @ axes[0])
+            least, base = least - base + about, about
+        joints = range(1, len(tree.bodies))
+        moved = [tree.moved_by(joint, planar=len(axes) == 1) for joint in joints]
+        momentum, energy, center = np.array(moved).reshape(-1, 3).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            turn = np.fmin(momentum / least, np.sqrt(energy / (least + base)))
+        turn = np.where(np.isnan(turn), np.inf, turn)
+        G = np.abs(robot.description.coupling[0])
+        with np.errstate(invalid="ignore"):
+            # A bound that is not known is no part of joints that do not move the body.
+            turn, center = (
+                np.where(G > 0, G * each[:, np.newaxis], 0.0).sum(axis=0) for each in (turn, center)
+            )
+        return cls(turn, center, least)
+
+
+@dataclass(frozen=True)
+class _Tree:
+    """The bodies of a robot, with bounds of the distances between them.
+
+    Attributes
+    ----------
+    bodies
+        As of the description.
+    hinges
+        (b, 3) origin of each body in its parent at the middle of the joint's range, m.
+    travels
+        Half of the range of the slider that carries each body, m; 0: it does not slide.
+    least_moments
+        Smallest principal moment of inertia of each body, kg m^2.
+    """
+
+    bodies: Sequence[Body]
+    hinges: Array
+    travels: list[float]
+    least_moments: list[float]
+
+    @classmethod
+    def of(cls, robot: SpaceRobot) -> _Tree:
+        bodies = robot.description.bodies
+        hinges, travels = np.zeros((len(bodies), 3)), [0.0] * len(bodies)
+        ranges = zip(*moving_joint_ranges(robot, robot.lower, robot.upper), strict=True)
+        for b, (body, (lower, upper)) in enumerate(zip(bodies[1:], ranges, strict=True), 1):
+            assert body.joint is not None
+            hinges[b] = body.origin.r
+            if body.joint.kind is JointKind.PRISMATIC:
+                travels[b] = (upper - lower) / 2
+                if math.isfinite(travels[b]):
+                    hinges[b] += body.origin.R @ body.joint.axis * (lower + upper) / 2
+        moments = [float(np.linalg.eigvalsh(body.inertia.about_com)[0]) for body in bodies]
+        return cls(bodies, hinges, travels, [max(0.0, moment) for moment in moments])
+
+    def moved_by(self, joint: int, *, planar: bool) -> tuple[float, float, float]:
+        """Return bounds of the angular momentum ``h`` about the centre of mass (kg m^2/s), of the
+        inertia ``M`` (kg m^2 or kg) and of the displacement of the centre of mass (m), at unit rate
+        of the joint that carries a body.
+        """
+        body = self.bodies[joint]
+        assert body.joint is not None
+        axis, parent, here = body.joint.axis, body.parent, np.zeros(3)
+        across = np.eye(3) - np.outer(axis, axis)
+        levers = dict(self._distances(joint, here, parent, across))
+        m = np.array([each.inertia.mass for each in self.bodies])
+        total, behind = m.sum(), sum(m[k] for k in levers)
+        first_moment = sum(m[k] * lever for k, lever in levers.items())
+        if body.joint.kind is JointKind.PRISMATIC:
+            axis = body.origin.R @ axis
+            across = np.eye(3) - np.outer(axis, axis)
+            before = dict(self._distances(parent, self.hinges[joint], joint, across))
+            other = sum(m[k] * lever for k, lever in before.items())
+            share = behind / total
+            momentum = (1 - share) * first_moment + share * other
+            return momentum, behind * (1 - share), share
+        before = dict(self._distances(parent, self.hinges[joint], joint, np.eye(3)))
+        reach = dict(self._distances(joint, here, parent, np.eye(3)))
+        energy = largest = 0.0
+        for k, lever in levers.items():
+            inertia = self.bodies[k].inertia.about_com
+            moment = float(np.linalg.eigvalsh(inertia)[-1])
+            largest += moment + m[k] * reach[k] ** 2
+            energy += (axis @ inertia @ axis if k == joint else moment) + m[k] * lever**2
+        # |X a| <= sqrt(|X| a . X a) for the inertia X of all that is behind the joint.
+        momentum = energy if planar else math.sqrt(largest * energy)
+        if len(levers) == 1:
+            d, rest = body.inertia.com, 1 - behind / total
+            own = body.inertia.about_com @ axis + rest * behind * np.cross(d, np.cross(axis, d))
+            momentum = float(np.linalg.norm(own))
+        momentum += first_moment * sum(m[k] * far for k, far in before.items()) / total
+        return momentum, energy, first_moment / total
+
+    def _distances(
+        self, at: int, point: Array, came_from: int, measured: Array
+    ) -> Iterator[tuple[int, float]]:
+        """Yield the largest distances, m, of centres of mass from a ``point`` (3,) of body ``at``,
+        for this body and all that are reached from it, but by way of ``came_from``.
+
+        The matrix ``measured`` (3, 3) multiplies the vectors in this body, whose norms count.
+        """
+
+        def way(joint: int, vector: Array, R: Array) -> float:
+            distance, travel = float(np.linalg.norm(measured @ vector)), self.travels[joint]
+            if travel > 0:
+                carried = self.bodies[joint].joint
+                assert carried is not None
+                along = float(np.linalg.norm(measured @ R @ carried.axis))
+                distance += travel * along if along > _PARALLEL else 0.0
+            return distance
+
+        yield at, float(np.linalg.norm(measured @ (self.bodies[at].inertia.com - point)))
+        whole, start, parent = np.eye(3), np.zeros(3), self.bodies[at].parent
+        for child, body in enumerate(self.bodies):
+            if body.parent == at and child != came_from:
+                far = way(child, self.hinges[child] - point, body.origin.R)
+                for k, more in self._distances(child, start, at, whole):
+                    yield k, far + more
+        if at > 0 and parent != came_from:
+            far = way(at, point, whole)
+            for k, more in self._distances(parent, self.hinges[at], at, whole):
+                yield k, far + more
+
+
+@dataclass(frozen=True)
+class DurationBound:
+    """A duration that no manoeuvre to a goal is shorter than.
+
+    Attributes
+    ----------
+    seconds
+        The duration, a multiple of the control period.
+    reason
+        The motion that takes it, as a clause.
+    """
+
+    seconds: float
+    reason: str
+
+    @classmethod
+    def of(
+        cls,
+        robot: SpaceRobot,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        period: float,
+        axes: Array,
+        connection: ConnectionBounds,
+        *,
+        final_is_given: bool,
+        base_rate_limit: float = 0.0,
+    ) -> DurationBound:
+        """Return the bound for commands that are held for ``period`` s.
+
+        Parameters
+        ----------
+        boundary, limits
+            Ends of the manoeuvre, and limits of the joints.
+        axes
+            (m, 3) axes of the base along which the attitude at the end is given.
+        connection
+            Bounds of the motion of the base.
+        final_is_given
+            Whether the last shape of the boundary conditions is the only one at the goal.
+        base_rate_limit
+            Fastest turn of the base, rad/s; 0: any.
+        """
+        within = "within the velocity and acceleration limits"
+        weights, amounts, drifts, reasons = [], [], [], []
+        if final_is_given and boundary.final is not None:
+            ways = np.nan_to_num(np.abs(boundary.final - boundary.start))
+            weights += list(np.eye(robot.n))
+            amounts += ways.tolist()
+            drifts += [0.0] * robot.n
+            reasons += [
+                f"joint '{joint.name}' moves by {way:.4g} {joint.unit} {within} that it has"
+                for joint, way in zip(robot.description.movable_joints, ways, strict=True)
+            ]
+        angle = _least_turn(boundary.goal_rotation, axes)
+        turns = f"the base turns by {angle:.4g} rad"
+        if angle > 0:
+            momentum = float(np.linalg.norm(boundary.angular_momentum))
+            weights.append(connection.turn)
+            amounts.append(angle)
+            drifts.append(momentum / connection.inertia if momentum > 0 else 0.0)
+            reasons.append(f"{turns} {within} of the joints")
+        if boundary.center is not None:
+            center = robot.center_of_mass(boundary.start)
+            moved = float(np.linalg.norm(boundary.center - center))
+            weights.append(connection.center)
+            amounts.append(moved)
+            drifts.append(0.0)
+            reasons.append(
+                f"the centre of mass moves by {moved:.4g} m in the base {within} of the joints"
+            )
+        seconds = np.zeros(0)
+        if weights:
+            ends = np.maximum(np.abs(boundary.velocity), np.abs(boundary.final_velocity))
+            wanted = np.array(amounts) * (1 - _BOUND_ROUNDING)
+            # As many held velocities make no more way than a motion of one period more.
+            seconds = _shortest_times(np.array(weights), wanted, np.array(drifts), limits, ends)
+            seconds = seconds - period
+        if base_rate_limit > 0 and angle > 0:
+            reasons.append(f"{turns} at optimal.max_base_rate at most")
+            seconds = np.append(seconds, angle * (1 - _BOUND_ROUNDING) / base_rate_limit)
+        if not seconds.max(initial=0.0) > 0:
+            return cls(0.0, "")
+        most = int(np.argmax(seconds))
+        return cls(math.ceil(seconds[most] / period - _BOUND_ROUNDING) * period, reasons[most])
+
+    def __str__(self) -> str:
+        return f"no manoeuvre to this goal takes less than {self.seconds:.6g} s, as {self.reason}"
+
+
+def _least_turn(rotation: Array, axes: Array) -> float:
+    """Return the least angle, rad, by which a base turns to ``rotation`` (4,) along ``axes``."""
+    if not len(axes):
+        return 0.0
+    along = float(axes[0] @ rotation[:3]) if len(axes) == 1 else np.linalg.norm(rotation[:3])
+    return abs(math.remainder(2 * math.atan2(along, rotation[3]), 2 * math.pi))
+
+
+def _shortest_times(
+    weights: Array, amounts: Array, drifts: Array, limits: MotionLimits, ends: Array
+) -> Array:
+    """Return the times (K,), s, before which no motion of the joints reaches the amounts (K,).
+
+    In a time ``T`` that is ``weights`` (K, n) times the ways of the joints, plus ``drifts`` (K,)
+    times ``T``. Joints are no faster at both ends than ``ends`` (n,).
+    """
+    ends = np.minimum(np.broadcast_to(ends, limits.velocity.shape), limits.velocity)
+
+    def reached(T: Array) -> Array:
+        T = T[:, np.newaxis]
+        ramp = np.minimum(T / 2, (limits.velocity - ends) / limits.acceleration)
+        ways = ends * T + limits.acceleration * ramp * (T - ramp)
+        with np.errstate(invalid="ignore"):
+            parts = np.where(weights > 0, weights * ways, 0.0)
+        return np.asarray(parts.sum(axis=1) + drifts * T[:, 0])
+
+    lower, upper = np.zeros(len(amounts)), np.full(len(amounts), 1e-3)
+    for _ in range(_BISECTIONS):
+        upper = np.where(reached(upper) < amounts, 2 * upper, upper)
+    for _ in range(_BISECTIONS):
+        middle = (lower + upper) / 2
+        short = reached(middle) < amounts
+        lower, upper = np.where(short, middle, lower), np.where(short, upper, middle)
+    return lower

@@ -1,0 +1,410 @@
+"""Bounds that are proved before a search, against random motions, plans, and numbers by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from planning.test_optimal import ARM_START, QUICK
+from planning.test_reach import some_shape, urdf_of
+from scipy.spatial.transform import Rotation
+from support.oracles.pinocchio_oracle import PinocchioOracle
+
+from spacerobot_ros.benchmarks.measurements import CASES, requests
+from spacerobot_ros.errors import NotFoundError, PlanningError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.planning import plan
+from spacerobot_ros.planning.core.controllability import shape_box
+from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
+from spacerobot_ros.planning.methods.optimal.method import OptimalGait
+from spacerobot_ros.planning.methods.optimal.motion_bounds import ConnectionBounds, DurationBound
+from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
+    MotionLimits,
+    OptimalOptions,
+)
+from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
+from spacerobot_ros.resources import robot_file
+
+Array = npt.NDArray[np.float64]
+
+PERIOD = 0.1
+WHOLE = np.eye(3)
+FEW_AND_MANY = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 20))]
+LINK = (
+    '<link name="{0}"><inertial><origin xyz="{1}"/><mass value="{2}"/>'
+    '<inertia ixx="{3}" iyy="{3}" izz="{3}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+
+
+def of_two(kind: str, origin: str, axis: str, com: str = "0 0 0") -> SpaceRobot:
+    """Return a base of 6 kg and 3 kg m^2 that carries 2 kg of 0.5 kg m^2 by one joint."""
+    joint = (
+        f'<joint name="one" type="{kind}"><parent link="base"/><child link="arm"/>'
+        f'<origin xyz="{origin}"/><axis xyz="{axis}"/>'
+        '<limit lower="-0.5" upper="1.5" velocity="1" effort="1"/></joint>'
+    )
+    links = LINK.format("base", "0 0 0", 6, 3), LINK.format("arm", com, 2, 0.5)
+    return SpaceRobot.from_urdf(f'<robot name="two">{links[0]}{links[1]}{joint}</robot>')
+
+
+def bound_of(robot: SpaceRobot, boundary: BoundaryConditions, **limits: Any) -> DurationBound:
+    """Return the bound of a robot with limits (n,), for any attitude or that about its axis."""
+    axes = limits.pop("axes", None)
+    axes = BaseRotations.of(robot).axes if axes is None else axes
+    given = {"final_is_given": boundary.final is not None, **limits.pop("more", {})}
+    within = MotionLimits(robot.lower, robot.upper, **limits)
+    connection = ConnectionBounds.of(robot, axes)
+    return DurationBound.of(robot, boundary, within, PERIOD, axes, connection, **given)
+
+
+# -- motion of the base by each joint ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", FEW_AND_MANY)
+@pytest.mark.parametrize("kind", ["tree", "chain", "planar", "sliders"])
+def test_no_joint_moves_the_base_beyond_its_bound(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    urdf = urdf_of(kind, rng)
+    robot = SpaceRobot.from_urdf(urdf)
+    oracle = PinocchioOracle(urdf, robot.joint_names)
+    axes = BaseRotations.of(robot).axes
+    bounds = ConnectionBounds.of(robot, axes)
+    step = 1e-5
+    for _ in range(8):
+        q = some_shape(robot, rng)
+        turns = np.linalg.norm(oracle.connection(q)[3:], axis=0)
+        assert np.all(turns <= bounds.turn * (1 + 1e-9) + 1e-12)
+        for joint, most in enumerate(bounds.center):
+            either = [oracle.center_of_mass(q + x * step * np.eye(robot.n)[joint]) for x in (-1, 1)]
+            assert np.linalg.norm(either[1] - either[0]) / (2 * step) <= most * (1 + 1e-6) + 1e-9
+
+
+@pytest.mark.parametrize("name", ["planar_chain", "three_joint_arm"])
+def test_the_bounds_are_no_empty_claims(name: str) -> None:
+    robot = SpaceRobot.from_file(robot_file(name))
+    bounds = ConnectionBounds.of(robot, BaseRotations.of(robot).axes)
+    rng = np.random.default_rng(1)
+    shapes = [some_shape(robot, rng) for _ in range(60)]
+    turns = np.max([np.linalg.norm(robot.connection(q)[3:], axis=0) for q in shapes], axis=0)
+    assert turns[0] > 0.4 * bounds.turn[0]
+
+
+def test_a_wheel_in_the_middle_turns_the_base_by_its_share_of_the_inertia() -> None:
+    robot = of_two("revolute", "0 0 0", "0 0 1")
+    bounds = ConnectionBounds.of(robot, WHOLE)
+    assert bounds.inertia == pytest.approx(3.5)
+    np.testing.assert_allclose(bounds.turn, [0.5 / 3.5])
+    np.testing.assert_allclose(bounds.center, [0.0])
+
+
+def test_a_slider_turns_the_base_by_its_lever() -> None:
+    # The reduced mass is 1.5 kg, the lever 0.4 m; the way along the slot is no lever.
+    bounds = ConnectionBounds.of(of_two("prismatic", "0.3 0.4 0", "1 0 0"), WHOLE)
+    np.testing.assert_allclose(bounds.turn, [1.5 * 0.4 / 3.5])
+    np.testing.assert_allclose(bounds.center, [0.25])
+    # The energy of the slider, 1.5 kg, is the smaller bound of a long lever.
+    bounds = ConnectionBounds.of(of_two("prismatic", "0 40 0", "1 0 0"), WHOLE)
+    np.testing.assert_allclose(bounds.turn, [np.sqrt(1.5 / (3.5 + 3.0))])
+
+
+def test_a_link_beside_its_axis_has_the_lever_of_both_masses() -> None:
+    # h = 0.5 + 1.5 * 0.2^2 of the link itself, and 1.5 * 0.2 * 0.3 of the base's lever.
+    bounds = ConnectionBounds.of(of_two("revolute", "0.3 0 0", "0 0 1", com="0.2 0 0"), WHOLE)
+    np.testing.assert_allclose(bounds.turn, [(0.5 + 1.5 * 0.04 + 1.5 * 0.06) / 3.5])
+    np.testing.assert_allclose(bounds.center, [0.25 * 0.2])
+
+
+def test_a_joint_moves_all_that_follow_it() -> None:
+    urdf = (
+        '<robot name="three">'
+        + "".join(LINK.format(name, "0.1 0 0", 2, 0.5) for name in ("base", "one", "two"))
+        + '<joint name="first" type="revolute"><parent link="base"/><child link="one"/>'
+        '<origin xyz="0.4 0 0"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
+        '<joint name="second" type="revolute"><parent link="one"/><child link="two"/>'
+        '<origin xyz="0.5 0 0"/><axis xyz="0 0 1"/>{}'
+        '<limit lower="-3" upper="3" velocity="2" effort="1"/></joint></robot>'
+    )
+    axis = np.array([[0.0, 0.0, 1.0]])
+    free = ConnectionBounds.of(SpaceRobot.from_urdf(urdf.format("")), axis)
+    robot = SpaceRobot.from_urdf(urdf.format('<mimic joint="first" multiplier="-2"/>'))
+    bounds = ConnectionBounds.of(robot, axis)
+    np.testing.assert_allclose(bounds.turn, [free.turn[0] + 2 * free.turn[1]])
+    turns = [abs(robot.connection(np.array([q]))[5, 0]) for q in np.linspace(-1, 1, 9)]
+    assert max(turns) <= bounds.turn[0]
+
+
+def test_the_way_of_a_slider_without_limits_is_not_known() -> None:
+    urdf = (
+        '<robot name="free">'
+        + "".join(LINK.format(name, "0.1 0 0", 2, 0.5) for name in ("base", "one", "two"))
+        + '<joint name="turn" type="continuous"><parent link="base"/><child link="one"/>'
+        '<axis xyz="0 0 1"/></joint>'
+        '<joint name="slide" type="prismatic"><parent link="one"/><child link="two"/>'
+        '<axis xyz="1 0 0"/><limit lower="-1e400" upper="1e400" velocity="2" effort="1"/></joint>'
+        "</robot>"
+    )
+    bounds = ConnectionBounds.of(SpaceRobot.from_urdf(urdf), WHOLE)
+    assert bounds.turn[0] == np.inf
+    assert np.isfinite(bounds.turn[1])
+    goal = Rotation.from_rotvec([0, 0, 1.0]).as_quat()
+    boundary = BoundaryConditions(np.zeros(2), goal, np.zeros(2))
+    found = bound_of(
+        SpaceRobot.from_urdf(urdf), boundary, velocity=np.ones(2), acceleration=np.ones(2)
+    )
+    assert found.seconds == 0.0
+
+
+# -- durations --------------------------------------------------------------------------------
+
+
+def held_rates(ticks: int, velocity: Array, acceleration: Array) -> Array:
+    """Return the fastest rates (ticks, n) that are held from rest to rest."""
+    k = np.arange(1, ticks + 1)[:, np.newaxis]
+    ramps = np.minimum(k, ticks + 1 - k) * PERIOD * acceleration
+    return np.minimum(velocity, ramps)
+
+
+@pytest.mark.parametrize("way", [1e-4, 0.03, 0.4, 1.9])
+@pytest.mark.parametrize("acceleration", [0.7, 40.0])
+def test_a_joint_takes_the_time_of_its_fastest_motion(way: float, acceleration: float) -> None:
+    robot = of_two("revolute", "0 0 0", "0 0 1")
+    limits = {"velocity": np.array([0.9]), "acceleration": np.array([acceleration])}
+    start, final = np.array([-0.4]), np.array([-0.4 + way])
+    boundary = BoundaryConditions(start, np.array([0, 0, 0, 1.0]), final, final)
+    found = bound_of(robot, boundary, **limits)
+    fewest = next(
+        ticks
+        for ticks in range(1, 1000)
+        if held_rates(ticks, **limits).sum() * PERIOD >= way * (1 - 1e-9)
+    )
+    # The bound is that of a continuous motion of one period more.
+    assert (fewest - 1) * PERIOD - 1e-9 <= found.seconds <= fewest * PERIOD + 1e-9
+    assert found.seconds == 0 or found.reason == (
+        f"joint 'one' moves by {way:.4g} rad within the velocity and acceleration limits that it "
+        "has"
+    )
+
+
+@pytest.mark.parametrize("seed", FEW_AND_MANY)
+@pytest.mark.parametrize("kind", ["tree", "chain", "planar", "sliders"])
+def test_no_motion_is_faster_than_the_bound(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    urdf = urdf_of(kind, rng)
+    robot = SpaceRobot.from_urdf(urdf)
+    oracle = PinocchioOracle(urdf, robot.joint_names)
+    velocity, acceleration = rng.uniform(0.1, 0.6, robot.n), rng.uniform(0.2, 2.0, robot.n)
+    ticks = int(rng.integers(2, 30))
+    rates = held_rates(ticks, velocity, acceleration) * rng.choice([-1, 1], robot.n)
+    lower, upper = shape_box(robot)
+    way = rates.sum(axis=0) * PERIOD
+    share = np.minimum(1.0, (upper - lower) / np.abs(way))
+    rates, way = rates * share, way * share
+    start = (lower + upper - way) / 2
+    q, attitude = start, Rotation.identity()
+    for rate in rates:
+        step, side = rate * PERIOD, np.sqrt(3) / 6
+        one, two = (oracle.base_twist(q + (0.5 + s) * step, step)[3:] for s in (-side, side))
+        for first, second in ((0.25 + side, 0.25 - side), (0.25 - side, 0.25 + side)):
+            attitude = attitude * Rotation.from_rotvec(first * one + second * two)
+        q = q + step
+    turn = attitude.as_quat()
+    limits = {"velocity": velocity, "acceleration": acceleration}
+    free = BoundaryConditions(start, turn, q)
+    center = replace(free, center=oracle.center_of_mass(q))
+    given = replace(free, final=q)
+    for boundary in (free, center, given):
+        assert bound_of(robot, boundary, **limits).seconds <= (ticks + 1e-6) * PERIOD
+    if share.max() == 1.0:
+        # A joint is as fast as it can be.
+        assert bound_of(robot, given, **limits).seconds >= (ticks - 1 - 1e-6) * PERIOD
+
+
+def test_ends_in_motion_and_a_drift_shorten_the_bound() -> None:
+    robot = of_two("revolute", "0 0 0", "0 0 1")
+    limits = {"velocity": np.ones(1), "acceleration": np.full(1, 0.1)}
+    goal = Rotation.from_rotvec([0.0, 0.0, 0.2]).as_quat()
+    rest = BoundaryConditions(np.zeros(1), goal, np.zeros(1))
+    # The base turns by a seventh of the joint: 1.4 rad.
+    ways = {0.0: 2 * np.sqrt(1.4 / 0.1), 1.0: 1.4}
+    for speed, time in ways.items():
+        found = bound_of(robot, replace(rest, velocity=speed), **limits, axes=WHOLE)
+        assert time - 2 * PERIOD < found.seconds <= time
+    drifting = replace(rest, angular_momentum=np.array([0.35, 0.0, 0.0]))
+    assert bound_of(robot, drifting, **limits, axes=WHOLE).seconds <= 0.2 / 0.1
+    slow = bound_of(robot, rest, **limits, axes=WHOLE, more={"base_rate_limit": 0.01})
+    assert slow.seconds == pytest.approx(20.0)
+    assert slow.reason == "the base turns by 0.2 rad at optimal.max_base_rate at most"
+    # A turn about another axis than the only one is no part of the goal.
+    along = bound_of(robot, rest, **limits, axes=np.array([[1.0, 0.0, 0.0]]))
+    assert along == DurationBound(0.0, "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("name", list(CASES))
+def test_no_plan_is_faster_than_the_bound(name: str, seed: int) -> None:
+    case, robot = CASES[name], SpaceRobot.from_file(robot_file(name))
+    options = OptimalOptions(**case.options, cache=0, starts=6, answers=1, intervals=30)
+    method = OptimalGait(robot, PERIOD, options=options)
+    (request,) = requests(robot, case, 1, seed)
+    schedule = method.plan(request)
+    # Within a time that is a little shorter than the bound, the goal is refused with that bound.
+    bound = bound_by_refusal(method, request)
+    assert 0 < bound <= schedule.duration + 1e-9
+
+
+def bound_by_refusal(method: OptimalGait, request: Any) -> float:
+    """Return the bound with which a goal is refused that is asked for in one tick, s."""
+    asked = replace(method.options, duration=1e-9)
+    gait = OptimalGait(method.robot, PERIOD, options=asked)
+    with pytest.raises(PlanningError, match=r"takes less than") as refusal:
+        gait.plan(request)
+    return float(str(refusal.value).split("takes less than ")[1].split(" s,")[0])
+
+
+# -- refusals ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        pytest.fail("A search was begun.")
+
+    monkeypatch.setattr(ManoeuvreSearch, "search", fail)
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        (
+            {"robot": "planar_chain", "rotvec": (0, 0, 2.6), "longest": 1.0},
+            r"within optimal\.longest = 1 s: no manoeuvre to this goal takes less than 1\.\d+ s, "
+            r"as the base turns by 2\.6 rad within the velocity and acceleration limits of the "
+            r"joints\. Allow more time\.",
+        ),
+        (
+            {
+                "robot": "three_joint_arm",
+                "rotvec": (0, 0, 0.1),
+                "start": ARM_START,
+                "joint_positions": (1.0, -0.7, 1.5),
+                "duration": 2.0,
+            },
+            # 1 rad at 0.5 rad/s, with ramps of 0.5 s: 2.5 s, less a period.
+            r"within optimal\.duration = 2 s: no manoeuvre to this goal takes less than 2\.4 s, as "
+            r"joint 'shoulder_yaw' moves by 1 rad",
+        ),
+        (
+            {
+                "robot": "three_joint_arm",
+                "rotvec": (0, 0, 0.5),
+                "start": ARM_START,
+                "max_base_rate": 0.05,
+                "longest": 9.0,
+            },
+            r"no manoeuvre to this goal takes less than 10 s, as the base turns by 0\.5 rad at "
+            r"optimal\.max_base_rate at most\. Allow more time\.",
+        ),
+    ],
+)
+@pytest.mark.usefixtures("no_search")
+def test_a_time_that_is_too_short_is_refused_before_a_search(
+    asked: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(PlanningError, match=sentence):
+        plan(**asked, **{**QUICK, "control_period": PERIOD})
+
+
+def searches(
+    monkeypatch: pytest.MonkeyPatch, answer: Callable[[OptimalOptions, bool], float | None]
+) -> list[tuple[float, float, bool]]:
+    """Have searches find manoeuvres of durations; return duration and longest of each, and whether
+    it ends after few starts.
+    """
+    asked: list[tuple[float, float, bool]] = []
+
+    def begin(self: Any, request: Any, boundary: Any, limits: Any, *chosen: Any) -> Any:
+        options, brief = chosen[0], len(chosen) > 2
+        asked.append((options.duration, options.longest, brief))
+        duration = answer(options, brief)
+        if duration is None:
+            raise NotFoundError("Nothing was found.")
+        return SimpleNamespace(manoeuvre=SimpleNamespace(duration=duration))
+
+    monkeypatch.setattr(OptimalGait, "_begin_now", begin)
+    return asked
+
+
+def begin_in_asked_time(**options: Any) -> Any:
+    robot = SpaceRobot.from_file(robot_file("planar_chain"))
+    method: Any = OptimalGait(robot, PERIOD, options=OptimalOptions(**options, cache=0))
+    return method._begin_in_asked_time(None, None, None, method.options, None)
+
+
+LONG = OptimalOptions().longest
+
+
+def test_a_manoeuvre_in_the_asked_time_needs_no_other_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = searches(monkeypatch, lambda *_: 3.0)
+    assert begin_in_asked_time().manoeuvre.duration == 3.0
+    assert begin_in_asked_time(longest=4.0).manoeuvre.duration == 3.0
+    assert asked == [(0.0, LONG, False), (0.0, 4.0, True)]
+
+
+@pytest.mark.parametrize("option", ["longest", "duration"])
+def test_a_much_longer_manoeuvre_is_named_and_ends_the_search(
+    monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    asked = searches(monkeypatch, lambda options, _: None if 2.0 in vars(options).values() else 2.6)
+    with pytest.raises(NotFoundError) as refusal:
+        begin_in_asked_time(**{option: 2.0})
+    assert str(refusal.value) == (
+        f"No manoeuvre to the goal was found within optimal.{option} = 2 s: the fastest that was "
+        "found takes 2.6 s. Allow more time."
+    )
+    assert [each[2] for each in asked] == [True, False]
+    assert asked[1][:2] == (0.0, LONG)
+
+
+def test_a_little_longer_manoeuvre_does_not_end_the_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = searches(monkeypatch, lambda options, _: None if options.longest == 2.0 else 2.4)
+    with pytest.raises(NotFoundError, match=r"takes 2\.4 s\. Allow more time\. Nothing was found"):
+        begin_in_asked_time(longest=2.0)
+    assert asked == [(0.0, 2.0, True), (0.0, LONG, False), (0.0, 2.0, False)]
+
+
+def test_where_nothing_is_found_at_all_the_search_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = searches(monkeypatch, lambda *_: None)
+    with pytest.raises(NotFoundError) as refusal:
+        begin_in_asked_time(duration=2.0)
+    assert str(refusal.value) == "Nothing was found."
+    assert len(asked) == 3
+
+
+def test_the_fastest_manoeuvre_may_be_fast_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = searches(monkeypatch, lambda options, brief: None if brief else 1.9)
+    assert begin_in_asked_time(longest=2.0).manoeuvre.duration == 1.9
+    assert asked == [(0.0, 2.0, True), (0.0, LONG, False)]
+    # One of a given duration is another.
+    assert begin_in_asked_time(duration=2.0).manoeuvre.duration == 1.9
+    assert asked[-1] == (2.0, LONG, False)
+
+
+def test_a_search_in_vain_says_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    searches(monkeypatch, lambda *_: None)
+    with pytest.raises(NotFoundError) as refusal:
+        plan("planar_chain", rotvec=(0, 0, 2.6), **QUICK)
+    assert str(refusal.value).startswith(
+        "Nothing was found. It is proved that no manoeuvre to this goal takes less than 1."
+    )
