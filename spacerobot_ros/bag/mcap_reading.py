@@ -322,6 +322,18 @@ _DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 """Head of a message record: opcode, length, channel, sequence, log time, publish time."""
 
+MESSAGE_HEADERS = np.dtype(
+    [
+        ("opcode", "<u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+"""The same head in arrays."""
+
 _MESSAGE_BODY = struct.Struct("<HIQQ")
 _MESSAGE_INDEX_HEAD = struct.Struct("<HI")
 _FOOTER_SIZE = RECORD_HEADER.size + struct.calcsize("<QQI")
@@ -339,6 +351,9 @@ _SUMMARY_PARSERS: dict[int, Callable[[ReadDataStream], Any]] = {
 
 RawMessage = tuple[int, int, int, bytes]
 """A recorded message: channel, log time and publish time in ns, serialised bytes."""
+
+MessageBlock = tuple[NDArray[np.uint64], NDArray[np.uint64], NDArray[np.uint64], list[bytes]]
+"""N recorded messages: their channels (N,), log times (N,), publish times (N,) and bytes."""
 
 
 # -- summary ----------------------------------------------------------------------------------
@@ -437,7 +452,22 @@ def messages_in_time_order(
     end_ns: int = _LATEST_TIME_NS,
     summary: Summary | None = None,
 ) -> Iterator[RawMessage]:
+    """Iterate over the messages of :func:`blocks_in_time_order`, one by one."""
+    for block in blocks_in_time_order(path, channel_ids, start_ns, end_ns, summary):
+        *numbers, messages = block
+        yield from zip(*(each.tolist() for each in numbers), messages, strict=True)
+
+
+def blocks_in_time_order(
+    path: str | os.PathLike[str],
+    channel_ids: set[int],
+    start_ns: int = 0,
+    end_ns: int = _LATEST_TIME_NS,
+    summary: Summary | None = None,
+) -> Iterator[MessageBlock]:
     """Iterate over messages of a bag by log time, those of one time in the order they were written.
+
+    Each block has the messages of chunks that overlap in time.
 
     Only chunks whose times overlap are in memory together.
 
@@ -464,10 +494,13 @@ def messages_in_time_order(
                 for message in messages_in_file_order(file)
                 if message[0] in channel_ids and start_ns <= message[1] <= end_ns
             ]
-            yield from sorted(wanted, key=lambda message: message[1])
+            if wanted:
+                *numbers, data = zip(*sorted(wanted, key=lambda message: message[1]), strict=True)
+                channels, logged, published = np.array(numbers, np.uint64)
+                yield channels, logged, published, list(data)
             return
         for cluster in _overlapping_chunks(summary, channel_ids, start_ns, end_ns):
-            yield from _messages_in_chunks(file, cluster, channel_ids, start_ns, end_ns)
+            yield _messages_in_chunks(file, cluster, channel_ids, start_ns, end_ns)
 
 
 def _overlapping_chunks(
@@ -502,21 +535,27 @@ def _messages_in_chunks(
     channel_ids: set[int],
     start_ns: int,
     end_ns: int,
-) -> Iterator[RawMessage]:
-    chunks, entries = [], []
-    for number, index in enumerate(sorted(cluster, key=lambda i: i.chunk_start_offset)):
+) -> MessageBlock:
+    chunks, entries, size = [], [], 0
+    for index in sorted(cluster, key=lambda i: i.chunk_start_offset):
         chunk, pairs = _chunk_and_entries(file, index, channel_ids)
         chunks.append(chunk)
-        entries.append(np.column_stack([pairs, np.full(len(pairs), number, np.uint64)]))
+        entries.append(pairs + np.array([0, size], np.uint64))
+        size += len(chunk)
     table = np.concatenate(entries)
     table = table[(table[:, 0] >= start_ns) & (table[:, 0] <= end_ns)]
-    order = np.lexsort((table[:, 1], table[:, 2], table[:, 0]))
-    for _, position, number in table[order].tolist():
-        chunk = chunks[number]
-        _, length, channel, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(chunk, position)
-        end = position + RECORD_HEADER.size + length
-        data = chunk[position + _MESSAGE_HEAD.size : end]
-        yield channel, log_ns, publish_ns, data
+    order = np.lexsort((table[:, 1], table[:, 0]))
+    places = table[order, 1].astype(np.int64)
+    data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
+    content = np.frombuffer(data, np.uint8)
+    within = np.arange(MESSAGE_HEADERS.itemsize)
+    heads = content[places[:, np.newaxis] + within].view(MESSAGE_HEADERS)[:, 0]
+    if not set(np.unique(heads["channel"]).tolist()) <= channel_ids:
+        raise ValueError("a message index names messages of other channels")
+    begins = places + _MESSAGE_HEAD.size
+    ends = places + RECORD_HEADER.size + heads["length"].astype(np.int64)
+    messages = [data[a:b] for a, b in zip(begins.tolist(), ends.tolist(), strict=True)]
+    return heads["channel"], heads["log_time"], heads["publish_time"], messages
 
 
 def _chunk_and_entries(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
 from html import escape
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.mcap_reading import (
     RawMessage,
+    blocks_in_time_order,
     file_size,
     indexed_records,
     messages_in_file_order,
@@ -356,19 +357,21 @@ class Bag:
     def __getitem__(self, topic: str) -> TopicSeries:
         topic = self._recorded_name(topic)
         if topic not in self._series_by_topic:
-            channels = self._channels(topic)
-            decode = self._decoder(channels[0])
-            times, data = self._read_channels({channel.id for channel in channels})
-            self._series_by_topic[topic] = TopicSeries(
-                topic,
-                self.topics[topic],
-                times,
-                data,
-                self._message_types.fields,
-                decode,
-                self._max_decoded_bytes,
-            )
+            self._read_together({topic: self._decoder(self._channels(topic)[0])})
         return self._series_by_topic[topic]
+
+    def load(self, topics: Iterable[str]) -> None:
+        """Read topics together, in one pass over the file; those that cannot be read are left out.
+
+        Each is in memory from then on.
+        """
+        decoders = {}
+        wanted = {self._recorded_name(topic) for topic in topics}
+        for topic in wanted - self._series_by_topic.keys():
+            with suppress(RecordingError):
+                decoders[topic] = self._decoder(self._channels(topic)[0])
+        if decoders:
+            self._read_together(decoders)
 
     @property
     def _statistics(self) -> Any:
@@ -401,14 +404,28 @@ class Bag:
                 f"The definition of {type_name} in the bag {self.path} cannot be read: {error}."
             ) from error
 
-    def _read_channels(self, channel_ids: set[int]) -> tuple[NDArray[np.int64], list[bytes]]:
-        """Read some channels: log times in nanoseconds in order, serialised messages."""
-        times: list[int] = []
-        data: list[bytes] = []
-        for _, log_time_ns, _, message in self.raw_messages(channel_ids):
-            times.append(log_time_ns)
-            data.append(message)
-        return np.array(times, np.int64), data
+    def _read_together(self, decoders: Mapping[str, Callable[[bytes], Any]]) -> None:
+        """Read the messages of topics, each with the function that decodes a message."""
+        ids = {topic: [each.id for each in self._channels(topic)] for topic in decoders}
+        times: dict[str, list[NDArray[np.uint64]]] = {topic: [] for topic in decoders}
+        data: dict[str, list[bytes]] = {topic: [] for topic in decoders}
+        wanted = {channel for channels in ids.values() for channel in channels}
+        blocks = blocks_in_time_order(self.path, wanted, summary=self._summary)
+        for channels, log_times, _, messages in blocks:
+            for topic in decoders:
+                rows = np.flatnonzero(np.isin(channels, ids[topic]))
+                times[topic].append(log_times[rows])
+                data[topic] += [messages[row] for row in rows.tolist()]
+        for topic, decode in decoders.items():
+            self._series_by_topic[topic] = TopicSeries(
+                topic,
+                self.topics[topic],
+                np.concatenate([np.zeros(0, np.uint64), *times[topic]]).astype(np.int64),
+                data[topic],
+                self._message_types.fields,
+                decode,
+                self._max_decoded_bytes,
+            )
 
 
 def _type_name(schemas: dict[int, Any], channel: Channel) -> str:
@@ -468,6 +485,11 @@ class RecordedRobot:
             return None
         # The summary of a damaged bag may count messages that are missing.
         return self.bag[topic] if len(self.bag[topic]) else None
+
+    def load(self, names: Iterable[str]) -> None:
+        """Read topics of the stack together, as far as the bag has them: see :meth:`Bag.load`."""
+        types = {f"{self.namespace}/{name}": topic_named(name).type for name in names}
+        self.bag.load(topic for topic, kind in types.items() if self.bag.topics.get(topic) == kind)
 
     def __getitem__(self, name: str) -> TopicSeries:
         """Return a topic of the stack.

@@ -25,23 +25,12 @@ from spacerobot_ros.bag.mcap_file import (
     encode,
     no_entries,
 )
+from spacerobot_ros.bag.mcap_reading import MESSAGE_HEADERS
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.messages.definitions import message_definition, type_hash
 
 _MESSAGE_HEADER = struct.Struct("<BQHIQQ")
 """Head of a message record: opcode, length, channel, sequence, log time, publish time."""
-
-_MESSAGE_HEADERS = np.dtype(
-    [
-        ("opcode", "<u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<u8"),
-        ("publish_time", "<u8"),
-    ]
-)
-"""The same head in arrays."""
 
 _pack_header = _MESSAGE_HEADER.pack
 _HEADER_LENGTH = _MESSAGE_HEADER.size - 9
@@ -271,12 +260,12 @@ class BagWriter:
             As by :meth:`write`; messages before the refused chunk are in the bag.
         """
         channels = np.array(channel_ids)
-        headers = np.zeros(len(messages), _MESSAGE_HEADERS)
+        headers = np.zeros(len(messages), MESSAGE_HEADERS)
         headers["opcode"], headers["channel"] = _MESSAGE, channels
         headers["log_time"], headers["publish_time"] = log_times_ns, publish_times_ns
         sizes = np.fromiter(map(len, messages), np.int64, len(messages))
         headers["length"] = sizes + _HEADER_LENGTH
-        heads, size = headers.tobytes(), _MESSAGE_HEADERS.itemsize
+        heads, size = headers.tobytes(), MESSAGE_HEADERS.itemsize
         pieces: list[bytes] = [b""] * (2 * len(messages))
         pieces[::2] = [heads[i : i + size] for i in range(0, len(heads), size)]
         pieces[1::2] = messages

@@ -47,6 +47,21 @@ _SAME_CLOCK_TOLERANCE = 1.0
 
 _COMMAND_TOPICS = ("joint_commands", "base_wrench", "joint_reference")
 
+_QUANTITY_TOPICS = (
+    *("momentum", "end_effector_pose", "momentum_expected"),
+    *("base_wrench_realised", "thrusters", "target/odom", "target/odom_true"),
+)
+"""Topics whose fields are quantities of a flight, beside those with a true and a measured one."""
+
+_FLIGHT_TOPICS = (
+    *("odom", "odom_true", "joint_states", "joint_states_true"),
+    *_QUANTITY_TOPICS,
+    *_COMMAND_TOPICS,
+    *(topic for topic, _ in STATUS_TOPICS.values()),
+    *("events", "clearance"),
+)
+"""Topics that every flight is read from, together: one pass over a bag unpacks it once."""
+
 _NO_GOAL = Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
 """Goal of the base where a bag has none, or leaves it free."""
 
@@ -95,6 +110,8 @@ class FlightBag:
         self.path = bags[0].path
         self.namespace = namespace
         self.parts = [RecordedRobot(bag, namespace) for bag in bags]
+        for part in self.parts:
+            part.load(_FLIGHT_TOPICS)
         states = [
             s for name in ("odom", "joint_states", "momentum") for s in self.series_of(name)[:1]
         ]
@@ -227,10 +244,7 @@ class FlightBag:
                     makers[quantity] = partial(self.true_signal, name, number)
                 if erring and quantity != "effort" and self.series_of(f"{name}_true"):
                     makers[f"measured_{quantity}"] = partial(self.measured_signal, name, number)
-        for name in (
-            *("momentum", "end_effector_pose", "momentum_expected"),
-            *("base_wrench_realised", "thrusters", "target/odom", "target/odom_true"),
-        ):
+        for name in _QUANTITY_TOPICS:
             for field in TOPICS[name].state if self.series_of(name) else ():
                 makers[field.quantity] = partial(self.quantity, name, field)
         for topic in self._poses_of_end_effectors():

@@ -21,7 +21,14 @@ from mcap.writer import CompressionType, Writer
 from std_msgs.msg import UInt8, UInt8MultiArray
 from support.made_bags import joint_states, made_bag
 
-from spacerobot_ros.bag import BagWriter, QosProfile, RecordingError, TopicSeries, read_bag
+from spacerobot_ros.bag import (
+    BagWriter,
+    QosProfile,
+    RecordingError,
+    TopicSeries,
+    mcap_reading,
+    read_bag,
+)
 from spacerobot_ros.bag.mcap_file import INFINITE_NS
 from spacerobot_ros.bag.mcap_reading import messages_in_time_order
 from spacerobot_ros.bag.playback import Playback
@@ -75,6 +82,53 @@ def test_messages_come_by_time_and_those_of_one_time_as_they_were_written(
         part = messages_in_time_order(path, {2}, start, end)
         wanted = [n for n in order if start <= times[n] <= end and n % 2]
         assert [data[8:-1] for *_, data in part] == [b"%03d" % n for n in wanted]
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+def test_topics_that_are_read_together_are_the_same_and_each_chunk_is_unpacked_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunked: bool
+) -> None:
+    times = [random.Random(1).randrange(30) for _ in range(60)]
+    path = written(tmp_path / "bag.mcap", times, chunked, 150)
+    unpacked: list[int] = []
+    unpack = mcap_reading.unpack_chunk
+
+    def counted(body: bytes, place: int) -> bytes:
+        unpacked.append(place)
+        return unpack(body, place)
+
+    monkeypatch.setattr(mcap_reading, "unpack_chunk", counted)
+    bag = read_bag(path)
+    # One that is not there is left out; leading slashes do not count.
+    bag.load(["a", "/b", "/c"])
+    once = len(unpacked)
+    assert len(set(unpacked)) == once
+    assert (once > 5) == chunked
+    for topic, first in (("/a", 0), ("/b", 1)):
+        order = sorted(range(first, 60, 2), key=times.__getitem__)
+        assert [message.data for _, message in bag[topic].messages()] == [f"{n:03d}" for n in order]
+        np.testing.assert_array_equal(bag[topic].time_ns, [times[n] for n in order])
+    bag.load(["/a", "/b"])
+    assert len(unpacked) == once
+    with pytest.raises(RecordingError, match="no topic /c"):
+        bag["/c"]
+
+
+def test_a_message_index_of_another_channel_is_damage(tmp_path: Path) -> None:
+    path = written(tmp_path / "bag.mcap", [1, 2, 3, 4], True, 10_000)
+    content, head = bytearray(path.read_bytes()), struct.Struct("<BQHIQQ")
+    text = string("001")
+    place = content.index(text) - head.size
+    opcode, length, channel, *rest = head.unpack_from(content, place)
+    assert (channel, length) == (2, head.size - 9 + len(text))
+    head.pack_into(content, place, opcode, length, 1, *rest)
+    # Without its checksum, the chunk is not found to be changed.
+    chunk = content.index(b"\x06", 8)
+    content[chunk + 9 + 24 : chunk + 9 + 28] = bytes(4)
+    path.write_bytes(content)
+    assert len(list(messages_in_time_order(path, {1, 2}))) == 4
+    with pytest.raises(RecordingError, match="names messages of other channels"):
+        read_bag(path)["/b"]
 
 
 def test_messages_in_order_are_read_chunk_by_chunk(tmp_path: Path) -> None:
