@@ -467,9 +467,7 @@ def blocks_in_time_order(
 ) -> Iterator[MessageBlock]:
     """Iterate over messages of a bag by log time, those of one time in the order they were written.
 
-    Each block has the messages of chunks that overlap in time.
-
-    Only chunks whose times overlap are in memory together.
+    Each block has the messages of chunks whose times overlap; only these are in memory together.
 
     Parameters
     ----------
