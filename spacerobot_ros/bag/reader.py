@@ -413,7 +413,8 @@ class Bag:
         blocks = blocks_in_time_order(self.path, wanted, summary=self._summary)
         for channels, log_times, _, messages in blocks:
             for topic in decoders:
-                rows = np.flatnonzero(np.isin(channels, ids[topic]))
+                of_topic = np.any([channels == each for each in ids[topic]], axis=0)
+                rows = np.flatnonzero(of_topic)
                 times[topic].append(log_times[rows])
                 data[topic] += [messages[row] for row in rows.tolist()]
         for topic, decode in decoders.items():

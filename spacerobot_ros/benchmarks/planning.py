@@ -21,8 +21,8 @@ _GOAL_SEED = 7
 _DURATION_RATIO_BOUNDS = (1.01, 1.02, 1.03)
 """Bounds of duration ratios; goals with ratios below each bound are counted."""
 
-_BOUND = re.compile(r"takes less than \S+ s|no nearer than \S+ m")
-"""The bound in a refusal: of the duration, or of the distance."""
+_BOUND = re.compile(r"takes less than \S+ s|no nearer than \S+ m|keeps it in \[[^]]*\]")
+"""The bound in a refusal: of the duration, of the distance, or of a joint."""
 
 _LARGE_ROBOTS = ("seven_joint_arm", "quadruped", "dual_arm")
 """Robots with 7, 12 and 14 joints in the benchmark of first plans."""
