@@ -18,11 +18,16 @@ from support.oracles.pinocchio_oracle import PinocchioOracle
 from spacerobot_ros.benchmarks.measurements import CASES, requests
 from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import plan
+from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core.controllability import shape_box
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.planning.methods.optimal.method import OptimalGait
-from spacerobot_ros.planning.methods.optimal.motion_bounds import ConnectionBounds, DurationBound
+from spacerobot_ros.planning.methods.optimal.motion_bounds import (
+    ConnectionBounds,
+    DurationBound,
+    link_demands,
+)
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -221,6 +226,21 @@ def test_no_motion_is_faster_than_the_bound(kind: str, seed: int) -> None:
     given = replace(free, final=q)
     for boundary in (free, center, given):
         assert bound_of(robot, boundary, **limits).seconds <= (ticks + 1e-6) * PERIOD
+    # Without thrust the centre of mass stays; the last link is at its goal then.
+    link = robot.link_names[-1]
+    position = oracle.center_of_mass(start) - attitude.apply(oracle.center_of_mass(q))
+    oracle.set_configuration(q, turn, position)
+    R, r = oracle.frame_W(link)
+    goal = Goal.checked(np.zeros(3), turn)
+    ends = (EndEffectorGoal(link, r, Rotation.from_matrix(R).as_quat()),)
+    goal = replace(goal, end_effectors=ends)
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), start)
+    request = PlanRequest(state, goal, Tolerance(0.0, 0.0))
+    axes = BaseRotations.of(robot).axes
+    demands = list(link_demands(robot, request, free, ConnectionBounds.of(robot, axes)))
+    found = bound_of(robot, free, **limits, axes=np.zeros((0, 3)), more={"demands": demands})
+    assert found.seconds <= (ticks + 1e-6) * PERIOD
+    assert found.seconds > 0 or ticks < 4 or max(each.amount for each in demands) < 1e-3
     if share.max() == 1.0:
         # A joint is as fast as it can be.
         assert bound_of(robot, given, **limits).seconds >= (ticks - 1 - 1e-6) * PERIOD
@@ -300,6 +320,17 @@ def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
             # 1 rad at 0.5 rad/s, with ramps of 0.5 s: 2.5 s, less a period.
             r"within optimal\.duration = 2 s: no manoeuvre to this goal takes less than 2\.4 s, as "
             r"joint 'shoulder_yaw' moves by 1 rad",
+        ),
+        (
+            {
+                "robot": "three_joint_arm",
+                "start": ARM_START,
+                "end_effector_position": (0.3, 0.9, 0.2),
+                "max_velocity": [0.05] * 3,
+                "longest": 3.0,
+            },
+            r"within optimal\.longest = 3 s: no manoeuvre to this goal takes less than \d\.\d s, "
+            r"as 'end_effector' moves by 1\.5\d+ m within the velocity and acceleration limits of",
         ),
         (
             {

@@ -63,7 +63,11 @@ from spacerobot_ros.planning.methods.optimal.initial_guesses import (
 )
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
-from spacerobot_ros.planning.methods.optimal.motion_bounds import ConnectionBounds, DurationBound
+from spacerobot_ros.planning.methods.optimal.motion_bounds import (
+    ConnectionBounds,
+    DurationBound,
+    link_demands,
+)
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -556,6 +560,7 @@ class OptimalGait(GaitMethod):
             self._connection_bounds,
             final_is_given=final_is_given or only_sliders,
             base_rate_limit=chosen.max_base_rate,
+            demands=link_demands(robot, request, boundary, self._connection_bounds),
         )
         name, given = _asked_time(chosen)
         if bound.seconds > given + self.control_period / 2:

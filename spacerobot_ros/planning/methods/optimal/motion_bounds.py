@@ -23,22 +23,25 @@ shape is sampled.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Body, JointKind
-from spacerobot_ros.planning.methods.optimal.problem import (
-    BoundaryConditions,
-    MotionLimits,
-)
+from spacerobot_ros.model.rotations import quaternion_inverse, quaternion_multiply
+from spacerobot_ros.planning.core.goal import end_effector_pose
+from spacerobot_ros.planning.core.method import PlanRequest
+from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
 
 _BOUND_ROUNDING = 1e-6
 """Relative rounding error of a bound: manoeuvres end beside their goals by less than that."""
 
-_BISECTIONS = 60
+_BISECTIONS, _LONGEST = 32, 1e10
+"""Halvings of an interval that holds a shortest time, and the longest time that is looked for, s."""
+
+_WITHIN = "within the velocity and acceleration limits"
 
 _PARALLEL = 1e-12
 """Sine of the angle between two directions below which they are the same."""
@@ -167,6 +170,11 @@ class ConnectionBounds:
     center: Array
     inertia: float
 
+    def drift(self, boundary: BoundaryConditions) -> float:
+        """Return the largest turn of the base with its joints at rest, rad/s."""
+        momentum = float(np.linalg.norm(boundary.angular_momentum))
+        return momentum / self.inertia if momentum > 0 else 0.0
+
     @classmethod
     def of(cls, robot: SpaceRobot, axes: Array) -> ConnectionBounds:
         """Return the bounds of a robot whose base turns about ``axes`` (m, 3), base components."""
@@ -181,13 +189,44 @@ class ConnectionBounds:
         with np.errstate(divide="ignore", invalid="ignore"):
             turn = np.fmin(momentum / least, np.sqrt(energy / (least + base)))
         turn = np.where(np.isnan(turn), np.inf, turn)
-        G = np.abs(robot.description.coupling[0])
-        with np.errstate(invalid="ignore"):
-            # A bound that is not known is no part of joints that do not move the body.
-            turn, center = (
-                np.where(G > 0, G * each[:, np.newaxis], 0.0).sum(axis=0) for each in (turn, center)
-            )
-        return cls(turn, center, least)
+        return cls(_coupled(robot, turn), _coupled(robot, center), least)
+
+    def of_link(self, robot: SpaceRobot, link: str) -> LinkBounds:
+        """Return the bounds of the motion of a link of the robot."""
+        tree, (body, pose) = _Tree.of(robot), robot.description.frames[link]
+        masses = [each.inertia.mass for each in tree.bodies]
+        apart = tree.distances(body, pose.r, -1, np.eye(3))
+        far = float(sum(masses[k] * distance for k, distance in apart) / sum(masses))
+        turning, levers = tree.chain(body, pose.r)
+        place = self.turn * far + self.center + _coupled(robot, levers)
+        return LinkBounds(self.turn + _coupled(robot, turning), place, far)
+
+
+@dataclass(frozen=True)
+class LinkBounds:
+    """Bounds of the motion of a link at zero momentum, for all shapes within the joint limits.
+
+    Attributes
+    ----------
+    turn
+        (n,) largest turn of the link with each joint, rad per rad or m.
+    place
+        (n,) largest displacement of its origin, m per rad or m.
+    distance
+        Largest distance of its origin from the centre of mass, m.
+    """
+
+    turn: Array
+    place: Array
+    distance: float
+
+
+def _coupled(robot: SpaceRobot, values: Array) -> Array:
+    """Return bounds (n,) by the joints of those by all moving joints (m,)."""
+    G = np.abs(robot.description.coupling[0])
+    with np.errstate(invalid="ignore"):
+        # A bound that is not known is no part of joints that do not move the body.
+        return np.asarray(np.where(G > 0, G * values[:, np.newaxis], 0.0).sum(axis=0))
 
 
 @dataclass(frozen=True)
@@ -235,20 +274,20 @@ class _Tree:
         assert body.joint is not None
         axis, parent, here = body.joint.axis, body.parent, np.zeros(3)
         across = np.eye(3) - np.outer(axis, axis)
-        levers = dict(self._distances(joint, here, parent, across))
+        levers = dict(self.distances(joint, here, parent, across))
         m = np.array([each.inertia.mass for each in self.bodies])
         total, behind = m.sum(), sum(m[k] for k in levers)
         first_moment = sum(m[k] * lever for k, lever in levers.items())
         if body.joint.kind is JointKind.PRISMATIC:
             axis = body.origin.R @ axis
             across = np.eye(3) - np.outer(axis, axis)
-            before = dict(self._distances(parent, self.hinges[joint], joint, across))
+            before = dict(self.distances(parent, self.hinges[joint], joint, across))
             other = sum(m[k] * lever for k, lever in before.items())
             share = behind / total
             momentum = (1 - share) * first_moment + share * other
             return momentum, behind * (1 - share), share
-        before = dict(self._distances(parent, self.hinges[joint], joint, np.eye(3)))
-        reach = dict(self._distances(joint, here, parent, np.eye(3)))
+        before = dict(self.distances(parent, self.hinges[joint], joint, np.eye(3)))
+        reach = dict(self.distances(joint, here, parent, np.eye(3)))
         energy = largest = 0.0
         for k, lever in levers.items():
             inertia = self.bodies[k].inertia.about_com
@@ -264,7 +303,23 @@ class _Tree:
         momentum += first_moment * sum(m[k] * far for k, far in before.items()) / total
         return momentum, energy, first_moment / total
 
-    def _distances(
+    def chain(self, body: int, point: Array) -> tuple[Array, Array]:
+        """Return how far each moving joint (m,) turns (rad/rad) and displaces (m/rad or m/m) a
+        ``point`` (3,) of a body at most while the base rests.
+        """
+        turning, levers = (np.zeros(len(self.bodies) - 1) for _ in range(2))
+        way = 0.0
+        while body > 0:
+            joint = self.bodies[body].joint
+            assert joint is not None
+            across, slides = np.cross(joint.axis, point), joint.kind is JointKind.PRISMATIC
+            turning[body - 1] = 0.0 if slides else 1.0
+            levers[body - 1] = 1.0 if slides else way + float(np.linalg.norm(across))
+            way += float(np.linalg.norm(point)) + self.travels[body]
+            point, body = self.hinges[body], self.bodies[body].parent
+        return turning, levers
+
+    def distances(
         self, at: int, point: Array, came_from: int, measured: Array
     ) -> Iterator[tuple[int, float]]:
         """Yield the largest distances, m, of centres of mass from a ``point`` (3,) of body ``at``,
@@ -287,12 +342,35 @@ class _Tree:
         for child, body in enumerate(self.bodies):
             if body.parent == at and child != came_from:
                 far = way(child, self.hinges[child] - point, body.origin.R)
-                for k, more in self._distances(child, start, at, whole):
+                for k, more in self.distances(child, start, at, whole):
                     yield k, far + more
         if at > 0 and parent != came_from:
             far = way(at, point, whole)
-            for k, more in self._distances(parent, self.hinges[at], at, whole):
+            for k, more in self.distances(parent, self.hinges[at], at, whole):
                 yield k, far + more
+
+
+@dataclass(frozen=True)
+class Demand:
+    """A motion that takes time: ``weights`` times the ways of the joints, plus ``drift`` times the
+    duration, are at least ``amount``.
+
+    Attributes
+    ----------
+    weights
+        (n,), rad or m per rad or m.
+    amount
+        rad or m.
+    reason
+        The motion, as a clause.
+    drift
+        rad/s or m/s.
+    """
+
+    weights: Array
+    amount: float
+    reason: str
+    drift: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -322,6 +400,7 @@ class DurationBound:
         *,
         final_is_given: bool,
         base_rate_limit: float = 0.0,
+        demands: Iterable[Demand] = (),
     ) -> DurationBound:
         """Return the bound for commands that are held for ``period`` s.
 
@@ -337,49 +416,37 @@ class DurationBound:
             Whether the last shape of the boundary conditions is the only one at the goal.
         base_rate_limit
             Fastest turn of the base, rad/s; 0: any.
+        demands
+            Further ones.
         """
-        within = "within the velocity and acceleration limits"
-        weights, amounts, drifts, reasons = [], [], [], []
-        if final_is_given and boundary.final is not None:
-            ways = np.nan_to_num(np.abs(boundary.final - boundary.start))
-            weights += list(np.eye(robot.n))
-            amounts += ways.tolist()
-            drifts += [0.0] * robot.n
-            reasons += [
-                f"joint '{joint.name}' moves by {way:.4g} {joint.unit} {within} that it has"
-                for joint, way in zip(robot.description.movable_joints, ways, strict=True)
-            ]
+        demands = list(demands)
         angle = _least_turn(boundary.goal_rotation, axes)
         turns = f"the base turns by {angle:.4g} rad"
         if angle > 0:
-            momentum = float(np.linalg.norm(boundary.angular_momentum))
-            weights.append(connection.turn)
-            amounts.append(angle)
-            drifts.append(momentum / connection.inertia if momentum > 0 else 0.0)
-            reasons.append(f"{turns} {within} of the joints")
+            reason = f"{turns} {_WITHIN} of the joints"
+            demands.append(Demand(connection.turn, angle, reason, connection.drift(boundary)))
+        if final_is_given and boundary.final is not None:
+            ways = np.nan_to_num(np.abs(boundary.final - boundary.start)).tolist()
+            for unit, joint, way in zip(
+                np.eye(robot.n), robot.description.movable_joints, ways, strict=True
+            ):
+                moves = f"joint '{joint.name}' moves by {way:.4g} {joint.unit}"
+                demands.append(Demand(unit, way, f"{moves} {_WITHIN} that it has"))
         if boundary.center is not None:
-            center = robot.center_of_mass(boundary.start)
-            moved = float(np.linalg.norm(boundary.center - center))
-            weights.append(connection.center)
-            amounts.append(moved)
-            drifts.append(0.0)
-            reasons.append(
-                f"the centre of mass moves by {moved:.4g} m in the base {within} of the joints"
-            )
-        seconds = np.zeros(0)
-        if weights:
-            ends = np.maximum(np.abs(boundary.velocity), np.abs(boundary.final_velocity))
-            wanted = np.array(amounts) * (1 - _BOUND_ROUNDING)
-            # As many held velocities make no more way than a motion of one period more.
-            seconds = _shortest_times(np.array(weights), wanted, np.array(drifts), limits, ends)
-            seconds = seconds - period
-        if base_rate_limit > 0 and angle > 0:
-            reasons.append(f"{turns} at optimal.max_base_rate at most")
-            seconds = np.append(seconds, angle * (1 - _BOUND_ROUNDING) / base_rate_limit)
-        if not seconds.max(initial=0.0) > 0:
+            way = float(np.linalg.norm(boundary.center - robot.center_of_mass(boundary.start)))
+            moves = f"the centre of mass moves by {way:.4g} m in the base"
+            demands.append(Demand(connection.center, way, f"{moves} {_WITHIN} of the joints"))
+        ends = np.maximum(np.abs(boundary.velocity), np.abs(boundary.final_velocity))
+        # As many held velocities make no more way than a motion of one period more.
+        times = _shortest_times(demands, limits, ends) - period
+        bounds = list(zip(times.tolist(), (each.reason for each in demands), strict=True))
+        if base_rate_limit > 0:
+            least = angle * (1 - _BOUND_ROUNDING) / base_rate_limit
+            bounds.append((least, f"{turns} at optimal.max_base_rate at most"))
+        seconds, reason = max(bounds, key=lambda each: each[0], default=(0.0, ""))
+        if not seconds > 0:
             return cls(0.0, "")
-        most = int(np.argmax(seconds))
-        return cls(math.ceil(seconds[most] / period - _BOUND_ROUNDING) * period, reasons[most])
+        return cls(math.ceil(seconds / period - _BOUND_ROUNDING) * period, reason)
 
     def __str__(self) -> str:
         return f"no manoeuvre to this goal takes less than {self.seconds:.6g} s, as {self.reason}"
@@ -393,14 +460,40 @@ def _least_turn(rotation: Array, axes: Array) -> float:
     return abs(math.remainder(2 * math.atan2(along, rotation[3]), 2 * math.pi))
 
 
-def _shortest_times(
-    weights: Array, amounts: Array, drifts: Array, limits: MotionLimits, ends: Array
-) -> Array:
-    """Return the times (K,), s, before which no motion of the joints reaches the amounts (K,).
+def link_demands(
+    robot: SpaceRobot,
+    request: PlanRequest,
+    boundary: BoundaryConditions,
+    connection: ConnectionBounds,
+) -> Iterator[Demand]:
+    """Yield the ways of the end-effectors to the goals of a request, less its tolerances."""
+    state, tolerance, drift = request.state, request.tolerance, connection.drift(boundary)
+    for goal in request.goal.end_effectors:
+        of_link = connection.of_link(robot, goal.link)
+        position, quaternion = end_effector_pose(
+            robot, goal.link, state.position, state.quaternion, state.q
+        )
+        way = float(np.linalg.norm(goal.position - position)) - tolerance.position
+        moves = f"'{goal.link}' moves by {way:.4g} m {_WITHIN} of the joints"
+        yield Demand(of_link.place, way, moves, drift * of_link.distance)
+        if goal.quaternion is None:
+            continue
+        turn = quaternion_multiply(quaternion_inverse(quaternion), goal.quaternion)
+        angle = _least_turn(turn, np.eye(3)) - tolerance.attitude
+        turns = f"'{goal.link}' turns by {angle:.4g} rad {_WITHIN} of the joints"
+        yield Demand(of_link.turn, angle, turns, drift)
 
-    In a time ``T`` that is ``weights`` (K, n) times the ways of the joints, plus ``drifts`` (K,)
-    times ``T``. Joints are no faster at both ends than ``ends`` (n,).
+
+def _shortest_times(demands: Sequence[Demand], limits: MotionLimits, ends: Array) -> Array:
+    """Return the times (K,), s, before which no motion of the joints meets each of K demands.
+
+    Joints are no faster at both ends than ``ends`` (n,).
     """
+    if not demands:
+        return np.zeros(0)
+    weights = np.array([each.weights for each in demands])
+    amounts = np.array([each.amount * (1 - _BOUND_ROUNDING) for each in demands])
+    drifts = np.array([each.drift for each in demands])
     ends = np.minimum(np.broadcast_to(ends, limits.velocity.shape), limits.velocity)
 
     def reached(T: Array) -> Array:
@@ -412,8 +505,8 @@ def _shortest_times(
         return np.asarray(parts.sum(axis=1) + drifts * T[:, 0])
 
     lower, upper = np.zeros(len(amounts)), np.full(len(amounts), 1e-3)
-    for _ in range(_BISECTIONS):
-        upper = np.where(reached(upper) < amounts, 2 * upper, upper)
+    while np.any(short := reached(upper) < amounts) and upper.max() < _LONGEST:
+        upper = np.where(short, 2 * upper, upper)
     for _ in range(_BISECTIONS):
         middle = (lower + upper) / 2
         short = reached(middle) < amounts
