@@ -39,7 +39,7 @@ _BOUND_ROUNDING = 1e-6
 """Relative rounding error of a bound: manoeuvres end beside their goals by less than that."""
 
 _BISECTIONS, _LONGEST = 32, 1e10
-"""Halvings of an interval that holds a shortest time, and the longest time that is looked for, s."""
+"""Halvings of the interval of a shortest time, and the longest time that is looked for, s."""
 
 _WITHIN = "within the velocity and acceleration limits"
 
