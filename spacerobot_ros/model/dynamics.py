@@ -310,7 +310,8 @@ def curvature(A: ca.SX, q: ca.SX) -> list[list[ca.SX]]:
     """
     F = -A
     n = q.shape[0]
-    dF = [ca.reshape(ca.jacobian(F[:, j], q), 6, n) for j in range(n)]
+    # All columns at once: their derivatives share most of their operations.
+    dF = [ca.reshape(each, 6, n) for each in ca.vertsplit(ca.jacobian(ca.vec(F), q), 6)]
     K = [[ca.SX(6, 1) for _ in range(n)] for _ in range(n)]
     for i in range(n):
         for j in range(i + 1, n):

@@ -18,11 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.model.compilation import (
-    cached_function,
     compilation_settings,
     compiled,
     dense_function,
-    source_hash,
 )
 from spacerobot_ros.model.composite_rigid_body import (
     composite_dynamics,
@@ -279,15 +277,13 @@ class ModelFunctions:
         return self._shape_function(f"jacobian_{index}", point_jacobian(self._kin, link))
 
     def _curvature(self) -> ca.Function:
-        def derived() -> ca.Function:
-            K = curvature(self._connection, self._kin.q)
-            # Columns run over i fastest: reshaped in Fortran order this is (6, i, j).
-            stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
-            return self._shape_function("curvature", stacked)
-
-        facts = f"{source_hash(curvature.__module__)} {self.equations_key}"
-        key = hashlib.sha256(facts.encode()).hexdigest()
-        return cached_function("curvature", key, derived)
+        K = curvature(self._connection, self._kin.q)
+        # Columns run over i fastest: reshaped in Fortran order this is (6, i, j).
+        stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
+        inputs = {"q": self._kin.q} | self._kin.mass_properties.inputs
+        # It has few common subexpressions, and looking for them takes several times as long.
+        names = [*inputs], ["result"]
+        return ca.Function("curvature", [*inputs.values()], [ca.densify(stacked)], *names)
 
     def _momentum(self) -> ca.Function:
         state = self._state_symbols("v_WB_B", quaternion=True)

@@ -177,6 +177,9 @@ class _MappedFunction(ca.Callback):
     def __init__(self, function: ca.Function, tape: _OperationList, run: Any, count: int) -> None:
         ca.Callback.__init__(self)
         self._function, self._tape, self._run, self._count = function, tape, run, count
+        steps, constants = tape.steps.ctypes.data, tape.constants.ctypes.data
+        self._operations = steps, len(tape.steps), constants, tape.memory_size
+        self._sizes = tape.argument_sizes.ctypes.data, tape.result_sizes.ctypes.data
         self.construct(f"{function.name()}_at_{count}", {})
 
     def get_n_in(self) -> int:
@@ -203,17 +206,14 @@ class _MappedFunction(ca.Callback):
         self, arguments: tuple[memoryview, ...], results: tuple[memoryview, ...]
     ) -> int:
         """Compute the results at all places."""
-        tape = self._tape
+        of_arguments, of_results = self._sizes
         return int(
             self._run(
-                tape.steps.ctypes.data,
-                len(tape.steps),
-                tape.constants.ctypes.data,
-                tape.memory_size,
+                *self._operations,
                 _pointers(arguments),
-                tape.argument_sizes.ctypes.data,
+                of_arguments,
                 _pointers(results),
-                tape.result_sizes.ctypes.data,
+                of_results,
                 self._count,
             )
         )

@@ -146,3 +146,13 @@ def test_a_solution_keeps_inequalities_of_shape_velocity_and_acceleration(arm: S
     kept = solved(arm, inequalities=(PathInequality(bound),))
     assert power(kept).max() <= 0.1 + 1e-5
     assert kept.duration > free.duration
+
+
+def test_derivatives_and_curvature_repeat_few_operations(arm: SpaceRobot) -> None:
+    """Repeated ones, which take long to find, are found where they are few."""
+    stages = Stages.of(arm, np.eye(3), False, PathConstraints.of(arm, OptimalOptions()))
+    curvature = arm.function("curvature", compile=False)
+    for function, share in ((stages.interval.hessian, 1.03), (curvature, 1.2)):
+        arguments = function.sx_in()
+        fewest = ca.Function("fewest", arguments, ca.cse(function.call(arguments)))
+        assert function.n_instructions() <= share * fewest.n_instructions()
