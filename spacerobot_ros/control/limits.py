@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from operator import mul
 
 import casadi as ca
 import numpy as np
@@ -114,9 +115,10 @@ class Saturated:
         wrench = commanded.wrench_B - realised.wrench_B
         return cls(realised, Actuation(wrench, commanded.tau - realised.tau))
 
-    @cached_property
+    @property
     def limited(self) -> bool:
         """Whether any limit has changed the command."""
+        # It is looked at once a tick: to keep it takes longer.
         return any(self.excess.wrench_B.tolist()) or any(self.excess.tau.tolist())
 
 
@@ -289,10 +291,7 @@ class JointRateLimits:
     def largest_rate_share(self, qdot: Array) -> float:
         """Return the largest of rates (n,) as a share of its limit."""
         # Python numbers: arrays of a few joints take longer, and every state calls this.
-        share = 0.0
-        for rate, inverse in zip(qdot.tolist(), self._inverse, strict=True):
-            share = max(share, abs(rate * inverse))
-        return share
+        return max(0.0, *map(abs, map(mul, qdot.tolist(), self._inverse)))
 
     def braking_command(self, state: ControlState) -> Actuation:
         """Return the command, not limited, under which joint rates and momenta decay.
