@@ -7,13 +7,13 @@ ICRA, 2012, whose successor coal is.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from spacerobot_ros.collision.rounded_box import separation
+from spacerobot_ros.collision.rounded_box import separating_planes, separation
 from spacerobot_ros.files import warn_first_time
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
@@ -37,6 +37,17 @@ class DistanceFunction(Protocol):
         self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
     ) -> Array:
         """Return the distances."""
+        ...
+
+    def planes(
+        self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
+    ) -> tuple[Array, Array]:
+        """Return the distances, and planes and points (N, 7) between the solids.
+
+        A plane touches the first solid where it is nearest to the second one: a unit normal (3,)
+        toward that and the distance of the plane from the origin, m, in the frame of the first
+        link. The point (3,) is the nearest one of the second solid in the frame of its link, m.
+        """
         ...
 
 
@@ -99,22 +110,42 @@ class ExactDistances:
         self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
     ) -> Array:
         """Return the distances."""
+        poses = R_1, r_1, R_2, r_2
+        return np.array([distance for distance, *_ in self._results(first, second, *poses)])
+
+    def planes(
+        self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
+    ) -> tuple[Array, Array]:
+        """Return the distances, and planes and points between the solids."""
+        (_, R_a, r_a), (_, R_b, r_b) = self._geometries[first], self._geometries[second]
+        distances, planes = np.empty(len(R_1)), np.empty((len(R_1), 7))
+        results = self._results(first, second, R_1, r_1, R_2, r_2)
+        for k, (distance, result, R_ab, r_ab) in enumerate(results):
+            normal = R_a @ result.normal
+            distances[k], planes[k, :3] = distance, normal
+            planes[k, 3] = normal @ (R_a @ result.getNearestPoint1() + r_a)
+            planes[k, 4:] = R_b @ (R_ab.T @ (result.getNearestPoint2() - r_ab)) + r_b
+        return distances, planes
+
+    def _results(
+        self, first: int, second: int, R_1: Array, r_1: Array, R_2: Array, r_2: Array
+    ) -> Iterator[tuple[float, Any, Array, Array]]:
+        """Yield the distance of two solids, coal's result in the frame of the first one, and the
+        pose of the second one there.
+        """
         coal = self._coal
         (one, R_a, r_a), (other, R_b, r_b) = self._geometries[first], self._geometries[second]
         compute = coal.ComputeDistance(one, other)
         request, result = coal.DistanceRequest(), coal.DistanceResult()
-        # Of one solid in the frame of the other.
         R_ab = np.swapaxes(R_1 @ R_a, 1, 2) @ (R_2 @ R_b)
         between = (r_2 + R_2 @ r_b) - (r_1 + R_1 @ r_a)
         r_ab = np.einsum("nba,nb->na", R_1 @ R_a, between)
         here, there = coal.Transform3s.Identity(), coal.Transform3s.Identity()
-        found = np.empty(len(R_1))
         for k in range(len(R_1)):
             there.setRotation(R_ab[k])
             there.setTranslation(r_ab[k])
             result.clear()
-            found[k] = compute(here, there, request, result)
-        return found
+            yield compute(here, there, request, result), result, R_ab[k], r_ab[k]
 
     def placed(self) -> PlacedSolids:
         """Return the same solids for one state after another."""
@@ -182,3 +213,10 @@ class EnclosureDistances:
         """Return the bounds."""
         one, other = self._enclosures[first], self._enclosures[second]
         return separation(one, R_1, r_1, other, R_2, r_2)
+
+    def planes(
+        self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
+    ) -> tuple[Array, Array]:
+        """Return the distances, and planes and points between the enclosures."""
+        one, other = self._enclosures[first], self._enclosures[second]
+        return separating_planes(one, R_1, r_1, other, R_2, r_2)

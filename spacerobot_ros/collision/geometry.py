@@ -302,6 +302,20 @@ class CollisionGeometry:
         a, b = self._link_of[i], self._link_of[j]
         return self.distance_function(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
 
+    def planes(self, pair: int, poses: Poses) -> tuple[Array, Array]:
+        """Return the distances (N,) of a pair, m, and planes and points (N, 7) between them.
+
+        Planes are in the frame of the first link, points in that of the second one
+        (:meth:`.DistanceFunction.planes`). Of a link and an obstacle, planes are the obstacle's,
+        in W.
+        """
+        R, r = poses
+        i, j = self.pairs[pair]
+        if self.with_obstacles[pair]:
+            i, j = j, i
+        a, b = self._link_of[i], self._link_of[j]
+        return self.distance_function.planes(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
+
     def nearest(self, shape: Array) -> tuple[float, int] | None:
         """Return the smallest distance at a shape (n,), m, and its pair; None without pairs."""
         if not len(self.pairs):

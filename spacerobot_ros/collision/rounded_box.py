@@ -113,6 +113,38 @@ def separation(
     R_1, r_1, R_2, r_2
         Poses of these frames in a common one: (N, 3, 3), and (N, 3) in m.
     """
+    return _widest_gaps(first, R_1, r_1, second, R_2, r_2)[0]
+
+
+def separating_planes(
+    first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
+) -> tuple[Array, Array]:
+    """Return the bounds of :func:`separation`, and planes and points (N, 7) that attain them.
+
+    A plane touches the first box: a unit normal toward the second one, and its distance from the
+    origin, m, in the frame of the first link. The point is the one of the second box that is
+    nearest to the plane, in the frame of its link, m. Parameters are those of :func:`separation`.
+    """
+    bounds, directions = _widest_gaps(first, R_1, r_1, second, R_2, r_2)
+    on_first = _support(first, R_1, directions)
+    on_second = _support(second, R_2, -directions)
+    normals = np.einsum("nba,nb->na", R_1, directions)
+    offsets = np.einsum("na,na->n", normals, np.einsum("nba,nb->na", R_1, on_first))
+    return bounds, np.column_stack([normals, offsets, np.einsum("nba,nb->na", R_2, on_second)])
+
+
+def _support(box: RoundedBox, R: Array, directions: Array) -> Array:
+    """Return the points (N, 3) of a box, turned by R, that lie farthest in directions (N, 3)."""
+    axes = R @ box.pose.R
+    corner = box.half * np.sign(np.round(np.einsum("nba,nb->na", axes, directions), 9))
+    of_core = np.einsum("nab,nb->na", axes, corner)
+    return np.asarray(R @ box.pose.r + of_core + box.radius * directions)
+
+
+def _widest_gaps(
+    first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
+) -> tuple[Array, Array]:
+    """Return the bounds (N,), and the directions (N, 3) that attain them, from first to second."""
     c_1, c_2 = r_1 + R_1 @ first.pose.r, r_2 + R_2 @ second.pose.r
     A, B = R_1 @ first.pose.R, R_2 @ second.pose.R
     radii = first.radius + second.radius
@@ -132,15 +164,17 @@ def separation(
 
     found = gaps(axes)
     found[:, 6:][parallel] = -np.inf
-    best = found.max(axis=1)
+    widest = found.argmax(axis=1)
+    rows = np.arange(len(found))
+    best, directions = found[rows, widest], axes[rows, :, widest]
     apart = best > 0
     if apart.any():
-        between, A, B = between[apart], A[apart], B[apart]
-        nearest = _directions(c_1[apart], A, c_2[apart], B, first.half, second.half)
-        cores = np.full(len(best), -np.inf)
-        cores[apart] = gaps(nearest[:, :, np.newaxis])[:, 0]
+        nearest = _directions(c_1, A, c_2, B, first.half, second.half)
+        cores = np.where(apart, gaps(nearest[:, :, np.newaxis])[:, 0], -np.inf)
+        directions = np.where((cores > best)[:, np.newaxis], nearest, directions)
         best = np.maximum(best, cores)
-    return np.asarray(best - radii)
+    toward = np.where(np.einsum("na,na->n", between, directions) < 0, -1.0, 1.0)
+    return np.asarray(best - radii), directions * toward[:, np.newaxis]
 
 
 def nearest_points(

@@ -12,8 +12,16 @@ of the base since the start, too: at zero momentum the centre of mass C of the s
 point of the link at ``r_BP(q)`` in the base is, seen from C in the attitude of the base at the
 start, at ``X (r_BP(q) - r_BC(q))``, where the obstacle is at rest.
 
-Those of links are in C, too: ``rows.c`` with the tables of one robot, for all of its pairs. Its
-formulas are the same with derivatives by hand, which take a tenth of the time of CasADi's.
+Rows of a second kind are distances from planes (:meth:`DistanceRows.of_planes`). Between two convex
+solids at given poses there is a plane that touches the first one where it is nearest to the second,
+and moves with it. The distance of the nearest point of the second one from that plane is that of
+the solids at these poses, or less the depth of their contact, and near them to first order. Such
+rows are exact and cheap, and are made anew along every path that a solver has found (J. Schulman
+and others, "Motion planning with sequential convex optimization and convex collision checking",
+International Journal of Robotics Research 33, 2014).
+
+Smooth rows of links are in C, too: ``rows.c`` with the tables of one robot, for all of its pairs.
+Its formulas are the same with derivatives by hand, which take a tenth of the time of CasADi's.
 """
 
 from __future__ import annotations
@@ -36,6 +44,9 @@ from spacerobot_ros.model.kinematics import joint_positions
 
 SHARPNESS_OF_MINIMUM, SHARPNESS_OF_FACES = 300.0, 150.0
 """Sharpness of smooth minima over balls and of smooth maxima over faces, 1/m."""
+
+PLANE_SIZE = 7
+"""Numbers of a plane and a point."""
 
 _MAX_ROD_WIDTH_RATIO = 0.35
 """Ratio of width to length below which a box of about square section is a rod, and its sections'
@@ -159,12 +170,18 @@ class DistanceRows:
         Whether one of each pair is an obstacle: the functions then take ``y = [q; X]`` (n + 4) in
         place of q, with a quaternion X of any norm, and the numbers ``w``
         (:func:`world_pose_parameters`) after that.
+    is_plane
+        Whether the row is the distance from a plane: ``w`` are then its numbers (7,), a unit normal
+        (3,) and the distance from the origin, m, in the frame of the first link, and the point
+        (3,), m, in that of the second one. Of an obstacle the plane is in the frame of the centre
+        of mass with the attitude of the base at the start, and the point in that of the link.
     """
 
     values: ca.Function
     jacobian: ca.Function
     hessian: ca.Function
     is_of_obstacle: bool = False
+    is_plane: bool = False
 
     @classmethod
     def of(cls, geometry: CollisionGeometry, pairs: Sequence[int]) -> DistanceRows:
@@ -185,6 +202,35 @@ class DistanceRows:
             ca.Function("distances", [q], [ca.cse(d)]),
             ca.Function("distances_jac", [q], [ca.cse(ca.jacobian(d, q))]),
             ca.Function("distances_hess", [q, multipliers], [ca.cse(hessian)]),
+        )
+
+    @classmethod
+    def of_planes(
+        cls, geometry: CollisionGeometry, pair: int, center_of_mass: ca.Function
+    ) -> DistanceRows:
+        """Derive the distance of a pair from its plane; ``center_of_mass`` as for obstacles."""
+        robot, of_obstacle = geometry.robot, bool(geometry.with_obstacles[pair])
+        n = len(robot.joint_names)
+        y, plane = ca.SX.sym("y", n + 4 if of_obstacle else n), ca.SX.sym("plane", PLANE_SIZE)
+        multiplier, q = ca.SX.sym("lambda"), y[:n]
+        normal, offset, point = plane[:3], plane[3], plane[4:]
+        first, second = (geometry.solids[i] for i in geometry.pairs[pair])
+        if of_obstacle:
+            chain, X = chain_of(robot, first.body), y[n:]
+            R_BL, r_BL = _pose_of_link(robot, first, chain, joint_positions(robot, q))
+            R_X = symbolic_rotations.matrix_from_quaternion(X / ca.norm_2(X))
+            x = R_X @ (r_BL + R_BL @ point - center_of_mass(q))
+        else:
+            (R_A, r_A), (R_P, r_P) = _relative_poses(robot, first, second, q)
+            x = R_A.T @ (r_P + R_P @ point - r_A)
+        d = ca.dot(normal, x) - offset
+        hessian = ca.hessian(multiplier * d, y)[0]
+        return cls(
+            ca.Function("distances", [y, plane], [ca.cse(d)]),
+            ca.Function("distances_jac", [y, plane], [ca.cse(ca.jacobian(d, y))]),
+            ca.Function("distances_hess", [y, plane, multiplier], [ca.cse(hessian)]),
+            of_obstacle,
+            is_plane=True,
         )
 
     @classmethod

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,7 +17,11 @@ from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_world
+from spacerobot_ros.planning import RobotState
+from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
+from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
 
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 MIDDLE, RADIUS = np.array([0.4, -0.3, 0.7]), 0.11
 WORLD = f"""<robot name="world"><link name="w"/><link name="rock"><collision>
 <origin xyz="0 0.2 0"/><geometry><sphere radius="{RADIUS}"/></geometry></collision></link>
@@ -117,6 +123,45 @@ def test_rows_follow_the_turn_of_the_base(geometry: CollisionGeometry) -> None:
         assert rows.jacobian(y, w).full()[0] == pytest.approx(slope, abs=1e-6)
         bend = [(rows.jacobian(y + e, w) - rows.jacobian(y - e, w)).full()[0] / 2e-6 for e in steps]
         assert rows.hessian(y, w, 2.0).full() == pytest.approx(2 * np.array(bend), abs=1e-5)
+
+
+def test_planes_follow_the_turn_of_the_base(geometry: CollisionGeometry) -> None:
+    robot = SpaceRobot(geometry.robot)
+    center_of_mass = robot.function("center_of_mass", compile=False)
+    pair = pair_of(geometry, "left")
+    row = DistanceRows.of_planes(geometry, pair, center_of_mass)
+    shapes, base = moving(7)
+    start = Rotation.from_quat(base.quaternion[0])
+    r_WC = base.position[0] + start.apply(robot.center_of_mass(shapes[0]))
+    state = RobotState(base.position[0], base.quaternion[0], shapes[0])
+    boundary = BoundaryConditions(shapes[0], IDENTITY, shapes[-1], state=state)
+    clearance, prediction = SimpleNamespace(geometry=geometry), SimpleNamespace()
+    library = DistanceLibrary(clearance, robot, prediction)  # type: ignore[arg-type]
+    rng = np.random.default_rng(3)
+
+    def distance(y: Array) -> float:
+        R_WB = start * Rotation.from_quat(y[2:])
+        r_WB = r_WC - R_WB.apply(robot.center_of_mass(y[:2]))
+        at = BasePoses(r_WB[np.newaxis], R_WB.as_quat()[np.newaxis])
+        return float(left_ball_to_rock(y[np.newaxis, :2], at)[0])
+
+    for q, x in zip(shapes, rng.normal(size=(7, 4)), strict=True):
+        R_WB = start * Rotation.from_quat(x)
+        r_WB = r_WC - R_WB.apply(robot.center_of_mass(q))
+        at = BasePoses(r_WB[np.newaxis], R_WB.as_quat()[np.newaxis])
+        y = np.concatenate([q, x])
+        (found,), (plane,) = library.planes(boundary, pair, geometry.poses(q[np.newaxis], at))
+        assert found == pytest.approx(distance(y), abs=1e-6)
+        assert float(row.values(y, plane)) == pytest.approx(found, abs=1e-6)
+        steps = 1e-6 * np.eye(6)
+        # Of balls the distance from the plane changes as that of the balls does.
+        slope = [(distance(y + e) - distance(y - e)) / 2e-6 for e in steps]
+        assert row.jacobian(y, plane).full()[0] == pytest.approx(slope, abs=1e-5)
+        bend = [
+            (row.jacobian(y + e, plane) - row.jacobian(y - e, plane)).full()[0] / 2e-6
+            for e in steps
+        ]
+        assert row.hessian(y, plane, 2.0).full() == pytest.approx(2 * np.array(bend), abs=1e-5)
 
 
 def test_a_flight_by_an_obstacle_is_measured_and_touches_it(geometry: CollisionGeometry) -> None:

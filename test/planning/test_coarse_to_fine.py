@@ -104,6 +104,7 @@ def test_the_next_solution_is_refined_where_it_may_be_the_better_one(
             pairs: tuple[int, ...] = (),
             *,
             drifting: bool = False,
+            planes: bool = False,
         ) -> Scripted:
             return solvers[intervals]
 

@@ -203,10 +203,6 @@ def test_whatever_a_plan_depends_on_changes_its_key(monkeypatch: pytest.MonkeyPa
         keys.append(key_of(monkeypatch, made, REQUEST))
     assert len(set(keys)) == len(keys)
     assert key_of(monkeypatch, Keyed(), REQUEST) == keys[0]
-    # The pose of the world is that of the state.
-    elsewhere = Keyed()
-    elsewhere._limits = replace(elsewhere._limits, world=np.ones(12))
-    assert key_of(monkeypatch, elsewhere, REQUEST) == keys[0]
 
 
 # -- notes of schedules -------------------------------------------------------------------------

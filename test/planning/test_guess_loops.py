@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -112,7 +113,7 @@ def test_the_first_variables_of_a_solver_are_those_of_the_guess() -> None:
     made: Any = MultipleShooting.__new__(MultipleShooting)
     layout = Layout(2, 3)
     made._program = type("Program", (), {"layout": layout})()
-    x = made._initial_variables(guess)
+    x = made._initial_variables(guess, 0.05)
     assert len(x) == layout.size == 1 + 3 * 10 + 8
     assert x[0] == 0.3
     for k in range(4):
@@ -126,6 +127,9 @@ def test_the_first_variables_of_a_solver_are_those_of_the_guess() -> None:
     assert back.step == 0.3
     for found, given in ((back.shapes, q), (back.velocities, v), (back.quaternions, X)):
         np.testing.assert_allclose(found, given, atol=1e-15)
+    # Where links are kept apart, the last variable is half of the largest lack of distance.
+    made._program.layout = replace(layout, has_lack=True)
+    np.testing.assert_allclose(made._initial_variables(guess, 0.05), [*x, 0.025])
 
 
 def test_parameters_of_a_solver_are_the_ends_and_the_weights() -> None:
@@ -133,21 +137,21 @@ def test_parameters_of_a_solver_are_the_ends_and_the_weights() -> None:
     boundary = BoundaryConditions(
         np.array([0.3, -0.5]), turn, np.zeros(2), direction=direction, end_effectors=np.arange(7.0)
     )
-    fast = _pack_parameters(boundary, LIMITS, None)
+    guess = Trajectory(0.5, np.zeros((3, 2)), np.array([[0, 0], [0.2, -0.3], [0, 0]]), np.eye(4))
+    fast = _pack_parameters(boundary, LIMITS, guess, fixed=False)
     # The joint without a speed limit counts by its acceleration.
     expected = [0.3, -0.5, *turn, *direction, 0, 0, 0, *range(7), 0.5, 0.7, 1.0, 0.0]
     np.testing.assert_allclose(fast, expected)
-    guess = Trajectory(0.5, np.zeros((3, 2)), np.array([[0, 0], [0.2, -0.3], [0, 0]]), np.eye(4))
     centred = BoundaryConditions(*(boundary.start, turn, np.zeros(2)), center=np.array([4, 5, 6.0]))
-    apart = MotionLimits(
-        *(LIMITS.lower, LIMITS.upper, LIMITS.velocity, LIMITS.acceleration),
-        distances=np.array([0.01, 0.02]),
-        world=np.arange(12.0),
-    )
-    gentle = _pack_parameters(centred, apart, guess)
-    effort = 2 * ((0.2 / 0.5 / 0.5) ** 2 + (0.3 / 0.5 / 0.7) ** 2) / 2
-    expected = [0.3, -0.5, *turn, 0, 0, 0, 4, 5, 6, 0.5, 0.7, 0.0, 1 / effort, 0.01, 0.02]
-    np.testing.assert_allclose(gentle, [*expected, *range(12)])
+    # The same for both intervals, or one for each; a lack of distance costs by the guess.
+    for distances in ([[0.01, 0.02, 3.0]], [[0.01, 0.02, 3.0], [0.03, 0.04, 5.0]]):
+        apart = replace(LIMITS, distances=np.array(distances))
+        gentle = _pack_parameters(centred, apart, guess, fixed=True)
+        effort = 2 * ((0.2 / 0.5 / 0.5) ** 2 + (0.3 / 0.5 / 0.7) ** 2) / 2
+        expected = [0.3, -0.5, *turn, 0, 0, 0, 4, 5, 6, 0.5, 0.7, 0.0, 1 / effort, 300.0]
+        np.testing.assert_allclose(gentle, [*expected, *distances[0], *distances[-1]])
+        fast = _pack_parameters(centred, apart, guess, fixed=False)
+        np.testing.assert_allclose(fast[-9:-6], [1.0, 0.0, 300.0 * 1.0])
 
 
 def test_the_largest_rate_of_a_base_is_by_the_angle_between_attitudes() -> None:

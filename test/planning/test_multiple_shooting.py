@@ -96,13 +96,14 @@ def test_other_distances_are_solved_for_from_the_last_solution_in_no_more_steps(
     guess = InitialGuesses(stages.rotation_of_step, curvature, 40).resample(plain)
     asked = StopRule(300), DurationBounds(1.0, 60.0)
     for room in (0.02, 0.022, 0.021):
-        least = np.array([lowest + room])
+        least = np.array([[lowest + room]])
         limits = replace(MotionLimits.of(arm, options), distances=least)
         last = continued.solve(boundary, limits, guess, *asked)
         other = cold.solve(boundary, limits, replace(guess), *asked)
         assert last is not None
         assert other is not None
-        assert last.duration == pytest.approx(other.duration, rel=1e-4)
+        # Begun anew, in more time, it may end at a slower path.
+        assert last.duration <= other.duration * (1 + 1e-4)
         assert continued.iterations <= cold.iterations
         kept = rows.values(last.at_ticks(160).T).full().min() - lowest
         assert kept == pytest.approx(room, abs=1e-5)
@@ -118,11 +119,11 @@ def test_a_continued_solution_that_takes_too_many_steps_is_begun_anew(arm: Space
     stages = Stages.of(arm, np.eye(3), False, PathConstraints.of(arm, options))
     boundary = BoundaryConditions(ARM_START, TURN.as_quat(), ARM_START)
     solver = MultipleShooting(stages.with_distances([rows], 4), INTERVALS)
-    limits = replace(MotionLimits.of(arm, options), distances=np.array([-1.0]))
+    limits = replace(MotionLimits.of(arm, options), distances=np.array([[-1.0]]))
     bounds = DurationBounds(1.0, 60.0)
     first = solver.solve(boundary, limits, solved(arm), StopRule(300), bounds)
     assert first is not None
-    narrow = replace(limits, distances=np.array([10.0]))
+    narrow = replace(limits, distances=np.array([[10.0]]))
     assert solver.solve(boundary, narrow, first, StopRule(40), bounds) is None
     assert not solver.converged
     again = solver.solve(boundary, limits, first, StopRule(300), bounds)

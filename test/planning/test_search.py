@@ -25,6 +25,7 @@ from spacerobot_ros.planning.methods.optimal.held_commands import HeldCommands, 
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     TOLERANCE,
     DurationBounds,
+    Neighbourhood,
     StopRule,
 )
 from spacerobot_ros.planning.methods.optimal.problem import (
@@ -70,6 +71,7 @@ class Call:
     guess: Trajectory
     stop: StopRule
     bounds: DurationBounds
+    near: Neighbourhood | None = None
 
 
 @dataclass
@@ -81,12 +83,19 @@ class Solver:
     converged: bool = True
     iterations: int = 3
     turn: Any = None
+    lack: float = 0.0
     calls: list[Call] = field(default_factory=list)
 
     def solve(
-        self, _: object, limits: MotionLimits, guess: Trajectory, stop: StopRule, bounds: Any
+        self,
+        _: object,
+        limits: MotionLimits,
+        guess: Trajectory,
+        stop: StopRule,
+        bounds: Any,
+        near: Neighbourhood | None = None,
     ) -> Trajectory | None:
-        self.calls.append(Call(limits, guess, stop, bounds))
+        self.calls.append(Call(limits, guess, stop, bounds, near))
         duration = next(self.script, None)
         return None if duration is None else path(duration)
 
@@ -161,6 +170,7 @@ class Search(ManoeuvreSearch):
         pairs: tuple[int, ...] = (),
         *,
         drifting: bool = False,
+        planes: bool = False,
     ) -> Solver:
         assert not drifting
         self.tolerances.append((intervals, tolerance))
@@ -438,11 +448,14 @@ def test_links_are_kept_apart_at_eighty_instants_at_least(
 
     monkeypatch.setattr(module, "Stages", Stages)
     monkeypatch.setattr(module, "MultipleShooting", lambda *made: made)
-    apart = replace(model, distances=SimpleNamespace(of=list))  # type: ignore[arg-type]
+    library = SimpleNamespace(of=lambda pairs, planes: [*pairs, planes])
+    apart = replace(model, distances=library)  # type: ignore[arg-type]
     search: Any = ManoeuvreSearch(apart)
     made = search.solver(intervals, False, 1e-4, (3, 5))
     assert made == ("kept apart", intervals, 1e-4)
-    assert asked == [([3, 5], instants)]
+    assert asked == [([3, 5, False], instants)]
+    assert search.solver(intervals, False, 1e-4, (3, 5), planes=True) is not made
+    assert asked[1] == ([3, 5, True], instants)
     assert search.solver(intervals, False, 1e-4, (3, 5)) is made
     assert search.solver(intervals, True, 1e-4, (3, 5)) is not made
     assert isinstance(search.solver(intervals, False)[0], Stages)

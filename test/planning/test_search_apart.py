@@ -38,7 +38,7 @@ from spacerobot_ros.planning.methods.optimal.held_commands import (
     HeldCommands,
     ManoeuvreModel,
 )
-from spacerobot_ros.planning.methods.optimal.multiple_shooting import TOLERANCE
+from spacerobot_ros.planning.methods.optimal.multiple_shooting import TOLERANCE, Neighbourhood
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -79,6 +79,7 @@ class Kept:
     ) -> None:
         self.distances, self.rooms, self.too_far = distances, rooms, too_far or {}
         self.spent: list[float] = []
+        self.has_planes = False
 
     @property
     def pairs(self) -> tuple[int, ...]:
@@ -112,8 +113,16 @@ class Kept:
             self.rooms[pair] -= 1
         return bool(less)
 
-    def within(self, limits: MotionLimits) -> MotionLimits:
+    def by_planes(self) -> Kept:
+        other = Kept(self.distances, {})
+        other.has_planes = True
+        return other
+
+    def within(self, limits: MotionLimits, _: object = None) -> MotionLimits:
         return replace(limits, distances=np.array([float(self.rooms[p]) for p in self.pairs]))
+
+
+scripted_path = path
 
 
 class Apart(Search):
@@ -123,6 +132,20 @@ class Apart(Search):
         super().__init__(model, **scripts)
         self._begin = lambda _: kept  # type: ignore[assignment, return-value]
         self.separated_pairs: list[tuple[int, float, tuple[int, ...]]] = []
+        self.coarse: list[tuple[float, bool]] = []
+        self.by_planes: list[float | None] = []
+
+    def _clear_coarsely(self, state: Any, path: Trajectory, intervals: int) -> Any:
+        """Return a path by planes, by a script; none without one."""
+        self.coarse.append((round(path.duration, 6), state.kept.has_planes))
+        duration = self.by_planes.pop(0) if self.by_planes else None
+        if duration is None:
+            raise UnusableCandidateError("planes are in the way")
+        return state, scripted_path(duration)
+
+    def _clear_finely(self, state: Any, path: Trajectory, intervals: int) -> Manoeuvre:
+        assert state.kept.has_planes
+        return replace(made(path.duration), separated_pairs=7)
 
     def solver(  # type: ignore[override]
         self,
@@ -132,7 +155,9 @@ class Apart(Search):
         pairs: tuple[int, ...] = (),
         *,
         drifting: bool = False,
+        planes: bool = False,
     ) -> Solver:
+        assert not planes
         if pairs:
             self.separated_pairs.append((intervals, tolerance, pairs))
         return super().solver(intervals, position, tolerance, drifting=False)
@@ -245,20 +270,201 @@ def test_small_problems_and_drifting_robots_have_no_coarse_grid(
     assert found.duration == pytest.approx(8.7)
 
 
-def test_after_six_solutions_that_are_too_near_new_guesses_keep_their_pairs_apart(
+def test_after_four_solutions_that_are_too_near_new_guesses_keep_their_pairs_apart(
     model: ManoeuvreModel,
 ) -> None:
     kept = Kept({8.0: [-0.01, 0.001], 8.1: [0.002]}, {})
-    # Six that are too near; then guesses on the coarse grid, and one of them on the full grid.
-    search = Apart(model, kept, n40=[8.1] * 6 + [9.0], n8=[8.8] * 3)
+    # Four that are too near; seven guesses that need not keep clear, without a solution; then those
+    # that must on the coarse grid, and one of them on the full grid.
+    search = Apart(model, kept, n40=[8.1] * 4 + [9.0], n8=[None] * 7 + [8.8] * 3)
     asked = progress(kept)
     (found,) = search._keep_clear(asked, [made(8.0)], 40)
-    assert asked.rejection == "pair 0 is 0.002 m apart, 0.05 s"
-    assert search.separated_pairs[:6] == [(40, 1e-5, (0, 1))] * 6
-    assert kept.rooms == {0: 6, 1: 1}
-    assert list(asked.limits.distances) == [6, 1]
-    assert asked.starts == 3
+    assert search.separated_pairs[:4] == [(40, 1e-5, (0, 1))] * 4
+    assert search.separated_pairs[4:6] == [(40, 1e-5, (0, 1)), (8, 1e-4, (0, 1))]
+    assert kept.rooms == {0: 4, 1: 1}
+    assert list(asked.limits.distances) == [4, 1]
+    assert asked.starts == 7 + 2
+    assert asked.options.answers == 2
     assert found.duration == pytest.approx(9.0)
+
+
+@pytest.mark.parametrize(
+    ("smooth", "by_planes", "expected", "asked"),
+    [
+        # Within a twentieth no other is looked for.
+        ([8.4], [], [8.4], []),
+        ([8.45], [8.3], [8.45, 8.3], [8.0]),
+        ([8.45], [None], [8.45], [8.0]),
+        ([None], [8.3], [8.3], [8.0]),
+    ],
+)
+def test_planes_are_for_manoeuvres_that_smooth_rows_make_slow(
+    model: ManoeuvreModel,
+    smooth: list[float | None],
+    by_planes: list[float | None],
+    expected: list[float],
+    asked: list[float],
+) -> None:
+    kept = Kept({8.0: [-0.01]}, {})
+    search = Apart(model, kept, n40=smooth)
+    search.by_planes = by_planes
+    found = search._make_clear(progress(kept), made(8.0), 40)
+    assert [each.duration for each in found] == pytest.approx(expected)
+    assert search.coarse == [(duration, True) for duration in asked]
+
+
+def test_a_manoeuvre_in_a_given_time_is_not_to_be_faster(model: ManoeuvreModel) -> None:
+    kept = Kept({8.0: [-0.01]}, {})
+    search = Apart(model, kept, n40=[9.9])
+    search._make_held_commands = lambda _, path: made(path.duration)  # type: ignore[method-assign]
+    (found,) = search._make_clear(progress(kept, duration=9.9), made(8.0), 40)
+    assert found.duration == pytest.approx(9.9)
+    assert search.coarse == []
+
+
+def test_other_paths_that_need_not_keep_clear_are_made_clear_by_planes(
+    model: ManoeuvreModel,
+) -> None:
+    kept = Kept({8.0: [-0.01]}, {})
+    # The second is known, and the fourth the same as the third within a thousandth.
+    search = Apart(model, kept, n40=[None], n8=[8.8, 8.001, 8.5, 8.504, 8.3, 8.2, 8.1])
+    search.by_planes = [None, None, 9.6, 9.4, 9.2]
+    asked = progress(kept)
+    (found,) = search._keep_clear(asked, [made(8.0)], 40)
+    assert [duration for duration, _ in search.coarse] == [8.0, 8.8, 8.5, 8.3]
+    # Two are enough, and the faster one is made fine.
+    assert found.duration == pytest.approx(9.4)
+    assert found.separated_pairs == 7
+    assert asked.starts == 5
+
+
+def test_guesses_that_lead_to_known_paths_come_last(model: ManoeuvreModel) -> None:
+    kept = Kept({8.0: [-0.01]}, {})
+    search = Apart(model, kept, n40=[None], n8=[8.001, 8.8, 8.0, None, 8.801, 7.999, 8.0])
+    search.by_planes = [None, None, None, 9.6, 9.4]
+    (found,) = search._keep_clear(progress(kept), [made(8.0)], 40)
+    # The path, the only other one, and guesses of 10 s.
+    assert [duration for duration, _ in search.coarse] == [8.0, 8.8, 10.0, 10.0, 10.0]
+    assert found.duration == pytest.approx(9.4)
+
+
+class Clearing:
+    """A clearing of paths that notes the grids and times it is asked for."""
+
+    def __init__(self, *made: Any) -> None:
+        self.made = made
+
+    def _named(self) -> tuple[int, float, bool]:
+        intervals, tolerance = self.made[2].args[1:]
+        return intervals, tolerance, self.made[4] is not None
+
+    def clear(self, path: Trajectory, duration: float) -> Any:
+        CALLS.append(("clear", *self._named(), round(path.duration, 6), round(duration, 6)))
+        return scripted_path(duration), made(duration) if self.made[4] else None
+
+    def shorten(self, path: Trajectory, held: Any) -> Any:
+        CALLS.append(("shorten", *self._named(), round(path.duration, 6), held and held.duration))
+        return scripted_path(path.duration / 2), made(path.duration / 2) if held else None
+
+
+CALLS: list[tuple[Any, ...]] = []
+
+
+@pytest.mark.parametrize(
+    ("intervals", "changes", "calls", "expected"),
+    [
+        (
+            40,
+            {},
+            [
+                ("clear", 8, 1e-4, False, 8.0, 16.0),
+                ("shorten", 8, 1e-4, False, 16.0, None),
+                ("clear", 40, 1e-5, True, 9.6, 9.6),
+                ("shorten", 40, 1e-5, True, 9.6, 9.6),
+            ],
+            4.8,
+        ),
+        # No coarse grid.
+        (
+            39,
+            {},
+            [("clear", 39, 1e-5, True, 8.0, 16.0), ("shorten", 39, 1e-5, True, 16.0, 16.0)],
+            8.0,
+        ),
+        # In a given time, in whole ticks.
+        (40, {"duration": 11.03}, [("clear", 40, 1e-5, True, 8.0, 11.05)], 11.05),
+    ],
+)
+def test_paths_become_clear_and_fast_on_both_grids(
+    model: ManoeuvreModel,
+    monkeypatch: pytest.MonkeyPatch,
+    intervals: int,
+    changes: dict[str, float],
+    calls: list[tuple[Any, ...]],
+    expected: float,
+) -> None:
+    monkeypatch.setattr(module, "PathClearing", Clearing)
+    monkeypatch.setattr(module, "KeptByPlanes", Kept)
+    CALLS.clear()
+    kept = Kept({}, {3: 1})
+    search = Search(model)
+    asked = progress(kept, **changes)
+    # Pairs of a path that has become clear on the coarse grid are kept apart.
+    asked.kept = Kept({}, {3: 1} if "duration" in changes or intervals == 40 else {})
+    coarse = search._clear_coarsely(asked, path(8.0), intervals)
+    found = search._clear_finely(*coarse, intervals)
+    assert calls == CALLS
+    assert found.duration == pytest.approx(expected)
+    assert found.separated_pairs == len(asked.kept.pairs)
+
+
+def test_a_clear_manoeuvre_that_takes_too_long_is_none(
+    model: ManoeuvreModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "PathClearing", Clearing)
+    monkeypatch.setattr(module, "KeptByPlanes", Kept)
+    asked = progress(Kept({}, {}), longest=7.9)
+    with pytest.raises(UnusableCandidateError, match="no path"):
+        Search(model)._clear_finely(asked, path(8.0), 40)
+
+
+@pytest.mark.parametrize(("duration", "bounds"), [(9.3, (9.3, 9.3)), (None, (0.1, 90.0))])
+def test_a_path_by_planes_is_solved_for_near_its_guess(
+    model: ManoeuvreModel,
+    monkeypatch: pytest.MonkeyPatch,
+    duration: float | None,
+    bounds: tuple[float, float],
+) -> None:
+    class Planes(Kept):
+        def within(self, limits: MotionLimits, guess: Any = None, *, pushing: bool = False) -> Any:
+            assert guess.duration == pytest.approx(8.0)
+            return replace(limits, distances=np.array([[1.0 + pushing]]))
+
+    monkeypatch.setattr(module, "KeptByPlanes", Planes)
+    search = Search(model, n40=[8.6, None])
+    solver = search.scripted[40]
+    solver.lack = 0.004
+    asked = progress(Planes({}, {3: 1}))
+    near = Neighbourhood.within(LIMITS, 0.5, 0.1 if duration else 0.0)
+    # Ranges are 4.5 and 6.5 rad: 0.3 rad of each.
+    np.testing.assert_allclose(near.reach, [0.15, 0.15])
+    solved, lack = search._solve_apart(asked, 40, 1e-4, grid_path(40, 8.0), duration, near)
+    assert (solved.duration, lack) == (pytest.approx(8.6), 0.004)
+    (call,) = solver.calls
+    assert call.near is near
+    assert (call.bounds.shortest, call.bounds.longest) == pytest.approx(bounds)
+    assert call.limits.distances.item() == (2.0 if duration else 1.0)
+    with pytest.raises(UnusableCandidateError, match="no path within the limits"):
+        search._solve_apart(asked, 40, 1e-4, grid_path(40, 8.0), duration, near)
+
+
+def grid_path(intervals: int, duration: float) -> Trajectory:
+    """Return a path of as many intervals."""
+    velocities = np.zeros((intervals + 1, 2))
+    shapes = np.tile(BOUNDARY.start, (intervals + 1, 1))
+    return Trajectory(
+        duration / intervals, shapes, velocities, np.tile(IDENTITY, (intervals + 1, 1))
+    )
 
 
 def test_nothing_is_begun_anew_after_the_time_budget(model: ManoeuvreModel) -> None:
@@ -266,27 +472,14 @@ def test_nothing_is_begun_anew_after_the_time_budget(model: ManoeuvreModel) -> N
     search = Apart(model, kept, n40=[None, 9.0], n8=[8.8] * 4)
     late = progress(kept, time_budget=1e-9)
     assert search._keep_clear(late, [made(8.0)], 40) == []
-    assert late.rejection == "the solver found no path within the limits"
+    assert late.rejection == "planes are in the way"
     assert late.starts == 0
-
-
-def test_a_refined_solution_keeps_clear_with_pairs_of_its_own(model: ManoeuvreModel) -> None:
-    kept = Kept({9.0: [0.001]}, {3: 1})
-    search = Apart(model, kept, n40=[9.0, 9.2], n8=[8.0])
-    asked = progress(kept)
-    fine, coarse = search.scripted[40], search.scripted[8]
-    solution = coarse.solve(None, LIMITS, path(8.0), asked.stop_rule(found=False), None)
-    assert solution is not None
-    (found,) = search._refine_solutions(asked, [solution], coarse, fine)  # type: ignore[arg-type]
-    assert found.duration == pytest.approx(9.2)
-    assert found.separated_pairs == 2
-    assert kept.rooms == {3: 1}
 
 
 def test_a_search_without_room_says_which_pair_is_in_the_way(model: ManoeuvreModel) -> None:
     kept = Kept({8.0: [-0.01]}, {})
     search = Apart(model, kept, n40=[8.0] * 99, n8=[7.9] * 99)
-    with pytest.raises(NotFoundError, match=r"pair 0 is -0.01 m apart, 0.05 s\. More optimal"):
+    with pytest.raises(NotFoundError, match=r"planes are in the way\. More optimal"):
         search.search(BOUNDARY, LIMITS, IDENTITY, 40, OPTIONS)
 
 
@@ -307,7 +500,8 @@ class Ticks(Search):
         self.grid = asked[1]
         return self
 
-    def solve(self, aim: Any, limits: Any, guess: Any, stop: Any, bounds: Any) -> Any:
+    def solve(self, aim: Any, limits: Any, guess: Any, stop: Any, bounds: Any, near: Any) -> Any:
+        self.near = near
         self.calls.append((aim, limits, round(guess.duration, 6), bounds.shortest, bounds.longest))
         return path(bounds.longest) if next(self.solutions) else None
 
@@ -370,6 +564,7 @@ def test_a_drifting_manoeuvre_is_solved_for_in_whole_ticks(
         goals.append(aim if solved == "+" else goals[-1])
     assert [call[0] for call in search.calls] == goals[: len(times)]
     assert search.aims == aims
+    assert search.near is None
     limits = search.calls[0][1]
     np.testing.assert_allclose(limits.velocity, 0.99 * LIMITS.velocity)
     np.testing.assert_allclose(limits.acceleration, 0.99 * LIMITS.acceleration)
@@ -458,3 +653,22 @@ def test_the_aim_is_turned_by_the_difference_of_solution_and_commands() -> None:
     assert asked[0] == 18
     np.testing.assert_array_equal(asked[1], IDENTITY)
     np.testing.assert_array_equal(asked[2], L_0)
+
+
+def test_a_drifting_path_between_planes_changes_little_in_whole_ticks(
+    model: ManoeuvreModel,
+) -> None:
+    search: Any = Ticks(model, iter([True]), iter([True]))
+    kept = Kept({}, {0: 4}).by_planes()
+    kept.rooms = {0: 4}
+    asked: Any = SimpleNamespace(
+        boundary="goal",
+        limits=LIMITS,
+        kept=kept,
+        options=OPTIONS,
+        cancellation=NEVER,
+        stop_rule=lambda found: found,
+    )
+    assert search._hold_in_whole_ticks(asked, path(8.03)) == "held for 8.05 s"
+    assert search.near.largest_lack == 0
+    np.testing.assert_allclose(search.near.reach, [0.09, 0.09])

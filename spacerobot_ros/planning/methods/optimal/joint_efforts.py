@@ -22,6 +22,7 @@ from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     TOLERANCE,
     DurationBounds,
     MultipleShooting,
+    Neighbourhood,
     StopRule,
 )
 from spacerobot_ros.planning.methods.optimal.problem import (
@@ -155,18 +156,20 @@ class EffortLimitedShooting(MultipleShooting):
         guess: Trajectory,
         stop: StopRule,
         duration: DurationBounds,
+        near: Neighbourhood | None = None,
     ) -> Trajectory | None:
         """Solve as :class:`MultipleShooting` does, with joint efforts within limits."""
         # A guess whose efforts just reach their limits was made for these limits.
         peak = self._efforts.peak(guess, boundary)
         if not _AT_LIMITS_FROM <= peak <= 1 + _AT_LIMITS_BEYOND:
-            solution = super().solve(boundary, limits, guess, stop, duration)
+            solution = super().solve(boundary, limits, guess, stop, duration, near)
             if solution is None or self._efforts.peak(solution, boundary) <= 1:
                 return solution
             guess = solution if duration.fixed else self._efforts.slowed(solution, boundary)
         if self._limited is None:
             stages = self._stages((self._efforts.inequality(drifting=self._with_drift),))
             self._limited = MultipleShooting(stages, self.intervals, self._tolerance)
-        solution = self._limited.solve(boundary, limits, guess, stop, duration)
+        solution = self._limited.solve(boundary, limits, guess, stop, duration, near)
         self.iterations, self.converged = self._limited.iterations, self._limited.converged
+        self.lack = self._limited.lack
         return solution

@@ -956,7 +956,7 @@ class OptimalGait(GaitMethod):
             "shape": np.zeros(0) if shape is None else shape,
             "time": np.array([self.control_period, self.integration_step]),
             "tolerance": np.array([tolerance.position, tolerance.attitude]),
-            **{name: values for name, values in vars(self._limits).items() if name != "world"},
+            **vars(self._limits),
         }
         for each in goal.end_effectors:
             numbers[f"end_effector {each.link}"] = np.array(each.values)

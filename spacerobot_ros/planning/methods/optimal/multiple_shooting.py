@@ -52,6 +52,12 @@ _WARM_STRETCH = 1.5
 """With distances: factor of the time of the guess. At full speed velocities and accelerations are
 at their limits, which leaves the solver no room to go round."""
 
+_LARGEST_REACH, _LARGEST_REACH_SHARE = 0.3, 0.15
+"""Largest reach of a neighbourhood, rad or m, and as a share of a joint's range."""
+
+_COST_OF_LACK = 300.0
+"""Cost of a distance that is lacking, in durations or efforts of the guess per m."""
+
 _CONTINUED_OPTIONS = {
     "ipopt.mu_init": 1e-6,
     "ipopt.warm_start_init_point": "yes",
@@ -106,6 +112,31 @@ class DurationBounds:
 
 
 @dataclass(frozen=True)
+class Neighbourhood:
+    """The paths near to a guess among which a solver looks for one that keeps links apart.
+
+    Attributes
+    ----------
+    reach
+        (n,) largest change of the shape anywhere on the path, m or rad.
+    largest_lack
+        Distance by which links may be nearer than they ought to be, m. It costs much, so that it
+        vanishes where the solver finds a way.
+    """
+
+    reach: Array
+    largest_lack: float = 0.0
+
+    @classmethod
+    def within(
+        cls, limits: MotionLimits, share: float = 1.0, largest_lack: float = 0.0
+    ) -> Neighbourhood:
+        """Return the neighbourhood of a share of the largest reach of joints with some limits."""
+        width = limits.upper - limits.lower
+        return cls(share * np.minimum(_LARGEST_REACH, _LARGEST_REACH_SHARE * width), largest_lack)
+
+
+@dataclass(frozen=True)
 class _Solution:
     """A solution, and the variables and multipliers from which a solver continues."""
 
@@ -128,6 +159,8 @@ class MultipleShooting:
         self.intervals = intervals
         self.iterations, self.converged = 0, False
         """Number of the solver's steps for its last solution, and whether the solver converged."""
+        self.lack = 0.0
+        """Distance by which links are nearer in its last solution than they ought to be, m."""
         self.turn = stages.rotation_of_step
         self._drifting = stages.drifting
         self._program = program(stages, intervals)
@@ -167,6 +200,7 @@ class MultipleShooting:
         guess: Trajectory,
         stop: StopRule,
         duration: DurationBounds,
+        near: Neighbourhood | None = None,
     ) -> Trajectory | None:
         """Return the fastest trajectory near ``guess``; None if none.
 
@@ -185,9 +219,16 @@ class MultipleShooting:
             Conditions on which the solver stops early.
         duration
             Its bounds.
+        near
+            Where the solution is to be near the guess; None: anywhere.
         """
         N, layout = self.intervals, self._program.layout
         vertices = np.array([np.tile(x, (N + 1, 1)) for x in (limits.lower, limits.upper)])
+        if near is not None:
+            middle = np.clip(guess.shapes + guess.step * guess.velocities / 2, *vertices)
+            vertices = np.clip(
+                middle + np.multiply.outer([-1.0, 1.0], near.reach)[:, None], *vertices
+            )
         if boundary.final is not None:
             given = np.isfinite(boundary.final)
             vertices[:, N, given] = boundary.final[given]
@@ -203,6 +244,9 @@ class MultipleShooting:
             )
             for i in (0, 1)
         )
+        lack = 0.0 if near is None else near.largest_lack
+        if layout.has_lack:
+            most[-1] = lack
         self._monitor.begin(stop)
         solver = self._solver
         begin: Mapping[str, Array | ca.DM]
@@ -211,7 +255,7 @@ class MultipleShooting:
         else:
             slower = self._has_distances and not duration.fixed and not boundary.is_timed
             first = guess.stretched(_WARM_STRETCH) if slower else guess
-            begin = {"x0": self._initial_variables(first)}
+            begin = {"x0": self._initial_variables(first, lack)}
         self._last = None
         result = solver(
             **begin,
@@ -220,14 +264,14 @@ class MultipleShooting:
             lbg=self._program.lower,
             ubg=self._program.upper,
             p=_pack_parameters(
-                boundary, limits, guess if duration.fixed else None, drifting=self._drifting
+                boundary, limits, guess, fixed=duration.fixed, drifting=self._drifting
             ),
         )
         stats = solver.stats()
         self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
         x = result["x"].full().ravel()
         if not self.converged and solver is not self._solver:
-            return self.solve(boundary, limits, guess, stop, duration)
+            return self.solve(boundary, limits, guess, stop, duration, near)
         if not self.converged:
             # Where the goal drifts away, no time makes up for what each interval violates.
             infeasible = self._drifting and stats["return_status"] == _INFEASIBLE
@@ -235,18 +279,20 @@ class MultipleShooting:
                 return None
             x = self._monitor.best
         trajectory = self._unpack_trajectory(x)
+        self.lack = float(x[-1]) if layout.has_lack else 0.0
         if self._has_distances and self.converged:
             begin = {"x0": result["x"], "lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
             self._last = _Solution(trajectory, begin)
         return trajectory
 
-    def _initial_variables(self, guess: Trajectory) -> Array:
+    def _initial_variables(self, guess: Trajectory, lack: float) -> Array:
         """Return the initial values of the program's variables by a guess."""
         h, v = guess.step, guess.velocities
         a = np.diff(v, axis=0) / h
-        return _pack_knots(
-            self._program.layout, h, guess.quaternions, guess.shapes + h * v / 2, v, a
-        )
+        x = _pack_knots(self._program.layout, h, guess.quaternions, guess.shapes + h * v / 2, v, a)
+        if self._program.layout.has_lack:
+            x[-1] = lack / 2
+        return x
 
     def _unpack_trajectory(self, x: Array) -> Trajectory:
         h, (X, s, v, _) = float(x[0]), (x[each] for each in self._program.layout.knots())
@@ -256,16 +302,18 @@ class MultipleShooting:
 def _pack_parameters(
     boundary: BoundaryConditions,
     limits: MotionLimits,
-    gentle: Trajectory | None,
+    guess: Trajectory,
     *,
+    fixed: bool,
     drifting: bool = False,
 ) -> Array:
     typical = np.where(np.isfinite(limits.velocity), limits.velocity, limits.acceleration)
-    weights = np.array([1.0, 0.0])
-    if gentle is not None:
+    weights = np.array([1.0, 0.0, _COST_OF_LACK * guess.duration])
+    if fixed:
         # In units of the guess, so that the solver sees numbers of about one.
-        change = np.diff(gentle.velocities, axis=0) / gentle.step / typical
-        weights = np.array([0.0, 1.0 / max(float(np.sum(change**2)) / len(change), 1e-300)])
+        change = np.diff(guess.velocities, axis=0) / guess.step / typical
+        effort = max(float(np.sum(change**2)) / len(change), 1e-300)
+        weights = np.array([0.0, 1.0 / effort, _COST_OF_LACK])
     center = np.zeros(3) if boundary.center is None else boundary.center
     return np.concatenate(
         [
@@ -276,16 +324,18 @@ def _pack_parameters(
                 center,
                 boundary.end_effectors,
             ),
-            *(typical, weights),
+            *(typical, weights if limits.distances.size else weights[:2]),
             boundary.angular_momentum if drifting else np.zeros(0),
-            *(limits.distances, limits.world),
+            np.broadcast_to(
+                limits.distances, (len(guess.shapes) - 1, limits.distances.shape[-1])
+            ).ravel(),
         ]
     )
 
 
 def _pack_knots(layout: Layout, step: float, *knots: Array) -> Array:
     """Return the variables of a step and of X, s, v and a at their knots."""
-    x = np.empty(layout.size)
+    x = np.zeros(layout.size)
     x[0] = step
     for places, values in zip(layout.knots(), knots, strict=True):
         x[places] = values

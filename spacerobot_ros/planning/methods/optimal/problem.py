@@ -251,9 +251,8 @@ class BoundaryConditions:
 @dataclass(frozen=True)
 class MotionLimits:
     """Bounds (n,) of the joints: ``lower`` and ``upper`` in m or rad, ``velocity`` a second,
-    ``acceleration`` a second squared; ``distances`` (K,) are the smallest ones, m, of the pairs of
-    links that a solver keeps apart. Where one of a pair is an obstacle, ``world`` (12,) is the pose
-    of the world (:func:`.world_pose_parameters`).
+    ``acceleration`` a second squared; ``distances`` (N, M), or (1, M) for all, are the parameters
+    of the rows that keep pairs of links apart in N intervals (:meth:`.KeptDistances.within`).
     """
 
     lower: Array
@@ -261,7 +260,6 @@ class MotionLimits:
     velocity: Array
     acceleration: Array
     distances: Array = field(default_factory=lambda: np.zeros(0))
-    world: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: MotionOptions, method: str = "optimal") -> MotionLimits:

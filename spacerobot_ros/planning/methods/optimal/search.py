@@ -17,12 +17,14 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from spacerobot_ros.collision import Approach
+from spacerobot_ros.collision.rows import DistanceRows
 from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -40,12 +42,16 @@ from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuess
 from spacerobot_ros.planning.methods.optimal.joint_efforts import EffortLimitedShooting
 from spacerobot_ros.planning.methods.optimal.kept_distances import (
     ROUNDS,
+    KeptByPlanes,
     KeptDistances,
+    PathClearing,
+    instants_of,
 )
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     TOLERANCE,
     DurationBounds,
     MultipleShooting,
+    Neighbourhood,
     StopRule,
 )
 from spacerobot_ros.planning.methods.optimal.problem import (
@@ -95,22 +101,30 @@ coarse grid underestimates some costs by more than others."""
 _MAX_SEPARATION_ITERATIONS = 80
 """Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most."""
 
-_MAX_CLEARING_ITERATIONS = 200
-"""Steps of the solver from a manoeuvre in collision, or from a guess, to one that keeps clear at
-most: those that come to an end take fewer."""
+_MAX_CLEARING_ITERATIONS = 150
+"""Steps of the solver from a manoeuvre in collision to one that keeps clear at most: those that
+come to an end take fewer."""
 
-_MAX_CLEAR_STARTS, _CLEAR_ANSWERS = 16, 4
-"""Guesses of a search that keeps clear from the beginning at most, and solutions that end it."""
+_MAX_ITERATIONS_BY_PLANES = 80
+"""Steps of the solver between paths that planes are made for at most."""
+
+_GOOD_CLEAR_RATIO = 1.05
+"""Ratio of the duration of a manoeuvre that keeps clear to that of the one in collision up to which
+no faster one is looked for."""
+
+_MAX_CLEAR_STARTS, _MAX_LAST_STARTS, _CLEAR_ANSWERS = 16, 6, 2
+"""Further guesses near which manoeuvres that keep clear are looked for at most; those with smooth
+rows after them; and the number of solutions that ends either search."""
 
 _MAX_SHORTENING_ROUNDS = 3
 """Solutions by which a manoeuvre is made to keep no more distance than is asked for."""
 
-_DISTANCE_INSTANTS = 80
-"""Instants of a manoeuvre at which links are kept apart on a grid at least: between the knots of a
-coarse one they would come too near."""
-
 _DEEP_CONTACT = -0.02
 """Distance of links below which their way round is looked for on a coarse grid, m."""
+
+_CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR = 2.0, 1.2
+"""Ratios of the time of a path that is to become clear to that of a path in collision, and to that
+of a clear path on a coarse grid: slow joints leave room to go round."""
 
 _SAME_COST_TOLERANCE = 1e-3
 """Relative difference of costs below which two solutions count as the same."""
@@ -127,6 +141,10 @@ _MAX_ITERATIONS_OF_STOPS = 120
 
 _MAX_FULL_GRID_STARTS = 3
 """Number of guesses on the full grid after a coarse grid without solutions."""
+
+_HELD_REACH_SHARE = 0.3
+"""Share of the largest reach by which a clear path may change where it is solved for in whole
+ticks."""
 
 _LIMIT_SHARE_IN_GIVEN_TIME = 0.99
 """Share of velocity and acceleration limits for manoeuvres of a given duration."""
@@ -199,6 +217,16 @@ class Manoeuvre:
     separated_pairs: int = 0
 
     @property
+    def positions(self) -> Array:
+        """(N + 1, n) shapes at the ticks, m or rad."""
+        return self.held.positions
+
+    @property
+    def quaternions(self) -> Array:
+        """(N + 1, 4) turns of the base since the start there."""
+        return self.held.quaternions
+
+    @property
     def solution_time(self) -> float:
         """Duration before it was made into held commands, s."""
         return self.solution.duration
@@ -246,6 +274,16 @@ class _SearchState:
             )
         last = deadline if found else last_call
         return StopRule(self.options.iterations, self.cancellation, deadline, last)
+
+    @property
+    def hastens(self) -> bool:
+        """Whether the manoeuvre is to be fast."""
+        return self.options.duration == 0 and not self.gentle
+
+    def by_planes(self) -> _SearchState:
+        """Return the same with no pairs yet that planes keep apart."""
+        assert self.kept is not None
+        return replace(self.with_iterations(_MAX_ITERATIONS_BY_PLANES), kept=self.kept.by_planes())
 
     def with_iterations(self, most: int) -> _SearchState:
         """Return the same with at most so many steps of the solver from a guess."""
@@ -304,7 +342,9 @@ class ManoeuvreSearch:
         self._wheels = ReactionWheels.of(model.robot.description)
         self._holder = CommandHolder(model)
         self._stages: dict[tuple[bool, bool, bool], Stages] = {}
-        self._solvers: dict[tuple[int, bool, float, tuple[int, ...], bool], MultipleShooting] = {}
+        self._solvers: dict[
+            tuple[int, bool, float, tuple[int, ...], bool, bool], MultipleShooting
+        ] = {}
 
     def search(
         self,
@@ -397,33 +437,119 @@ class ManoeuvreSearch:
             return found
         freed: list[Manoeuvre] = []
         for each in in_order:
-            if freed and each.duration >= freed[0].duration:
+            if freed and each.duration >= min(one.duration for one in freed):
                 break
-            near = replace(progress, kept=kept.copy())
-            try:
-                freed.append(self._make_clear(near, each, intervals))
-            except UnusableCandidateError as reason:
-                progress.rejection = str(reason)
-                assert near.kept is not None
-                kept.include(near.kept)
-            progress.cancellation.raise_if_requested()
+            freed += self._make_clear(progress, each, intervals)
         # A robot that drifts finds others sooner after it has coasted.
-        if freed or progress.cut_short(found=False) or progress.boundary.drifts:
+        if freed or progress.boundary.drifts:
             return freed
+        known, clear = [each.solution for each in found], []
+        for path in self._other_paths(progress, intervals, known):
+            with self._attempt(progress):
+                clear.append(self._clear_coarsely(progress.by_planes(), path, intervals))
+            if len(clear) == _CLEAR_ANSWERS:
+                break
+        for state, path in sorted(clear, key=lambda each: each[1].duration):
+            with self._attempt(progress):
+                return [self._clear_finely(state, path, intervals)]
+        if progress.cut_short(found=False):
+            return []
+        # The last resort: guesses anew, with smooth rows for the pairs that have come near.
         progress.limits = kept.within(progress.limits)
         options = progress.options
         progress.options = replace(
             options,
-            starts=min(options.starts, _MAX_CLEAR_STARTS),
+            starts=min(options.starts, _MAX_LAST_STARTS),
             answers=min(options.answers, _CLEAR_ANSWERS),
             iterations=min(options.iterations, _MAX_CLEARING_ITERATIONS),
         )
-        return self._search_on_grids(progress, intervals)
+        again = self._search_on_grids(progress, intervals)
+        for each in sorted(again, key=lambda one: one.duration):
+            if freed := self._make_clear(progress, each, intervals):
+                break
+        return freed
+
+    def _other_paths(
+        self, progress: _SearchState, intervals: int, known: Sequence[Trajectory]
+    ) -> Iterator[Trajectory]:
+        """Yield other solutions that need not keep clear, from guesses on a coarse grid, then those
+        guesses that led to known solutions.
+        """
+        costs = [progress.cost(each) for each in known]
+        free = replace(progress, kept=None)
+        grid = self._get_solver(free, *self._coarse_grid(progress, intervals))
+        guesses = _build_guesses(self._robot, grid, progress.boundary)
+        boundary, limits = progress.boundary, progress.limits
+        unused: list[Trajectory] = []
+        for guess in itertools.islice(
+            guesses.generate(boundary, limits, boundary.likely_final_shape),
+            min(progress.options.starts, _MAX_CLEAR_STARTS),
+        ):
+            if progress.cut_short(found=False):
+                return
+            solution = self._solve_from_guess(free, grid, guess, progress.stop_rule(found=False))
+            progress.cancellation.raise_if_requested()
+            progress.starts += 1
+            result = _NO_PATH_FOUND if solution is None else f"{solution.duration:.6g} s"
+            progress.report(f"start {progress.starts}", result, grid.iterations)
+            if solution is None:
+                continue
+            cost = progress.cost(solution)
+            if any(abs(cost - other) <= _SAME_COST_TOLERANCE * other for other in costs):
+                unused.append(guess)
+            else:
+                costs.append(cost)
+                yield solution
+        yield from unused
+
+    def _coarse_grid(self, progress: _SearchState, intervals: int) -> tuple[int, float]:
+        """Return the intervals of the coarse grid and the tolerance on it; of the full grid where
+        there is none.
+        """
+        coarser = intervals // _COARSE_GRID_RATIO
+        # On a coarse grid the attitude of a robot that drifts is too far off.
+        if progress.boundary.is_timed or coarser < _MIN_COARSE_INTERVALS:
+            return intervals, TOLERANCE
+        return coarser, _COARSE_TOLERANCE
+
+    @contextmanager
+    def _attempt(self, progress: _SearchState) -> Iterator[None]:
+        """Note the reason why there is no manoeuvre, instead of raising an error."""
+        try:
+            yield
+        except UnusableCandidateError as reason:
+            progress.rejection = str(reason)
+        progress.cancellation.raise_if_requested()
 
     def _make_clear(
         self, progress: _SearchState, manoeuvre: Manoeuvre, intervals: int
+    ) -> list[Manoeuvre]:
+        """Return manoeuvres near to one that keep clear; that one itself, if it does."""
+        kept = progress.kept
+        assert kept is not None
+        if not kept.approaches(manoeuvre.positions, manoeuvre.quaternions):
+            return [manoeuvre]
+        found: list[Manoeuvre] = []
+        # Pairs of one manoeuvre are not those of another.
+        smooth = kept.copy()
+        with self._attempt(progress):
+            state = replace(progress, kept=smooth)
+            found.append(self._clear_smoothly(state, manoeuvre, intervals))
+        if not found:
+            kept.include(smooth)
+        aim = _GOOD_CLEAR_RATIO * manoeuvre.duration
+        if found and (found[0].duration <= aim or not progress.hastens):
+            return found
+        with self._attempt(progress):
+            state = progress.by_planes()
+            coarse = self._clear_coarsely(state, manoeuvre.solution, intervals)
+            found.append(self._clear_finely(*coarse, intervals))
+        return found
+
+    def _clear_smoothly(
+        self, progress: _SearchState, manoeuvre: Manoeuvre, intervals: int
     ) -> Manoeuvre:
-        """Return a manoeuvre near to one that comes too near; itself, if it keeps clear.
+        """Return a manoeuvre near to one that comes too near, by smooth rows.
 
         Raises
         ------
@@ -432,9 +558,7 @@ class ManoeuvreSearch:
         """
         kept = progress.kept
         assert kept is not None
-        near = kept.approaches(manoeuvre.held.positions, manoeuvre.held.quaternions)
-        if not near:
-            return manoeuvre
+        near = kept.approaches(manoeuvre.positions, manoeuvre.quaternions)
         progress = progress.with_iterations(_MAX_CLEARING_ITERATIONS)
         coarser = intervals // _COARSE_GRID_RATIO
         # On a coarse grid the attitude of a robot that drifts is too far off.
@@ -466,13 +590,13 @@ class ManoeuvreSearch:
         assert kept is not None
         solution, near = (
             manoeuvre.solution,
-            kept.approaches(manoeuvre.held.positions, manoeuvre.held.quaternions),
+            kept.approaches(manoeuvre.positions, manoeuvre.quaternions),
         )
         for _ in range(ROUNDS):
             kept.add(near)
             solution = self._solve_with_separation(progress, solution, intervals, tolerance)
             made = self._make_held_commands(progress, solution)
-            near = kept.approaches(made.held.positions, made.held.quaternions)
+            near = kept.approaches(made.positions, made.quaternions)
             if not near:
                 return replace(made, separated_pairs=len(kept.pairs))
         raise UnusableCandidateError(kept.message(near[0], self._period))
@@ -500,7 +624,7 @@ class ManoeuvreSearch:
                 manoeuvre = self._make_held_commands(closer, solution)
             except UnusableCandidateError:
                 break
-            near = kept.approaches(manoeuvre.held.positions, manoeuvre.held.quaternions)
+            near = kept.approaches(manoeuvre.positions, manoeuvre.quaternions)
             if not near and manoeuvre.duration < best.duration:
                 best = replace(manoeuvre, separated_pairs=len(kept.pairs))
         return best
@@ -535,6 +659,120 @@ class ManoeuvreSearch:
             raise UnusableCandidateError(_NO_PATH_FOUND)
         return solution
 
+    def _clear_coarsely(
+        self, progress: _SearchState, path: Trajectory, intervals: int
+    ) -> tuple[_SearchState, Trajectory]:
+        """Return a fast path near to another one that keeps clear on a coarse grid, with the search
+        whose pairs it keeps apart; the same path where it is for the full grid alone.
+
+        Raises
+        ------
+        UnusableCandidateError
+            None was found.
+        """
+        coarser, tolerance = self._coarse_grid(progress, intervals)
+        if not progress.hastens or coarser == intervals:
+            return progress, path
+        clearing = self._path_clearing(progress, coarser, tolerance)
+        slow, _ = clearing.clear(path, _CLEARING_TIME_FACTOR * path.duration)
+        fast, _ = clearing.shorten(slow, None)
+        progress.report("clear path", f"{fast.duration:.6g} s", 0)
+        return progress, fast.stretched(_RESAMPLED_TIME_FACTOR)
+
+    def _clear_finely(self, progress: _SearchState, path: Trajectory, intervals: int) -> Manoeuvre:
+        """Return a manoeuvre near to a path that keeps clear, by the full grid.
+
+        Raises
+        ------
+        UnusableCandidateError
+            None was found.
+        """
+        options, kept = progress.options, progress.kept
+        assert kept is not None
+        clearing = self._path_clearing(
+            progress, intervals, TOLERANCE, partial(self._make_held_commands, progress)
+        )
+        shortest = self._shortest_duration(progress)
+        duration = path.duration if kept.pairs else _CLEARING_TIME_FACTOR * path.duration
+        if options.duration > 0:
+            duration = self._given_duration(options)
+        elif progress.gentle:
+            path = self._slow_to_effort_limits(path, progress.boundary)
+            duration = max(_GENTLE_DURATION_FACTOR * path.duration, shortest)
+        path, made = clearing.clear(path, duration)
+        if progress.hastens:
+            path, made = clearing.shorten(path, made)
+        elif progress.gentle:
+            fast = path.at_full_speed(progress.limits, shortest)
+            made = self._make_held_commands(
+                progress, self._slow_to_effort_limits(fast, progress.boundary)
+            )
+            if near := kept.approaches(made.positions, made.quaternions):
+                raise UnusableCandidateError(kept.message(near[0], self._period))
+        assert made is not None
+        if made.duration > max(options.longest, options.duration) + self._period / 2:
+            raise UnusableCandidateError(_NO_PATH_FOUND)
+        progress.report("manoeuvre that keeps clear", f"{made.duration:.6g} s", 0)
+        return replace(made, separated_pairs=len(kept.pairs))
+
+    def _path_clearing(
+        self,
+        progress: _SearchState,
+        intervals: int,
+        tolerance: float,
+        hold: Callable[[Trajectory], Manoeuvre] | None = None,
+    ) -> PathClearing[Manoeuvre]:
+        """Return the clearing of paths on a grid, as held commands or as they are."""
+        kept, limits = progress.kept, progress.limits
+        assert isinstance(kept, KeptByPlanes)
+        solve = partial(self._solve_apart, progress, intervals, tolerance)
+        return PathClearing(kept, limits, solve, self._period, hold)
+
+    def _solve_apart(
+        self,
+        progress: _SearchState,
+        intervals: int,
+        tolerance: float,
+        guess: Trajectory,
+        duration: float | None,
+        near: Neighbourhood,
+    ) -> tuple[Trajectory, float]:
+        """Return a solution near to a guess that keeps pairs of links apart, in a duration, s
+        (None: the fastest one), and by how much they are too near all the same, m.
+
+        Raises
+        ------
+        UnusableCandidateError
+            No such solution was found.
+        """
+        kept, boundary, limits = progress.kept, progress.boundary, progress.limits
+        assert isinstance(kept, KeptByPlanes)
+        if progress.options.duration > 0:
+            limits = _narrowed(limits)
+        solver = self._get_solver(progress, intervals, tolerance)
+        if len(guess.shapes) != intervals + 1:
+            guess = _build_guesses(self._robot, solver, boundary).resample(guess)
+        shortest = self._shortest_duration(progress)
+        bounds = DurationBounds(shortest, progress.options.longest)
+        if duration is not None:
+            bounds = DurationBounds(duration, duration)
+        within = kept.within(limits, guess, pushing=near.largest_lack > 0)
+        # On the same grid, a solver continues at its own last solution.
+        stop = progress.stop_rule(found=False)
+        solution = solver.solve(boundary, within, guess, stop, bounds, near)
+        progress.cancellation.raise_if_requested()
+        result = _NO_PATH_FOUND
+        if solution is not None:
+            result = f"{solution.duration:.6g} s, {1e3 * solver.lack:.3g} mm too near"
+        progress.report(f"{len(kept.pairs)} pair(s) apart", result, solver.iterations)
+        if solution is None:
+            raise UnusableCandidateError(_NO_PATH_FOUND)
+        if duration is None and not solver.converged and self._constraints.base_rate_limit == 0:
+            # A solution without convergence is not yet as fast as possible.
+            solution = solution.at_full_speed(limits, shortest)
+            solution = self._slow_to_effort_limits(solution, boundary)
+        return solution, solver.lack
+
     def _get_solver(
         self, progress: _SearchState, intervals: int, tolerance: float = TOLERANCE
     ) -> MultipleShooting:
@@ -545,6 +783,7 @@ class ManoeuvreSearch:
             tolerance,
             pairs,
             drifting=progress.boundary.drifts,
+            planes=progress.kept is not None and progress.kept.has_planes,
         )
 
     def _search_from_guesses(
@@ -604,13 +843,11 @@ class ManoeuvreSearch:
         found: list[Manoeuvre] = []
         costs: list[float] = []
         solutions_agree = progress.solutions_agree(solutions)
-        brief, most = progress, _MAX_REFINED_SOLUTIONS
-        if progress.kept is not None:
-            # A step with many pairs takes long, and solutions that keep clear are near to the end.
-            brief, most = progress.with_iterations(_MAX_SEPARATION_ITERATIONS), 1
         for solution in sorted(solutions, key=progress.cost):
             cost = progress.cost(solution)
-            if found and (len(found) == most or cost > _MAX_REFINED_COST_RATIO * costs[0]):
+            if found and (
+                len(found) == _MAX_REFINED_SOLUTIONS or cost > _MAX_REFINED_COST_RATIO * costs[0]
+            ):
                 break
             least = min((one.solution_time for one in found), default=math.inf)
             if solutions_agree and solution.duration > (1 - _SAME_COST_TOLERANCE) * least:
@@ -621,13 +858,10 @@ class ManoeuvreSearch:
                 refined: Trajectory | None = solution
                 if grid is not full:
                     guess = _build_guesses(self._robot, full, progress.boundary).resample(solution)
-                    stop = brief.stop_rule(found=bool(found))
-                    refined = self._solve_from_guess(brief, full, guess, stop)
+                    stop = progress.stop_rule(found=bool(found))
+                    refined = self._solve_from_guess(progress, full, guess, stop)
                     progress.cancellation.raise_if_requested()
-                manoeuvre = self._make_held_commands(brief, refined)
-                if brief.kept is not None:
-                    near = replace(brief, kept=brief.kept.copy())
-                    manoeuvre = self._make_clear(near, manoeuvre, full.intervals)
+                manoeuvre = self._make_held_commands(progress, refined)
                 found.append(manoeuvre)
                 costs.append(cost)
                 result = f"{manoeuvre.duration:.6g} s"
@@ -644,14 +878,20 @@ class ManoeuvreSearch:
         pairs: tuple[int, ...] = (),
         *,
         drifting: bool = False,
+        planes: bool = False,
     ) -> MultipleShooting:
         """Return the solver with a number of intervals, with or without a position, which keeps
-        pairs of links apart; ``drifting``, for an angular momentum that is not zero.
+        pairs of links apart; ``drifting``, for an angular momentum that is not zero; ``planes``, by
+        distances from planes.
         """
-        key = intervals, position, tolerance, pairs, drifting
+        key = intervals, position, tolerance, pairs, drifting, planes
         if key not in self._solvers:
-            instants = max(2, math.ceil(_DISTANCE_INSTANTS / intervals))
-            of = partial(self._get_stages, position, pairs, instants, drifting)
+            rows = (
+                partial(self._distances.of, pairs, planes=planes)
+                if pairs and self._distances
+                else None
+            )
+            of = partial(self._get_stages, position, rows, instants_of(intervals), drifting)
             self._solvers[key] = (
                 MultipleShooting(of(), intervals, tolerance)
                 if self._efforts is None
@@ -664,7 +904,7 @@ class ManoeuvreSearch:
     def _get_stages(
         self,
         position: bool,
-        pairs: tuple[int, ...],
+        rows: Callable[[], list[DistanceRows]] | None,
         instants: int,
         drifting: bool,
         inequalities: Sequence[PathInequality] = (),
@@ -680,9 +920,9 @@ class ManoeuvreSearch:
                 end_effectors=self._end_effectors and self._end_effectors.function,
                 drifting=drifting,
             )
-        if not pairs or self._distances is None:
+        if rows is None:
             return self._stages[key]
-        return self._stages[key].with_distances(self._distances.of(pairs), instants)
+        return self._stages[key].with_distances(rows(), instants)
 
     def _solve_from_guess(
         self,
@@ -693,17 +933,10 @@ class ManoeuvreSearch:
     ) -> Trajectory | None:
         """Return the solution from a guess, None if there is none."""
         boundary, limits, options = progress.boundary, progress.limits, progress.options
-        shortest = _MIN_TICKS * self._period
-        if progress.gentle:
-            shortest = max(shortest, min(_GENTLE_TICKS * self._period, _GENTLE_TIME))
+        shortest = self._shortest_duration(progress)
         guess = self._constraints.slowed(guess)
         if options.duration > 0:
-            limits = replace(
-                limits,
-                velocity=_LIMIT_SHARE_IN_GIVEN_TIME * limits.velocity,
-                acceleration=_LIMIT_SHARE_IN_GIVEN_TIME * limits.acceleration,
-            )
-            T = max(round(options.duration / self._period), 1) * self._period
+            limits, T = _narrowed(limits), self._given_duration(options)
         elif progress.gentle:
             guess = self._slow_to_effort_limits(guess, boundary)
             T = max(_GENTLE_DURATION_FACTOR * guess.duration, shortest)
@@ -719,6 +952,15 @@ class ManoeuvreSearch:
         if solution is None or not progress.gentle:
             return solution
         return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest), boundary)
+
+    def _shortest_duration(self, progress: _SearchState) -> float:
+        """Return the duration that a manoeuvre has at least, s."""
+        gentle = min(_GENTLE_TICKS * self._period, _GENTLE_TIME) if progress.gentle else 0.0
+        return max(_MIN_TICKS * self._period, gentle)
+
+    def _given_duration(self, options: OptimalOptions) -> float:
+        """Return the duration that is asked for in whole ticks, s."""
+        return max(round(options.duration / self._period), 1) * self._period
 
     def _slow_to_effort_limits(
         self, trajectory: Trajectory, boundary: BoundaryConditions
@@ -766,12 +1008,11 @@ class ManoeuvreSearch:
         trajectory of least effort in as many control periods, or a few more, is solved for.
         """
         boundary, limits, kept = progress.boundary, progress.limits, progress.kept
-        within = limits if kept is None else kept.within(limits)
-        narrowed = replace(
-            within,
-            velocity=_LIMIT_SHARE_IN_GIVEN_TIME * limits.velocity,
-            acceleration=_LIMIT_SHARE_IN_GIVEN_TIME * limits.acceleration,
-        )
+        narrowed, near = _narrowed(limits), None
+        if kept is not None:
+            narrowed = kept.within(narrowed, trajectory)
+        if kept is not None and kept.has_planes:
+            near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
         solver = self._get_solver(progress, len(trajectory.shapes) - 1)
         ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
         guess, aim = trajectory, boundary
@@ -784,7 +1025,7 @@ class ManoeuvreSearch:
             T = (ticks + more) * self._period
             guess = guess.stretched(T / guess.duration)
             stop = progress.stop_rule(found=False)
-            solution = solver.solve(aim, narrowed, guess, stop, DurationBounds(T, T))
+            solution = solver.solve(aim, narrowed, guess, stop, DurationBounds(T, T), near)
             progress.cancellation.raise_if_requested()
             if solution is None:
                 continue
@@ -794,6 +1035,15 @@ class ManoeuvreSearch:
             guess = solution
             aim = self._holder.corrected_end(solution, boundary, ticks + more)
         return None
+
+
+def _narrowed(limits: MotionLimits) -> MotionLimits:
+    """Return the limits of manoeuvres of a given duration."""
+    return replace(
+        limits,
+        velocity=_LIMIT_SHARE_IN_GIVEN_TIME * limits.velocity,
+        acceleration=_LIMIT_SHARE_IN_GIVEN_TIME * limits.acceleration,
+    )
 
 
 class MotionSearch:

@@ -38,7 +38,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.collision.rows import DistanceRows
+from spacerobot_ros.collision.rows import PLANE_SIZE, DistanceRows
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cached_function, source_hash
 from spacerobot_ros.model.description import Array
@@ -146,7 +146,8 @@ class Stages:
         The rotation vector (3,) of a step (:func:`turn_function`).
     distances
         Distances of pairs of links, and of links and obstacles, in an interval, less the smallest
-        ones that are allowed, both as its rows and ``>= 0``; None: none.
+        ones that are allowed or from planes, plus a lack that is a variable of the program: as its
+        rows and ``>= 0``; None: none.
     """
 
     joints: int
@@ -325,19 +326,22 @@ def _distance_block(n: int, pairs: Sequence[DistanceRows], instants: int) -> Con
     """Return the distances at equally spaced instants of an interval, by the chain rule.
 
     The last instant is the end of the interval. The turn of the base there is about the weighted
-    mean of those at the knots; rows take it at any norm.
+    mean of those at the knots; rows take it at any norm. Rows are all of one kind: smooth ones less
+    the smallest distances, or distances from planes, which each instant has of its own.
     """
     # In MX, whose functions call those of the pairs: made anew for every choice of pairs.
     h, s, v, v_next = ca.MX.sym("h"), *(ca.MX.sym(name, n) for name in ("s", "v", "v+"))
-    X, X_next = ca.MX.sym("X", 4), ca.MX.sym("X+", 4)
-    z, least = ca.vertcat(h, X, s, v, X_next, v_next), ca.MX.sym("least", len(pairs))
+    X, X_next, lack = ca.MX.sym("X", 4), ca.MX.sym("X+", 4), ca.MX.sym("lack")
+    z = ca.vertcat(h, X, s, v, X_next, v_next, lack)
     turning = any(rows.is_of_obstacle for rows in pairs)
-    world = ca.MX.sym("world", 12 if turning else 0)
-    multipliers = ca.MX.sym("lambda", least.numel() * instants)
+    by_planes = any(rows.is_plane for rows in pairs)
+    least = ca.MX.sym("least", 0 if by_planes else len(pairs))
+    world = ca.MX.sym("world", 12 if turning and not by_planes else 0)
+    planes = ca.MX.sym("planes", PLANE_SIZE, len(pairs) * instants if by_planes else 0)
+    multipliers = ca.MX.sym("lambda", len(pairs) * instants)
     values, jacobian, hessian = [], [], ca.MX(z.numel(), z.numel())
     size = n + 4 if turning else n
-    of_instants = ca.vertsplit(multipliers, least.numel())
-    for number, by_row in enumerate(of_instants, 1):
+    for number, by_row in enumerate(ca.vertsplit(multipliers, len(pairs)), 1):
         tau = number / instants
         # The point is s + h (b v + c v+).
         b, c = tau - 1 / 2 - tau**2 / 2, tau**2 / 2
@@ -346,11 +350,15 @@ def _distance_block(n: int, pairs: Sequence[DistanceRows], instants: int) -> Con
         turned = ca.vertcat(point, (1 - tau) * X + tau * X_next)
         slopes, curvature = [], ca.MX(size, size)
         for row, (rows, multiplier) in enumerate(zip(pairs, ca.vertsplit(by_row), strict=True)):
-            at = (turned, world) if rows.is_of_obstacle else (point,)
+            at = [turned if rows.is_of_obstacle else point]
+            if by_planes:
+                at.append(planes[:, (number - 1) * len(pairs) + row])
+            elif rows.is_of_obstacle:
+                at.append(world)
             J, H = rows.jacobian(*at), rows.hessian(*at, multiplier)
             if turning and not rows.is_of_obstacle:
                 J, H = ca.horzcat(J, ca.MX(1, 4)), ca.diagcat(H, ca.MX(4, 4))
-            values.append(rows.values(*at) - least[row])
+            values.append(rows.values(*at) + (lack if by_planes else lack - least[row]))
             slopes.append(J)
             curvature += H
         J = ca.vertcat(*slopes)
@@ -358,11 +366,13 @@ def _distance_block(n: int, pairs: Sequence[DistanceRows], instants: int) -> Con
         bend = ca.horzcat(ca.MX(1, 5 + n), b * slope, ca.MX(1, 4), c * slope)
         # How [point; turn] moves with z: by a column, and by multiples of units.
         weights = (b * h, c * h)
-        jacobian.append(_point_derivative_columns(J, along, weights, tau, n))
+        by_lack = ca.MX.ones(len(pairs), 1)
+        jacobian.append(ca.horzcat(_point_derivative_columns(J, along, weights, tau, n), by_lack))
         half = _point_derivative_columns(curvature, along, weights, tau, n)
-        hessian += ca.triu(_point_derivative_columns(half.T, along, weights, tau, n))
-        hessian += ca.vertcat(bend, ca.MX(z.numel() - 1, z.numel()))
-    z_p, J = [z, ca.vertcat(least, world)], ca.vertcat(*jacobian)
+        by_point = ca.triu(_point_derivative_columns(half.T, along, weights, tau, n))
+        by_point += ca.vertcat(bend, ca.MX(by_point.size1() - 1, by_point.size2()))
+        hessian += ca.diagcat(by_point, ca.MX(1, 1))
+    z_p, J = [z, ca.vertcat(least, world, ca.vec(planes))], ca.vertcat(*jacobian)
     return ConstraintBlock(
         ca.Function("distances", z_p, [ca.vertcat(*values)]),
         ca.Function("distances_jac", z_p, [ca.vertcat(*values), J]),
@@ -491,11 +501,13 @@ def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
 class Layout:
     """Indices of the variables of N intervals: the step, then knot after knot ``X, s, v, a``.
 
-    The last knot has no acceleration.
+    The last knot has no acceleration. Where links are kept apart, the last variable is by how much
+    they are nearer than they ought to be, m (``has_lack``).
     """
 
     joints: int
     intervals: int
+    has_lack: bool = False
 
     @property
     def _knot(self) -> int:
@@ -504,7 +516,7 @@ class Layout:
     @property
     def size(self) -> int:
         """Number of variables."""
-        return 1 + self._knot * self.intervals + 4 + 2 * self.joints
+        return 1 + self._knot * self.intervals + 4 + 2 * self.joints + self.has_lack
 
     def knots(self) -> tuple[Indices, Indices, Indices, Indices]:
         """Return the places of X (N + 1, 4), s, v (N + 1, n) and a (N, n)."""
@@ -541,7 +553,7 @@ class _PlacedBlock:
     variables, rows
         Places (count, ...) of its variables in x, and of its rows in g; rows of -1 are left out.
     parameters
-        The part of p that it takes.
+        The part of p that it takes: a column for all places, or one for each.
     called_functions
         Those that the program calls: CasADi does not keep them alive.
     """
@@ -556,7 +568,8 @@ class _PlacedBlock:
         """Return the results at all places, each place's nonzeros after the other's."""
         count = len(self.variables)
         z = ca.reshape(x[self.variables.ravel().tolist()], -1, count)
-        p = ca.repmat(self.parameters, 1, count)
+        p = self.parameters
+        p = p if p.size2() == count else ca.repmat(p, 1, count)
         at_all = mapped(function, count)
         self.called_functions.append(at_all)
         results = at_all(z, p, *more)
@@ -574,16 +587,16 @@ class _PlacedBlock:
 def program(stages: Stages, intervals: int) -> Program:
     """Assemble the program from the stages of a problem."""
     n, N = stages.joints, intervals
-    layout = Layout(n, N)
+    layout = Layout(n, N, stages.distances is not None)
     X, s, v, a = layout.knots()
     x = ca.MX.sym("x", layout.size)
     kept = 0 if stages.distances is None else stages.distances.rows
     goals = int(stages.end.values.size1_in(1)) - 7
     sizes = {"start": n, "turn": 4, "direction": 3, "center": 3, "end_effectors": goals}
     drift = int(stages.interval.values.numel_in(1)) - _DIRECTION_SIZE
-    sizes |= {"typical": n, "weights": 2, "angular_momentum": drift}
+    sizes |= {"typical": n, "weights": 2 + layout.has_lack, "angular_momentum": drift}
     if stages.distances is not None:
-        sizes["distances"] = int(stages.distances.values.numel_in(1))
+        sizes["distances"] = N * int(stages.distances.values.numel_in(1))
     p = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
     zero = np.zeros((N, 1), dtype=np.int64)
 
@@ -616,10 +629,14 @@ def program(stages: Stages, intervals: int) -> Program:
     rows = equalities + N * (stages.path_row_count + kept)
     if stages.distances is not None:
         of_distances = equalities + N * stages.path_row_count + np.arange(N * kept).reshape(N, kept)
-        variables = np.hstack([zero, X[:-1], s[:-1], v[:-1], X[1:], v[1:]])
-        placed.append(_PlacedBlock(stages.distances, variables, of_distances, p["distances"]))
+        lack = np.full((N, 1), layout.size - 1)
+        variables = np.hstack([zero, X[:-1], s[:-1], v[:-1], X[1:], v[1:], lack])
+        of_places = ca.reshape(p["distances"], -1, N)
+        placed.append(_PlacedBlock(stages.distances, variables, of_distances, of_places))
     change = ca.reshape(x[a.ravel().tolist()], n, N) / ca.repmat(p["typical"], 1, N)
     f = p["weights"][0] * N * x[0] + p["weights"][1] * ca.sumsqr(change) / N
+    if layout.has_lack:
+        f += p["weights"][2] * x[-1]
 
     g = _gather_rows(rows, [(each.rows, each.called(each.block.values, x)[0]) for each in placed])
     values, jacobian = _jacobian(placed, x, rows)
