@@ -12,9 +12,10 @@ import casadi as ca
 import pytest
 
 from spacerobot_ros.batch import native
-from spacerobot_ros.batch.native import Job, Pending, Program, RowLayout, VectorUnit
+from spacerobot_ros.batch.native import Job, Pending, Program, RowLayout
 from spacerobot_ros.model import vector_machine
 from spacerobot_ros.model.compilation import NoLibraryError, cxx_compiler
+from spacerobot_ros.model.vector_machine import VectorUnit
 
 ROWS = RowLayout({"alive": 1, "state": 7, "measured": 3})
 

@@ -360,9 +360,14 @@ def test_planes_of_obstacles_are_seen_from_the_center_of_mass_at_the_start() -> 
 def test_a_path_is_looked_at_from_its_start_to_its_end() -> None:
     among = planes_library(1.0)
     asked: list[tuple[Any, ...]] = []
-    among.clearance.approaches = lambda *at: asked.append(at) or ["near"]
-    pairs, path = by_planes(among), trajectory(16)
-    assert pairs.approaches_of(path) == ["near"]
+
+    def approaches(*at: Any) -> list[Any]:
+        asked.append(at)
+        return ["near"]
+
+    among.clearance.approaches = approaches
+    pairs: Any = by_planes(among)
+    assert pairs.approaches_of(trajectory(16)) == ["near"]
     ((shapes, required, base),) = asked
     np.testing.assert_allclose(shapes, START + np.linspace(0, 1, 81)[:, None] * (FINAL - START))
     assert required is REQUIRED

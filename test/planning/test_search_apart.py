@@ -315,8 +315,8 @@ def test_planes_are_for_manoeuvres_that_smooth_rows_make_slow(
 
 def test_a_manoeuvre_in_a_given_time_is_not_to_be_faster(model: ManoeuvreModel) -> None:
     kept = Kept({8.0: [-0.01]}, {})
-    search = Apart(model, kept, n40=[9.9])
-    search._make_held_commands = lambda _, path: made(path.duration)  # type: ignore[method-assign]
+    search: Any = Apart(model, kept, n40=[9.9])
+    search._make_held_commands = lambda _, path: made(path.duration)
     (found,) = search._make_clear(progress(kept, duration=9.9), made(8.0), 40)
     assert found.duration == pytest.approx(9.9)
     assert search.coarse == []
@@ -399,7 +399,7 @@ def test_paths_become_clear_and_fast_on_both_grids(
     model: ManoeuvreModel,
     monkeypatch: pytest.MonkeyPatch,
     intervals: int,
-    changes: dict[str, float],
+    changes: dict[str, Any],
     calls: list[tuple[Any, ...]],
     expected: float,
 ) -> None:
@@ -449,7 +449,8 @@ def test_a_path_by_planes_is_solved_for_near_its_guess(
     # Ranges are 4.5 and 6.5 rad: 0.3 rad of each.
     np.testing.assert_allclose(near.reach, [0.15, 0.15])
     solved, lack = search._solve_apart(asked, 40, 1e-4, grid_path(40, 8.0), duration, near)
-    assert (solved.duration, lack) == (pytest.approx(8.6), 0.004)
+    assert solved.duration == pytest.approx(8.6)
+    assert lack == 0.004
     (call,) = solver.calls
     assert call.near is near
     assert (call.bounds.shortest, call.bounds.longest) == pytest.approx(bounds)

@@ -142,7 +142,7 @@ def _program(stages: Stages, boundary: BoundaryConditions) -> dict[str, Any]:
     made = program(stages, intervals)
     s = np.arange(1, made.layout.size + 1)
     x = 0.3 + 0.2 * np.sin(1.3 * s)
-    p = _pack_parameters(boundary, WITHIN, _wavy(stages.joints, intervals))
+    p = _pack_parameters(boundary, WITHIN, _wavy(stages.joints, intervals), fixed=True)
     multipliers = np.cos(0.9 * np.arange(made.lower.size))
     values, jacobian = made.jac_g(x, p)
     hessian = made.hess_lag(x, p, 0.7, multipliers)
