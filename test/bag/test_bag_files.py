@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import struct
@@ -138,6 +139,19 @@ def cut(path: Path) -> None:
 def lengthen(path: Path) -> None:
     with path.open("ab") as file:
         file.write(b"x")
+
+
+def test_a_path_that_cannot_be_followed_is_told_by_its_reason(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with BagWriter(path) as writer:
+        path.rename(tmp_path / "b.mcap")
+        path.symlink_to(path)
+        with pytest.raises(RecordingError) as caught:
+            writer.check()
+        reason = os.strerror(errno.ELOOP)
+        assert str(caught.value) == f"The bag {path} is lost while it is written: {reason}."
+        path.unlink()
+        (tmp_path / "b.mcap").rename(path)
 
 
 @pytest.mark.parametrize(

@@ -162,6 +162,7 @@ def test_the_target_weighs_otherwise(scenario: Scenario) -> None:
         (target,) = targets_of(name, scenario)
         flight, units[name] = target.apply(flight, value), target.unit
         assert target.assigned_parameters == {name}
+        assert not target.is_text
     assert units == {"target.mass": "1", "target.inertia": "1", "target.com.y": "m"}
     assert flight.has_target_masses
     found = load_target(flight.scenario.plant.target)
@@ -211,6 +212,13 @@ def test_turns_are_about_the_axes_of_the_robot(name: str, scenario: Scenario) ->
         before, after = scenario.goal.quaternion, flight.scenario.goal.quaternion
     turn = Rotation.from_quat(before).inv() * Rotation.from_quat(after)
     np.testing.assert_allclose(turn.as_rotvec(), [0.0, 0.25, 0.0], atol=1e-12)
+
+
+def test_a_start_without_an_attitude_is_turned_from_that_of_the_world(scenario: Scenario) -> None:
+    upright = scenario.with_overrides("plant", {"initial_orientation": []})
+    flight = targets_of("initial.rotvec.y", upright)[0].apply(DrawnFlight.of(upright), 0.25)
+    turned: Any = flight.scenario.plant.initial_orientation
+    np.testing.assert_allclose(turned, [0.0, np.sin(0.125), 0.0, np.cos(0.125)], atol=1e-15)
 
 
 def test_goals_are_shifted_in_the_world(scenario: Scenario) -> None:

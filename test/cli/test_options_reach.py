@@ -114,7 +114,7 @@ def test_goals_of_end_effectors_reach_the_scenario(
     assert_hands(hands)
 
 
-@pytest.mark.parametrize("pose", [(), (0.25, -0.5, 0.75)])
+@pytest.mark.parametrize("pose", [(), (0.25, -0.5, 0.75), (0.25, -0.5, 0.75, 0.6, 0.0, 0.0, 0.8)])
 def test_goals_of_end_effectors_are_sent_with_and_without_one_of_the_base(
     pose: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,7 +129,8 @@ def test_goals_of_end_effectors_are_sent_with_and_without_one_of_the_base(
     (goal,) = sent
     assert_hands(goal.end_effectors)
     if pose:
-        np.testing.assert_array_equal(goal.position, pose)
+        np.testing.assert_array_equal(goal.position, pose[:3])
+        np.testing.assert_allclose(goal.quaternion, pose[3:] or (0, 0, 0, 1))
 
 
 def way_in(folder: Path) -> Path:

@@ -44,6 +44,7 @@ def test_schedule_and_path_are_written_and_drawn(tmp_path: Path) -> None:
     written = json.loads(target.read_text())
     assert written["method"] == "optimal"
     assert written["succeeded"] is True
+    assert written["goal"] == pytest.approx([0, 0, 0, 0, 0, np.sin(0.35), np.cos(0.35)])
     assert written["attitude_error_rad"] < 1e-6
     assert written["final_attitude_rotvec_rad"] == pytest.approx([0, 0, 0.7], abs=1e-6)
     positions = np.array(written["schedule"]["positions"])

@@ -88,6 +88,25 @@ def test_the_bound_of_overlapping_boxes_is_minus_their_depth() -> None:
     assert bound(one, Pose(), other, Pose(r=np.array([1.3, 0.2, 0.1]))) == pytest.approx(-0.2)
 
 
+def test_a_capsule_is_its_own_bound() -> None:
+    radius, length = 0.2, 0.6
+    box = RoundedBox.around(Shape("capsule", (radius, length), OFFSET))
+    assert box.volume == pytest.approx(math.pi * radius**2 * (length + 4 / 3 * radius))
+    # End to end, its balls are 0.9 m apart.
+    along = Pose(r=OFFSET.R @ [0.0, 0.0, 0.9 + length])
+    assert bound(box, Pose(), box, along) == pytest.approx(0.9 - 2 * radius)
+
+
+def test_edges_that_cross_overlap_by_their_heights() -> None:
+    """Beams that lie on their edges, one across the other at 30 degrees."""
+    rest = Pose(matrix_from_rpy([math.pi / 4, 0.0, 0.0]))
+    beam = RoundedBox(rest, np.array([2.0, 0.1, 0.1]))
+    height = 0.1 * math.sqrt(2)
+    for depth in (0.01, 0.03):
+        above = Pose(matrix_from_rpy([0, 0, math.pi / 6]), np.array([0, 0, 2 * height - depth]))
+        assert bound(beam, Pose(), beam, above) == pytest.approx(-depth)
+
+
 @pytest.mark.parametrize("squash", [(1.0, 1.0, 1.0), (0.05, 0.05, 1.0), (1.0, 0.4, 0.0)])
 def test_a_mesh_is_enclosed(squash: tuple[float, float, float]) -> None:
     rng = np.random.default_rng(5)

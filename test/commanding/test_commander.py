@@ -202,6 +202,13 @@ def test_every_state_is_answered_once_by_its_stamp(planner: Rig, controller: Rig
         assert rig.host.commands == [1, 2, 3]
 
 
+def test_a_controller_answers_when_the_pose_comes_after_the_joints(controller: Rig) -> None:
+    controller.joints(1)
+    assert controller.host.commands == []
+    controller.odom(1)
+    assert controller.host.commands == [1]
+
+
 def test_an_inactive_commander_answers_nothing_until_it_is_active(planner: Rig) -> None:
     planner.commander.deactivate()
     planner.state(1)

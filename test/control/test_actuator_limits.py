@@ -30,6 +30,14 @@ def test_force_and_torque_are_limited_apart() -> None:
     np.testing.assert_array_equal(saturated.realised.tau, COMMAND.tau)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_efforts_of_all_joints_beyond_their_limits_are_lowered(sign: float) -> None:
+    limits = ActuatorLimits(np.inf, np.inf, np.array([2.0, 3.0]))
+    saturated = limits.apply(Actuation(np.zeros(6), sign * np.array([2.5, 7.0])))
+    np.testing.assert_array_equal(saturated.realised.tau, [sign * 2.0, sign * 3.0])
+    np.testing.assert_array_equal(saturated.excess.tau, [sign * 0.5, sign * 4.0])
+
+
 @pytest.mark.parametrize("limits", [(13.0, 3.0, 7.0), (np.inf, np.inf, np.inf)])
 def test_what_is_possible_passes(limits: tuple[float, float, float]) -> None:
     force, torque, effort = limits

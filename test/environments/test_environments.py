@@ -32,7 +32,7 @@ from spacerobot_ros.environments.tasks import (
     command_of,
 )
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
-from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.compilation import cxx_compiler
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
 from spacerobot_ros.resources import robot_file, share_directory
@@ -201,10 +201,10 @@ def test_a_step_is_that_of_the_plant_of_the_scenario() -> None:
     assert before == pytest.approx(0.3)
     np.testing.assert_allclose(observation[:3], [0, 0, 0.3], atol=1e-12)
     np.testing.assert_array_equal(observation[3:6], plant.q)
-    action = np.array([0.25, -1.5, 0.5])
+    action = np.array([0.25, -1.5, 3.0])
     observation, reward, terminated, truncated, info = environment.step(action)
     for _ in range(3):
-        plant.step(np.array([0.25, -1.0, 0.5]) * robot.velocity_limit)
+        plant.step(np.array([0.25, -1.0, 1.0]) * robot.velocity_limit)
     for part, wanted in zip(
         np.split(observation[3:], [3, 6]), (plant.q, plant.qdot, plant.twist), strict=True
     ):
@@ -213,7 +213,7 @@ def test_a_step_is_that_of_the_plant_of_the_scenario() -> None:
     assert info["error"] == pytest.approx(np.arccos((np.trace(R_BG) - 1) / 2), abs=1e-9)
     seconds = 3 * scenario.plant.control_period
     assert reward == pytest.approx(
-        10 * (before - info["error"]) - seconds * (0.02 + 0.01 * (0.0625 + 1 + 0.25) / 3)
+        10 * (before - info["error"]) - seconds * (0.02 + 0.01 * (0.0625 + 1 + 1) / 3)
     )
     assert (terminated, truncated) == (False, False)
 
@@ -487,6 +487,21 @@ def test_random_attitudes_are_within_their_spread() -> None:
     np.testing.assert_allclose(np.array(turns)[:, :2], 0.0, atol=1e-12)
     assert 0.25 < np.abs(turns).max() <= 0.3
     assert min(turn[2] for turn in turns) < -0.1
+
+
+def test_a_base_that_no_joint_turns_is_turned_by_torques_alone() -> None:
+    hull = """<robot name="hull"><link name="hull"><inertial><mass value="20"/>
+      <inertia ixx="1.5" iyy="2" izz="2.5" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+    robot, given = SpaceRobot(parse_robot(hull)), states(0)
+    with pytest.raises(ParameterError, match=r"do not turn its base .* give 'max_torque'"):
+        Reorient(robot, pushed=(True, False)).random_goal(given, 0.3, np.random.default_rng(6))
+    task, rng = Reorient(robot, pushed=(False, True)), np.random.default_rng(6)
+    start = Rotation.from_quat(given.pose[0, 3:])
+    goals = Rotation.from_quat([task.random_goal(given, 0.3, rng) for _ in range(60)])
+    turns = (start.inv() * goals).as_rotvec()
+    assert 0.25 < np.linalg.norm(turns, axis=1).max() <= 0.3
+    # About all axes: the turns span the space.
+    assert np.linalg.svd(turns, compute_uv=False)[-1] > 0.5
 
 
 def test_a_link_of_a_planar_robot_reaches_in_its_plane() -> None:

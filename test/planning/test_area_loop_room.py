@@ -70,6 +70,8 @@ def test_boxes_of_loops_keep_clear_and_are_the_best_that_do(arm: SpaceRobot) -> 
     assert kept.shape[1] + kept.longest[1] / 2 <= WALL + 1e-12
     assert kept.longest.max() <= 0.5
     assert nominal_with_clearance(arm, START.q, [(0, 1, 2)], 1.0, 0.5, lambda shapes: False) is None
+    # Edges of less than a tenth of a milliradian are none.
+    assert nominal_with_clearance(arm, START.q, [(0, 1, 2)], 1.0, 1e-5, lambda shapes: True) is None
     seen: list[Array] = []
 
     def refuse(shapes: Array) -> bool:

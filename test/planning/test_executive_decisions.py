@@ -342,6 +342,7 @@ def test_statuses_speak_of_a_goal_by_its_id() -> None:
 
 def test_times_and_corrections_are_those_of_the_goal() -> None:
     loop = resting()
+    assert loop.executive.statistics.plan_time_s == 0.0, "before the first goal"
     stub_of(loop).overshoot = 0.1
     status = loop.decide(NEAR)
     assert status.manoeuvre_time_s == pytest.approx(2 * 8 * 0.05)

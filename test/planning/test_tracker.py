@@ -122,6 +122,24 @@ def test_braking_near_the_end_of_a_schedule_stays_on_it() -> None:
     np.testing.assert_allclose(commanded(braking, 30, RAMP[20])[0], RAMP[20])
 
 
+def test_wheels_go_over_to_their_rates_after_the_schedule_while_the_others_brake() -> None:
+    ends = np.array([0.0, 0.6, 0.0])
+    schedule = replace(schedule_of(), end_velocities=ends)
+    braking = ScheduleFollower(schedule, START_NS, 2.0).braking_follower(
+        START_NS + 4 * PERIOD_NS, 1.2
+    )
+    places = np.array([commanded(braking, 4 + ticks, np.zeros(3))[0] for ticks in range(16)])
+    plain = ScheduleFollower(schedule_of(), START_NS, 2.0).braking_follower(
+        START_NS + 4 * PERIOD_NS, 1.2
+    )
+    others = np.array([commanded(plain, 4 + ticks, np.zeros(3))[0] for ticks in range(16)])
+    np.testing.assert_array_equal(places[:, [0, 2]], others[:, [0, 2]])
+    # From -0.2 to 0.6 rad/s in 1.2 s, by the trapezoids of a steady change; then steadily on.
+    rates = np.interp(PERIOD * np.arange(16), [0.0, 1.2], [-0.2, 0.6])
+    trapezoids = PERIOD * np.cumsum((rates[1:] + rates[:-1]) / 2)
+    np.testing.assert_allclose(places[:, 1], -0.08 + np.append(0.0, trapezoids), atol=1e-12)
+
+
 @pytest.mark.parametrize("since", [0, 3, 9, 40])
 def test_the_shapes_of_braking_are_those_that_will_be_commanded(since: int) -> None:
     follower = ScheduleFollower(schedule_of(), START_NS, 2.0)

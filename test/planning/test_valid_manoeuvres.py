@@ -52,7 +52,7 @@ def method(**options: Any) -> Any:
 
     def attitudes(positions: Array, quaternion: Array, _: Array) -> Array:
         end = Rotation.from_quat(quaternion) * TURN * Rotation.from_rotvec(made.off)
-        return np.tile(end.as_quat(), (len(positions), 1))
+        return np.vstack([np.tile(quaternion, (len(positions) - 1, 1)), end.as_quat()])
 
     made._prediction = SimpleNamespace(attitudes=attitudes)
     kind = SimpleNamespace(
@@ -135,7 +135,13 @@ def test_limits_efforts_and_distances_are_kept() -> None:
     made = method()
     made.near = "links 'a' and 'b' are near"
     assert refusal(made, shapes(30)) == "links 'a' and 'b' are near"
-    rows = SimpleNamespace(evaluate=lambda turn, q, p: (np.array([[0.0, made.miss]]), 0, 0))
+
+    def evaluate(turn: Array, q: Array, _: Any) -> tuple[Array, int, int]:
+        assert (Rotation.from_quat(turn[0]).inv() * TURN).magnitude() < 1e-9, "at the end"
+        np.testing.assert_array_equal(q, [FINAL])
+        return np.array([[0.0, made.miss]]), 0, 0
+
+    rows = SimpleNamespace(evaluate=evaluate)
     made = method()
     made.kind.model.end_effectors = rows
     made.miss = 0.9e-7

@@ -145,7 +145,9 @@ def test_kills_come_in_their_order() -> None:
     assert timeline.due(0.5) == ([], [])
     assert timeline.due(1.0) == (["planner"], [])
     assert timeline.away == {"planner"}
-    assert timeline.due(5.5) == (["plant"], ["planner"])
+    assert timeline.due(4.5) == ([], ["planner"])
+    assert timeline.away == set()
+    assert timeline.due(5.5) == (["plant"], [])
     assert timeline.due(100.0) == (["planner"], ["plant"])
     assert timeline.due(200.0) == ([], [])
     assert timeline.away == {"planner"}

@@ -100,6 +100,7 @@ def test_a_line_is_read_and_written(line: str, written: str) -> None:
         ("joint_stuck elbow", ("shoulder_yaw, shoulder_pitch, elbow_pitch",)),
         ("joint_slow elbow_pitch at 3", ("needs a value", "factor")),
         ("joint_slow elbow_pitch 1.5", ("1.5", "0 to 1")),
+        ("nozzle_weak minus_x 1.5", ("1.5", "0 to 1")),
         ("actuator_noise elbow_pitch -1", ("-1", "from 0 to 1e+06")),
         ("sensor_noise position 1e200", ("1e+200", "from 0 to 1e+06")),
         ("sensor_noise joints 1e155", ("from 0 to 1e+06",)),

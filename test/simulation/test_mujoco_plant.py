@@ -258,6 +258,18 @@ def test_a_stuck_joint_is_held_and_let_go() -> None:
     np.testing.assert_allclose(flown.momentum[:6], flown.expected_momenta, rtol=0, atol=1e-4)
 
 
+def test_servos_leave_a_stuck_joint_alone_and_turn_the_others() -> None:
+    rates = np.array([0.2, 0.4, -0.3])
+    flown = plant(**ARM, faults=["joint_stuck shoulder_pitch at 0.25"])
+    places = []
+    for _ in range(30):
+        flown.step(rates)
+        places.append(flown.q.copy())
+    moved = np.array(places[29]) - places[14]
+    np.testing.assert_allclose(moved[[0, 2]], 15 / 40 * rates[[0, 2]], atol=1e-4)
+    assert np.ptp(np.array(places[10:])[:, 1]) < 1e-5
+
+
 def test_a_wheel_at_its_largest_rate_gets_no_faster() -> None:
     robot = SpaceRobot.from_file(robot_file("servicer_wheels"))
     wheel = robot.joint_names.index(robot.description.wheel_names[1])

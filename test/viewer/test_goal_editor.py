@@ -125,6 +125,8 @@ def test_the_ghost_is_not_drawn_where_the_robot_is(server: Any) -> None:
     assert not is_drawn()
     assert not is_drawn(POSE * [1, 1, 1, -1, -1, -1, -1]), "the same attitude"
     assert is_drawn(POSE + np.eye(7)[0] * 0.1)
+    # Rounding makes a quaternion longer than one, and no cosine of an angle.
+    assert not is_drawn(POSE * [1, 1, 1, *[1 + 1e-12] * 4])
     half = np.array([0.0, 0.0, 0.05])
     assert is_drawn(np.concatenate([POSE[:3], np.sin(half), [np.cos(0.05)]])), "0.1 rad"
     page.editor.show_check(GoalCheck(Verdict.REACHABLE, shape=np.array([0.0, 0.0, 0.1])))

@@ -227,6 +227,17 @@ def test_a_past_of_many_states_is_evenly_thinned() -> None:
     assert recent.at(last + 1.0) == 19_999
 
 
+def test_a_past_that_begins_late_is_thinned_as_one_from_zero() -> None:
+    kept = []
+    for began in (0.0, 4096.0):
+        recent: content.RecentItems[int] = content.RecentItems(span_s=256.0, most=64)
+        for k in range(1000):
+            recent.add(began + 0.125 * k, k)
+        kept.append(list(recent.items))
+    assert kept[0] == kept[1]
+    assert 32 <= len(kept[0]) <= 64
+
+
 def test_an_empty_line_stays_hidden_when_its_layer_is_shown(server: Any) -> None:
     line = scene.Lines(server.scene, "/line", (1, 2, 3))
     line.show(visible=True)

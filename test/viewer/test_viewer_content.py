@@ -333,7 +333,10 @@ def test_the_momentum_budget_is_that_of_the_controller() -> None:
         assert tint in row[2]
     assert "dumped" not in text
     dumping = controlled(momentum=parts, wheels=shares, dumping=True)
-    assert "The momentum of the wheels is being dumped." in content.momentum_html(dumping)
+    (line,) = re.findall(
+        "<[^<]*>The momentum of the wheels is being dumped.", content.momentum_html(dumping)
+    )
+    assert "#c98a00" in line, "a warning"
 
 
 def test_without_a_momentum_budget_there_is_no_panel() -> None:
@@ -394,6 +397,8 @@ def test_a_trail_is_as_long_as_the_flight_with_as_many_points_as_are_drawn() -> 
     assert 50 <= len(trail.points) <= 100
     assert trail.points[0][0] == 0.0
     assert trail.points[-1][0] > 48.0
+    gaps = np.diff(trail.points[:, 0])
+    assert gaps.max() < 2.2 * gaps.min(), "thinned evenly"
     trail.add(100.0, np.array([0.5, 1.0, 0.0]))
     assert trail.points[-1].tolist() == [0.5, 1.0, 0.0]
     assert trail.points[-2][0] < 0.5
