@@ -20,12 +20,13 @@ from spacerobot_ros.commanding.commander import (
     StateArrays,
 )
 from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerCommander
+from spacerobot_ros.commanding.fly_to import FlyTo
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.commanding.trajectory_output import TrajectoryOutput
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.errors import CommandError, PlanningError
+from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Inertia
@@ -475,6 +476,28 @@ def test_an_abort_gives_up_goals_with_and_without_a_robot(robot: SpaceRobot) -> 
     rig.state(1)
     assert rig.commander.abort() is not None
     assert rig.host.statuses[-1].goal_id == "5.000000000"
+
+
+def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
+    planner: Rig,
+) -> None:
+    first, second = MagicMock(), MagicMock()
+    for goal_id, client in (("a", first), ("b", second)):
+        planner.commander.receive_fly_to(goal_id, lambda: FlyTo(GOAL), client)
+    decided = [(each.state.value, each.goal_id) for each in planner.host.statuses if each.goal_id]
+    assert decided == [("aborted", "a")]
+    ended = [each.goal_id for each in planner.host.events if each.kind is EventKind.GOAL_ABORTED]
+    assert ended == ["a"]
+    (result,) = first.end.call_args.args
+    assert result.outcome == "aborted"
+    second.end.assert_not_called()
+
+
+@pytest.mark.parametrize("tick_rate", [0.0, -0.5, -1.0, 1e6])
+def test_a_commander_has_a_positive_tick_rate(tick_rate: float) -> None:
+    for kind in (PlannerConfig, ControllerConfig):
+        with pytest.raises(ParameterError, match="tick_rate"):
+            config(kind, tick_rate=tick_rate)
 
 
 def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(

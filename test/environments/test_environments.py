@@ -582,6 +582,17 @@ def test_environments_are_made_without_rendering_alone() -> None:
                 make(ARM, scenario="planar_chain", render_mode="human")
 
 
+def test_the_defaults_are_those_of_the_page() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs/environments.md").read_text("utf-8")
+    config, weights = EpisodeConfig("reorient"), RewardWeights()
+    told = re.findall(r"^\| `(hold|time_limit)` \| .* \| ([\d.]+) \|$", page, re.MULTILINE)
+    assert {name: getattr(config, name) for name in ("hold", "time_limit")} == {
+        name: float(value) for name, value in told
+    }
+    told = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| .* \|$", page, re.MULTILINE)
+    assert vars(weights) == {name: float(value) for name, value in told}
+
+
 def test_the_campaign_of_the_page_draws_masses_starts_and_goals(tmp_path: Path) -> None:
     page = (Path(__file__).resolve().parents[2] / "docs/environments.md").read_text("utf-8")
     (text,) = re.findall(r"```yaml\n(campaign:.*?)```", page, re.DOTALL)

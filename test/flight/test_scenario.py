@@ -191,6 +191,7 @@ def test_a_robot_beside_its_scenario_is_found_and_integers_go_with_floats(tmp_pa
     )
     scenario = load_scenario(str(file))
     assert scenario.problem().robot.n == 2
+    assert scenario.goal.position.tolist() == [0.0, 0.0, 0.0], "unless it is given"
     given = scenario.parameters("plant")
     assert given["robot"] == str(tmp_path / "mine.urdf")
     assert given["initial_joint_positions"] == (0.0, 0.5)

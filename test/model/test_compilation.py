@@ -450,3 +450,11 @@ def test_equal_robots_share_functions_and_others_do_not(monkeypatch: pytest.Monk
         monkeypatch.setenv("CC", real)
         monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
         assert again.function("velocity_step:2") is not step
+
+
+def test_a_long_wait_is_announced_once_in_a_process(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    for _ in range(3):
+        compilation._announce_compilation()
+    told = [each for each in caplog.records if hasattr(each, compilation.ANNOUNCEMENT_ATTRIBUTE)]
+    assert len(told) <= 1, "an earlier test may have heard it"

@@ -11,13 +11,14 @@ from planning.drifting import END_ERROR, angle_between, flown_by_pinocchio
 from planning.test_optimal import ARM_START, FOLDER
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from support.planners import planner_of
 
 from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, matrices_from_quaternions
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, plan
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.held_commands import DriftVariation
@@ -271,3 +272,23 @@ def test_a_goal_that_is_never_in_reach_has_the_refusal_of_the_whole_search(
     assert len(calls[-1]) == 6, "it is not to end early"
     # All goals' passes in four turns of the base, without an end before.
     assert len(calls) - few > few >= 2
+
+
+@pytest.mark.parametrize("kind", ["linear_momentum", "angular_momentum"])
+def test_a_momentum_counts_where_a_method_for_robots_at_rest_refuses_it(
+    arm: SpaceRobot, kind: str
+) -> None:
+    method = planner_of("area_loop", arm, 0.25, Tolerance(1.0, 1e-3)).method
+    counts = []
+    for speed in np.geomspace(1e-13, 1e-5, 17):
+        momentum = speed * arm.total_mass * np.array([0.6, 0.0, -0.8])
+        state = replace(RobotState(np.zeros(3), ATTITUDE, ARM_START), **{kind: momentum})
+        refused = False
+        try:
+            method._require_rest(state)
+        except PlanningError:
+            refused = True
+        np.testing.assert_array_equal(method.significant(momentum), refused * momentum)
+        counts.append(refused)
+    assert counts == sorted(counts)
+    assert len(set(counts)) == 2

@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.core.cancellation import NEVER
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 from spacerobot_ros.planning.methods.resolved_rate import (
@@ -20,6 +21,7 @@ from spacerobot_ros.planning.methods.resolved_rate import (
     ResolvedRateGait,
     _fastest_speeds,
     _LinkPath,
+    _LinkPaths,
     _SmoothPath,
     _TimedPath,
     trace_joint_path,
@@ -291,6 +293,17 @@ def test_a_singularity_is_described_by_its_measure_and_its_shape() -> None:
     )
 
 
+def test_the_measure_is_a_determinant_where_joints_are_as_many_as_rows() -> None:
+    square, wide = np.array([[0.0, -2.0], [1.5, 9.0]]), np.array([[0, -2.0, 0], [1.5, 0, 0]])
+    for J, name, value in (
+        (square, "|det J*|", 3.0),
+        (wide, "the smallest singular value of J* (scaled)", 15.0),
+    ):
+        lines: Any = SimpleNamespace(jacobian=lambda *_: J, scaled_jacobian=lambda *_: 10 * J)  # noqa: B023
+        found = _LinkPaths.singularity_measure(lines, np.zeros(J.shape[1]), IDENTITY)
+        assert (found[0], round(found[1], 12)) == (name, value)
+
+
 def test_the_first_of_a_limit_and_a_singularity_counts() -> None:
     beyond = [*SHAPES[:2], [2.0, 0.0], [2.0, 0.1], [2.0, 0.2]]
     slow_first = obstacle([0.5, 0.001, 0.2, 0.2, 0.2], beyond)
@@ -344,3 +357,16 @@ def test_commands_that_never_keep_the_limits_are_refused() -> None:
     tried, said = held([(1.0 + 2e-9, 0.0)] * 8)
     assert (tried, said) == ([10, 11, 12, 13, 14, 15, 16, 17], sentence)
     assert held([(1.0, 2e-9)]) == ([10], sentence)
+
+
+def test_a_robot_without_joints_moves_no_hand() -> None:
+    link = """<link name="{}"><inertial><mass value="2"/>
+      <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+    joint = """<joint name="slide" type="prismatic"><parent link="hull"/><child link="rod"/>
+      <limit lower="-1" upper="1" velocity="1" effort="1"/></joint>"""
+    with pytest.raises(PlanningError, match="'stone' has no joints"):
+        ResolvedRateGait.require_suitable(
+            SpaceRobot.from_urdf(f'<robot name="stone">{link.format("hull")}</robot>')
+        )
+    parts = link.format("hull") + joint + link.format("rod")
+    ResolvedRateGait.require_suitable(SpaceRobot.from_urdf(f'<robot name="one">{parts}</robot>'))

@@ -167,6 +167,28 @@ def test_the_hand_stops_before_the_singularity_of_paper_4_and_comes_back() -> No
     assert abs(np.linalg.det(J)) > 0.1
 
 
+def test_a_limit_is_over_when_it_has_not_come_for_the_timeout_of_twists(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loop = loop_of(twist_timeout=0.3)
+    fly(loop, 5)
+    follower = loop.executive._teleoperation.follower  # type: ignore[union-attr]
+    rates, limits = follower.rates, iter([*"ll....l", *40 * "."])
+
+    def limited(*given: Any) -> tuple[Array, str]:
+        return rates(*given)[0], "Joint 'wrist' is slow." if next(limits) == "l" else ""
+
+    monkeypatch.setattr(follower, "rates", limited)
+    begun = len(loop.statuses)
+    told = []
+    for _ in range(20):
+        fly(loop, 1)
+        told.append(loop.statuses[-1].message.startswith("Joint 'wrist' is slow."))
+    # With the last of the limits, 6 ticks of 0.05 s after it, and never in between.
+    assert told == 13 * [True] + 7 * [False]
+    assert len(loop.statuses) == begun + 2
+
+
 def test_joints_stop_at_their_limits() -> None:
     initial = InitialState(joint_positions=np.array([0.3, 2.5]))
     loop = loop_of("planar_manipulator", initial, clearance=0.0)

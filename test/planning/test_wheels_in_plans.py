@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from planning.drifting import END_ERROR, angle_between, flown_by_pinocchio, turn_rate_in_pinocchio
+from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
 from support.planner_loop import Loop, robot_of
 from support.wheels import ARM, ELBOW, HULL, WHEELS, text, wheel, wheeled_robot
 
@@ -19,6 +21,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_from_rotvec,
+    quaternion_inverse,
     quaternion_multiply,
     rotvec_from_quaternion,
 )
@@ -28,6 +31,9 @@ from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
+from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
+from spacerobot_ros.planning.methods.optimal.transcription import turn_function
 from spacerobot_ros.planning.methods.registry import build_method
 from spacerobot_ros.simulation.plant import InitialState
 
@@ -222,6 +228,34 @@ def test_wheels_spin_on_after_goals_at_restarts_and_after_an_abort(tmp_path: Pat
     apart = angle_between(loop.poses[-1][3:], loop.poses[-51][3:])
     assert apart < 0.25 * 50 * 0.05 * float(np.linalg.norm(initial.angular_momentum)) / 4.0
     assert loop.decide(([0.0, 0.0, 0.0], [0.2, 0.3, -0.1])).state is PlannerState.REACHED
+
+
+def test_guesses_keep_the_momentum_while_wheels_turn_the_base() -> None:
+    """By Pinocchio, with the rates of the base by differences of the attitudes of the guess."""
+    robot, state, goal, L_W = case(THREE, 3, 0.4)
+    wheels = ReactionWheels.of(robot.description)
+    R = matrix_from_quaternion(state.quaternion)
+    turn = quaternion_multiply(quaternion_inverse(state.quaternion), goal)
+    final = state.q + 0.4 * np.eye(robot.n)[wheels.other[0]]
+    boundary = BoundaryConditions(state.q, turn, final, angular_momentum=L_W @ R)
+    limits = MotionLimits(robot.lower, robot.upper, robot.velocity_limit, np.full(robot.n, 20.0))
+    curvature = robot.function("curvature", compile=False)
+    guesses = InitialGuesses(turn_function(robot, drifting=True), curvature, 8, L_W @ R)
+    oracle = PinocchioOracle(THREE, robot.joint_names)
+    for guess in islice(guesses.generate_with_wheels(wheels, boundary, limits, robot), 2):
+        attitudes = Rotation.from_quat(guess.quaternions)
+        assert attitudes[0].magnitude() < 1e-9
+        assert angle_between(guess.quaternions[-1], turn) < 1e-9
+        assert not guess.velocities[[0, -1]].any()
+        halves = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() / guess.step
+        for k in (1, 3, 5, 7):
+            rates = oracle.base_twist(
+                guess.shapes[k],
+                guess.velocities[k],
+                guess.quaternions[k],
+                [0, 0, 0, *boundary.angular_momentum],
+            )
+            np.testing.assert_allclose(rates[3:], (halves[k - 1] + halves[k]) / 2, atol=1e-9)
 
 
 def test_rates_that_are_not_finite_are_refused() -> None:

@@ -16,10 +16,11 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import Scenario, load_scenario, scenario_or_robot, scenario_text
 from spacerobot_ros.session.run import run_scenario
+from spacerobot_ros.session.stack import Stack
 
 QUICK = {"optimal.answers": 1, "optimal.intervals": 20, "optimal.cache": 0}
 
@@ -182,3 +183,13 @@ def test_a_part_of_the_base_is_not_sent_with_an_end_effector(tmp_path: Path) -> 
     scenario = load_scenario("reach").with_end_effectors([aim], frozenset({"attitude"}))
     with pytest.raises(ParameterError, match="whole pose of the base or with none"):
         run_scenario(scenario, tmp_path / "run.mcap")
+
+
+@pytest.mark.parametrize("base", [frozenset(), POSE])
+def test_end_effectors_are_sent_with_the_whole_pose_of_the_base_and_with_none(
+    base: frozenset[Controlled],
+) -> None:
+    aim = EndEffectorGoal.checked("link_7", [0.4, 0.1, 0.8])
+    scenario = load_scenario("reach").with_end_effectors([aim], base)
+    made = type("Unstarted", (Stack,), dict.fromkeys(Stack.__abstractmethods__))
+    assert made(scenario, None).names == ("plant", "planner")

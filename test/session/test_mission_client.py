@@ -113,7 +113,9 @@ def test_every_goal_has_an_id_of_its_own_though_time_stands_still(harness: Harne
 
 def test_the_first_gait_for_the_goal_is_kept(harness: Harness) -> None:
     mission = Mission(harness, "planner")
+    assert mission.client.goal_id is None
     goal_id = mission.send(GOAL)
+    assert mission.client.goal_id == goal_id
     statuses = [
         PlannerStatus(
             PlannerState.EXECUTING,
