@@ -270,19 +270,19 @@ def test_small_problems_and_drifting_robots_have_no_coarse_grid(
     assert found.duration == pytest.approx(8.7)
 
 
-def test_after_four_solutions_that_are_too_near_new_guesses_keep_their_pairs_apart(
+def test_after_six_solutions_that_are_too_near_new_guesses_keep_their_pairs_apart(
     model: ManoeuvreModel,
 ) -> None:
     kept = Kept({8.0: [-0.01, 0.001], 8.1: [0.002]}, {})
-    # Four that are too near; seven guesses that need not keep clear, without a solution; then those
+    # Six that are too near; seven guesses that need not keep clear, without a solution; then those
     # that must on the coarse grid, and one of them on the full grid.
-    search = Apart(model, kept, n40=[8.1] * 4 + [9.0], n8=[None] * 7 + [8.8] * 3)
+    search = Apart(model, kept, n40=[8.1] * 6 + [9.0], n8=[None] * 7 + [8.8] * 3)
     asked = progress(kept)
     (found,) = search._keep_clear(asked, [made(8.0)], 40)
-    assert search.separated_pairs[:4] == [(40, 1e-5, (0, 1))] * 4
-    assert search.separated_pairs[4:6] == [(40, 1e-5, (0, 1)), (8, 1e-4, (0, 1))]
-    assert kept.rooms == {0: 4, 1: 1}
-    assert list(asked.limits.distances) == [4, 1]
+    assert search.separated_pairs[:6] == [(40, 1e-5, (0, 1))] * 6
+    assert search.separated_pairs[6:8] == [(40, 1e-5, (0, 1)), (8, 1e-4, (0, 1))]
+    assert kept.rooms == {0: 6, 1: 1}
+    assert list(asked.limits.distances) == [6, 1]
     assert asked.starts == 7 + 2
     assert asked.options.answers == 2
     assert found.duration == pytest.approx(9.0)

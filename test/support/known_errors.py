@@ -264,7 +264,8 @@ class Workplace:
 
     def _pytest(self, words: Iterable[str]) -> tuple[int | None, str]:
         """Run tests in the copy; return pytest's exit code, None out of time, and its output."""
-        options = ("-q", "-x", "-p", "no:cacheprovider", "--tb=line")
+        # Some of the tests that are named have become slow.
+        options = ("-q", "-x", "-p", "no:cacheprovider", "--tb=line", "-m", "slow or not slow")
         process = subprocess.Popen(
             [sys.executable, "-m", "pytest", *options, *words],
             cwd=self._folder,

@@ -51,7 +51,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     UnusableCandidateError,
 )
 
-ROUNDS = 4
+ROUNDS = 6
 """Solutions from one guess, each with more pairs or more room, before it is given up."""
 
 _INITIAL_MARGIN = 2e-3

@@ -101,7 +101,7 @@ coarse grid underestimates some costs by more than others."""
 _MAX_SEPARATION_ITERATIONS = 80
 """Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most."""
 
-_MAX_CLEARING_ITERATIONS = 150
+_MAX_CLEARING_ITERATIONS = 200
 """Steps of the solver from a manoeuvre in collision to one that keeps clear at most: those that
 come to an end take fewer."""
 
