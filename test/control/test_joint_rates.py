@@ -456,6 +456,19 @@ def test_what_is_held_does_not_change_with_the_arrays_of_a_state() -> None:
     assert np.abs(controller.command(0.01, state, q, state.qdot).realised.tau).max() > 0.1
 
 
+def test_a_reference_at_rest_does_not_change_with_the_arrays_of_a_state() -> None:
+    state = planar_start()
+    reference = Reference.present(load("planar_manipulator"), state)
+    assert reference.base is not None
+    assert reference.joints is not None
+    parts = reference.base.position, reference.base.quaternion, reference.joints.q
+    before = [part.copy() for part in parts]
+    for part in (state.r_WB, state.quaternion_WB, state.q):
+        part += 0.1
+    for part, expected in zip(parts, before, strict=True):
+        np.testing.assert_array_equal(part, expected)
+
+
 @pytest.mark.parametrize(
     ("wanted", "pushed", "share"),
     [

@@ -150,6 +150,10 @@ def test_messages_of_a_clock_wait_together_until_something_else_is_asked(tmp_pat
     assert (len(alone), recording.messages, writer.messages_written) == (1, 2, 0)
     assert recording.now_ns == 3 * S
     assert writer.messages_written == 2
+    # What is recorded alone comes after those that waited.
+    take(message("/clock", 3 * S, rng))
+    recording.record(writer.add_topic("/talk", TOPICS["/momentum"]), b"alone")
+    assert writer.message_counts == {"/clock": 3, "/talk": 1}
     cut = message("/clock", 4 * S, rng)[:4]
     take(cut)
     assert recording.now_ns == 0, "a cut message has no time"

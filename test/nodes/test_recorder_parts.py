@@ -140,6 +140,24 @@ def test_messages_carry_the_clock_and_their_stamps(tmp_path: Path) -> None:
     assert attachments == [("a.robot_description.urdf", b"<robot name='1'/>")]
 
 
+def test_without_a_clock_messages_keep_their_stamps(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = BagWriter(path)
+    recording = Recording(writer, 2.0, wall_time=lambda: 7 * S)
+    recording.start()
+    channel = writer.add_topic("/joint_states", "sensor_msgs/msg/JointState", QosProfile())
+    take = recorder._recording_callback(
+        recording, recorder._StampReader(), "/joint_states", JointState, channel
+    )
+    for second in (0.5, 1.5, 1.5, 1.25):
+        take(bytes(serialize_message(joint_states(second, ["a"], [1.0], [2.0]))))
+    recording.close()
+    with path.open("rb") as file:
+        found = make_reader(file).iter_messages(log_time_order=False)
+        times = [(record.log_time / S, record.publish_time / S) for _, _, record in found]
+    assert times == [(7.0, 0.5), (7.0, 1.5), (7.0, 1.5), (7.0, 1.25)]
+
+
 def test_losses_add_up(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a.mcap") as writer:
         recording = Recording(writer, 2.0)

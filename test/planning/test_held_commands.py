@@ -177,6 +177,15 @@ FREE = BoundaryConditions(np.zeros(3), IDENTITY, np.zeros(3))
 GIVEN = BoundaryConditions(np.zeros(3), IDENTITY, np.zeros(3), np.zeros(3))
 
 
+@pytest.mark.parametrize(("boundary", "ends"), [(FREE, [False, True]), (GIVEN, [False])])
+def test_the_end_moves_where_it_is_free_and_all_else_fails(
+    model: ManoeuvreModel, boundary: BoundaryConditions, ends: list[bool]
+) -> None:
+    holder = Stretched(model, found=False)
+    assert holder.hold(straight(4.0, 0.9), boundary, WIDE, fixed=True) is None
+    assert [moves_end for _, moves_end, _ in holder.asked] == ends
+
+
 def ticks_of(holder: Stretched) -> list[int]:
     return list(dict.fromkeys(ticks for ticks, _, _ in holder.asked))
 

@@ -37,7 +37,7 @@ from spacerobot_ros.report.figures_over_time import (
 from spacerobot_ros.report.figures_space import cycles_figure
 from spacerobot_ros.report.flight import FlightReport, TimedStatus, joint_unit, read_report
 from spacerobot_ros.report.page import page
-from spacerobot_ros.report.page_parts import PagePart
+from spacerobot_ros.report.page_parts import PagePart, table, tiles
 from spacerobot_ros.report.tables import (
     headline,
     joint_table,
@@ -607,6 +607,14 @@ def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
         assert odd(n) in read, n
     assert "<i>13&.mcap" in content.text
     assert odd(14) in content.values, "the picture's other text"
+
+
+def test_tiles_and_tables_hold_text_alone() -> None:
+    odd = [f"<i title='{n}'>&amp;\"{n}" for n in range(6)]
+    content = Reader(tiles([(odd[0], odd[1], odd[2])]) + table("a", [odd[3]], [[odd[4], odd[5]]]))
+    assert "i" not in content.tags
+    for text in odd:
+        assert text in content.text
 
 
 # -- thrusters, and parts without measurements ------------------------------------------------
