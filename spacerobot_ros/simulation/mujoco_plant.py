@@ -155,11 +155,6 @@ class MujocoPlant:
         self._loads: PlantLoads | None = None
         self.reset()
 
-    @property
-    def name(self) -> str:
-        """Name and version of the engine."""
-        return f"MuJoCo {self._mujoco.__version__}"
-
     # -- the plant ----------------------------------------------------------------------------
 
     def reset(self) -> None:

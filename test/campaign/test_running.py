@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -163,6 +164,17 @@ def test_two_processes_do_not_fly_into_one_folder(tmp_path: Path) -> None:
         run_campaign(small(), tmp_path)
     first.close()
     assert run_campaign(small(flights=1), tmp_path).flown == 1
+
+
+def test_a_folder_that_cannot_be_made_costs_no_open_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    closed: list[int] = []
+    monkeypatch.setattr(os, "close", closed.append)
+    with pytest.raises(RecordingError, match="cannot be written"):
+        Dataset(tmp_path / "file" / "campaign").begin(small())
+    assert closed == []
 
 
 def test_what_is_half_written_is_not_there(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.commanding.trajectory_output import TrajectoryOutput
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
+from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Inertia
@@ -491,13 +491,6 @@ def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
     (result,) = first.end.call_args.args
     assert result.outcome == "aborted"
     second.end.assert_not_called()
-
-
-@pytest.mark.parametrize("tick_rate", [0.0, -0.5, -1.0, 1e6])
-def test_a_commander_has_a_positive_tick_rate(tick_rate: float) -> None:
-    for kind in (PlannerConfig, ControllerConfig):
-        with pytest.raises(ParameterError, match="tick_rate"):
-            config(kind, tick_rate=tick_rate)
 
 
 def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(

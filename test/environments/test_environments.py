@@ -341,6 +341,7 @@ def test_wheels_turn_the_base() -> None:
 def test_goals_of_a_scenario() -> None:
     config = EpisodeConfig("reorient", scenario="planar_chain", goals="scenario")
     episodes = Episodes(config, 2, in_lanes=False)
+    assert episodes.engine == "scalar"
     episodes.begin([1], [np.random.default_rng(0)] * 2)
     wanted = load_scenario("planar_chain").goal.quaternion
     np.testing.assert_array_equal(episodes.goals, [[0, 0, 0, 1], wanted])

@@ -292,6 +292,19 @@ def test_states_are_saved_at_the_ticks_at_which_they_are_published() -> None:
     assert any(len(each.messages) == 3 for each in streams.values())
 
 
+@pytest.mark.parametrize("joints", [0, 2])
+def test_commands_of_joints_are_saved_where_there_are_joints(joints: int) -> None:
+    command = SimpleNamespace(tick=np.arange(3), values=np.ones((3, joints)))
+    flight: Any = SimpleNamespace(
+        control_period=0.25,
+        scenario=SimpleNamespace(plant=PlantConfig(actuation="effort")),
+        commands={"joint_commands": command},
+        joint_names=("hip", "knee")[:joints],
+    )
+    streams = list(saved._command_streams(flight))
+    assert [each.time_ns.tolist() for each in streams] == [[0, 250_000_000, 500_000_000]][:joints]
+
+
 def test_measured_quantities_are_the_true_ones_where_no_sensor_errs() -> None:
     true = {name: object() for name in ("pose", "twist", "q", "qdot")}
     rest = {"effort": object(), "momentum": object()}
