@@ -60,9 +60,8 @@ class BasePrediction:
     def __init__(self, robot: SpaceRobot, control_period: float, integration_step: float) -> None:
         self._robot = robot
         self._control_period = control_period
-        # Most manoeuvres have few ticks: compiling the step would take longer.
         substeps = count_steps(control_period, integration_step)
-        self._step = robot.compiled_on_demand.velocity_step(substeps)
+        self._step = robot.velocity_step(substeps)
         self._step.inputs[3][:] = control_period
 
     def attitudes(self, positions: Array, quaternion: Array, L_W: Array) -> Array:

@@ -315,7 +315,9 @@ class PlanningWorker:
         The positions are (K + 1, 3), the attitudes (K + 1, 4).
         """
         config = self._config
-        prediction = BasePrediction(self._robot, config.control_period, config.integration_step)
+        # Most manoeuvres have few ticks: compiling the step would take longer.
+        robot = self._robot.compiled_on_demand
+        prediction = BasePrediction(robot, config.control_period, config.integration_step)
         times: Array = config.control_period * np.arange(len(shapes), dtype=float)
         attitudes = prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
         positions = prediction.positions(state, times, shapes, attitudes)
