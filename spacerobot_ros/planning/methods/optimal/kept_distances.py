@@ -336,14 +336,12 @@ class KeptByPlanes(KeptDistances):
         """Return shapes (N K, n) and turns (N K, 4) of the base since the start at the K instants
         of all N intervals at which pairs are kept apart.
         """
-        instants = instants_of(len(path.shapes) - 1)
-        h, v, X = path.step, path.velocities[:, np.newaxis], path.quaternions[:, np.newaxis]
+        intervals = len(path.shapes) - 1
+        instants, X = instants_of(intervals), path.quaternions[:, np.newaxis]
         tau = np.arange(1, instants + 1)[:, np.newaxis] / instants
-        moved = h * ((tau - tau**2 / 2) * v[:-1] + tau**2 / 2 * v[1:])
-        shapes = path.shapes[:-1, np.newaxis] + moved
         turns = (1 - tau) * X[:-1] + tau * X[1:]
         turns /= np.linalg.norm(turns, axis=2, keepdims=True)
-        return shapes.reshape(-1, shapes.shape[2]), turns.reshape(-1, 4)
+        return path.at_ticks(intervals * instants)[1:], turns.reshape(-1, 4)
 
     def approaches_of(self, path: Trajectory) -> list[Approach]:
         """Return the pairs that come too near along a path, nearest first."""
