@@ -104,8 +104,9 @@ def test_goals_of_one_stamp_are_one_goal(harness: Harness) -> None:
     hand = flight.probe.create_publisher(PoseStamped, "end_effector/goal_pose", 10)
     link = flight.probe.create_publisher(PoseStamped, "link_3/goal_pose", 10)
     harness.connect()
+    # Each could be reached, in another shape than the other.
     hand.publish(place(reachable("end_effector"), 7))
-    link.publish(place(reachable("link_3"), 7))
+    link.publish(place(reachable("link_3", [0.5, -1.2, 0.6]), 7))
     harness.settle(flight.probe)
     flight.start()
     status = flight.wait("refused")
@@ -114,6 +115,12 @@ def test_goals_of_one_stamp_are_one_goal(harness: Harness) -> None:
     # Both parts are bound to each other; one alone is no such goal.
     hand.publish(place(reachable("end_effector"), 8))
     assert values_of(flight.wait("reached"))["goal_id"] == "8.000000000"
+    aims = {each: reachable(each, [0.3, -1.0, 0.9]) for each in ("end_effector", "link_3")}
+    hand.publish(place(aims["end_effector"], 9))
+    link.publish(place(aims["link_3"], 9))
+    await_reached(flight, "9.000000000")
+    for each, aim in aims.items():
+        np.testing.assert_allclose(flown_to(flight, each), aim, atol=1e-6)
 
 
 def test_a_goal_of_a_link_goes_on_after_a_restart(harness: Harness, tmp_path: Path) -> None:

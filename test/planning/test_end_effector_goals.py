@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.hand_motion import end_of_motion
 
-from spacerobot_ros.errors import GoalError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.errors import GoalError, NotFoundError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, build_method, plan
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, PoseError, Tolerance
@@ -233,14 +233,37 @@ def test_goals_that_are_none_are_refused(arguments: dict[str, Any], message: str
         plan("three_joint_arm", start=at_rest(ARM), **arguments, **QUICK)
 
 
-def test_goals_of_more_than_the_joints_bring_about_are_refused() -> None:
-    with pytest.raises(PlanningError, match="6 independent coordinates"):
-        plan(
-            "three_joint_arm",
-            end_effector_pose=(1.2, 0.4, 0.3, 0, 0, 0, 1),
-            start=at_rest(ARM),
-            **QUICK,
-        )
+@pytest.mark.parametrize("base", [None, (0.02, 0.03, -0.04)])
+def test_a_pose_of_more_coordinates_than_the_joints_move_is_reached_where_it_can_be(
+    base: tuple[float, float, float] | None,
+) -> None:
+    """Three joints and the turn of the base move five coordinates of a pose, and three of a pose
+    with the base's attitude: a goal off those is refused, and one on them is met."""
+    name, hand = "three_joint_arm", "end_effector"
+    end = np.array([-0.7, -0.2, 1.9])
+    r, R = beside(name, ARM, end, hand)
+    given: dict[str, Any] = {}
+    if base is not None:
+        # The same shape with the base turned puts the hand elsewhere, about the centre of mass.
+        turned = ATTITUDE * Rotation.from_rotvec(base)
+        robot = robot_of(name)
+        r_CE = robot.link_pose(hand, end)[1] - robot.center_of_mass(end)
+        r_WC = PLACE + ATTITUDE.apply(robot.center_of_mass(ARM))
+        r = r_WC + turned.apply(r_CE)
+        R = turned * Rotation.from_matrix(robot.link_pose(hand, end)[0])
+        given["rotvec"] = turned.as_rotvec()
+    schedule = plan(
+        name, end_effector_pose=[*r, *R.as_quat()], start=at_rest(ARM), **given, **QUICK
+    )
+    found = ends(name, schedule, hand, "base_link")
+    np.testing.assert_allclose(found[hand][0], r, atol=1e-6)
+    assert (found[hand][1].inv() * R).magnitude() < 1e-6
+    if base is not None:
+        assert (found["base_link"][1].inv() * turned).magnitude() < 1e-6
+    off = R * Rotation.from_rotvec([0.1, -0.2, 0.1])
+    numbers = 5 if base is None else 3
+    with pytest.raises(NotFoundError, match=f"6 independent coord.* no more than {numbers}: ask"):
+        plan(name, end_effector_pose=[*r, *off.as_quat()], start=at_rest(ARM), **given, **QUICK)
 
 
 def test_a_default_end_effector_is_named_where_there_is_none() -> None:

@@ -219,22 +219,15 @@ def test_goals_off_the_plane_or_the_axis_of_a_chain_are_refused(chain: SpaceRobo
     )
 
 
-def test_a_goal_of_more_numbers_than_the_joints_move_is_refused(
-    arm: SpaceRobot, chain: SpaceRobot, rows: EndEffectorRows, position_rows: EndEffectorRows
+def test_the_rank_counts_coordinates_that_the_joints_move(
+    chain: SpaceRobot, rows: EndEffectorRows, position_rows: EndEffectorRows
 ) -> None:
-    position_rows.require_enough_freedom(fixed_attitude=True)
-    with pytest.raises(NotFoundError) as error:
-        rows.require_enough_freedom(fixed_attitude=False)
-    assert str(error.value) == (
-        "The goal of 'end_effector' and 'base_link' asks for 9 independent coordinates, and the "
-        "joints of robot 'three_joint_arm' move no more than 5, so no manoeuvre is looked for: ask "
-        "for a position instead of a pose, or for less of the base."
-    )
+    assert position_rows.rank(fixed_attitude=True) == (3, 3)
+    assert rows.rank(fixed_attitude=False) == (5, 9)
     # Two joints and the turn of the base bring about three numbers in a plane.
     planar = EndEffectorRows(chain, [(chain.link_names[-1], True)], np.eye(3)[2:])
-    planar.require_enough_freedom(fixed_attitude=False)
-    with pytest.raises(PlanningError, match=r"asks for 3 independent .* no more than 2, "):
-        planar.require_enough_freedom(fixed_attitude=True)
+    assert planar.rank(fixed_attitude=False) == (3, 3)
+    assert planar.rank(fixed_attitude=True) == (2, 3)
 
 
 # -- the specification --------------------------------------------------------------------------
@@ -271,8 +264,10 @@ def test_kinds_of_goals_differ_by_their_parts(arm: SpaceRobot) -> None:
     common = {"shape", "end_effectors"}
     more = [set(), set(), set(), {"attitude"}, {"position"}]
     assert [each.controls for each in kinds] == [common | each for each in more]
-    assert [len(each.axes) for each in kinds] == [0, 0, 3, 3, 0]
-    assert [each.rows_at_end is None for each in kinds] == [False, False, True, False, False]
+    assert [len(each.axes) for each in kinds] == [0, 3, 3, 3, 3]
+    # Three joints move five coordinates of a pose, and of two positions.
+    assert [each.overdetermined for each in kinds] == [False, True, False, False, True]
+    assert [each.rows_at_end is None for each in kinds] == [False, True, True, False, True]
     names = [[name for name, _ in each.rows.links] for each in kinds]
     assert names == [[TOOL]] * 4 + [[TOOL, "base_link"]]
     assert [each.rows.links[0][1] for each in kinds] == [False, True, False, False, False]

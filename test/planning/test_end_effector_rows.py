@@ -9,7 +9,7 @@ from planning.test_end_effector_goals import ARM, ATTITUDE, FOLDER, PLACE, Array
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.errors import NotFoundError, PlanningError
+from spacerobot_ros.errors import NotFoundError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
@@ -165,8 +165,10 @@ def test_inverse_kinematics_with_a_base_that_follows_is_given_or_turns_by_loops(
     shapes = np.array([[1.0, -0.4, 0.6], [0.2, -0.9, 1.4], [1.6, -1.5, -0.4]])
     given = Rotation.from_rotvec([0.1, -0.2, 0.15]).as_quat()
     for attitude in (None, given):
+        turns = None if follows else found.rows.turns_along_direct_path(ARM, shapes)
+        turns = turns if attitude is None else np.tile(attitude, (3, 1))
         q, X, miss = found._inverse_kinematics(
-            shapes, ARM, LIMITS, parameters, attitude, follows=follows
+            shapes, ARM, LIMITS, parameters, turns, fixed=attitude is not None
         )
         assert q.shape == (3, 3)
         assert np.all((LOWER <= q) & (q <= UPPER))
@@ -209,43 +211,42 @@ def test_the_parts_of_a_goal_are_what_is_controlled(arm: SpaceRobot) -> None:
         free.joined_with(pose),
         free.joined_with(Goal(pose.position, pose.quaternion, base=frozenset({"attitude"}))),
     )
-    for goal, controls, links, axes in (
-        (free, {"shape", "end_effectors"}, [(HAND, True)], 0),
+    place = Goal.of_end_effectors([EndEffectorGoal(HAND, np.array([7.0, 0.0, 0.0]))])
+    still = place.joined_with(Goal(pose.position, pose.quaternion, base=frozenset({"attitude"})))
+    for goal, controls, links, axes, exact in (
+        (place, {"shape", "end_effectors"}, [(HAND, False)], 0, False),
+        (still, {"shape", "end_effectors", "attitude"}, [(HAND, False)], 3, False),
+        # Three joints move five coordinates of a pose, so that one that can be met fixes the shape.
+        (free, {"shape", "end_effectors"}, [(HAND, True)], 3, True),
         (
             whole,
             {"shape", "end_effectors", "attitude", "position"},
             [(HAND, True), ("base_link", False)],
             3,
+            True,
         ),
-        (attitude, {"shape", "end_effectors", "attitude"}, [(HAND, True)], 3),
+        (attitude, {"shape", "end_effectors", "attitude"}, [(HAND, True)], 3, True),
     ):
         found = specification(arm, goal)
         assert found.controls == controls
         assert list(found.rows.links) == links
         assert len(found.axes) == axes
-        assert found.rows_at_end is found.rows
+        assert found.overdetermined == exact
+        assert found.rows_at_end is (None if exact else found.rows)
     keys = {EndEffectorSpecification.key(each) for each in (free, whole, attitude)}
     assert len(keys) == 3
-    place = Goal.of_end_effectors([EndEffectorGoal(HAND, np.array([7.0, 0.0, 0.0]))])
     assert EndEffectorSpecification.key(place) not in keys
     moved = Goal.of_end_effectors([EndEffectorGoal(HAND, np.ones(3), hand.quaternion)])
     assert EndEffectorSpecification.key(moved) == EndEffectorSpecification.key(free)
 
 
-def test_more_than_the_joints_bring_about_is_counted(arm: SpaceRobot) -> None:
+def test_coordinates_that_the_joints_move_are_counted(arm: SpaceRobot) -> None:
     rows = EndEffectorRows(arm, [(HAND, True), ("base_link", False)], np.eye(3))
-    with pytest.raises(NotFoundError) as refusal:
-        rows.require_enough_freedom(fixed_attitude=True)
-    assert str(refusal.value) == (
-        "The goal of 'end_effector' and 'base_link' asks for 9 independent coordinates, and the "
-        "joints of robot 'three_joint_arm' move no more than 3, so no manoeuvre is looked for: ask "
-        "for a position instead of a pose, or for less of the base."
-    )
+    assert rows.rank(fixed_attitude=True) == (3, 9)
     # Loops turn the base about its own axis of the first joint, which moves neither of the two.
-    with pytest.raises(PlanningError, match=r"9 independent .* no more than 5, "):
-        rows.require_enough_freedom(fixed_attitude=False)
+    assert rows.rank(fixed_attitude=False) == (5, 9)
     rows = EndEffectorRows(arm, [(HAND, False)], np.eye(3))
-    rows.require_enough_freedom(fixed_attitude=True)
+    assert rows.rank(fixed_attitude=True) == (3, 3)
 
 
 def test_a_guess_begins_at_its_end() -> None:

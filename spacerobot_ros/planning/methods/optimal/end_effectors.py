@@ -42,6 +42,7 @@ from spacerobot_ros.planning.core.goal import (
     EndEffectorGoal,
     Goal,
     RobotState,
+    Tolerance,
     end_effector_pose,
 )
 from spacerobot_ros.planning.core.method import PlanRequest
@@ -92,6 +93,9 @@ _POSSIBLE_ENDS = 6
 
 _MIN_END_DIFFERENCE = 0.05
 """Ends nearer than this, as shares of the joints' ranges, are the same."""
+
+_DAMPING_OF_EXACT_ENDS = 1e-9
+"""The same where ends are to meet their goals exactly."""
 
 _GIVEN_SHAPE_ERROR = 1e-9
 """Smallest error at which given joint positions contradict a goal of an end-effector, m or rad."""
@@ -208,15 +212,10 @@ class EndEffectorRows:
             X = quaternion_multiply(X, rotations[:, k])
         return X
 
-    def require_enough_freedom(self, fixed_attitude: bool) -> None:
-        """Refuse goals with more independent numbers than the joints can bring about.
+    def rank(self, fixed_attitude: bool) -> tuple[int, int]:
+        """Return how many of the rows the joints move independently, and how many rows there are.
 
-        Such goals are reached by chance at most, which proves nothing about one of them.
-
-        Raises
-        ------
-        NotFoundError
-            The goal has more independent numbers.
+        Shapes in general position decide, with the attitude of the base given or free.
         """
         ranks, rows = [], 0
         for q, turn in zip(*self._samples(), strict=True):
@@ -228,14 +227,7 @@ class EndEffectorRows:
             J = np.vstack(blocks)
             rows = len(J)
             ranks.append(int(np.linalg.matrix_rank(J, tol=1e-6)))
-        if max(ranks) < rows:
-            names = " and ".join(f"'{each.link}'" for each in self.directions)
-            raise NotFoundError(
-                f"The goal of {names} asks for {rows} independent coordinates, and the joints of "
-                f"robot '{self.robot.description.name}' move no more than {max(ranks)}, so no "
-                "manoeuvre is looked for: ask for a position instead of a pose, or for less of "
-                "the base."
-            )
+        return max(ranks), rows
 
     def require_directions(
         self, state: RobotState, goals: Sequence[EndEffectorGoal], tolerance: tuple[float, float]
@@ -327,6 +319,10 @@ class EndEffectorSpecification:
         How the joints turn the base.
     attitude, position, shape
         Whether attitude and position of the base, and joint positions are parts of the goal.
+    overdetermined
+        Whether the goal has more coordinates than the joints move independently. Hardly any such
+        goal can be reached; one that can is reached in single shapes, which inverse kinematics
+        finds before the motion is planned.
     """
 
     rows: EndEffectorRows
@@ -334,6 +330,7 @@ class EndEffectorSpecification:
     attitude: bool
     position: bool
     shape: bool
+    overdetermined: bool
 
     @classmethod
     def of(cls, robot: SpaceRobot, base: GoalSpecification, goal: Goal) -> EndEffectorSpecification:
@@ -350,8 +347,10 @@ class EndEffectorSpecification:
         if position:
             links.append((robot.base_link, False))
         axes = base.base_rotations.axes if base.base_rotations.loops_turn_base else np.zeros((0, 3))
+        rows = EndEffectorRows(robot, links, axes)
+        rank, count = rows.rank(attitude)
         shape = goal.joint_positions is not None
-        return cls(EndEffectorRows(robot, links, axes), base, attitude, position, shape)
+        return cls(rows, base, attitude, position, shape, rank < count)
 
     @staticmethod
     def key(goal: Goal) -> tuple[object, ...]:
@@ -370,19 +369,24 @@ class EndEffectorSpecification:
         return frozenset(parts)
 
     @property
+    def ends_in_one_shape(self) -> bool:
+        """Whether a motion is planned to a given shape, not to given end-effectors."""
+        return self.shape or self.overdetermined
+
+    @property
     def axes(self) -> Array:
         """Directions (m, 3) in the base along which its attitude is to be reached."""
-        if self.shape:
+        if self.ends_in_one_shape:
             return self.rows.axes
         return self.base.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
     @property
     def rows_at_end(self) -> EndEffectorRows | None:
-        """The rows of the optimal control problem; none where the last shape is given.
+        """The rows of the optimal control problem; none where it ends in one shape.
 
         The attitude that goes with the shape is then that of the goal.
         """
-        return None if self.shape else self.rows
+        return None if self.ends_in_one_shape else self.rows
 
     def boundary_conditions(
         self,
@@ -427,8 +431,10 @@ class EndEffectorSpecification:
             turn = self._turn_with_shape(request, shape, turn, parameters)
             ends: list[PossibleEnd] = [PossibleEnd(shape, turn)]
         else:
-            rows.require_enough_freedom(self.attitude)
             ends = self._find_possible_ends(state.q, limits, parameters, turn)
+        if shape is None and self.overdetermined:
+            ends = [self._exact_end(state.q, limits, parameters, ends, tolerance)]
+            shape, turn = ends[0].shape, ends[0].base_rotation
         return BoundaryConditions(
             state.q,
             turn,
@@ -436,7 +442,7 @@ class EndEffectorSpecification:
             shape,
             None,
             direction,
-            end_effectors=np.zeros(0) if self.shape else parameters,
+            end_effectors=np.zeros(0) if self.ends_in_one_shape else parameters,
             possible_ends=tuple(ends),
         )
 
@@ -502,7 +508,6 @@ class EndEffectorSpecification:
         NotFoundError
             No possible end was found.
         """
-        given = turn if self.attitude else None
         rng = np.random.default_rng(0)
         middle, half = limits.joint_ranges(start)
         speed = np.where(np.isfinite(limits.velocity), limits.velocity, half)
@@ -512,8 +517,11 @@ class EndEffectorSpecification:
             anywhere = middle + half * rng.uniform(-1, 1, (count, len(start)))
             share = np.linspace(0.0, 1.0, count)[:, np.newaxis]
             shapes = np.clip(start + share * (anywhere - start), limits.lower, limits.upper)
+            turns = None if follows else self.rows.turns_along_direct_path(start, shapes)
+            if self.attitude:
+                turns = np.tile(turn, (count, 1))
             shapes, X, miss = self._inverse_kinematics(
-                shapes, start, limits, parameters, given, follows=follows
+                shapes, start, limits, parameters, turns, fixed=self.attitude
             )
             nearest = min(nearest, float(miss.min()))
             times = np.abs((shapes - start) / np.maximum(speed, 1e-9)).max(axis=1)
@@ -525,14 +533,57 @@ class EndEffectorSpecification:
                     ends.append(PossibleEnd(shapes[k], X[k]))
             if ends:
                 return ends[:_POSSIBLE_ENDS]
-            if given is not None and not follows:
-                continue
+        raise self._not_found(nearest)
+
+    def _exact_end(
+        self,
+        start: Array,
+        limits: MotionLimits,
+        parameters: Array,
+        ends: Sequence[PossibleEnd],
+        tolerance: Tolerance,
+    ) -> PossibleEnd:
+        """Return the first of some ends that meets an overdetermined goal within its tolerance.
+
+        Raises
+        ------
+        NotFoundError
+            None does.
+        """
+        turns = np.array([each.base_rotation for each in ends])
+        shapes, X, miss = self._inverse_kinematics(
+            np.array([each.shape for each in ends]),
+            start,
+            limits,
+            parameters,
+            turns if self.attitude or len(self.rows.axes) else None,
+            fixed=self.attitude,
+            damping=_DAMPING_OF_EXACT_ENDS,
+            error=_GIVEN_SHAPE_ERROR,
+        )
+        exact = miss <= max(_GIVEN_SHAPE_ERROR, min(tolerance.position, tolerance.attitude))
+        if not exact.any():
+            raise self._not_found(float(miss.min()))
+        k = int(np.argmax(exact))
+        return PossibleEnd(shapes[k], X[k])
+
+    def _not_found(self, nearest: float) -> NotFoundError:
+        """Return the error for a goal whose nearest shape misses it by ``nearest``, m or rad."""
+        robot = self.rows.robot.description.name
         names = " and ".join(f"'{link}'" for link, _ in self.rows.links)
-        raise NotFoundError(
-            f"No shape of robot '{self.rows.robot.description.name}' that puts {names} to the goal "
-            f"was found from {2 * _STARTS + _ADDITIONAL_STARTS} shapes; the nearest is "
-            f"{nearest:.3g} m or rad away. A nearer goal may help, a position instead of a pose, "
-            "or more freedom of the base."
+        remedy = (
+            "A nearer goal may help, a position instead of a pose, or more freedom of the base."
+        )
+        if self.overdetermined:
+            rank, count = self.rows.rank(self.attitude)
+            remedy = (
+                f"The goal asks for {count} independent coordinates, and the joints move no more "
+                f"than {rank}: ask for a position instead of a pose, or for less of the base."
+            )
+        return NotFoundError(
+            f"No shape of robot '{robot}' that puts {names} to the goal was found from "
+            f"{2 * _STARTS + _ADDITIONAL_STARTS} shapes; the nearest is {nearest:.3g} m or rad "
+            f"away. {remedy}"
         )
 
     def _inverse_kinematics(
@@ -541,36 +592,36 @@ class EndEffectorSpecification:
         start: Array,
         limits: MotionLimits,
         parameters: Array,
-        given: Array | None,
+        turns: Array | None,
         *,
-        follows: bool,
+        fixed: bool,
+        damping: float = _DAMPING,
+        error: float = _END_ERROR / 10,
     ) -> tuple[Array, Array, Array]:
         """Return shapes (K, n), turns (K, 4) and errors (K,) of ends, from first shapes (K, n).
 
-        The turn is the ``given`` one; else it ``follows`` from the direct way, or is free along the
-        axes.
+        The ``turns`` (K, 4) of the base are ``fixed``, or first ones that are free along the axes;
+        None: they follow from the direct way.
         """
         rows, n, count = self.rows, len(start), len(shapes)
         connection = rows.robot.function("connection", compile=False)
-        free = given is None and not follows
-        X = np.tile(given, (count, 1)) if given is not None else None
-        if X is None:
-            X = rows.turns_along_direct_path(start, shapes)
+        X = rows.turns_along_direct_path(start, shapes) if turns is None else turns
+        free = turns is not None and not fixed
         for _ in range(_ITERATIONS):
             values, by_rotation, by_shape = rows.evaluate(X, shapes, parameters)
             J = by_shape
             if free:
                 J = np.concatenate([by_shape, by_rotation @ rows.axes.T], axis=2)
-            elif given is None:
+            elif turns is None:
                 A = connection(shapes.T).full()[3:].reshape(3, count, n).transpose(1, 0, 2)
                 J = by_shape - by_rotation @ A
-            if np.abs(values).max() <= _END_ERROR / 10:
+            if np.abs(values).max() <= error:
                 break
             # Joints at a limit that the step would take beyond it are left out of it.
             for _ in range(2):
                 normal = J.transpose(0, 2, 1) @ J
                 largest = np.maximum(np.abs(normal).max(axis=(1, 2)), 1e-12)
-                normal = normal + _DAMPING * largest[:, np.newaxis, np.newaxis] * np.eye(J.shape[2])
+                normal = normal + damping * largest[:, np.newaxis, np.newaxis] * np.eye(J.shape[2])
                 slope = -(J.transpose(0, 2, 1) @ values[:, :, np.newaxis])
                 step = np.linalg.solve(normal, slope)[:, :, 0]
                 beyond = (shapes <= limits.lower) & (step[:, :n] < 0)
@@ -582,9 +633,9 @@ class EndEffectorSpecification:
             step *= np.minimum(1.0, _MAX_STEP / np.abs(step).max(axis=1, keepdims=True).clip(1e-9))
             shapes = np.clip(shapes + step[:, :n], limits.lower, limits.upper)
             if free:
-                turns = quaternions_from_rotvecs(step[:, n:] @ rows.axes)
-                X = quaternion_multiply(X, turns)
-            elif given is None:
+                turned = quaternions_from_rotvecs(step[:, n:] @ rows.axes)
+                X = quaternion_multiply(X, turned)
+            elif turns is None:
                 X = rows.turns_along_direct_path(start, shapes)
         values, _, _ = rows.evaluate(X, shapes, parameters)
         return shapes, X, np.abs(values).max(axis=1)
