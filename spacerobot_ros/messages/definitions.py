@@ -14,13 +14,14 @@ import sys
 from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from spacerobot_ros.errors import RecordingError
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 Fields: TypeAlias = dict[str, tuple[Any, list[tuple[str, Any]]]]
 """Type name -> constants and fields, as ``rosbags`` parses a definition."""
@@ -156,7 +157,7 @@ def fields_of(type_name: str) -> Fields:
 
     Raises as :func:`message_definition` does.
     """
-    return dict(get_types_from_msg(message_definition(type_name), type_name))
+    return dict(_parsed(message_definition(type_name), type_name))
 
 
 # -- types of bags ----------------------------------------------------------------------------
@@ -174,7 +175,7 @@ class MessageTypes:
     """Message types defined in a bag, parsed on first use."""
 
     def __init__(self) -> None:
-        self._store = get_typestore(Stores.EMPTY)
+        self._store = _empty_store()
 
     @property
     def fields(self) -> dict[str, Any]:
@@ -217,6 +218,19 @@ class MessageTypes:
             own.fielddefs[name], own.types[name] = store.fielddefs[name], store.types[name]
 
 
+def _parsed(text: str, type_name: str) -> Any:
+    # The parser is slow to import, and tools that read no messages do not need it.
+    from rosbags.typesys import get_types_from_msg
+
+    return get_types_from_msg(text, type_name)
+
+
+def _empty_store() -> Typestore:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.EMPTY)
+
+
 def _types_of_fields(fields: Any) -> list[Any]:
     return [(name.lower(), kind) for name, kind in fields]
 
@@ -224,7 +238,7 @@ def _types_of_fields(fields: Any) -> list[Any]:
 @lru_cache(maxsize=64)
 def _type_store(type_name: str, text: bytes) -> tuple[Typestore, Any]:
     """Return the types that a schema defines and the class of one type; cached for all bags."""
-    parsed, store = _parse_definition(type_name, text), get_typestore(Stores.EMPTY)
+    parsed, store = _parse_definition(type_name, text), _empty_store()
     try:
         store.register(parsed)
         return store, store.get_msgdef(type_name)
@@ -242,7 +256,7 @@ def _parse_definition(type_name: str, text: bytes) -> Any:
             "message needs"
         )
     try:
-        types = get_types_from_msg(text.decode(), type_name)
+        types = _parsed(text.decode(), type_name)
     except Exception as error:
         raise ValueError(_error_in_one_line(error)) from error
     if type_name not in types:
