@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import pinocchio
 import pytest
+from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
@@ -96,8 +98,10 @@ class Row:
     same: bool
 
 
-def row(robot: SpaceRobot, request: PlanRequest, distances: Distances) -> Row:
-    options = method_options("optimal", {"cache": 0})
+def row(
+    robot: SpaceRobot, request: PlanRequest, distances: Distances, *, with_position: bool
+) -> Row:
+    options = method_options("optimal", {"cache": 0, "base_position": int(with_position)})
     found: list[tuple[float, float, float] | None] = []
     schedules: list[Any] = []
     for clearance in (None, Clearance(robot.description, CLEARANCE)):
@@ -159,6 +163,36 @@ def summary_of(rows: list[Row]) -> Summary:
     )
 
 
+def random_goals(robot: SpaceRobot, start: Array, count: int) -> Iterator[Goal]:
+    """Yield goals from a shape (n,) at rest in the origin: attitudes, attitudes with a position of
+    the base, and attitudes with a shape by turns.
+    """
+    rng, geometry = np.random.default_rng(20260), Clearance(robot.description, CLEARANCE).geometry
+    low, high = np.maximum(robot.lower, -1.0), np.minimum(robot.upper, 1.0)
+
+    def keeps_clear(shape: Array) -> bool:
+        nearest = geometry.nearest(shape)
+        return nearest is None or nearest[0] >= CLEARANCE
+
+    for number in range(count):
+        axis = rng.normal(size=3)
+        turn = rng.uniform(0.05, 0.5) * axis / np.linalg.norm(axis)
+        quaternion = Goal.from_rotvec(np.zeros(3), turn).quaternion
+        position, shape = np.zeros(3), None
+        if number % 3 == 1:
+            # The centre of mass rests, so a shape puts the base to one position.
+            other = np.random.default_rng([20260, number])
+            end = other.uniform(low, high)
+            while not keeps_clear(end):
+                end = other.uniform(low, high)
+            turned = Rotation.from_rotvec(turn).apply(robot.center_of_mass(end))
+            position = robot.center_of_mass(start) - turned
+        if number % 3 == 2:
+            shape = rng.uniform(low, high)
+            shape = shape if keeps_clear(shape) else None
+        yield Goal(position, quaternion, shape)
+
+
 @pytest.fixture(scope="module")
 def rows_of_all() -> list[Row]:
     """Rows of all robots that were planned for, by the tests before the last one."""
@@ -171,25 +205,13 @@ def test_plans_to_random_goals_keep_clear(
     name: str, tmp_path: Path, rows_of_all: list[Row]
 ) -> None:
     robot = SpaceRobot.from_file(robot_file(name))
-    rng = np.random.default_rng(20260)
     start = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
     distances = Distances(robot, Clearance(robot.description, CLEARANCE), start, tmp_path)
     rows = []
-    for number in range(GOALS):
-        axis = rng.normal(size=3)
-        turn = rng.uniform(0.05, 0.5) * axis / np.linalg.norm(axis)
-        low, high = np.maximum(robot.lower, -1.0), np.minimum(robot.upper, 1.0)
-        # Every third goal has a shape, if links keep clear in it.
-        shape = rng.uniform(low, high) if number % 3 == 2 else None
-        if shape is not None:
-            nearest = Clearance(robot.description, CLEARANCE).geometry.nearest(shape)
-            if nearest is not None and nearest[0] < CLEARANCE:
-                shape = None
-        quaternion = Goal.from_rotvec(np.zeros(3), turn).quaternion
+    for number, goal in enumerate(random_goals(robot, start, GOALS)):
         state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), start)
-        tolerance = Tolerance(1e-6, 1e-6, 1e-6)
-        request = PlanRequest(state, Goal(np.zeros(3), quaternion, shape), tolerance)
-        rows.append(row(robot, request, distances))
+        request = PlanRequest(state, goal, Tolerance(1e-6, 1e-6, 1e-6))
+        rows.append(row(robot, request, distances, with_position=number % 3 == 1))
         print(f"  {name}: goal {number}: {rows[-1]}", flush=True)
     rows_of_all += rows
     print(f"{name}: {summary_of(rows)}", flush=True)
