@@ -17,6 +17,7 @@ import numpy as np
 
 from spacerobot_ros.control.status import ControllerStatus, tracking_time
 from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.parameters import replaced
 from spacerobot_ros.planning.core.goal import PoseError
 from spacerobot_ros.planning.execution.status import PlannerStatus, manoeuvre_time
 
@@ -139,24 +140,31 @@ def momentum_change(momenta: Array, reference: Array) -> Array:
 
 
 def momentum_drift(momenta: Array, expected: Array | None = None) -> Array:
-    """Return the largest change (2,) of linear and angular momentum that thrust does not explain.
+    """Return the largest change (..., 2) of linear and angular momentum that thrust does not
+    explain.
 
-    That is ``max |m(t) - m(0)|`` over the flight, with the momenta ``m`` less those that the
+    That is ``max |m(t) - m(0)|`` over each flight, with the momenta ``m`` less those that the
     thrusters have put in.
 
     Parameters
     ----------
     momenta
-        (N, 6) or more columns, the momenta first: kg m/s and kg m^2/s.
+        (..., N, 6) or more columns, the momenta first: kg m/s and kg m^2/s. Rows that are not
+        finite do not count.
     expected
         (N, 6) momenta at the start and those that the thrusters have put in since; None, or of
         another number of rows: no thrust.
     """
-    m = momenta[:, :6]
+    m = momenta[..., :6]
     if expected is not None and len(expected) == len(m):
         m = m - expected
-    m = m[np.isfinite(m).all(axis=1)]
-    return momentum_change(m, m[0]).max(axis=0) if len(m) else np.full(2, np.nan)
+    finite = np.asarray(np.isfinite(m).all(axis=-1, keepdims=True))
+    if not finite.any():
+        return np.full((*m.shape[:-2], 2), np.nan)
+    m = np.where(finite, m, 0.0)
+    first = np.take_along_axis(m, finite.argmax(axis=-2, keepdims=True), axis=-2)
+    changes = np.where(finite, momentum_change(m, first), 0.0)
+    return np.where(finite.any(axis=-2), changes.max(axis=-2), np.nan)
 
 
 def peak(values: Array) -> Array:
@@ -213,7 +221,7 @@ class Metric:
         SI unit (empty: none) and a short description, as texts for the user.
     evaluate
         Function of the measures and the robot: a number, NaN where a flight has none; or a number
-        for each joint.
+        for each joint, (..., n) for measures of joints (..., n) of several flights.
     by_joint
         Whether ``<name>.<joint>`` is the number of a joint, and the name itself the worst of all.
     smallest_is_worst
@@ -255,6 +263,9 @@ def _margin_metric(quantity: str, limit: str, peak_of: Callable[[Measures], Arra
         smallest_is_worst=True,
     )
 
+
+_OF_JOINTS = ("peak_rate", "peak_effort", "lowest", "highest")
+"""Fields of :class:`Measures` that have a number for each joint."""
 
 CLEARANCE = "clearance_m"
 """Name of the metric that campaigns measure only where a criterion names it."""
@@ -345,19 +356,32 @@ METRICS: dict[str, Metric] = {
 
 def metrics_of(measures: Measures, robot: RobotDescription) -> dict[str, float]:
     """Return every metric of a flight by name, those of joints too; NaN where it has none."""
-    metrics: dict[str, float] = {}
+    (metrics,) = metrics_of_each([measures], robot)
+    return metrics
+
+
+def metrics_of_each(
+    measures: Sequence[Measures], robot: RobotDescription
+) -> list[dict[str, float]]:
+    """Return the metrics of flights of the same robot; see :func:`metrics_of`."""
+    if not measures:
+        return []
+    joints = {name: np.array([getattr(each, name) for each in measures]) for name in _OF_JOINTS}
+    of_joints = replaced(measures[0], **joints)
+    columns: dict[str, list[float]] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
         for name, metric in METRICS.items():
-            value = metric.evaluate(measures, robot)
             if not metric.by_joint:
-                metrics[name] = float(value)
+                columns[name] = [float(metric.evaluate(each, robot)) for each in measures]
                 continue
-            by_joint = np.asarray(value, dtype=float)
-            worst = by_joint.min if metric.smallest_is_worst else by_joint.max
-            metrics[name] = float(worst()) if by_joint.size else math.nan
-            for joint, number in zip(robot.joint_names, by_joint.tolist(), strict=True):
-                metrics[f"{name}.{joint}"] = number
-    return metrics
+            by_joint = np.asarray(metric.evaluate(of_joints, robot), dtype=float)
+            worst = np.full(len(measures), math.nan)
+            if robot.joint_names:
+                worst = (np.min if metric.smallest_is_worst else np.max)(by_joint, axis=1)
+            columns[name] = worst.tolist()
+            for joint, numbers in zip(robot.joint_names, by_joint.T.tolist(), strict=True):
+                columns[f"{name}.{joint}"] = numbers
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def metric_names(joints: Sequence[str]) -> list[str]:

@@ -535,6 +535,10 @@ def test_momenta_of_a_flight() -> None:
     momenta[0, 3] = math.nan
     np.testing.assert_allclose(measures.momentum_drift(momenta), [5.0, 2.0])
     assert np.isnan(measures.momentum_drift(momenta[:1])).tolist() == [True, True]
+    # Flights that have rows of their own that count.
+    late = np.array([momenta, momenta[[0, 0, 0, 0]], momenta[[2, 0, 3, 0]]])
+    found = measures.momentum_drift(late)
+    np.testing.assert_allclose(found, [[5.0, 2.0], [np.nan] * 2, [0.0, 3.0]])
     np.testing.assert_array_equal(measures.peak(np.array([[1.0, -3.0], [-2.0, 0.0]])), [2.0, 3.0])
     np.testing.assert_array_equal(measures.peak(np.empty((0, 2))), [0.0, 0.0])
     wrenches = np.array([[3.0, 0, 4, 0, 0, 1], [0, 0, 0, 0, -5, 12]])

@@ -103,6 +103,10 @@ class InitialStates:
     def __len__(self) -> int:
         return len(self.position)
 
+    def __getitem__(self, rows: Counts) -> InitialStates:
+        """Return some rows, in any order and number."""
+        return InitialStates(*(getattr(self, each.name)[rows] for each in fields(self)))
+
     def initial_state(self, index: int) -> InitialState:
         """Return one row as an initial state of the plant."""
         is_center_of_mass = bool(self.position_is_of_center_of_mass[index])
@@ -162,6 +166,10 @@ class SensorErrors:
 
     def __len__(self) -> int:
         return len(self.seeds)
+
+    def __getitem__(self, rows: Counts) -> SensorErrors:
+        """Return some rows, in any order and number."""
+        return SensorErrors(*(getattr(self, each.name)[rows] for each in fields(self)))
 
     def config(self, index: int) -> SensorConfig:
         """Return one row as a configuration of the plant's sensors."""

@@ -238,8 +238,9 @@ class Dataset:
         if not self._rows:
             return
         arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
-        records = [_record_of_row(row) for row in self._rows]
-        table = arrow.Table.from_pylist(records, schema=self._schema)
+        table = arrow.Table.from_pydict(
+            _columns_of_rows(self._rows, self._schema.names), schema=self._schema
+        )
         folder = self.folder / _FLIGHTS_FOLDER
         while (path := folder / f"part-{self._part:06d}.parquet").exists():
             self._part += 1
@@ -324,21 +325,27 @@ def _row_schema(campaign: Campaign) -> Any:
     return arrow.schema(fields)
 
 
-def _record_of_row(row: Row) -> dict[str, Any]:
-    return {
-        "flight": row.draw.number,
-        "seed": row.draw.seed,
-        "passed": row.passed,
-        "outcome": row.outcome,
-        "reason": row.reason,
-        **{f"{DRAW_PREFIX}{name}": value for name, value in row.draw.values.items()},
-        **row.metrics,
-        "wall_time_s": row.wall_time,
-        "plan_time_s": row.plan_time,
-        "engine": row.engine,
-        "fallback": row.fallback,
-        "versions": VERSIONS_JSON,
+def _columns_of_rows(rows: Sequence[Row], names: Sequence[str]) -> dict[str, list[Any]]:
+    """Return the values of rows in columns of these names; None where a row has none."""
+    columns: dict[str, list[Any]] = {
+        "flight": [row.draw.number for row in rows],
+        "seed": [row.draw.seed for row in rows],
+        "passed": [row.passed for row in rows],
+        "outcome": [row.outcome for row in rows],
+        "reason": [row.reason for row in rows],
+        "wall_time_s": [row.wall_time for row in rows],
+        "plan_time_s": [row.plan_time for row in rows],
+        "engine": [row.engine for row in rows],
+        "fallback": [row.fallback for row in rows],
+        "versions": [VERSIONS_JSON] * len(rows),
     }
+    for name in names:
+        if name.startswith(DRAW_PREFIX):
+            drawn = name.removeprefix(DRAW_PREFIX)
+            columns[name] = [row.draw.values.get(drawn) for row in rows]
+        elif name not in columns:
+            columns[name] = [row.metrics.get(name) for row in rows]
+    return columns
 
 
 def _fingerprint_of(campaign: Campaign) -> str:

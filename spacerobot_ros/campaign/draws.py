@@ -8,8 +8,9 @@ flights.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,9 @@ infinite."""
 
 _BLOCK_SIZE = 256
 """Number of draws that are computed together."""
+
+_SEED = "plant.sensors.seed"
+"""Name of the seed of a flight, which campaigns may disperse like other parameters."""
 
 
 @dataclass(frozen=True)
@@ -148,14 +152,49 @@ def drawn_flight(campaign: Campaign, draw: Draw, common: DrawnFlight | None = No
     RobotDescriptionError
         A drawn mass or inertia is not that of a body.
     """
-    flight = common or DrawnFlight.of(campaign.scenario)
-    flight = flight.with_overrides("plant", {"sensors.seed": draw.seed})
+    ((_, flight),) = drawn_flights(campaign, [draw], common or DrawnFlight.of(campaign.scenario))
+    if isinstance(flight, Exception):
+        raise flight
+    return flight
+
+
+def drawn_flights(
+    campaign: Campaign, draws: Iterable[Draw], common: DrawnFlight
+) -> Iterator[tuple[Draw, DrawnFlight | Exception]]:
+    """Yield draws with their flights, or with the error that :func:`drawn_flight` raises.
+
+    Mass properties are computed for many draws together.
+    """
+    of_masses = [each for each in campaign.dispersions if each.target.changes_masses_only]
+    has_own_seed = _SEED not in campaign.names
+    remaining = iter(draws)
+    while block := list(islice(remaining, _BLOCK_SIZE)):
+        flights = common.repeated(len(block))
+        for dispersion in of_masses:
+            drawn = np.array([draw.values[dispersion.name] for draw in block])
+            # Other values are refused below.
+            flights = dispersion.target.apply(flights, np.where(np.isfinite(drawn), drawn, 1.0))
+        seeds = [draw.seed if has_own_seed else None for draw in block]
+        each = zip(block, flights.separate(seeds), flights.surely_physical().tolist(), strict=True)
+        for draw, flight, is_physical in each:
+            try:
+                made = _with_values(campaign, draw, flight)
+                if not is_physical:
+                    made.require_physical()
+            except Exception as error:
+                yield draw, error
+            else:
+                yield draw, made
+
+
+def _with_values(campaign: Campaign, draw: Draw, flight: DrawnFlight) -> DrawnFlight:
+    """Return a flight that has the masses of a draw with its other values, too."""
     for dispersion in campaign.dispersions:
-        value = draw.values[dispersion.name]
-        if not dispersion.target.is_text and not math.isfinite(value):
+        value, target = draw.values[dispersion.name], dispersion.target
+        if not target.is_text and not math.isfinite(value):
             raise ParameterError(f"The value drawn for '{dispersion.name}' is {value}.")
-        flight = dispersion.target.apply(flight, value)
-    flight.require_physical()
+        if not target.changes_masses_only:
+            flight = target.apply(flight, value)
     return flight
 
 

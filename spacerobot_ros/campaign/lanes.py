@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from spacerobot_ros.batch import (
 )
 from spacerobot_ros.batch.flights import BatchResult
 from spacerobot_ros.campaign.config import Campaign
-from spacerobot_ros.campaign.draws import Draw, drawn_flight
+from spacerobot_ros.campaign.draws import Draw, drawn_flights
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, nominal_robots, plant_robot, robots_of
 from spacerobot_ros.campaign.rows import LANES, Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
@@ -44,11 +43,10 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.parameters import replaced
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.execution.status import PlannerStatus, describe_remaining_error
 from spacerobot_ros.scenario import Scenario
-from spacerobot_ros.simulation.config import OrbitConfig, SensorConfig, TableConfig
+from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
@@ -176,11 +174,13 @@ class LanesEngine:
             lanes = self._scheduled
         common, batch, ticks = DrawnFlight.of(campaign.scenario), list[_PreparedDraw](), 0
         began = time.perf_counter()
-        for draw in draws:
+        for draw, flight in drawn_flights(campaign, draws, common):
             if stopped():
                 return
             try:
-                ready = lanes.prepare_draw(campaign, draw, drawn_flight(campaign, draw, common))
+                if isinstance(flight, Exception):
+                    raise flight
+                ready = lanes.prepare_draw(campaign, draw, flight)
             except Exception as error:  # The error is reported as a row.
                 yield Row.of_error(draw, error, self.name)
                 continue
@@ -212,18 +212,15 @@ class LanesEngine:
             yield from (Fallback(each.draw, str(error)) for each in batch)
             return
         taken = (time.perf_counter() - began) / len(batch)
-        for row, ready in enumerate(batch):
-            if row in result.failures:
-                yield Fallback(ready.draw, "was refused by the plant")
-                continue
-            measures = lanes.measures(result, row, ready, flights)
+        flown: list[tuple[Draw, Measures]] = []
+        for ready, measures in zip(
+            batch, lanes.measures(campaign, result, batch, flights, taken), strict=True
+        ):
             if isinstance(measures, str):
                 yield Fallback(ready.draw, measures)
-            elif measures.duration > campaign.max_flight_time and ready.plan is not None:
-                yield Fallback(ready.draw, "took longer than the campaign allows")
             else:
-                measures = replaced(measures, wall_time=taken + ready.plan_time)
-                yield Row.of(campaign, ready.draw, measures, self.name)
+                flown.append((ready.draw, measures))
+        yield from Row.of_each(campaign, flown, self.name)
 
 
 class _ScheduledLanes:
@@ -235,6 +232,8 @@ class _ScheduledLanes:
     def __init__(self) -> None:
         self._extremes: tuple[GaitSchedule, Array, Array] | None = None
         """The last schedule, and the lowest and highest positions (n,) of its joints, m or rad."""
+        self._planned_values: _PlannedValues | None = None
+        """What determines the plans of the last scenario, which many draws share."""
         self._last_plan: tuple[Any, _Plan | None] | None = None
         """The last plan from a state measured without noise, and the values that determine it."""
 
@@ -268,9 +267,15 @@ class _ScheduledLanes:
 
     def _plan_first_state(self, flight: DrawnFlight) -> _Plan | None:
         """Return the plan for the first state; the last one if the same values determine it."""
-        if _has_noise(flight):
+        values = self._planned_values
+        if values is None or values.scenario is not flight.scenario:
+            values = self._planned_values = _PlannedValues.of(flight.scenario)
+        if values.are_noisy:
             return _first_plan(flight)
-        key = _values_that_determine_plan(flight)
+        masses = None
+        if values.depend_on_masses and flight.inertial is not None:
+            masses = flight.inertial.vector.tolist()
+        key = values.others, masses
         if self._last_plan is None or self._last_plan[0] != key:
             self._last_plan = key, _first_plan(flight)
         return self._last_plan[1]
@@ -300,50 +305,66 @@ class _ScheduledLanes:
         )
 
     def measures(
-        self, result: BatchResult, row: int, ready: _PreparedDraw, flights: Flights
-    ) -> Measures | str:
-        """Return the measures of a flight whose goal is decided at the end of its schedule, or the
-        reason for a fallback.
+        self,
+        campaign: Campaign,
+        result: BatchResult,
+        batch: Sequence[_PreparedDraw],
+        flights: Flights,
+        taken: float,
+    ) -> Iterator[Measures | str]:
+        """Yield the measures of each flight whose goal is decided at the end of its schedule, or
+        the reason for a fallback; ``taken`` is the wall time of a flight in the batch, s.
         """
-        if any(counts[row].any() for counts in result.limited_ticks.values()):
-            return "had a joint at its limit"
-        scenario, schedule = ready.flight.scenario, ready.schedule
-        end = flights.report_ticks.index(schedule.ticks)
-        measured, q = result.measured_pose[row, end], result.measured_q[row, end]
-        band = max(_END_POSITION_TOLERANCE, scenario.planner.shape_deadband)
-        if np.abs(schedule.positions[-1] - q).max(initial=0.0) > band:
-            return "had a joint that did not follow its schedule"
-        error = PoseError.between(measured[:3], measured[3:], scenario.goal, q)
-        tolerance = scenario.planner.tolerance
-        remaining = describe_remaining_error(error, schedule.controls, tolerance, scenario.goal)
-        outcome, message = Outcome.REACHED, f"The goal is reached: {remaining}."
-        if not tolerance.admits(error, schedule.controls):
-            if scenario.planner.max_corrections:
-                return "needed corrections"
-            outcome = Outcome.FAILED
-            message = f"The goal is not reached: {remaining} after 0 correction(s)."
-        assert ready.plan is not None
-        pose = result.pose[row, end]
-        hand = _end_effector_error(flights.robot, ready.flight, result.q[row, end], pose)
-        duration = float(result.time[end] - result.time[0])
-        lowest, highest = self._extremes_of(schedule)
-        return Measures(
-            outcome=outcome,
-            message=message,
-            duration=duration,
-            manoeuvre_time=duration,
-            error=PoseError.between(pose[:3], pose[3:], scenario.goal),
-            peak_rate=result.peak_rate[row],
-            peak_effort=result.peak_effort[row],
-            peak_wrench=np.zeros(2),
-            # The joints follow the schedule exactly at every tick.
-            lowest=lowest,
-            highest=highest,
-            momentum_drift=momentum_drift(result.momentum[row, : end + 1]),
-            end_effector_distance=math.nan if hand is None else hand.distance,
-            corrections=ready.plan.status.corrections,
-            plan_time=ready.plan_time,
-        )
+        rows = np.arange(len(batch))
+        instants = {tick: place for place, tick in enumerate(flights.report_ticks)}
+        ends = np.array([instants[each.schedule.ticks] for each in batch])
+        measured, measured_q = result.measured_pose[rows, ends], result.measured_q[rows, ends]
+        poses, q = result.pose[rows, ends], result.q[rows, ends]
+        last = np.array([each.schedule.positions[-1] for each in batch])
+        deviations = np.abs(last - measured_q).max(axis=1, initial=0.0).tolist()
+        limited = np.any([x.any(axis=1) for x in result.limited_ticks.values()], axis=0).tolist()
+        durations = (result.time[ends] - result.time[0]).tolist()
+        flown = np.arange(len(result.time)) <= ends[:, np.newaxis]
+        drifts = momentum_drift(np.where(flown[..., np.newaxis], result.momentum, np.nan))
+        for row, ready in enumerate(batch):
+            if row in result.failures:
+                yield "was refused by the plant"
+                continue
+            if limited[row]:
+                yield "had a joint at its limit"
+                continue
+            scenario, schedule = ready.flight.scenario, ready.schedule
+            if deviations[row] > max(_END_POSITION_TOLERANCE, scenario.planner.shape_deadband):
+                yield "had a joint that did not follow its schedule"
+                continue
+            decided = _decide_goal(scenario, schedule, measured[row], measured_q[row])
+            if isinstance(decided, str):
+                yield decided
+                continue
+            duration, pose = durations[row], poses[row]
+            if duration > campaign.max_flight_time:
+                yield "took longer than the campaign allows"
+                continue
+            assert ready.plan is not None
+            hand = _end_effector_error(flights.robot, ready.flight, q[row], pose)
+            lowest, highest = self._extremes_of(schedule)
+            yield Measures(
+                *decided,
+                duration=duration,
+                manoeuvre_time=duration,
+                error=PoseError.between(pose[:3], pose[3:], scenario.goal),
+                peak_rate=result.peak_rate[row],
+                peak_effort=result.peak_effort[row],
+                peak_wrench=np.zeros(2),
+                # The joints follow the schedule exactly at every tick.
+                lowest=lowest,
+                highest=highest,
+                momentum_drift=drifts[row],
+                end_effector_distance=math.nan if hand is None else hand.distance,
+                corrections=ready.plan.status.corrections,
+                plan_time=ready.plan_time,
+                wall_time=taken + ready.plan_time,
+            )
 
 
 class _ControlledLanes:
@@ -431,9 +452,25 @@ class _ControlledLanes:
         )
 
     def measures(
-        self, result: BatchResult, row: int, ready: _PreparedDraw, flights: Flights
+        self,
+        campaign: Campaign,
+        result: BatchResult,
+        batch: Sequence[_PreparedDraw],
+        flights: Flights,
+        taken: float,
+    ) -> Iterator[Measures | str]:
+        """Yield the measures of each flight, or the reason for a fallback; ``taken`` is the wall
+        time of a flight in the batch, s.
+        """
+        for row, ready in enumerate(batch):
+            if row in result.failures:
+                yield "was refused by the plant"
+            else:
+                yield self._measures_of(result, row, ready, flights, taken)
+
+    def _measures_of(
+        self, result: BatchResult, row: int, ready: _PreparedDraw, flights: Flights, taken: float
     ) -> Measures | str:
-        """Return the measures of a flight, or the reason for a fallback."""
         decision, period_ns = Decision(result.decision[row]), ready.flight.scenario.plant.period_ns
         decided = int(result.decision_tick[row])
         if decision is Decision.LOST:
@@ -472,6 +509,7 @@ class _ControlledLanes:
             end_effector_angle=angle,
             propellant=math.nan if flights.thrusters is None else float(result.propellant[row]),
             plan_time=0.0,
+            wall_time=taken + ready.plan_time,
         )
 
 
@@ -483,17 +521,26 @@ def _batch_of_flights(
 ) -> Flights:
     """Return the batch of drawn flights under the commands of a program."""
     robot, nominal = plant_robot(drawn[0]), InertialParameters.of(drawn[0].nominal)
-    plants = [each.scenario.plant for each in drawn]
+    # Draws that leave the scenario share it.
+    scenarios = {id(each.scenario): each.scenario for each in drawn}
+    places = {key: place for place, key in enumerate(scenarios)}
+    rows = np.array([places[id(each.scenario)] for each in drawn])
+    plants = [scenario.plant for scenario in scenarios.values()]
+    sensors = SensorErrors.of(robot, [plant.sensors for plant in plants])[rows]
+    sensors.seeds[:] = [
+        seed if each.seed is None else each.seed
+        for each, seed in zip(drawn, sensors.seeds.tolist(), strict=True)
+    ]
     source = plants[0].thrusters
     return Flights(
         robot=robot,
         actuation="effort" if isinstance(program, ControlledGoals) else "velocity",
         control_period=plants[0].control_period,
         ticks=ticks,
-        initial_states=InitialStates.of(robot, [InitialState.of(plant) for plant in plants]),
+        initial_states=InitialStates.of(robot, [InitialState.of(plant) for plant in plants])[rows],
         program=program,
         inertial=InertialParameters.stacked([each.inertial or nominal for each in drawn]),
-        sensors=SensorErrors.of(robot, [plant.sensors for plant in plants]),
+        sensors=sensors,
         integration_step=plants[0].integration_step,
         report_ticks=instants,
         thrusters=find_thrusters(source, robot.description) if source else None,
@@ -528,47 +575,74 @@ def _turns_end_effector(flights: Flights) -> bool:
 # -- schedules --------------------------------------------------------------------------------
 
 
-def _has_noise(flight: DrawnFlight) -> bool:
-    """Whether the first measured state may differ from draw to draw."""
-    return _has_errors(*_without_seed(flight.scenario.plant.sensors).values())
+def _decide_goal(
+    scenario: Scenario, schedule: GaitSchedule, pose: Array, q: Array
+) -> tuple[Outcome, str] | str:
+    """Return the outcome of a goal at the end of a schedule with its message, or the reason for a
+    fallback, for the measured pose (7,) and joint positions (n,).
+    """
+    error = PoseError.between(pose[:3], pose[3:], scenario.goal, q)
+    tolerance = scenario.planner.tolerance
+    remaining = describe_remaining_error(error, schedule.controls, tolerance, scenario.goal)
+    if tolerance.admits(error, schedule.controls):
+        return Outcome.REACHED, f"The goal is reached: {remaining}."
+    if scenario.planner.max_corrections:
+        return "needed corrections"
+    return Outcome.FAILED, f"The goal is not reached: {remaining} after 0 correction(s)."
 
 
-@lru_cache
-def _has_errors(*values: float | tuple[float, ...]) -> bool:
-    return any(np.any(value) for value in values)
+@dataclass(frozen=True)
+class _PlannedValues:
+    """The values of a scenario that determine a plan for the first state.
 
+    Attributes
+    ----------
+    scenario
+        The scenario.
+    are_noisy
+        Whether the first measured state may differ from draw to draw.
+    depend_on_masses
+        Whether the plan depends on the masses of the plant's robot.
+    others
+        All values that determine a plan without noise besides these masses, to be compared.
+    """
 
-def _without_seed(sensors: SensorConfig) -> dict[str, Any]:
-    """Return the parameters of sensors that do not differ from draw to draw by themselves."""
-    # A copy of the configuration with another seed takes ten times as long.
-    return {name: value for name, value in vars(sensors).items() if name != "seed"}
+    scenario: Scenario
+    are_noisy: bool
+    depend_on_masses: bool
+    others: Any
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> _PlannedValues:
+        """Return the values of a scenario."""
+        plant, goal = scenario.plant, scenario.goal
+        sensors = {name: value for name, value in vars(plant.sensors).items() if name != "seed"}
+        # Plans from rest do not depend on the masses of the plant's robot.
+        moving = any(plant.linear_momentum) or any(plant.angular_momentum)
+        shape = None if goal.joint_positions is None else goal.joint_positions.tolist()
+        return cls(
+            scenario,
+            are_noisy=any(np.any(value) for value in sensors.values()),
+            depend_on_masses=bool(moving or plant.initial_center_of_mass),
+            others=(
+                *(scenario.planner, {**vars(plant), "sensors": sensors}),
+                *(goal.position.tolist(), goal.quaternion.tolist(), shape),
+            ),
+        )
 
 
 def _first_plan(flight: DrawnFlight) -> _Plan | None:
     """Let the executive plan for the first state; None if it makes no whole schedule."""
     period = flight.scenario.plant.control_period
-    first = fly_scenario(flight.scenario, robots=robots_of(flight), longest=period, contacts=False)
+    first = fly_scenario(
+        flight.seeded_scenario, robots=robots_of(flight), longest=period, contacts=False
+    )
     if len(first.schedules) != 1 or first.gait is None:
         return None
     ((begins_ns, schedule),) = first.schedules
     if begins_ns or schedule.partial or not schedule.ticks:
         return None
     return _Plan(schedule, first.gait)
-
-
-def _values_that_determine_plan(flight: DrawnFlight) -> Any:
-    """Return the values that determine a plan without noise, to be compared."""
-    scenario = flight.scenario
-    plant = scenario.plant
-    configured = {**vars(plant), "sensors": _without_seed(plant.sensors)}
-    # Plans from rest do not depend on the masses of the plant's robot.
-    moving = any(plant.linear_momentum) or any(plant.angular_momentum)
-    masses = None
-    if flight.inertial is not None and (moving or plant.initial_center_of_mass):
-        masses = flight.inertial.vector.tolist()
-    goal = [*scenario.goal.position, *scenario.goal.quaternion]
-    shape = scenario.goal.joint_positions
-    return scenario.planner, configured, goal, None if shape is None else shape.tolist(), masses
 
 
 def _pad_positions(positions: Array, ticks: int) -> Array:

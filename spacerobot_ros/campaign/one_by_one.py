@@ -77,7 +77,7 @@ class FlightsEngine(_OneByOneEngine):
     ) -> Flight:
         """Fly one draw; see the base class."""
         return fly_scenario(
-            flight.scenario,
+            flight.seeded_scenario,
             robots=robots_of(flight),
             progress=lambda now, end: stopped(),
             longest=campaign.max_flight_time,
@@ -172,7 +172,7 @@ class RosEngine(_OneByOneEngine):
         began = time.perf_counter()
         with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
             bag = Path(folder, "flight.mcap")
-            scenario = flight.with_masses_in_urdf().scenario
+            scenario = flight.with_draws_in_scenario().scenario
             self._run_scenario(scenario, Path(folder, "draw.yaml"), bag, campaign.max_flight_time)
             flown = read_run(bag)
         if (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -11,7 +11,7 @@ from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.measures import Measures, metrics_of
+from spacerobot_ros.measures import Measures, metrics_of_each
 
 LANES = "lanes"
 """Name of the engine that flies many draws at once in SIMD lanes."""
@@ -58,17 +58,29 @@ class Row:
     @classmethod
     def of(cls, campaign: Campaign, draw: Draw, measures: Measures, engine: str) -> Row:
         """Return the row of a flight."""
-        metrics = metrics_of(measures, description_of(campaign.scenario))
-        return cls(
-            draw=draw,
-            outcome=measures.outcome.value,
-            reason=measures.message,
-            metrics=metrics,
-            passed=passes_criteria(campaign.criteria, measures.outcome.value, metrics),
-            engine=engine,
-            wall_time=measures.wall_time,
-            plan_time=measures.plan_time,
-        )
+        (row,) = cls.of_each(campaign, [(draw, measures)], engine)
+        return row
+
+    @classmethod
+    def of_each(
+        cls, campaign: Campaign, flown: Sequence[tuple[Draw, Measures]], engine: str
+    ) -> list[Row]:
+        """Return the rows of flights."""
+        robot = description_of(campaign.scenario)
+        found = metrics_of_each([measures for _, measures in flown], robot)
+        return [
+            cls(
+                draw=draw,
+                outcome=measures.outcome.value,
+                reason=measures.message,
+                metrics=metrics,
+                passed=passes_criteria(campaign.criteria, measures.outcome.value, metrics),
+                engine=engine,
+                wall_time=measures.wall_time,
+                plan_time=measures.plan_time,
+            )
+            for (draw, measures), metrics in zip(flown, found, strict=True)
+        ]
 
     @classmethod
     def of_error(cls, draw: Draw, error: BaseException, engine: str) -> Row:

@@ -232,7 +232,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
         )
     draw = draws[number]
     flight = drawn_flight(campaign, draw)
-    run_scenario(flight.with_masses_in_urdf().scenario, bag, longest=campaign.max_flight_time)
+    run_scenario(flight.with_draws_in_scenario().scenario, bag, longest=campaign.max_flight_time)
     measures = read_run(bag).measured(clearance=campaign.measures_clearance)
     row = Row.of(campaign, draw, measures, "ros")
     known = stored_flight(dataset, number)

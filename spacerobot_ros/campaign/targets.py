@@ -10,6 +10,7 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -35,6 +36,9 @@ _PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
 """Parameters that are the same in all flights of a campaign."""
 _MIN_FACTOR = 1e-6
 """Factors of masses and inertias between this and its inverse need no check of every body."""
+
+_FACTORS = ("mass", "inertia", "com")
+"""Attributes of :class:`DrawnFlight` that have numbers for each flight."""
 
 _POSE_TARGET_NAMES = ("goal", "end_effector_goal", "initial")
 
@@ -66,10 +70,13 @@ class DispersionTarget:
         Function that returns a flight with a drawn value.
     unit
         Unit, for people.
-    text
+    is_text
         Whether its values are texts.
     assigned_parameters
         Names of the numbers that it sets; two targets that set the same number share one.
+    changes_masses_only
+        Whether it changes mass properties of the robot and leaves the scenario: ``apply`` then
+        takes N flights with drawn values (N,), too.
     """
 
     name: str
@@ -77,27 +84,34 @@ class DispersionTarget:
     unit: str
     is_text: bool
     assigned_parameters: frozenset[str]
+    changes_masses_only: bool = False
 
 
 @dataclass(frozen=True)
 class DrawnFlight:
-    """One flight of a campaign.
+    """One flight of a campaign, or several that share a scenario and differ in masses.
+
+    Leading dimensions (...) are the flights: none is one, (N,) are N.
 
     Attributes
     ----------
     scenario
-        The scenario; the plant's masses are not in it before :meth:`with_masses_in_urdf`.
+        The scenario; the plant's masses and the seed are not in it before
+        :meth:`with_draws_in_scenario`. Flights whose draws leave the scenario have the same object.
     nominal
         The robot without dispersions.
     mass, inertia
-        (B,) factors of the bodies; the inertia goes with the mass, and with a factor of its own.
+        (..., B) factors of the bodies; the inertia goes with the mass, and with a factor of its
+        own.
     com
-        (B, 3) offsets of the centres of mass, m.
-    parameters, physical
+        (..., B, 3) offsets of the centres of mass, m.
+    parameters, is_physical
         Masses, centres and inertias of the nominal robot, and whether they are those of bodies
         without slack for rounding.
     has_target_masses
         Whether the mass properties of the target are drawn.
+    seed
+        Seed of the noise of sensors and actuators; None: that of the scenario.
     """
 
     scenario: Scenario
@@ -108,6 +122,7 @@ class DrawnFlight:
     parameters: InertialParameters
     is_physical: bool
     has_target_masses: bool = False
+    seed: int | None = None
 
     @classmethod
     def of(cls, scenario: Scenario) -> DrawnFlight:
@@ -132,13 +147,60 @@ class DrawnFlight:
         return replaced(self, scenario=self.scenario.with_overrides(node, parameters))
 
     @cached_property
+    def seeded_scenario(self) -> Scenario:
+        """The scenario with the seed of the flight."""
+        if self.seed is None:
+            return self.scenario
+        return self.scenario.with_overrides("plant", {"sensors.seed": self.seed})
+
+    @cached_property
     def inertial(self) -> InertialParameters | None:
         """Masses, centres and inertias of the bodies; None: those of the robot's description."""
-        shifted = bool(self.com.any())
-        if not shifted and np.all(self.mass == 1.0) and np.all(self.inertia == 1.0):
-            return None
+        return self._scaled_parameters if self._has_other_masses.any() else None
+
+    @property
+    def _has_other_masses(self) -> npt.NDArray[np.bool_]:
+        """(...) whether flights differ from the nominal robot in mass properties."""
+        factors = (self.mass != 1.0) | (self.inertia != 1.0) | self.com.any(axis=-1)
+        return np.asarray(factors.any(axis=-1))
+
+    @property
+    def _scaled_parameters(self) -> InertialParameters:
         scaled = self.parameters.scaled(self.mass, self.mass * self.inertia)
-        return scaled.shifted(self.com) if shifted else scaled
+        moved = np.asarray(self.com.any(axis=(-2, -1)))
+        if not moved.any():
+            return scaled
+        # Where no centre moves, zeros keep their signs.
+        return scaled.shifted(np.where(moved[..., np.newaxis, np.newaxis], self.com, -0.0))
+
+    def repeated(self, count: int) -> DrawnFlight:
+        """Return a flight as ``count`` equal ones."""
+        numbers = {name: getattr(self, name) for name in _FACTORS}
+        return replaced(
+            self, **{name: np.repeat(x[np.newaxis], count, axis=0) for name, x in numbers.items()}
+        )
+
+    def separate(self, seeds: Sequence[int | None]) -> list[DrawnFlight]:
+        """Return the flights one by one, with their seeds."""
+        flights = []
+        inertial, has_other_masses = self._scaled_parameters, self._has_other_masses.tolist()
+        for row, (seed, has_other) in enumerate(zip(seeds, has_other_masses, strict=True)):
+            factors = {name: getattr(self, name)[row] for name in _FACTORS}
+            flight = replaced(self, seed=seed, **factors)
+            # Known here: each flight would take as long as all of them together.
+            vars(flight)["inertial"] = inertial[row] if has_other else None
+            flights.append(flight)
+        return flights
+
+    def surely_physical(self) -> npt.NDArray[np.bool_]:
+        """Return whether flights (...) need no check of every body by :meth:`require_physical`.
+
+        Positive factors leave the ratios of principal moments.
+        """
+        factors = np.concatenate([self.mass, self.inertia], axis=-1)
+        mild = (factors > _MIN_FACTOR) & (factors < 1.0 / _MIN_FACTOR)
+        finite = np.isfinite(self.com).all(axis=(-2, -1))
+        return np.asarray(self.is_physical & mild.all(axis=-1) & finite)
 
     def require_physical(self) -> None:
         """Check that drawn masses and inertias are those of bodies.
@@ -148,34 +210,26 @@ class DrawnFlight:
         RobotDescriptionError
             They are not.
         """
-        if self.inertial is None:
-            return
-        factors = np.concatenate([self.mass, self.inertia])
-        small, large = factors.min(), factors.max()
-        # Positive factors leave the ratios of principal moments: the slow check is not needed.
-        mild = _MIN_FACTOR < small <= large < 1.0 / _MIN_FACTOR
-        if self.is_physical and mild and np.isfinite(self.com).all():
-            return
-        self.inertial.require_physical([body.name for body in self.nominal.bodies])
+        if self.inertial is not None and not self.surely_physical().all():
+            self.inertial.require_physical([body.name for body in self.nominal.bodies])
 
-    def with_masses_in_urdf(self) -> DrawnFlight:
-        """Return the flight with its masses in the URDF of the plant.
+    def with_draws_in_scenario(self) -> DrawnFlight:
+        """Return the flight with its seed in the scenario and its masses in the plant's URDF.
 
         The commanders go on to believe in the robot as it was, unless they have one of their own.
 
         To build one takes milliseconds: engines without ROS take :attr:`inertial` as it is.
         """
-        parameters = self.inertial
-        if parameters is None:
-            return self
-        text = urdf_with(self.nominal, parameters)
-        scenario = self.scenario.with_overrides("plant", {"robot_description": text})
-        for node in scenario.commanders:
-            config = scenario.config(node)
-            if not (config.robot or config.robot_description):
-                believed = {"robot_description": self.nominal.urdf}
-                scenario = scenario.with_overrides(node, believed)
-        return replace(self, scenario=scenario)
+        scenario, parameters = self.seeded_scenario, self.inertial
+        if parameters is not None:
+            text = urdf_with(self.nominal, parameters)
+            scenario = scenario.with_overrides("plant", {"robot_description": text})
+            for node in scenario.commanders:
+                config = scenario.config(node)
+                if not (config.robot or config.robot_description):
+                    believed = {"robot_description": self.nominal.urdf}
+                    scenario = scenario.with_overrides(node, believed)
+        return replace(self, scenario=scenario, seed=None)
 
 
 def description_of(scenario: Scenario) -> RobotDescription:
@@ -354,12 +408,11 @@ def _mass_property_targets(
 
         def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
             factors = getattr(flight, kind).copy()
-            factors[indices] *= float(drawn)
+            factors[..., indices] *= np.asarray(drawn, dtype=float)[..., np.newaxis]
             return replaced(flight, **{kind: factors})
 
-        return DispersionTarget(
-            name, apply, "1", False, frozenset(f"{kind}.{body}" for _, body in bodies)
-        )
+        sets = frozenset(f"{kind}.{body}" for _, body in bodies)
+        return DispersionTarget(name, apply, "1", False, sets, changes_masses_only=True)
 
     if not dot:
         return [target(_find_bodies("*", scenario), kind)]
@@ -386,10 +439,10 @@ def _center_targets(rest: str, scenario: Scenario) -> list[DispersionTarget]:
 def _center_target(index: int, column: int, name: str) -> DispersionTarget:
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         com = flight.com.copy()
-        com[index, column] += float(drawn)
-        return replace(flight, com=com)
+        com[..., index, column] += np.asarray(drawn, dtype=float)
+        return replaced(flight, com=com)
 
-    return DispersionTarget(name, apply, "m", False, frozenset({name}))
+    return DispersionTarget(name, apply, "m", False, frozenset({name}), changes_masses_only=True)
 
 
 def _floating_target(name: str, part: str, scenario: Scenario) -> DispersionTarget:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,15 @@ from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.report import metric_label
 from spacerobot_ros.campaign.rows import Row
-from spacerobot_ros.measures import METRICS, CaptureMeasures, Measures, Outcome
+from spacerobot_ros.campaign.targets import description_of
+from spacerobot_ros.measures import (
+    METRICS,
+    CaptureMeasures,
+    Measures,
+    Outcome,
+    metrics_of,
+    metrics_of_each,
+)
 from spacerobot_ros.planning.core.goal import PoseError
 
 FLOWN = Measures(
@@ -194,3 +203,14 @@ def test_what_a_flight_does_not_have_is_no_number(tmp_path: Path) -> None:
     assert (row["engine"], row["passed"]) == ("ros", False)
     assert row["position_error_m"] is None
     assert math.isnan(row["wall_time_s"])
+
+
+def test_the_metrics_of_flights_are_those_of_each() -> None:
+    robot = description_of(campaign().scenario)
+    other = replace(FLOWN, duration=3.5, peak_rate=np.array([9.0, 0.0, math.nan]), error=None)
+    found = metrics_of_each([FLOWN, other, FLOWN], robot)
+    assert str(found) == str([metrics_of(each, robot) for each in (FLOWN, other, FLOWN)])
+    assert [each["duration_s"] for each in found] == [41.5, 3.5, 41.5]
+    assert [each["peak_rate.slider_1"] for each in found] == [0.25, 9.0, 0.25]
+    assert [str(each["peak_rate"]) for each in found] == ["0.5", "nan", "0.5"]
+    assert metrics_of_each([], robot) == []

@@ -259,7 +259,9 @@ def batched(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[list[Any], l
             yield from (each.draw.number for each in batch)
 
         monkeypatch.setattr(lanes, "time", SimpleNamespace(perf_counter=lambda: now[0]))
-        monkeypatch.setattr(lanes, "drawn_flight", lambda *_: None)
+        monkeypatch.setattr(
+            lanes, "drawn_flights", lambda made, draws, common: ((draw, None) for draw in draws)
+        )
         monkeypatch.setattr(engine, "_fly_batch", flown)
         kinds = SimpleNamespace(max_batch_flights=3, prepare_draw=prepare)
         name = "_scheduled" if "planner" in made.scenario.commanders else "_controlled"
@@ -307,36 +309,33 @@ def measures(**given: Any) -> Measures:
 
 
 def test_a_batch_is_rows_and_what_is_left_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Times of planning are added to each flight's share of the wall time of its batch."""
     made = replace(PLANNED, max_flight_time=2.0)
-    answers = {
-        0: measures(),
-        1: "had a joint at its limit",
-        3: measures(duration=2.25),
-        4: measures(duration=2.25),
-    }
+    answers = [
+        measures(duration=1.5, wall_time=0.8),
+        "had a joint at its limit",
+        measures(duration=2.25, wall_time=1.8),
+        "lost control",
+        "lost control",
+    ]
 
-    def measured(result: Any, row: int, draw: _PreparedDraw, flights: Any) -> Any:
-        assert (result.failures, flights) == ({2: "no"}, "flights")
-        return answers[row]
+    def measured(*given: Any) -> Any:
+        assert given == (made, "result", batch, "flights", 0.8)
+        return answers
 
     times = iter([10.0, 14.0])
     monkeypatch.setattr(lanes, "time", SimpleNamespace(perf_counter=lambda: next(times)))
-    monkeypatch.setattr(lanes, "fly_lanes", lambda flights: SimpleNamespace(failures={2: "no"}))
+    monkeypatch.setattr(lanes, "fly_lanes", lambda flights: "result")
     kind: Any = SimpleNamespace(flights=lambda made, batch: "flights", measures=measured)
-    batch = [ready(n, 1 if n < 4 else 0, 0.25 * n) for n in range(5)]
-    row, limited, refused, long, last = LanesEngine()._fly_batch(made, kind, batch)
-    assert isinstance(row, Row)
-    assert (row.wall_time, row.engine, row.outcome) == (0.8, "lanes", "reached")
-    found = [each.reason for each in (limited, refused, long)]
-    assert found == [
-        "had a joint at its limit",
-        "was refused by the plant",
-        "took longer than the campaign allows",
-    ]
-    # A controller ends by itself after the longest time.
+    batch = [ready(n) for n in range(5)]
+    *left, first, last = LanesEngine()._fly_batch(made, kind, batch)
+    reasons = {1: "had a joint at its limit", 3: "lost control", 4: "lost control"}
+    assert left == [Fallback(Draw(number, 1, {}), reason) for number, reason in reasons.items()]
+    assert isinstance(first, Row)
     assert isinstance(last, Row)
-    assert last.wall_time == pytest.approx(0.8 + 1.0)
+    assert (first.wall_time, first.engine, first.outcome) == (0.8, "lanes", "reached")
+    assert [each.draw.number for each in (first, last)] == [0, 2]
+    assert [each.metrics["duration_s"] for each in (first, last)] == [1.5, 2.25]
+    assert last.wall_time == 1.8
 
 
 def test_a_batch_that_is_refused_is_left_to_another_engine(
@@ -397,9 +396,15 @@ def scheduled(**given: Any) -> Any:
     planner = {"max_corrections": 0, "position_tolerance": 0.02, **given.get("planner", {})}
     flight = DrawnFlight.of(START.with_poses(goal, None).with_overrides("planner", planner))
     draw = _PreparedDraw(Draw(1, 1, {}), flight, plan, 0.375)
+    first = SimpleNamespace(ticks=1, positions=positions, controls=schedule.controls)
+    plan = SimpleNamespace(schedule=first, status=plan.status)
+    batch = [_PreparedDraw(Draw(0, 1, {}), flight, plan), draw]
     robot = SimpleNamespace(description=SimpleNamespace(end_effector=lambda frame: ""))
     flights: Any = SimpleNamespace(report_ticks=(0, 1, 2), robot=robot)
-    return _ScheduledLanes().measures(result, 1, draw, flights)  # type: ignore[arg-type]
+    made = replace(PLANNED, max_flight_time=given.get("longest", 2.5))
+    one = SimpleNamespace(**vars(result), failures=given.get("failures", {}))
+    _, found = _ScheduledLanes().measures(made, one, batch, flights, 0.25)  # type: ignore[arg-type]
+    return found
 
 
 def test_the_measures_along_a_schedule_are_those_of_its_end() -> None:
@@ -413,7 +418,7 @@ def test_the_measures_along_a_schedule_are_those_of_its_end() -> None:
     assert math.isnan(found.end_effector_distance)
     assert math.isnan(found.end_effector_angle)
     assert (found.corrections, found.plan_time) == (1, 0.375)
-    assert math.isnan(found.wall_time)
+    assert found.wall_time == 0.625
     np.testing.assert_array_equal(found.peak_rate, [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(found.peak_effort, [4.0, 5.0, 6.0])
     np.testing.assert_array_equal(found.peak_wrench, [0.0, 0.0])
@@ -426,6 +431,9 @@ def test_the_measures_along_a_schedule_are_those_of_its_end() -> None:
     ("given", "reason"),
     [
         ({"limited": [[0], [2]]}, "had a joint at its limit"),
+        ({"limited": [[0], [2]], "failures": {1: "no"}}, "was refused by the plant"),
+        ({"failures": {0: "no"}}, None),
+        ({"longest": 2.4}, "took longer than the campaign allows"),
         ({"off": 1.1e-6}, "had a joint that did not follow its schedule"),
         ({"off": 0.9e-6}, None),
         ({"off": 0.0009, "planner": {"shape_deadband": 0.001}}, None),
@@ -515,13 +523,17 @@ def decided(decision: Decision, tick: int, **given: Any) -> Any:
         highest=second(0.5, 1.0),
         momentum_drift=second(6.0, 7.0),
         propellant=np.array([8.0, 9.0]),
+        failures=given.get("failures", {0: "no"}),
     )
     robot = SimpleNamespace(n=n, description=SimpleNamespace(end_effector=lambda frame: ""))
     starts = SimpleNamespace(qdot=second(-0.75, 0.25))
     flights: Any = SimpleNamespace(
         robot=robot, initial_states=starts, thrusters=given.get("thrusters")
     )
-    return _ControlledLanes().measures(result, 1, _PreparedDraw(Draw(1, 1, {}), flight), flights)
+    batch = [_PreparedDraw(Draw(number, 1, {}), flight) for number in range(2)]
+    made = replace(CONTROLLED, max_flight_time=0.0)  # A controller ends by itself after it.
+    _, found = _ControlledLanes().measures(made, result, batch, flights, 0.25)
+    return found
 
 
 def test_the_measures_of_control_are_those_of_the_end_of_the_flight() -> None:
@@ -556,6 +568,7 @@ def test_how_control_ends() -> None:
     assert cut.message == "Interrupted after 0.3 s of simulated time."
     assert cut.manoeuvre_time == cut.duration == pytest.approx(0.3)
     assert decided(Decision.LOST, 3) == "lost control"
+    assert decided(Decision.LOST, 3, failures={0: "", 1: "no"}) == "was refused by the plant"
     assert decided(Decision.REACHED, 0) == "ended at its first state"
     assert decided(Decision.REACHED, 1).outcome is Outcome.REACHED
 

@@ -22,7 +22,7 @@ from spacerobot_ros.campaign import report as reports
 from spacerobot_ros.campaign import running as reruns
 from spacerobot_ros.campaign.config import Criterion, Distribution, load_campaign, meets_criterion
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
-from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, sobol_problem
+from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, drawn_flights, sobol_problem
 from spacerobot_ros.campaign.report import Results, figure_with_axes
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation, run_campaign
@@ -364,13 +364,80 @@ def test_saltelli_samples_have_the_seed_of_the_campaign(monkeypatch: pytest.Monk
 
 def test_a_draw_changes_its_flight() -> None:
     flight = drawn_flight(MADE, Draw(3, 17, {"mass.mass_1": 1.25}))
-    assert flight.scenario.plant.sensors.seed == 17
+    assert flight.seeded_scenario.plant.sensors.seed == 17
+    assert flight.with_draws_in_scenario().scenario.plant.sensors.seed == 17
     assert flight.mass.tolist() == [1.0, 1.25, 1.0, 1.0]
     with pytest.raises(ParameterError) as refused:
         drawn_flight(MADE, Draw(3, 17, {"mass.mass_1": math.inf}))
     assert str(refused.value) == "The value drawn for 'mass.mass_1' is inf."
     common = DrawnFlight.of(MADE.scenario)
     assert drawn_flight(MADE, Draw(3, 17, {"mass.mass_1": 1.5}), common).nominal is common.nominal
+
+
+def test_draws_that_are_made_together_are_those_made_alone() -> None:
+    """Each is the robot times its own factors, and errors are those of their draws alone."""
+    names = ("mass.mass_1", "inertia", "com.mass_2.y", "planner.position_tolerance")
+    even = {"uniform": [0.5, 1.0]}
+    made = campaign(disperse=dict.fromkeys(names, even))
+    values = [
+        (1.25, 2.0, 0.5, 0.01),
+        (1.0, 1.0, 0.0, 0.02),
+        (math.inf, 1.0, 0.0, 0.02),
+        (0.5, 1.0, math.nan, -1.0),
+        (-1.0, 1.0, 0.0, 0.02),
+        (2.0, 1.0, 0.0, 0.04),
+        (1.0, 0.5, 0.0, 0.03),
+    ]
+    draws = [Draw(k, 10 + k, dict(zip(names, row, strict=True))) for k, row in enumerate(values)]
+    usual = DrawnFlight.of(made.scenario)
+    found = list(drawn_flights(made, iter(draws), usual))
+    assert [draw for draw, _ in found] == draws
+    errors = {k: each for k, (_, each) in enumerate(found) if isinstance(each, Exception)}
+    flights = {k: each for k, (_, each) in enumerate(found) if isinstance(each, DrawnFlight)}
+    for k, error in errors.items():
+        with pytest.raises(type(error)) as raised:
+            drawn_flight(made, draws[k])
+        assert str(raised.value) == str(error)
+    for k, words in {
+        2: "The value drawn for 'mass.mass_1' is inf.",
+        3: "The value drawn for 'com.mass_2.y' is nan.",
+        4: "The mass of 'mass_1'",
+    }.items():
+        assert words in str(errors.pop(k))
+    assert not errors
+    nominal = usual.parameters
+    for k, flight in flights.items():
+        mass, inertia, shift, tolerance = values[k]
+        alone = drawn_flight(made, draws[k])
+        assert flight.seed == alone.seed == 10 + k
+        assert flight.scenario.planner.position_tolerance == tolerance
+        if (mass, inertia, shift) == (1.0, 1.0, 0.0):
+            assert flight.inertial is alone.inertial is None
+            continue
+        masses = nominal.masses * [1.0, mass, 1.0, 1.0]
+        centers = nominal.centers + shift * np.outer([0, 0, 1, 0], [0, 1, 0])
+        tensors = nominal.inertias * inertia * np.reshape([1.0, mass, 1.0, 1.0], (4, 1, 1))
+        assert flight.inertial is not None
+        assert alone.inertial is not None
+        np.testing.assert_allclose(flight.inertial.masses, masses, rtol=1e-15)
+        np.testing.assert_allclose(flight.inertial.centers, centers, rtol=1e-15)
+        np.testing.assert_allclose(flight.inertial.inertias, tensors, rtol=1e-15)
+        assert flight.inertial.vector.tobytes() == alone.inertial.vector.tobytes()
+
+
+def test_draws_share_a_scenario_that_they_leave() -> None:
+    """What differs from one to the next, seeds and masses, is beside it."""
+    flights = [
+        drawn for _, drawn in drawn_flights(MADE, Draws(MADE), DrawnFlight.of(MADE.scenario))
+    ]
+    assert {id(flight.scenario) for flight in flights} == {id(MADE.scenario)}  # type: ignore[union-attr]
+    assert len({flight.seed for flight in flights}) == len(MADE.dispersions) * 6  # type: ignore[union-attr]
+
+
+def test_a_seed_that_is_dispersed_is_that_of_the_flight() -> None:
+    made = campaign(disperse={"plant.sensors.seed": {"choice": [41]}})
+    flight = drawn_flight(made, Draws(made)[0])
+    assert flight.seeded_scenario.plant.sensors.seed == 41
 
 
 def test_a_package_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -553,7 +620,7 @@ def test_a_flight_is_compared_with_its_row(
 
     row = Row(DRAWN, "reached", "There.", {"a_m": 1.5, "b_s": 3.0})
     in_urdf = SimpleNamespace(scenario="scenario")
-    flight = SimpleNamespace(inertial=inertial, with_masses_in_urdf=lambda: in_urdf)
+    flight = SimpleNamespace(inertial=inertial, with_draws_in_scenario=lambda: in_urdf)
     dataset = SimpleNamespace(campaign=lambda: made)
     stored: list[Any] = [(outcome, engine, {"a_m": 1.25, "b_s": 3.0})]
 

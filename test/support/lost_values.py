@@ -133,18 +133,18 @@ def _change_columns() -> None:
             measures.METRICS[name] = replace(metric, unit="lost")
         evaluate = partial(_evaluate_metric, name, metric.evaluate)
         measures.METRICS[name] = replace(measures.METRICS[name], evaluate=evaluate)
-    record_of = dataset._record_of_row
+    columns_of = dataset._columns_of_rows
 
-    def record_of_row(row: Any) -> dict[str, Any]:
-        record = record_of(row)
-        for column, value in record.items():
+    def columns_of_rows(rows: Any, names: Any) -> dict[str, list[Any]]:
+        columns = columns_of(rows, names)
+        for column, values in columns.items():
             name = column.partition(".")[0]
             _write_use(f"column {name}")
             if lost == f"column {name}" and name not in measures.METRICS:
-                record[column] = _other_value(value)
-        return record
+                columns[column] = [_other_value(value) for value in values]
+        return columns
 
-    dataset._record_of_row = record_of_row
+    dataset._columns_of_rows = columns_of_rows
 
 
 def _evaluate_metric(name: str, evaluate: Any, *arguments: Any) -> Any:
