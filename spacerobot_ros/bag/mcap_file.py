@@ -439,8 +439,8 @@ class McapFile:
         offset in ``records``, one after the other.
         """
         given = {channel: np.array(entry, "<u8") for channel, entry in entries.items() if entry}
-        times = [entry[::2] for entry in given.values()]
-        start, end = (int(f([f(each) for each in times])) for f in (np.min, np.max))
+        times = np.concatenate([entry[::2] for entry in given.values()])
+        start, end = int(times.min()), int(times.max())
         data = self._compress(records)
         chunk = encode(
             Chunk(

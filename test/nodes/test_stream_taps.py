@@ -6,13 +6,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from support.recorded_stack import LATCHED_TOPICS, STREAMS, Stack
 from support.ros_harness import DEEP, Harness, nanoseconds
+
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM
+from spacerobot_ros.nodes.common.streams import RawOutput, with_information
 
 TAPPED = {"/clock", "/odom", "/base_pose", "/joint_states", "/momentum", "/joint_commands"}
 
@@ -148,3 +155,41 @@ def test_other_topics_are_subscribed(stack: Stack) -> None:
     stack.harness.spin_until(lambda: stack.recorder.messages_recorded > before + 1, "the note")
     stack.stop()
     assert [message.data for message in stack.close_bag()["/notes"]] == ["hello"]
+
+
+@pytest.mark.parametrize(("qos", "number"), [(STREAM, 1), (LATCHED, 4)])
+def test_messages_that_nobody_can_receive_are_not_published(
+    ros_context: rclpy.Context, qos: QoSProfile, number: int
+) -> None:
+    """The middleware numbers what it is given: a late subscription sees what came before."""
+    sender, receiver = (
+        rclpy.create_node(name, context=ros_context) for name in ("sender", "receiver")
+    )
+    output = RawOutput(sender.create_publisher(String, "words", qos), latched=qos is LATCHED)
+    kept: list[bytes] = []
+    output.add_listener(kept.append)
+    said = [serialize_message(String(data=word)) for word in ("one", "two", "three", "four")]
+    for raw in said[:3]:
+        output.take(raw)
+    heard: list[tuple[int, bytes]] = []
+    receiver.create_subscription(
+        String,
+        "words",
+        with_information(
+            lambda raw, about: heard.append((about["publication_sequence_number"], raw))
+        ),
+        qos,
+        raw=True,
+    )
+    executor = SingleThreadedExecutor(context=ros_context)
+    executor.add_node(receiver)
+    while not output.readers():
+        executor.spin_once(timeout_sec=0.01)
+    output.take(said[3])
+    while not heard or heard[-1][1] != said[3]:
+        executor.spin_once(timeout_sec=0.1)
+    assert heard[-1] == (number, said[3])
+    assert kept == said
+    for node in (sender, receiver):
+        node.destroy_node()
+    executor.shutdown()

@@ -174,7 +174,9 @@ def _one_after_another(*acts: RawCallback) -> RawCallback:
 class RawOutput(RawStream):
     """Messages of one publisher: ``take`` publishes a message.
 
-    A new listener is shown the last message of a latched topic first, as a subscription is.
+    A message that nobody can receive is not given to the middleware: nobody is subscribed, and the
+    topic keeps no last message for late subscribers. A new listener is shown the last message of a
+    latched topic first, as a subscription is.
 
     Parameters
     ----------
@@ -186,13 +188,18 @@ class RawOutput(RawStream):
 
     def __init__(self, publisher: Publisher, *, latched: bool = False) -> None:
         self._last: bytes | None = None
-        publish = raw_publish(publisher)
+        publish, count_readers = raw_publish(publisher), publisher.handle.get_subscription_count
 
         def keep_and_publish(raw: bytes) -> None:
             self._last = raw
             publish(raw)
 
-        self._publish = keep_and_publish if latched else publish
+        def publish_to_readers(raw: bytes) -> None:
+            # To count takes a third of the time of a publication.
+            if count_readers():
+                publish(raw)
+
+        self._publish = keep_and_publish if latched else publish_to_readers
         super().__init__(publisher.topic_name, self._publish)
         self.readers: Callable[[], int] = publisher.get_subscription_count
         """Function that returns the number of matched subscriptions."""

@@ -377,12 +377,12 @@ class PlantNode(FlightNode):
         if self._reported.update():
             self._publisher.rebuild()
         self._publisher.publish(now, all_topics=self._tick % self._pose_ticks == 0)
-        if self._marker_ticks and self._tick % self._marker_ticks == 0:
-            self._markers.publish(now)
         if self._clearance is not None and self._tick % self._clearance_ticks == 0:
             self._clearance.publish(now)
         if self._tf_ticks and self._tick % self._tf_ticks == 0:
             self._transforms.publish(now)
+        if self._marker_ticks and self._tick % self._marker_ticks == 0:
+            self._markers.publish(now)
         if self._report_ticks and self._tick % self._report_ticks == 0:
             self._publish_report()
 

@@ -521,7 +521,7 @@ class LinkMarkers:
 
     def __init__(self, node: FlightNode, plant: PlantWithFaults, world_frame: str) -> None:
         self._plant, self._world_frame = plant, world_frame
-        self._publisher: Any = node.create_publisher(MarkerArray, "markers", STREAM)
+        self._stream = node.send_raw(MarkerArray, "markers")
         self._drawn: set[tuple[str, int]] = set()
         """Namespaces and numbers of all markers so far."""
         self.use_obstacles(plant.robot.description.world)
@@ -578,4 +578,4 @@ class LinkMarkers:
             for pose, target in zip(self._of_target, self._targets[count:], strict=True):
                 shape = at @ pose
                 target[:3], target[3:] = shape.r, quaternion_from_matrix(shape.R)
-        self._publisher.publish(self._template.serialised(stamp_bytes(time_ns)))
+        self._stream.take(self._template.serialised(stamp_bytes(time_ns)))
