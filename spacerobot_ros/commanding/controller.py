@@ -24,7 +24,7 @@ from spacerobot_ros.control.servicing import Task
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.times import SECOND
 
@@ -61,6 +61,9 @@ class ControllerCommander(Commander):
         self._own_law = own_law
         self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
+        self._pose, self._twist = np.zeros(7), np.zeros(6)
+        self._measured: ControlState | None = None
+        """The last measured state, as long as its joints are in the same arrays."""
         self._target: RobotDescription | None = None
         """The target, as it is described."""
         self._target_odometry: Stamped | None = None
@@ -230,8 +233,7 @@ class ControllerCommander(Commander):
         try:
             q, qdot, measured = decoder.q, decoder.qdot, None
             if pairing is _WHOLE:
-                pose, twist = decoder.decode_base(states.odom)
-                measured = ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
+                measured = self._measured_state(*decoder.decode_base(states.odom), q, qdot)
             now = stamp / SECOND
             self._read_target(decoder)
             result = executive.command(now, measured, q, qdot, self._reference(decoder))
@@ -242,6 +244,16 @@ class ControllerCommander(Commander):
         if send:
             self.host.send_command(stamp)
         executive.evaluate(now, result)
+
+    def _measured_state(self, pose: Array, twist: Array, q: Array, qdot: Array) -> ControlState:
+        """Return a state of the robot; its arrays are used again for the next one."""
+        self._pose[:], self._twist[:] = pose, twist
+        measured = self._measured
+        if measured is None or measured.q is not q or measured.qdot is not qdot:
+            r_WB, quaternion_WB = self._pose[:3], self._pose[3:]
+            measured = ControlState(r_WB, quaternion_WB, self._twist[:3], self._twist[3:], q, qdot)
+            self._measured = measured
+        return measured
 
     def _read_target(self, decoder: StateDecoder) -> None:
         """Read the latest odometry of the target."""

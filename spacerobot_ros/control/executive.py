@@ -13,7 +13,6 @@ from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
-from spacerobot_ros.control.reference import OutputErrors
 from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, TaskState
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
@@ -32,7 +31,8 @@ GOAL_KEYS = (BASE_GOAL_KEY, END_EFFECTOR)
 """Keys of goals: frames of the robot that goal poses are for."""
 
 
-_NO_ERRORS = OutputErrors(0.0, 0.0, 0.0)
+# Names of the module are found faster than members of an enum: they are needed for every state.
+_MEASURED, _TRACKING, _NO_DECISION = Mode.MEASURED, ControllerState.TRACKING, Decision.NONE
 
 
 class ControlExecutive:
@@ -137,7 +137,7 @@ class ControlExecutive:
     def state(self) -> ControllerState:
         """The state that statuses report."""
         mode = self.controller.mode
-        if mode is Mode.MEASURED:
+        if mode is _MEASURED:
             return self._goal_state
         estimated = mode is Mode.ESTIMATED
         return ControllerState.ESTIMATING if estimated else ControllerState.STOPPED
@@ -411,18 +411,11 @@ class ControlExecutive:
             for event in self.controller.wheels.events():
                 self._report_event(event)
                 self._next_report = time
-        if self.controller.mode is Mode.MEASURED and self._goal_state is ControllerState.TRACKING:
+        if self.controller.mode is _MEASURED and self._goal_state is _TRACKING:
             self._watch_errors()
-        pursued = self._goal_state is ControllerState.TRACKING and self.servicing.task is None
-        if self.controller.mode is Mode.MEASURED and pursued:
-            at_rest = self.controller.reference_at_rest(time)
-            # Errors decide nothing while the reference moves.
-            errors = self.controller.errors() if at_rest else _NO_ERRORS
-            decision = self._monitor.decide_by_errors(time, at_rest, errors, self._goal_config)
-            if decision != Decision.NONE:
-                self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
-                self._file.delete()
-                self._report_decision(kind, self._message(self._goal_state), self._goal_state)
+        pursued = self._goal_state is _TRACKING and self.servicing.task is None
+        if self.controller.mode is _MEASURED and pursued:
+            self._decide(time)
         state = self.state
         if (
             state is self._reported_state
@@ -434,6 +427,20 @@ class ControlExecutive:
         self._reported_state, self._limited = state, result.limited
         self._command_report = _command_report(self.controller, result)
         self._publish(state, self._message(state), self._goal_id)
+
+    def _decide(self, time: float) -> None:
+        """Report the decision about the goal, if this state brings it."""
+        controller, monitor, config = self.controller, self._monitor, self._goal_config
+        at_rest = controller.reference_at_rest(time)
+        if not at_rest and not monitor.is_late(time, config):
+            # Errors decide nothing while the reference moves.
+            monitor.restart_settling()
+            return
+        decision = monitor.decide_by_errors(time, at_rest, controller.errors(), config)
+        if decision != _NO_DECISION:
+            self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
+            self._file.delete()
+            self._report_decision(kind, self._message(self._goal_state), self._goal_state)
 
     # -- control that is lost -----------------------------------------------------------------
 

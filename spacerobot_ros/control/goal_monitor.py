@@ -91,6 +91,10 @@ class GoalMonitor:
         self.large_error_states = (largest_share > 1.0) * (self.large_error_states + 1)
         return self.large_error_states >= LOST_STATES
 
+    def is_late(self, time: Scalar, config: ControllerConfig) -> Scalar:
+        """Whether the goal should have been reached by a time (s)."""
+        return config.time_limit and time - self.started >= config.time_limit - _ROUNDING
+
     def decide_by_errors(
         self, time: Scalar, at_rest: Scalar, errors: OutputErrors, config: ControllerConfig
     ) -> Scalar:
@@ -118,8 +122,7 @@ class GoalMonitor:
         since = was_within * self.within_since + (1 - was_within) * time
         self.within_since = within * since + (1 - within) * _NOT_WITHIN_TOLERANCE
         settled = within * (time - since >= config.settle_time - _ROUNDING)
-        late = time - self.started >= config.time_limit - _ROUNDING
-        failed = (1 - settled) * late if config.time_limit else 0
+        failed = (1 - settled) * self.is_late(time, config)
         return settled * Decision.REACHED + failed * Decision.FAILED
 
     def decide(

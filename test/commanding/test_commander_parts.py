@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -332,6 +333,8 @@ def answering(pairing: Pairing, *, send: bool = True, fails: Exception | None = 
         decode_base=lambda odom: (np.arange(7.0), np.arange(10.0, 16.0)),
     )  # fmt: skip
     made._reference = lambda decoder: "reference"
+    made._pose, made._twist, made._measured = np.zeros(7), np.zeros(6), None
+    made._measured_state = partial(ControllerCommander._measured_state, made)
     ControllerCommander._answer_state(made, pairing, send=send)
     return made
 
