@@ -17,6 +17,7 @@ import json
 import logging
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -42,6 +43,9 @@ from spacerobot_ros.termination import tool
 _COMMON_FLAGS = ("-fPIC", "-shared", "-ffp-contract=off")
 
 _COMPILER_FLAGS = ("-O1", *_COMMON_FLAGS)
+
+_LASTING_FLAGS = ("-O2", *_COMMON_FLAGS)
+"""Flags for functions that run for a long time: they take half as long again to compile."""
 
 _SOURCE_FLAGS = ("-O2", *_COMMON_FLAGS)
 """Flags for C that was written by hand: short, with loops."""
@@ -191,8 +195,11 @@ def dense_function(
     return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))
 
 
-def compiled(function: ca.Function) -> ca.Function:
+def compiled(function: ca.Function, *, lasting: bool = False) -> ca.Function:
     """Return the function as compiled C, or unchanged if it is not or cannot be compiled.
+
+    One that is ``lasting`` is compiled for this processor's vector registers, with the same
+    numbers, bit for bit: it runs for long enough that the compiler may take longer.
 
     Raises
     ------
@@ -206,10 +213,14 @@ def compiled(function: ca.Function) -> ca.Function:
     try:
         if compiler is None:
             raise _CompilationError("no C compiler (cc, gcc, clang or $CC) was found")
-        key = _hash_text(f"{_platform_key(compiler, _COMPILER_FLAGS)}\n{_c_source(function)}")
+        flags = _COMPILER_FLAGS
+        if lasting:
+            vectors = ("-mavx2",) if "avx2" in processor_features() else ()
+            flags = (*_LASTING_FLAGS, *vectors)
+        key = _hash_text(f"{_platform_key(compiler, flags)}\n{_c_source(function)}")
         if found := _load_compiled(Cache(cache_directory()), function.name(), key):
             return found
-        return _compile_function(function, key, _COMPILER_FLAGS, compiler)
+        return _compile_function(function, key, flags, compiler)
     except _CompilationError as reason:
         _warn_of_virtual_machine(reason)
         return function
@@ -398,6 +409,17 @@ def _compiler(*candidates: str | None) -> str | None:
         if found:
             return found
     return None
+
+
+@lru_cache(maxsize=1)
+def processor_features() -> frozenset[str]:
+    """Return the features of this processor, by Linux's names; empty where it names none."""
+    try:
+        text = Path("/proc/cpuinfo").read_text("utf-8", errors="replace")
+    except OSError:
+        return frozenset()
+    found = re.search(r"^flags\s*:(.*)$", text, re.MULTILINE)
+    return frozenset(found[1].split() if found else ())
 
 
 def cache_directory() -> Path:

@@ -97,11 +97,16 @@ class ModelFunctions:
             return self._symbolic[name]
         return self.composed(name, lambda: self._symbolic[name])
 
-    def composed(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
-        """Return a function composed of those of the model, compiled once per name."""
+    def composed(
+        self, name: str, build: Callable[[], ca.Function], *, lasting: bool = False
+    ) -> ca.Function:
+        """Return a function composed of those of the model, compiled once per name.
+
+        ``lasting`` is that of :func:`.compiled`.
+        """
         key = (name, *compilation_settings())
         if key not in self._compiled:
-            self._compiled[key] = compiled(build())
+            self._compiled[key] = compiled(build(), lasting=lasting)
         return self._compiled[key]
 
     def is_compiled(self, name: str) -> bool:

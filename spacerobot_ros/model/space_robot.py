@@ -296,10 +296,11 @@ class SpaceRobot:
     def composed(self, name: str, build: Callable[[Composition], ca.Function]) -> BufferedFunction:
         """Return a function that ``build`` composes from MX functions of the model, with buffers.
 
-        It is compiled once per name for all robots that differ in mass properties alone.
+        It is compiled once per name for all robots that differ in mass properties alone, to be
+        evaluated in every tick.
         """
         model = self._model
-        function = model.composed(name, lambda: build(Composition(model, ca.MX)))
+        function = model.composed(name, lambda: build(Composition(model, ca.MX)), lasting=True)
         return BufferedFunction(function, self._p)
 
     def expressions(self) -> Composition:

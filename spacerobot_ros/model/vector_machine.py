@@ -27,6 +27,7 @@ from spacerobot_ros.model.compilation import (
     c_compiler,
     compilation_settings,
     native_library,
+    processor_features,
 )
 
 _SOURCE_FILE = Path(__file__).with_name("vector_machine.c")
@@ -77,13 +78,8 @@ _PORTABLE_UNIT = VectorUnit("two at a time", 2, (), "")
 @lru_cache(maxsize=1)
 def vector_unit() -> VectorUnit:
     """Return the widest registers that this processor and its kernel support."""
-    try:
-        text = Path("/proc/cpuinfo").read_text("utf-8", errors="replace")
-    except OSError:
-        return _PORTABLE_UNIT
-    found = re.search(r"^flags\s*:(.*)$", text, re.MULTILINE)
-    flags = found[1].split() if found else []
-    return next((unit for flag, unit in VECTOR_UNITS.items() if flag in flags), _PORTABLE_UNIT)
+    features = processor_features()
+    return next((unit for name, unit in VECTOR_UNITS.items() if name in features), _PORTABLE_UNIT)
 
 
 _TRIAL = "vector_machine_trial"

@@ -190,6 +190,9 @@ class FakeNode:
     def create_publisher(self, *_: Any) -> Any:
         return SimpleNamespace(publish=self.published.append)
 
+    def send_raw(self, *_: Any) -> Any:
+        return SimpleNamespace(take=self.published.append)
+
     def get_fully_qualified_name(self) -> str:
         return "/a/plant"
 
