@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from functools import lru_cache
 from typing import Any
 
 from spacerobot_ros.errors import SpaceRobotError
@@ -22,6 +23,7 @@ unpack_stamp = struct.Struct(f"<{HEADER_STAMP.start}xiI").unpack_from
 """Returns seconds and nanoseconds of the time at the beginning of a serialised message."""
 
 
+@lru_cache(maxsize=1)
 def stamp_bytes(time_ns: int) -> bytes:
     """Return a time as a serialised builtin_interfaces/Time.
 

@@ -47,6 +47,14 @@ def free_name(path: Path, first: int = 0) -> Path:
         number += 1
 
 
+def _places_by_value(numbers: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Yield each of some numbers with its places, in order."""
+    order = np.argsort(numbers, kind="stable")
+    ascending = numbers[order]
+    begins = np.flatnonzero(np.diff(ascending, prepend=-1))
+    yield from zip(ascending[begins].tolist(), np.split(order, begins[1:]), strict=True)
+
+
 class BagWriter:
     """Writes serialised ROS 2 messages into a bag that any ROS 2 tool opens.
 
@@ -278,11 +286,10 @@ class BagWriter:
             last = min(int(np.searchsorted(ends, room)) + 1, len(messages))
             offsets = len(self._chunk) - begin + ends[first:last] - sizes[first:last] - size
             entries = np.column_stack([log_times_ns[first:last], offsets])
-            within = channels[first:last]
-            for channel in dict.fromkeys(channel_ids[first:last]):
+            for channel, places in _places_by_value(channels[first:last]):
                 if channel not in self._entries:
                     raise self._explain_refusal(channel)
-                self._entries[channel].frombytes(entries[within == channel].tobytes())
+                self._entries[channel].frombytes(entries[places].tobytes())
             self._chunk += b"".join(pieces[2 * first : 2 * last])
             if len(self._chunk) >= self._chunk_size:
                 self._finish_chunk()

@@ -71,6 +71,10 @@ class CommanderActivity(Enum):
     """The commander has stopped after a decision about its goal (``stop_when_decided``)."""
 
 
+_ACTIVE = CommanderActivity.ACTIVE
+"""Found faster than the member of the enum, for every state."""
+
+
 class CommanderHost(Protocol):
     """The surroundings of a commander: a node, a loop without ROS, or a test."""
 
@@ -116,6 +120,9 @@ class StateDecoder(Protocol):
     def decode_base(self, odom: Any) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an odom or base reference, or raise CommandError."""
 
+    def measured_base(self, odom: Any) -> tuple[Array, Array]:
+        """Return what :meth:`decode_base` does, in arrays that the next call may overwrite."""
+
     def target(self, odom: Any) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an odom of the target, or raise CommandError."""
 
@@ -159,6 +166,10 @@ class ArrayDecoder:
         assert odom.pose is not None
         assert odom.twist is not None
         return odom.pose, odom.twist
+
+    def measured_base(self, odom: StateArrays) -> tuple[Array, Array]:
+        """Return pose and twist."""
+        return self.decode_base(odom)
 
     target = decode_base
 
@@ -226,7 +237,7 @@ class Commander(ABC):
     @property
     def active(self) -> bool:
         """Whether states are answered and goals accepted."""
-        return self.activity is CommanderActivity.ACTIVE
+        return self.activity is _ACTIVE
 
     def use_robot(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         """Command this robot from now on, and accept the goals that wait for it.

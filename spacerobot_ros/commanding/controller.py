@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from operator import is_not
 from typing import Any
 
 import numpy as np
@@ -61,9 +62,9 @@ class ControllerCommander(Commander):
         self._own_law = own_law
         self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
-        self._pose, self._twist = np.zeros(7), np.zeros(6)
         self._measured: ControlState | None = None
-        """The last measured state, as long as its joints are in the same arrays."""
+        """The last measured state."""
+        self._measured_arrays: tuple[Array, ...] = ()
         self._target: RobotDescription | None = None
         """The target, as it is described."""
         self._target_odometry: Stamped | None = None
@@ -233,7 +234,7 @@ class ControllerCommander(Commander):
         try:
             q, qdot, measured = decoder.q, decoder.qdot, None
             if pairing is _WHOLE:
-                measured = self._measured_state(*decoder.decode_base(states.odom), q, qdot)
+                measured = self._measured_state(*decoder.measured_base(states.odom), q, qdot)
             now = stamp / SECOND
             self._read_target(decoder)
             result = executive.command(now, measured, q, qdot, self._reference(decoder))
@@ -245,13 +246,13 @@ class ControllerCommander(Commander):
             self.host.send_command(stamp)
         executive.evaluate(now, result)
 
-    def _measured_state(self, pose: Array, twist: Array, q: Array, qdot: Array) -> ControlState:
-        """Return a state of the robot; its arrays are used again for the next one."""
-        self._pose[:], self._twist[:] = pose, twist
+    def _measured_state(self, *arrays: Array) -> ControlState:
+        """Return the state of a pose (7,), a twist (6,), q and qdot (n,)."""
         measured = self._measured
-        if measured is None or measured.q is not q or measured.qdot is not qdot:
-            r_WB, quaternion_WB = self._pose[:3], self._pose[3:]
-            measured = ControlState(r_WB, quaternion_WB, self._twist[:3], self._twist[3:], q, qdot)
+        # Messages of one robot are read into the same arrays, which the state has parts of.
+        if measured is None or any(map(is_not, arrays, self._measured_arrays)):
+            pose, twist, q, qdot = self._measured_arrays = arrays
+            measured = ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
             self._measured = measured
         return measured
 

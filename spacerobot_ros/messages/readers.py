@@ -48,6 +48,7 @@ _HEADER_BYTES = 4096
 """Size allowed for the header of a JointState and for padding, bytes."""
 
 _POSE_PATH, _TWIST_PATH = "pose.pose.position.x", "twist.twist.linear.x"
+_WRENCH_PATH = "wrench.force.x"
 
 Quantity = Literal["position", "velocity", "effort"]
 """Name of a number array of a JointState."""
@@ -204,10 +205,16 @@ class TemplateReader:
         offset, count = self._value_spans[path]
         return np.frombuffer(self.raw, np.float64, count, offset)
 
-    def byte_span(self, path: str) -> slice:
-        """Return the span of bytes of the values at ``path`` in messages of this layout."""
-        offset, count = self._value_spans[path]
-        return slice(offset, offset + 8 * count)
+    def copies_into(self, arrays: Mapping[str, Array]) -> list[tuple[memoryview, slice]]:
+        """Return the memory of arrays by path, and the bytes in messages of this layout that are
+        their values; arrays of values that messages lack are left out.
+        """
+        copies = []
+        for path, array in arrays.items():
+            if path in self._value_spans:
+                offset, count = self._value_spans[path]
+                copies.append((array.data.cast("B"), slice(offset, offset + 8 * count)))
+        return copies
 
     def value_count(self, path: str) -> int:
         """Return the number of values at ``path`` in messages of this layout."""
@@ -324,7 +331,7 @@ class JointReader:
         """Last accepted message: publishers often repeat the same bytes."""
         self._order: npt.NDArray[np.intp] | None = None
         self._copies: list[tuple[memoryview, slice]] = []
-        self.values = {name: np.zeros(len(joint_names)) for name in quantities}
+        self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
 
     def accept(self, raw: bytes) -> int:
         """Read a message into ``values`` and return its stamp in ns.
@@ -389,11 +396,7 @@ class JointReader:
             values[:] = 0.0
         # Joints in the model's order, as nodes of the stack send them, are copied as bytes.
         if names == self._joints:
-            self._copies = [
-                (values.data.cast("B"), self._reader.byte_span(name))
-                for name, values in self.values.items()
-                if self._reader.has_values(name)
-            ]
+            self._copies = self._reader.copies_into(self.values)
         else:
             self._order = order
 
@@ -417,11 +420,25 @@ class MessageDecoder:
         )
         self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
         self.check_robot, self.decode_joints = self._joints.require, self._joints.accept
+        self._measured = {_POSE_PATH: np.zeros(7), _TWIST_PATH: np.zeros(6)}
+        self._copies: list[tuple[memoryview, slice]] = []
+        self._known_layout = 0
 
     def decode_base(self, odom: bytes) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an Odometry."""
         self._odom.accept(odom)
         return self._odom.floats(_POSE_PATH), self._odom.floats(_TWIST_PATH)
+
+    def measured_base(self, odom: bytes) -> tuple[Array, Array]:
+        """Return :meth:`decode_base` in arrays that the next call overwrites."""
+        reader = self._odom
+        reader.accept(odom)
+        if reader.layout_changes != self._known_layout:
+            self._known_layout = reader.layout_changes
+            self._copies = reader.copies_into(self._measured)
+        for target, place in self._copies:
+            target[:] = reader.raw[place]
+        return self._measured[_POSE_PATH], self._measured[_TWIST_PATH]
 
     def target(self, odom: bytes) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an Odometry of the target."""
@@ -485,8 +502,9 @@ class _WrenchReader:
     def __init__(self, base_link: str, frame_prefix: str) -> None:
         self.values: Array = np.zeros(6)
         self._base_link, self._prefix = base_link, frame_prefix
-        self._reader = TemplateReader(WRENCH, {"wrench.force.x": 6})
+        self._reader = TemplateReader(WRENCH, {_WRENCH_PATH: 6})
         self._known_layout = 0
+        self._copies: list[tuple[memoryview, slice]] = []
 
     def accept(self, raw: bytes) -> int:
         reader = self._reader
@@ -495,7 +513,9 @@ class _WrenchReader:
             # Messages of one layout name the same frame.
             require_frame(reader.text("header.frame_id"), self._base_link, self._prefix)
             self._known_layout = reader.layout_changes
-        self.values[:] = reader.floats("wrench.force.x")
+            self._copies = reader.copies_into({_WRENCH_PATH: self.values})
+        for target, place in self._copies:
+            target[:] = reader.raw[place]
         return reader.stamp_ns
 
     @property

@@ -330,10 +330,10 @@ def answering(pairing: Pairing, *, send: bool = True, fails: Exception | None = 
 
     made._decoder = SimpleNamespace(
         decode_joints=decode_joints, q="q", qdot="qdot",
-        decode_base=lambda odom: (np.arange(7.0), np.arange(10.0, 16.0)),
+        measured_base=lambda odom: (np.arange(7.0), np.arange(10.0, 16.0)),
     )  # fmt: skip
     made._reference = lambda decoder: "reference"
-    made._pose, made._twist, made._measured = np.zeros(7), np.zeros(6), None
+    made._measured = None
     made._measured_state = partial(ControllerCommander._measured_state, made)
     ControllerCommander._answer_state(made, pairing, send=send)
     return made

@@ -88,7 +88,7 @@ def test_whatever_comes_is_read_by_name_or_refused(quantities: list[Any]) -> Non
                 assert reader.accept(raw) == stamp
                 assert set(reader.values) == set(quantities)
                 for quantity, values in wanted.items():
-                    np.testing.assert_array_equal(reader.values[quantity], values)  # type: ignore[index]
+                    np.testing.assert_array_equal(reader.values[quantity], values)
 
     check()
 
