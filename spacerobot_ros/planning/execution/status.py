@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import Enum
+from functools import lru_cache
 
 from spacerobot_ros.events import (
     INTEGER,
@@ -275,18 +276,30 @@ def describe_remaining_error(
     remaining = f"{body or hand} from the goal"
     if body and hand:
         remaining += f", {hand} from {'theirs' if several else 'its goal'}"
+    parts_left = () if goal is None else uncontrolled_parts(goal, controls)
+    return remaining + _describe_tolerance(tolerance, controls, len(error.shape) > 0, parts_left)
+
+
+@lru_cache  # Flights of a campaign ask for the same.
+def _describe_tolerance(
+    tolerance: Tolerance | None,
+    controls: frozenset[Controlled],
+    has_shape: bool,
+    parts_left: tuple[Controlled, ...],
+) -> str:
+    """Return the words in brackets of :func:`describe_remaining_error`; empty if there are none."""
     notes = []
     if tolerance is not None:
         hands = "end_effectors" in controls
         limits = (
             (f"{tolerance.position:.3g} m", hands or "position" in controls),
             (f"{tolerance.attitude:.3g} rad", hands or "attitude" in controls),
-            (f"{tolerance.shape:.3g} at the joints", "shape" in controls and len(error.shape)),
+            (f"{tolerance.shape:.3g} at the joints", "shape" in controls and has_shape),
         )
         notes.append("tolerance " + ", ".join(text for text, counts in limits if counts))
-    if goal is not None and (parts_left := uncontrolled_parts(goal, controls)):
+    if parts_left:
         notes.append(f"{' and '.join(parts_left)} not controlled")
-    return remaining + (f" ({'; '.join(notes)})" if notes else "")
+    return f" ({'; '.join(notes)})" if notes else ""
 
 
 def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
