@@ -273,9 +273,9 @@ class BagWriter:
         headers["log_time"], headers["publish_time"] = log_times_ns, publish_times_ns
         sizes = np.fromiter(map(len, messages), np.int64, len(messages))
         headers["length"] = sizes + _HEADER_LENGTH
-        heads, size = headers.tobytes(), MESSAGE_HEADERS.itemsize
+        size = MESSAGE_HEADERS.itemsize
         pieces: list[bytes] = [b""] * (2 * len(messages))
-        pieces[::2] = [heads[i : i + size] for i in range(0, len(heads), size)]
+        pieces[::2] = headers.view(f"V{size}").tolist()
         pieces[1::2] = messages
         ends = np.cumsum(sizes + size)
         first = 0

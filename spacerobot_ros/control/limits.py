@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from operator import mul
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -100,8 +101,7 @@ class MotionLimits:
         )
 
 
-@dataclass(frozen=True)
-class Saturated:
+class Saturated(NamedTuple):
     """A command within the limits of the actuators: ``realised``, and ``excess``,
     commanded minus realised.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -139,8 +140,7 @@ class Reference:
         return cls(base, pose, JointReference.at_rest(state.q.copy()))
 
 
-@dataclass(frozen=True)
-class Actuation:
+class Actuation(NamedTuple):
     """``wrench_B`` (6,): thruster force (N) over torque (N m) at the origin of the base link, base
     components; ``tau`` (n,): joint efforts (N m or N).
     """

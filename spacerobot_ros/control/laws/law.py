@@ -412,8 +412,8 @@ class ControlLaw(ABC):
     def _actuation(self, reference: Reference) -> Actuation:
         """Evaluate the function and return the command; its inputs are in ``self._in``."""
         self._function.evaluate()
-        actuation = self._out["actuation"]
-        return Actuation(actuation[:6].copy(), actuation[6:].copy())
+        actuation = self._out["actuation"].copy()
+        return Actuation(actuation[:6], actuation[6:])
 
 
 def _axis_gains(axis: str, position: GainPair, attitude: GainPair) -> GainPair:
