@@ -21,6 +21,8 @@ Array = npt.NDArray[np.float64]
 
 START = np.array([0.2, -0.4])
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+TURN = np.array([0.0, 0.6, 0.0, 0.8])
+"""That of the base on any way of the stand-in."""
 LIMITS = MotionLimits(
     np.array([-1.0, -2.0]), np.array([1.4, 3.0]), np.array([0.5, np.inf]), np.array([1.0, 1.0])
 )
@@ -31,8 +33,13 @@ def specification(*, attitude: bool = False, rows: Any = None) -> Any:
     """Return a specification with stand-ins for its rows."""
     made: Any = object.__new__(EndEffectorSpecification)
     robot = SimpleNamespace(description=SimpleNamespace(name="stand-in"))
-    rows = rows or SimpleNamespace(robot=robot, links=[("left", True), ("right", False)])
-    for name, value in {"rows": rows, "attitude": attitude}.items():
+    rows = rows or SimpleNamespace(
+        robot=robot,
+        links=[("left", True), ("right", False)],
+        turns_along_direct_path=lambda start, shapes: np.tile(TURN, (len(shapes), 1)),
+    )
+    parts = {"rows": rows, "attitude": attitude, "overdetermined": False}
+    for name, value in parts.items():
         object.__setattr__(made, name, value)
     return made
 
@@ -45,12 +52,12 @@ class Kinematics:
         self.asked: list[tuple[Array, Any, bool]] = []
 
     def __call__(
-        self, shapes: Array, start: Array, limits: Any, parameters: Any, given: Any, *, follows: Any
+        self, shapes: Array, start: Array, limits: Any, parameters: Any, turns: Any, *, fixed: bool
     ) -> tuple[Array, Array, Array]:
         assert start is START
         assert limits is LIMITS
         assert parameters == "goals"
-        self.asked.append((shapes, given, follows))
+        self.asked.append((shapes, turns, fixed))
         ends, miss = self.answers.pop(0) if self.answers else ([[0.0, 0.0]], [0.5])
         turns = np.tile(IDENTITY, (len(ends), 1)) + np.arange(float(len(ends)))[:, np.newaxis]
         return np.array(ends), turns, np.array(miss)
@@ -70,11 +77,13 @@ def test_ends_are_sought_from_the_start_from_nearby_and_from_anywhere() -> None:
         "No shape of robot 'stand-in' that puts 'left' and 'right' to the goal was found from 128 "
         "shapes; the nearest is 0.3 m or rad away."
     )
-    assert [(len(shapes), given, follows) for shapes, given, follows in kinematics.asked] == [
-        (16, None, True),
-        (16, None, False),
-        (96, None, False),
-    ]
+    assert [len(shapes) for shapes, _, _ in kinematics.asked] == [16, 16, 96]
+    # First the base follows from the joints; then loops may turn it further.
+    (_, follows, _), *others = kinematics.asked
+    assert follows is None
+    for shapes, turns, _ in others:
+        np.testing.assert_array_equal(turns, np.tile(TURN, (len(shapes), 1)))
+    assert not any(fixed for _, _, fixed in kinematics.asked)
     rng = np.random.default_rng(0)
     for shapes, _, _ in kinematics.asked:
         anywhere = MIDDLE + HALF * rng.uniform(-1, 1, shapes.shape)
@@ -86,7 +95,9 @@ def test_a_given_attitude_of_the_base_is_that_of_all_ends() -> None:
     kinematics = Kinematics()
     with pytest.raises(NotFoundError):
         ends_of(kinematics, attitude=True)
-    assert all(given is IDENTITY for _, given, _ in kinematics.asked)
+    for shapes, turns, fixed in kinematics.asked:
+        np.testing.assert_array_equal(turns, np.tile(IDENTITY, (len(shapes), 1)))
+        assert fixed
 
 
 def test_ends_that_are_soonest_reached_come_first_and_same_ones_once() -> None:
@@ -139,18 +150,19 @@ class Plane:
 
 
 def solved(
-    rows: Plane, goal: Array, first: list[list[float]], given: Array | None, *, follows: bool
+    rows: Plane, goal: Array, first: list[list[float]], turn: Array | None, *, fixed: bool
 ) -> tuple[Array, Array, Array]:
+    turns = None if turn is None else np.tile(turn, (len(first), 1))
     found = specification(rows=rows)._inverse_kinematics(
-        np.array(first), START, LIMITS, goal, given, follows=follows
+        np.array(first), START, LIMITS, goal, turns, fixed=fixed
     )
     return found[0], found[1], found[2]
 
 
-@pytest.mark.parametrize(("given", "follows"), [(IDENTITY, True), (None, True)])
-def test_steps_of_inverse_kinematics_are_those_of_newton(given: Any, follows: bool) -> None:
+@pytest.mark.parametrize("turn", [IDENTITY, None])
+def test_steps_of_inverse_kinematics_are_those_of_newton(turn: Any) -> None:
     rows, end = Plane(), np.array([0.6, 0.1])
-    shapes, X, miss = solved(rows, rows.A @ end, [[0.2, -0.3], [0.5, 0.4]], given, follows=follows)
+    shapes, X, miss = solved(rows, rows.A @ end, [[0.2, -0.3], [0.5, 0.4]], turn, fixed=True)
     np.testing.assert_allclose(shapes, [end, end], atol=1e-3)
     np.testing.assert_array_equal(X, [IDENTITY, IDENTITY])
     assert np.all(miss <= 2e-4)
@@ -160,7 +172,7 @@ def test_steps_of_inverse_kinematics_are_those_of_newton(given: Any, follows: bo
 
 def test_steps_are_no_longer_than_half_a_radian() -> None:
     rows, end = Plane(), np.array([1.3, 2.9])
-    shapes, _, _ = solved(rows, rows.A @ end, [[-0.9, -1.9]], IDENTITY, follows=True)
+    shapes, _, _ = solved(rows, rows.A @ end, [[-0.9, -1.9]], IDENTITY, fixed=True)
     np.testing.assert_allclose(shapes, [end], atol=1e-3)
     # 4.8 rad of the second joint take ten steps of 0.5 rad, and two more looks.
     assert 11 <= rows.steps <= 14
@@ -169,16 +181,14 @@ def test_steps_are_no_longer_than_half_a_radian() -> None:
 def test_joints_at_their_limits_leave_the_rest_to_others() -> None:
     """The goal is 0.3 rad beyond the first joint: the second one comes as near as it can."""
     rows, beyond = Plane(), np.array([1.7, 0.5])
-    shapes, _, miss = solved(
-        rows, rows.A @ beyond, [[1.4, 0.2], [0.0, 0.1]], IDENTITY, follows=True
-    )
+    shapes, _, miss = solved(rows, rows.A @ beyond, [[1.4, 0.2], [0.0, 0.1]], IDENTITY, fixed=True)
     column = rows.A[:, 1]
     best = 0.5 + column @ rows.A[:, 0] * 0.3 / (column @ column)
     np.testing.assert_allclose(shapes, [[1.4, best], [1.4, best]], atol=1e-3)
     residual = rows.A @ np.array([1.4, best]) - rows.A @ beyond
     np.testing.assert_allclose(miss, np.abs(residual).max(), atol=1e-3)
     below = np.array([-1.2, 0.5])
-    shapes, _, _ = solved(rows, rows.A @ below, [[-1.0, 0.2]], IDENTITY, follows=True)
+    shapes, _, _ = solved(rows, rows.A @ below, [[-1.0, 0.2]], IDENTITY, fixed=True)
     best = 0.5 - column @ rows.A[:, 0] * 0.2 / (column @ column)
     np.testing.assert_allclose(shapes, [[-1.0, best]], atol=1e-3)
 
@@ -186,7 +196,7 @@ def test_joints_at_their_limits_leave_the_rest_to_others() -> None:
 def test_a_base_that_loops_turn_helps_where_nothing_is_given() -> None:
     rows = Plane(turns=True)
     goal = np.array([0.5, 2.8])
-    shapes, X, miss = solved(rows, goal, [[0.2, 0.1]], None, follows=False)
+    shapes, X, miss = solved(rows, goal, [[0.2, 0.1]], IDENTITY, fixed=False)
     assert miss[0] <= 2e-4
     angle = Rotation.from_quat(X[0]).as_rotvec()
     np.testing.assert_allclose(
