@@ -21,7 +21,13 @@ from spacerobot_ros.batch import (
     fly_one_by_one,
     native,
 )
-from spacerobot_ros.model import InertialParameters, SpaceRobot, load_robot, vector_machine
+from spacerobot_ros.model import (
+    InertialParameters,
+    SpaceRobot,
+    compilation,
+    load_robot,
+    vector_machine,
+)
 from spacerobot_ros.model.compilation import cxx_compiler
 from spacerobot_ros.resources import share_directory
 
@@ -176,7 +182,7 @@ def test_without_a_compiler_the_plant_flies_them(
 
 
 def look_at_the_processor_again() -> None:
-    for each in (vector_machine.processor_features, vector_machine.vector_unit):
+    for each in (compilation.processor_features, vector_machine.vector_unit):
         each.cache_clear()
 
 

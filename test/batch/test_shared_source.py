@@ -13,7 +13,7 @@ import pytest
 
 from spacerobot_ros.batch import native
 from spacerobot_ros.batch.native import Job, Pending, Program, RowLayout
-from spacerobot_ros.model import vector_machine
+from spacerobot_ros.model import compilation, vector_machine
 from spacerobot_ros.model.compilation import NoLibraryError, cxx_compiler
 from spacerobot_ros.model.vector_machine import VectorUnit
 
@@ -148,7 +148,7 @@ def test_a_number_that_may_be_zero_is_chosen_by_a_function_for_vectors() -> None
 
 
 def look_at_the_processor_again() -> None:
-    for each in (vector_machine.processor_features, vector_machine.vector_unit):
+    for each in (compilation.processor_features, vector_machine.vector_unit):
         each.cache_clear()
 
 
