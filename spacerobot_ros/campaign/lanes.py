@@ -233,7 +233,7 @@ class _ScheduledLanes:
         self._extremes: tuple[GaitSchedule, Array, Array] | None = None
         """The last schedule, and the lowest and highest positions (n,) of its joints, m or rad."""
         self._planned_values: _PlannedValues | None = None
-        """What determines the plans of the last scenario, which many draws share."""
+        """The values that determine the plans of the last scenario, which many draws share."""
         self._last_plan: tuple[Any, _Plan | None] | None = None
         """The last plan from a state measured without noise, and the values that determine it."""
 
