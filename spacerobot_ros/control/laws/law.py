@@ -6,7 +6,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from operator import truediv
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -359,7 +358,8 @@ class ControlLaw(ABC):
 
     def largest_error_share(self, bounds: Array) -> float:
         """Return the largest error at the last command as a share of its bound (m,), > 0."""
-        shares = list(map(abs, map(truediv, self._out["error"].tolist(), bounds.tolist())))
+        errors = self._out["error"].tolist()
+        shares = [abs(e / bound) for e, bound in zip(errors, bounds.tolist(), strict=True)]
         # The largest of some numbers may hide one that is none: it must not count as reached.
         return math.nan if math.isnan(sum(shares)) else max(shares, default=0.0)
 
