@@ -213,17 +213,33 @@ def compiled(function: ca.Function, *, lasting: bool = False) -> ca.Function:
     try:
         if compiler is None:
             raise _CompilationError("no C compiler (cc, gcc, clang or $CC) was found")
-        flags = _COMPILER_FLAGS
-        if lasting:
-            vectors = ("-mavx2",) if "avx2" in processor_features() else ()
-            flags = (*_LASTING_FLAGS, *vectors)
-        key = _hash_text(f"{_platform_key(compiler, flags)}\n{_c_source(function)}")
+        flags, key = _flags_and_key(function, compiler, lasting=lasting)
         if found := _load_compiled(Cache(cache_directory()), function.name(), key):
             return found
         return _compile_function(function, key, flags, compiler)
     except _CompilationError as reason:
         _warn_of_virtual_machine(reason)
         return function
+
+
+def compiled_before(function: ca.Function) -> ca.Function | None:
+    """Return the function as the compiled C that the cache has of it; None: it has none."""
+    compiler = c_compiler()
+    if compiler is None:
+        return None
+    _, key = _flags_and_key(function, compiler, lasting=False)
+    return _load_compiled(Cache(cache_directory()), function.name(), key)
+
+
+def _flags_and_key(
+    function: ca.Function, compiler: str, *, lasting: bool
+) -> tuple[tuple[str, ...], str]:
+    """Return the flags that a function is compiled with, and its key in the cache."""
+    flags = _COMPILER_FLAGS
+    if lasting:
+        vectors = ("-mavx2",) if "avx2" in processor_features() else ()
+        flags = (*_LASTING_FLAGS, *vectors)
+    return flags, _hash_text(f"{_platform_key(compiler, flags)}\n{_c_source(function)}")
 
 
 def compiled_functions(

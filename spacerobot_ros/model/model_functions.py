@@ -20,6 +20,7 @@ import numpy.typing as npt
 from spacerobot_ros.model.compilation import (
     compilation_settings,
     compiled,
+    compiled_before,
     dense_function,
 )
 from spacerobot_ros.model.composite_rigid_body import (
@@ -110,8 +111,14 @@ class ModelFunctions:
         return self._compiled[key]
 
     def is_compiled(self, name: str) -> bool:
-        """Whether a function of the model is there compiled."""
-        return (name, *compilation_settings()) in self._compiled
+        """Whether a function of the model is there compiled, in this process or in the cache."""
+        key = (name, *compilation_settings())
+        if key not in self._compiled:
+            kept = compiled_before(self.function(name, compile=False))
+            if kept is None:
+                return False
+            self._compiled[key] = kept
+        return True
 
     @property
     def total_mass(self) -> float:

@@ -1,5 +1,5 @@
-/* Runs the operations of a CasADi function at many places at once: each operation at GROUP places,
- * then the next one. So an operation is read once for all of them, and computed in vector registers.
+/* Runs the operations of a CasADi function at many places at once: each operation in a few of the
+ * processor's vector registers, then the next one. So an operation is read once for many places.
  * The numbers are those of CasADi's virtual machine, bit for bit: the operations and their order are
  * the same, and nothing is contracted.
  */
@@ -12,6 +12,9 @@
 #define GROUP 2
 #endif
 
+/* The most registers for which an operation is read once: with more, less memory is in the cache. */
+#define MOST_REGISTERS 4
+
 typedef double Vector __attribute__((vector_size(GROUP * sizeof(double))));
 
 /* An operation: its number in CasADi, its result, and its operands: places of the memory, or for
@@ -20,13 +23,103 @@ typedef struct {
   int operation, result, first, second;
 } Step;
 
-#define OF_ALL(EXPRESSION)                     \
-  for (i = 0; i < GROUP; ++i) {                \
-    const double x = a[i], y = b[i];           \
+/* The numbers of all places: `sizes` are the nonzeros at a place, which stand together. */
+typedef struct {
+  const double *const *arguments;
+  const long long *argument_sizes;
+  double *const *results;
+  const long long *result_sizes;
+} Numbers;
+
+#define OF_REGISTERS(EXPRESSION)               \
+  _Pragma("GCC unroll 4")                      \
+  for (r = 0; r < registers; ++r) {            \
+    const Vector x = a[r], y = b[r];           \
     (void)y;                                   \
-    c[i] = (EXPRESSION);                       \
+    c[r] = (EXPRESSION);                       \
   }                                            \
   break;
+
+#define OF_ALL(EXPRESSION)                     \
+  for (i = 0; i < registers * GROUP; ++i) {    \
+    const double x = ((const double *)a)[i];   \
+    const double y = ((const double *)b)[i];   \
+    (void)y;                                   \
+    ((double *)c)[i] = (EXPRESSION);           \
+  }                                            \
+  break;
+
+/* Runs all operations at `count` places from `begin` on, at most `registers * GROUP`. */
+static inline __attribute__((always_inline)) void run_in_registers(
+    const Step *steps, long long step_count, const double *constants, Vector *memory,
+    const Numbers *numbers, long long begin, int count, const int registers) {
+  long long k;
+  int i, r;
+  for (k = 0; k < step_count; ++k) {
+    const Step s = steps[k];
+    const Vector *a = memory + (long long)s.first * registers;
+    const Vector *b = memory + (long long)s.second * registers;
+    Vector *c = memory + (long long)s.result * registers;
+    switch (s.operation) {
+      case INPUT: {
+        const long long size = numbers->argument_sizes[s.first];
+        const double *from = numbers->arguments[s.first] + begin * size + s.second;
+        double *to = (double *)c;
+        for (i = 0; i < count; ++i) to[i] = from[i * size];
+        for (; i < registers * GROUP; ++i) to[i] = to[count - 1];
+        break;
+      }
+      case OUTPUT: {
+        const long long size = numbers->result_sizes[s.result];
+        double *to = numbers->results[s.result];
+        if (!to) break;
+        to += begin * size + s.second;
+        for (i = 0; i < count; ++i) to[i * size] = ((const double *)a)[i];
+        break;
+      }
+      case CONST:
+        for (i = 0; i < registers * GROUP; ++i) ((double *)c)[i] = constants[s.first];
+        break;
+      case ASSIGN: OF_REGISTERS(x)
+      case ADD: OF_REGISTERS(x + y)
+      case SUB: OF_REGISTERS(x - y)
+      case MUL: OF_REGISTERS(x * y)
+      case DIV: OF_REGISTERS(x / y)
+      case NEG: OF_REGISTERS(-x)
+      case SQ: OF_REGISTERS(x * x)
+      case TWICE: OF_REGISTERS(2.0 * x)
+      case INV: OF_REGISTERS(1.0 / x)
+      case SQRT: OF_ALL(sqrt(x))
+      case SIN: OF_ALL(sin(x))
+      case COS: OF_ALL(cos(x))
+      case TAN: OF_ALL(tan(x))
+      case ASIN: OF_ALL(asin(x))
+      case ACOS: OF_ALL(acos(x))
+      case ATAN: OF_ALL(atan(x))
+      case ATAN2: OF_ALL(atan2(x, y))
+      case EXP: OF_ALL(exp(x))
+      case LOG: OF_ALL(log(x))
+      case POW: OF_ALL(pow(x, y))
+      case CONSTPOW: OF_ALL(pow(x, y))
+      case TANH: OF_ALL(tanh(x))
+      case FLOOR: OF_ALL(floor(x))
+      case CEIL: OF_ALL(ceil(x))
+      case FABS: OF_ALL(fabs(x))
+      case FMIN: OF_ALL(fmin(x, y))
+      case FMAX: OF_ALL(fmax(x, y))
+      case LT: OF_ALL(x < y ? 1.0 : 0.0)
+      case LE: OF_ALL(x <= y ? 1.0 : 0.0)
+      case EQ: OF_ALL(x == y ? 1.0 : 0.0)
+      case NE: OF_ALL(x != y ? 1.0 : 0.0)
+      case NOT: OF_ALL(x == 0.0 ? 1.0 : 0.0)
+      case AND: OF_ALL(x != 0.0 && y != 0.0 ? 1.0 : 0.0)
+      case OR: OF_ALL(x != 0.0 || y != 0.0 ? 1.0 : 0.0)
+      case IF_ELSE_ZERO: OF_ALL(x != 0.0 ? y : 0.0)
+      case SIGN: OF_ALL(x < 0.0 ? -1.0 : x > 0.0 ? 1.0 : x)
+      case COPYSIGN: OF_ALL(copysign(x, y))
+    }
+  }
+}
 
 /* Returns 0, or 1 where memory is short. `sizes` are the nonzeros of the arguments and results at a
  * place; the numbers of a place stand together. Results may be NULL. */
@@ -34,83 +127,24 @@ int run_at_places(const Step *steps, long long step_count, const double *constan
                   long long memory_size, const double *const *arguments,
                   const long long *argument_sizes, double *const *results,
                   const long long *result_sizes, long long places) {
-  void *block = malloc((size_t)(memory_size + 1) * sizeof(Vector) + sizeof(Vector));
+  const Numbers numbers = {arguments, argument_sizes, results, result_sizes};
+  const size_t size = (size_t)(memory_size + 1) * MOST_REGISTERS * sizeof(Vector);
+  void *block = malloc(size + sizeof(Vector));
   Vector *memory;
-  long long begin, k;
-  int i;
+  long long begin = 0;
   if (!block) return 1;
   memory = (Vector *)(((size_t)block + sizeof(Vector) - 1) / sizeof(Vector) * sizeof(Vector));
-  for (begin = 0; begin < places; begin += GROUP) {
-    const int count = places - begin < GROUP ? (int)(places - begin) : GROUP;
-    for (k = 0; k < step_count; ++k) {
-      const Step s = steps[k];
-      if (s.operation == INPUT) {
-        const long long size = argument_sizes[s.first];
-        const double *from = arguments[s.first] + begin * size + s.second;
-        double *c = (double *)&memory[s.result];
-        for (i = 0; i < count; ++i) c[i] = from[i * size];
-        for (; i < GROUP; ++i) c[i] = c[count - 1];
-        continue;
-      }
-      if (s.operation == OUTPUT) {
-        const long long size = result_sizes[s.result];
-        const double *c = (const double *)&memory[s.first];
-        double *to = results[s.result];
-        if (!to) continue;
-        to += begin * size + s.second;
-        for (i = 0; i < count; ++i) to[i * size] = c[i];
-        continue;
-      }
-      if (s.operation == CONST) {
-        double *c = (double *)&memory[s.result];
-        for (i = 0; i < GROUP; ++i) c[i] = constants[s.first];
-        continue;
-      }
-      {
-        const Vector a = memory[s.first], b = memory[s.second];
-        Vector c = a;
-        switch (s.operation) {
-          case ASSIGN: break;
-          case ADD: c = a + b; break;
-          case SUB: c = a - b; break;
-          case MUL: c = a * b; break;
-          case DIV: c = a / b; break;
-          case NEG: c = -a; break;
-          case SQ: c = a * a; break;
-          case TWICE: c = 2.0 * a; break;
-          case INV: c = 1.0 / a; break;
-          case SQRT: OF_ALL(sqrt(x))
-          case SIN: OF_ALL(sin(x))
-          case COS: OF_ALL(cos(x))
-          case TAN: OF_ALL(tan(x))
-          case ASIN: OF_ALL(asin(x))
-          case ACOS: OF_ALL(acos(x))
-          case ATAN: OF_ALL(atan(x))
-          case ATAN2: OF_ALL(atan2(x, y))
-          case EXP: OF_ALL(exp(x))
-          case LOG: OF_ALL(log(x))
-          case POW: OF_ALL(pow(x, y))
-          case CONSTPOW: OF_ALL(pow(x, y))
-          case TANH: OF_ALL(tanh(x))
-          case FLOOR: OF_ALL(floor(x))
-          case CEIL: OF_ALL(ceil(x))
-          case FABS: OF_ALL(fabs(x))
-          case FMIN: OF_ALL(fmin(x, y))
-          case FMAX: OF_ALL(fmax(x, y))
-          case LT: OF_ALL(x < y ? 1.0 : 0.0)
-          case LE: OF_ALL(x <= y ? 1.0 : 0.0)
-          case EQ: OF_ALL(x == y ? 1.0 : 0.0)
-          case NE: OF_ALL(x != y ? 1.0 : 0.0)
-          case NOT: OF_ALL(x == 0.0 ? 1.0 : 0.0)
-          case AND: OF_ALL(x != 0.0 && y != 0.0 ? 1.0 : 0.0)
-          case OR: OF_ALL(x != 0.0 || y != 0.0 ? 1.0 : 0.0)
-          case IF_ELSE_ZERO: OF_ALL(x != 0.0 ? y : 0.0)
-          case SIGN: OF_ALL(x < 0.0 ? -1.0 : x > 0.0 ? 1.0 : x)
-          case COPYSIGN: OF_ALL(copysign(x, y))
-        }
-        memory[s.result] = c;
-      }
-    }
+  while (begin < places) {
+    const long long left = places - begin;
+    const int registers = left > 2 * GROUP ? MOST_REGISTERS : left > GROUP ? 2 : 1;
+    const int count = left < registers * GROUP ? (int)left : registers * GROUP;
+    /* The compiler makes a program for each number of registers. */
+#define RUN(REGISTERS) \
+  run_in_registers(steps, step_count, constants, memory, &numbers, begin, count, REGISTERS)
+    if (registers == MOST_REGISTERS) RUN(MOST_REGISTERS);
+    else if (registers == 2) RUN(2);
+    else RUN(1);
+    begin += count;
   }
   free(block);
   return 0;

@@ -2,9 +2,9 @@
 
 The derivatives of a robot's motion have ten thousands of operations: a compiler needs seconds for
 them. Here a small C program (``vector_machine.c``), compiled once for all robots, reads the
-operations of a function one after the other and computes each at as many places as a register has
-numbers, which takes less time than compiled code without optimisation. Without a C compiler the
-functions run in CasADi's virtual machine, with the same numbers, bit for bit.
+operations of a function one after the other and computes each at as many places as a few registers
+have numbers, which takes less time than compiled code. Without a C compiler the functions run in
+CasADi's virtual machine, with the same numbers, bit for bit.
 """
 
 from __future__ import annotations

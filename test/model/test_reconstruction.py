@@ -157,6 +157,10 @@ def test_functions_are_compiled_once_they_were_called_often(
         found.append((x, *poses(x[: robot.n])))
         compiled.append([each.function.class_name() == "External" for each in (steps, poses)])
     assert compiled == [[False, False]] * 3 + [[True, True]] * 2
+    # Those that the cache has by now are there at once.
+    other = SpaceRobot(description, SymbolicModels.of(description)).compiled_on_demand
+    assert other.buffered("link_poses").function.class_name() == "External"
+    assert other.buffered("velocity_step:2").function.class_name() != "External"
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
     steps, poses = (robot.buffered(name) for name in ("velocity_step:3", "link_poses"))
     x = case.x

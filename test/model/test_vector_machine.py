@@ -28,7 +28,7 @@ def rows_of(x: ca.SX, p: ca.SX) -> ca.SX:
 
 
 @needs_compiler
-@pytest.mark.parametrize("count", [2, 7, 8, 9, 20])
+@pytest.mark.parametrize("count", [2, 4, 7, 8, 9, 15, 20, 37, 71])
 def test_the_numbers_are_those_of_the_virtual_machine(
     count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
