@@ -158,16 +158,22 @@ def test_other_topics_are_subscribed(stack: Stack) -> None:
 
 
 @pytest.mark.parametrize(("qos", "number"), [(STREAM, 1), (LATCHED, 4)])
+@pytest.mark.parametrize("looks", [False, True])
 def test_messages_that_nobody_can_receive_are_not_published(
-    ros_context: rclpy.Context, qos: QoSProfile, number: int
+    ros_context: rclpy.Context, qos: QoSProfile, number: int, looks: bool
 ) -> None:
-    """The middleware numbers what it is given: a late subscription sees what came before."""
+    """The middleware numbers what it is given: a late subscription sees what came before.
+
+    Where the owner ``looks`` for readers, a message before its next look is not published.
+    """
     sender, receiver = (
         rclpy.create_node(name, context=ros_context) for name in ("sender", "receiver")
     )
     output = RawOutput(sender.create_publisher(String, "words", qos), latched=qos is LATCHED)
     kept: list[bytes] = []
     output.add_listener(kept.append)
+    if looks:
+        output.look_for_readers()
     said = [serialize_message(String(data=word)) for word in ("one", "two", "three", "four")]
     for raw in said[:3]:
         output.take(raw)
@@ -185,11 +191,15 @@ def test_messages_that_nobody_can_receive_are_not_published(
     executor.add_node(receiver)
     while not output.readers():
         executor.spin_once(timeout_sec=0.01)
+    if looks:
+        output.take(said[2])
+        output.look_for_readers()
     output.take(said[3])
     while not heard or heard[-1][1] != said[3]:
         executor.spin_once(timeout_sec=0.1)
-    assert heard[-1] == (number, said[3])
-    assert kept == said
+    more = [said[2]] if looks else []
+    assert heard[-1] == (number + (looks and qos is LATCHED), said[3])
+    assert kept == [*said[:3], *more, said[3]]
     for node in (sender, receiver):
         node.destroy_node()
     executor.shutdown()

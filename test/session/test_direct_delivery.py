@@ -14,6 +14,7 @@ import pytest
 import rclpy
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -22,9 +23,11 @@ from support.slow import some_fast
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.nodes.common.streams import RawOutput
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.stack import InProcessStack
+from spacerobot_ros.times import SECOND, first_time_ns
 
 LINKED = {"/odom", "/joint_states", "/joint_commands"}
 
@@ -225,6 +228,38 @@ def test_the_middleware_takes_over_late_in_a_run(tmp_path: Path) -> None:
     subprocess.run(
         [sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True, timeout=120
     )
+
+
+def test_a_reader_outside_receives_every_state_soon_after_it_was_met(
+    ros_context: rclpy.Context, tmp_path: Path
+) -> None:
+    reader = rclpy.create_node("reader", context=ros_context)
+    made: list[Any] = []
+    met: list[int] = []
+
+    def appear(_: InProcessStack) -> None:
+        made.append(
+            reader.create_subscription(Odometry, "odom", lambda _: None, QoSProfile(depth=1000))
+        )
+
+    def notice(stack: InProcessStack) -> None:
+        (odom,) = (each for each in stack.plant.raw_streams if each.topic == "/odom")
+        assert isinstance(odom, RawOutput)
+        if not met and odom.readers():
+            met.append(stack.plant.tick)
+
+    acts = {60: appear, **dict.fromkeys(range(61, 500), notice)}
+    stack = make(gait(20.0), tmp_path / "a.mcap", ros_context, acts, direct=True)
+    assert fly(stack) is Outcome.REACHED
+    with made[0].handle:
+        taken = iter(lambda: made[0].handle.take_message(Odometry, True), None)
+        heard = [first_time_ns(raw) for raw, _ in taken]
+    reader.destroy_node()
+    sent = (read_bag(tmp_path / "a.mcap")["/odom"].time * SECOND).round().astype(int).tolist()
+    assert met
+    assert heard == sent[len(sent) - len(heard) :]
+    # Three messages are handed over in a tick, and fifty from one look for readers to the next.
+    assert met[0] <= sent.index(heard[0]) <= met[0] + 17
 
 
 def test_the_middleware_takes_over_when_a_node_is_cleaned_up(

@@ -21,6 +21,9 @@ _CHECK_PERIOD = 0.1
 _MESSAGES_PER_TURN = 1000
 """Messages delivered in one turn, of about 10 ms; then the executor serves timers and services."""
 
+_MESSAGES_PER_LOOK = 50
+"""Messages delivered from one look for readers outside to the next, about every millisecond."""
+
 _LONGEST_MATCHING = 1.0
 """Longest wall time until new subscriptions have met the publishers, s."""
 
@@ -38,8 +41,9 @@ class DirectDelivery:
 
     States and commands of a stack in one process need no middleware: where all publishers of a
     topic are in this process, its messages are given to the callbacks of the nodes that subscribe
-    it. They are published all the same, for everybody else. The nodes' own subscriptions of these
-    topics end meanwhile.
+    it. They are published all the same, for everybody else: within a turn of deliveries, a new
+    reader is noticed after some messages. The nodes' own subscriptions of these topics end
+    meanwhile.
 
     The decision is one for all topics, and changes once: as soon as one of the topics has another
     publisher, or one of the nodes is cleaned up, all nodes subscribe again, and the middleware
@@ -70,6 +74,8 @@ class DirectDelivery:
         """Number of messages in the executor's queue so far, and of those known to have left it."""
         self._left = _MESSAGES_PER_TURN
         self._announcing: list[AnnouncedPublisher | RawOutput] = []
+        self._outputs: list[RawOutput] = []
+        """The streams of the nodes, which look for readers."""
 
     @property
     def topics(self) -> set[str]:
@@ -107,6 +113,7 @@ class DirectDelivery:
         for node in flight_nodes:
             node.before_cleanup = self.end
         if self._links:
+            self._outputs = outputs
             clock = Clock(clock_type=ClockType.STEADY_TIME)
             self._timer = self._host.create_timer(_CHECK_PERIOD, self.check, clock=clock)
 
@@ -132,6 +139,8 @@ class DirectDelivery:
                 output.call_after_publication(None)
         for publisher in self._announcing:
             _set_announcement(publisher, None)
+        self._look_with_every_message()
+        self._outputs = []
 
     def _announce(self, outputs: Sequence[RawOutput], topics: set[str]) -> None:
         """Count the messages on topics that the executor delivers to nodes here."""
@@ -166,17 +175,32 @@ class DirectDelivery:
         queue = self._queue
         for take in readers:
             queue.append((take, raw))
-        while queue:
-            self._left -= 1
-            if not self._left:
-                # Messages that are published from now on wait until the executor calls again.
-                self._in_turn = False
-            take, raw = queue.popleft()
-            take(raw)
+        self._look_for_readers()
+        try:
+            while queue:
+                self._left -= 1
+                if not self._left % _MESSAGES_PER_LOOK:
+                    self._look_for_readers()
+                    if not self._left:
+                        # What is published from now on waits until the executor calls again.
+                        self._in_turn = False
+                take, raw = queue.popleft()
+                take(raw)
+        finally:
+            # What is published by timers and services may be a single message of its topic.
+            self._look_with_every_message()
         self._in_turn = False
         if self._left <= 0:
             self._left = _MESSAGES_PER_TURN
             self.check()
+
+    def _look_for_readers(self) -> None:
+        for output in self._outputs:
+            output.look_for_readers()
+
+    def _look_with_every_message(self) -> None:
+        for output in self._outputs:
+            output.look_with_every_message()
 
     def _has_other_publishers(self, link: _Link) -> bool:
         """Whether a topic has publishers beside those of this process."""

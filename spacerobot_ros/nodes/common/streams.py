@@ -129,8 +129,7 @@ class RawStream:
         self.topic = topic
         self.take = take
         """Called by the owner with each message; looked up every time."""
-        self._acts: tuple[RawCallback, ...] = (take,)
-        """Functions that the stream calls with a message, in order."""
+        self._act = take
         self._listener: RawCallback | None = None
 
     def add_listener(self, listener: RawCallback) -> None:
@@ -144,13 +143,15 @@ class RawStream:
         self._compose()
 
     def _compose(self) -> None:
-        """Make ``take`` call the listener, if any, and then the functions of the stream."""
+        """Make ``take`` call the listener, if any, and then the function of the stream."""
         listeners = () if self._listener is None else (self._listener,)
-        self.take = _one_after_another(*listeners, *self._acts)
+        self.take = _one_after_another(*listeners, self._act)
 
 
 def _one_after_another(*acts: RawCallback) -> RawCallback:
-    """Return a function that does one to three things with a message, without further calls."""
+    """Return a function that does up to three things with a message, without further calls."""
+    if not acts:
+        return _drop
     if len(acts) == 1:
         return acts[0]
     first, second, *others = acts
@@ -171,12 +172,19 @@ def _one_after_another(*acts: RawCallback) -> RawCallback:
     return call_three
 
 
+def _drop(_: bytes) -> None:
+    """Do nothing with a message."""
+
+
 class RawOutput(RawStream):
     """Messages of one publisher: ``take`` publishes a message.
 
     A message that nobody can receive is not given to the middleware: nobody is subscribed, and the
     topic keeps no last message for late subscribers. A new listener is shown the last message of a
     latched topic first, as a subscription is.
+
+    Every message looks for readers, unless its owner looks for many of them
+    (:meth:`look_for_readers`).
 
     Parameters
     ----------
@@ -188,6 +196,7 @@ class RawOutput(RawStream):
 
     def __init__(self, publisher: Publisher, *, latched: bool = False) -> None:
         self._last: bytes | None = None
+        self._latched = latched
         publish, count_readers = raw_publish(publisher), publisher.handle.get_subscription_count
 
         def keep_and_publish(raw: bytes) -> None:
@@ -200,7 +209,11 @@ class RawOutput(RawStream):
                 publish(raw)
 
         self._publish = keep_and_publish if latched else publish_to_readers
+        self._publish_unseen, self._count_readers = publish, count_readers
+        self._before: tuple[RawCallback, ...] = ()
+        self._after: tuple[RawCallback, ...] = ()
         super().__init__(publisher.topic_name, self._publish)
+        self._compose()
         self.readers: Callable[[], int] = publisher.get_subscription_count
         """Function that returns the number of matched subscriptions."""
         self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
@@ -214,15 +227,36 @@ class RawOutput(RawStream):
 
     def announce(self, on_publish: Callable[[], None] | None) -> None:
         """Call a function before each publication; None: no longer."""
-        before = () if on_publish is None else (lambda _: on_publish(),)
-        self._acts = *before, self._publish
+        self._before = () if on_publish is None else (lambda _: on_publish(),)
         self._compose()
 
     def call_after_publication(self, deliver: RawCallback | None) -> None:
         """Call a function with each message after its publication; None: no longer."""
-        after = () if deliver is None else (deliver,)
-        self._acts = self._publish, *after
+        self._after = () if deliver is None else (deliver,)
         self._compose()
+
+    def look_for_readers(self) -> None:
+        """Look for readers once for all messages until the next look; a latched topic needs none.
+
+        A change of what is done with messages ends that, as :meth:`look_with_every_message` does.
+        """
+        if not self._latched:
+            self.take = self._takes[self._count_readers() > 0]
+
+    def look_with_every_message(self) -> None:
+        """Look for readers with every message from now on."""
+        self.take = self._looking_take
+
+    def _compose(self) -> None:
+        listeners = () if self._listener is None else (self._listener,)
+        unread = _one_after_another(*listeners, *self._after)
+        self._looking_take, read = (
+            _one_after_another(*listeners, *self._before, publish, *self._after)
+            for publish in (self._publish, self._publish_unseen)
+        )
+        self._takes = unread, read
+        """What is done with a message that has no readers, and with one that has some."""
+        self.take = self._looking_take
 
 
 class RawInput(RawStream):
