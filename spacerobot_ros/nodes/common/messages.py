@@ -28,7 +28,6 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_matrix,
     quaternion_multiply,
 )
-from spacerobot_ros.model.visuals import solid_mesh
 from spacerobot_ros.times import SECOND, set_stamp
 
 if TYPE_CHECKING:
@@ -116,6 +115,8 @@ def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> Marke
     elif shape.kind == "sphere":
         size = (2 * size[0],) * 3
     elif shape.kind == "capsule":
+        from spacerobot_ros.model.visuals import solid_mesh  # Few shapes are capsules.
+
         size, mesh = (1.0, 1.0, 1.0), solid_mesh(replace(shape, pose=Pose()))
         corners = mesh.vertices[mesh.faces].reshape(-1, 3).tolist()
         marker.points = [Point(x=x, y=y, z=z) for x, y, z in corners]

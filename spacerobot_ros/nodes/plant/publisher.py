@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -36,7 +36,6 @@ from spacerobot_ros.nodes.common.messages import (
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.streams import RawOutput
 from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant, thrusters_in
-from spacerobot_ros.simulation.clearance import ClearanceMonitor
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.plant import Plant
@@ -44,6 +43,9 @@ from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import SECOND, set_stamp, stamp_bytes
 from spacerobot_ros.topics import TOPICS, Topic, pose_topic
+
+if TYPE_CHECKING:
+    from spacerobot_ros.simulation.clearance import ClearanceMonitor
 
 PROPELLANT_KEY = "propellant_kg"
 """Diagnostics key of the propellant used."""
@@ -489,6 +491,9 @@ class ClearancePublisher:
         ``before`` is the publisher among the obstacles so far, whose topic goes on;
         ``has_contact_forces`` is that of :class:`.ClearanceMonitor`.
         """
+        # Not every plant measures distances.
+        from spacerobot_ros.simulation.clearance import ClearanceMonitor
+
         links, so_far = tuple(plant.robot.link_names), None if before is None else before._monitor
         monitor = ClearanceMonitor.of(
             described, links, so_far, has_contact_forces=has_contact_forces
