@@ -17,7 +17,13 @@ from spacerobot_ros.control.detumbling import Detumbling
 from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
 from spacerobot_ros.control.laws.law import ControlLaw, Gains
 from spacerobot_ros.control.laws.registry import LAWS
-from spacerobot_ros.control.limits import ActuatorLimits, JointRateLimits, MotionLimits, Saturated
+from spacerobot_ros.control.limits import (
+    ActuatorLimits,
+    JointRateLimits,
+    LimitCheck,
+    MotionLimits,
+    Saturated,
+)
 from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
 from spacerobot_ros.control.reference import (
     PROFILES,
@@ -105,6 +111,7 @@ class CoordinatedController:
             groups = bool(selection.base), bool(selection.end_effector)
             self._profiles = ProfileFunction(*groups, law.robot.n if selection.joints else 0)
         self._limits, self.joint_rate_limits = limits, rates
+        self._check = LimitCheck(limits, rates, law.outputs.m)
         self._profile_type, self._motion = profile, motion
         self._control_period, self._estimation_time = control_period, estimation_time
         self.mode = Mode.MEASURED
@@ -266,7 +273,11 @@ class CoordinatedController:
                 commanded = self._to_rest(state)
         if state is not None:
             periods = self._periods_held(time)
-            result = self.apply_limits(state, commanded, periods)
+            error = self.law.error
+            if self.wheels is None and self._check.is_within(commanded, state.qdot, periods, error):
+                result = self._limits.unchanged(commanded)
+            else:
+                result = self.apply_limits(state, commanded, periods)
             if self.law.integrates and not self.coming_to_rest:
                 self.law.integrate_error(periods * self._control_period, limited=result.limited)
         else:
@@ -340,6 +351,11 @@ class CoordinatedController:
         for kind, places in self._distances:
             worst[kind] = max(worst[kind], math.hypot(*[error[i] for i in places]))
         return OutputErrors(**worst)
+
+    def largest_error_share(self, bounds: Array) -> float:
+        """Return the largest error of the last command as a share of its bound (m,), > 0."""
+        share = self._check.error_share(bounds) if self.wheels is None else None
+        return self.law.largest_error_share(bounds) if share is None else share
 
     def distance_from_reference(self) -> OutputDistance:
         """Return the distance of the last command's outputs from the reference."""

@@ -465,7 +465,7 @@ class ControlExecutive:
         if self._error_bounds is None:
             margins = self._config.error_margin
             self._error_bounds = self.controller.error_bounds(margins.as_errors())
-        share = self.controller.law.largest_error_share(self._error_bounds)
+        share = self.controller.largest_error_share(self._error_bounds)
         if self._monitor.check_errors(share):
             away = self.controller.distance_from_reference()
             self._abort_on_lost_control(f"the errors grow, the robot is {away} from the reference")
