@@ -40,14 +40,49 @@ typedef struct {
   }                                            \
   break;
 
-#define OF_ALL(EXPRESSION)                     \
-  for (i = 0; i < registers * GROUP; ++i) {    \
-    const double x = ((const double *)a)[i];   \
-    const double y = ((const double *)b)[i];   \
+#define OF_EACH(EXPRESSION)                    \
+  for (i = 0; i < count; ++i) {                \
+    const double x = a[i], y = b[i];           \
     (void)y;                                   \
-    ((double *)c)[i] = (EXPRESSION);           \
+    c[i] = (EXPRESSION);                       \
   }                                            \
   break;
+
+/* Computes an operation number by number: a rare one, or one that registers do not have. */
+static __attribute__((noinline)) void run_one_by_one(int operation, const double *a,
+                                                     const double *b, double *c, int count) {
+  int i;
+  switch (operation) {
+    case SQRT: OF_EACH(sqrt(x))
+    case SIN: OF_EACH(sin(x))
+    case COS: OF_EACH(cos(x))
+    case TAN: OF_EACH(tan(x))
+    case ASIN: OF_EACH(asin(x))
+    case ACOS: OF_EACH(acos(x))
+    case ATAN: OF_EACH(atan(x))
+    case ATAN2: OF_EACH(atan2(x, y))
+    case EXP: OF_EACH(exp(x))
+    case LOG: OF_EACH(log(x))
+    case POW: OF_EACH(pow(x, y))
+    case CONSTPOW: OF_EACH(pow(x, y))
+    case TANH: OF_EACH(tanh(x))
+    case FLOOR: OF_EACH(floor(x))
+    case CEIL: OF_EACH(ceil(x))
+    case FABS: OF_EACH(fabs(x))
+    case FMIN: OF_EACH(fmin(x, y))
+    case FMAX: OF_EACH(fmax(x, y))
+    case LT: OF_EACH(x < y ? 1.0 : 0.0)
+    case LE: OF_EACH(x <= y ? 1.0 : 0.0)
+    case EQ: OF_EACH(x == y ? 1.0 : 0.0)
+    case NE: OF_EACH(x != y ? 1.0 : 0.0)
+    case NOT: OF_EACH(x == 0.0 ? 1.0 : 0.0)
+    case AND: OF_EACH(x != 0.0 && y != 0.0 ? 1.0 : 0.0)
+    case OR: OF_EACH(x != 0.0 || y != 0.0 ? 1.0 : 0.0)
+    case IF_ELSE_ZERO: OF_EACH(x != 0.0 ? y : 0.0)
+    case SIGN: OF_EACH(x < 0.0 ? -1.0 : x > 0.0 ? 1.0 : x)
+    case COPYSIGN: OF_EACH(copysign(x, y))
+  }
+}
 
 /* Runs all operations at `count` places from `begin` on, at most `registers * GROUP`. */
 static inline __attribute__((always_inline)) void run_in_registers(
@@ -89,34 +124,9 @@ static inline __attribute__((always_inline)) void run_in_registers(
       case SQ: OF_REGISTERS(x * x)
       case TWICE: OF_REGISTERS(2.0 * x)
       case INV: OF_REGISTERS(1.0 / x)
-      case SQRT: OF_ALL(sqrt(x))
-      case SIN: OF_ALL(sin(x))
-      case COS: OF_ALL(cos(x))
-      case TAN: OF_ALL(tan(x))
-      case ASIN: OF_ALL(asin(x))
-      case ACOS: OF_ALL(acos(x))
-      case ATAN: OF_ALL(atan(x))
-      case ATAN2: OF_ALL(atan2(x, y))
-      case EXP: OF_ALL(exp(x))
-      case LOG: OF_ALL(log(x))
-      case POW: OF_ALL(pow(x, y))
-      case CONSTPOW: OF_ALL(pow(x, y))
-      case TANH: OF_ALL(tanh(x))
-      case FLOOR: OF_ALL(floor(x))
-      case CEIL: OF_ALL(ceil(x))
-      case FABS: OF_ALL(fabs(x))
-      case FMIN: OF_ALL(fmin(x, y))
-      case FMAX: OF_ALL(fmax(x, y))
-      case LT: OF_ALL(x < y ? 1.0 : 0.0)
-      case LE: OF_ALL(x <= y ? 1.0 : 0.0)
-      case EQ: OF_ALL(x == y ? 1.0 : 0.0)
-      case NE: OF_ALL(x != y ? 1.0 : 0.0)
-      case NOT: OF_ALL(x == 0.0 ? 1.0 : 0.0)
-      case AND: OF_ALL(x != 0.0 && y != 0.0 ? 1.0 : 0.0)
-      case OR: OF_ALL(x != 0.0 || y != 0.0 ? 1.0 : 0.0)
-      case IF_ELSE_ZERO: OF_ALL(x != 0.0 ? y : 0.0)
-      case SIGN: OF_ALL(x < 0.0 ? -1.0 : x > 0.0 ? 1.0 : x)
-      case COPYSIGN: OF_ALL(copysign(x, y))
+      default:
+        run_one_by_one(s.operation, (const double *)a, (const double *)b, (double *)c,
+                       registers * GROUP);
     }
   }
 }
@@ -136,13 +146,12 @@ int run_at_places(const Step *steps, long long step_count, const double *constan
   memory = (Vector *)(((size_t)block + sizeof(Vector) - 1) / sizeof(Vector) * sizeof(Vector));
   while (begin < places) {
     const long long left = places - begin;
-    const int registers = left > 2 * GROUP ? MOST_REGISTERS : left > GROUP ? 2 : 1;
+    const int registers = left > GROUP ? MOST_REGISTERS : 1;
     const int count = left < registers * GROUP ? (int)left : registers * GROUP;
-    /* The compiler makes a program for each number of registers. */
+    /* The compiler makes a program for either number of registers. */
 #define RUN(REGISTERS) \
   run_in_registers(steps, step_count, constants, memory, &numbers, begin, count, REGISTERS)
     if (registers == MOST_REGISTERS) RUN(MOST_REGISTERS);
-    else if (registers == 2) RUN(2);
     else RUN(1);
     begin += count;
   }
