@@ -277,9 +277,11 @@ class JointRateLimits:
                 return True
         return False
 
-    def shares(self) -> tuple[Array, Array]:
-        """Return by which rates and efforts (n,) of a control period are multiplied, so that a sum
-        of magnitudes up to 1 is surely far from the limit.
+    def factors(self) -> tuple[Array, Array]:
+        """Return the factors (n,) of joint rates, and of efforts that are held for a control period.
+
+        While a joint's rate and effort times its factors have magnitudes that sum up to 1 at most,
+        :meth:`apply` does not change a command because of that joint.
         """
         return self._per_rate, self._per_effort
 
@@ -372,7 +374,7 @@ class LimitCheck:
             for limit in (actuators.force, actuators.torque)
         ]
         effort[:] = actuators.effort
-        per_rate[:], per_effort[:] = rates.shares()
+        per_rate[:], per_effort[:] = rates.factors()
         self._checked: Array | None = None
         """The bounds of the last check."""
         self._given: Array | None = None

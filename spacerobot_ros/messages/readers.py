@@ -158,10 +158,16 @@ class TemplateReader:
         an array of any length.
     max_size
         Messages of another layout that are longer are refused unread, bytes.
+    arrays
+        Arrays by path that :meth:`copy` fills, as long as the values of a message that has them.
     """
 
     def __init__(
-        self, type_name: str, spans: Mapping[str, int | None], max_size: float = math.inf
+        self,
+        type_name: str,
+        spans: Mapping[str, int | None],
+        max_size: float = math.inf,
+        arrays: Mapping[str, Array] | None = None,
     ) -> None:
         self._type_name, self._spans, self._max_size = type_name, spans, max_size
         self._fields = fields_of(type_name)
@@ -171,6 +177,9 @@ class TemplateReader:
         self._fixed_spans: list[tuple[slice, bytes]] = []
         self._joined_spans: list[tuple[slice, bytes]] = []
         self._value_spans: dict[str, tuple[int, int]] = {}
+        self._arrays = arrays or {}
+        self._copies: list[tuple[memoryview, slice]] = []
+        """Memory of the arrays, and the bytes of their values in messages of this layout."""
         self._layout: Layout | None = None
         self.layout_changes = 0
         """Number of layout changes."""
@@ -205,16 +214,11 @@ class TemplateReader:
         offset, count = self._value_spans[path]
         return np.frombuffer(self.raw, np.float64, count, offset)
 
-    def copies_into(self, arrays: Mapping[str, Array]) -> list[tuple[memoryview, slice]]:
-        """Return the memory of arrays by path, and the bytes in messages of this layout that are
-        their values; arrays of values that messages lack are left out.
-        """
-        copies = []
-        for path, array in arrays.items():
-            if path in self._value_spans:
-                offset, count = self._value_spans[path]
-                copies.append((array.data.cast("B"), slice(offset, offset + 8 * count)))
-        return copies
+    def copy(self) -> None:
+        """Copy the values of the accepted message into the arrays; those that it lacks stay."""
+        raw = self.raw  # The message itself may have been big-endian.
+        for target, place in self._copies:
+            target[:] = raw[place]
 
     def value_count(self, path: str) -> int:
         """Return the number of values at ``path`` in messages of this layout."""
@@ -283,6 +287,12 @@ class TemplateReader:
             count = leaf.shape[0] if wanted is None else wanted
             if count:
                 self._value_spans[path] = leaf.offset, count
+        self._copies = [
+            (array.data.cast("B"), slice(begin, begin + 8 * count))
+            for path, array in self._arrays.items()
+            for begin, count in [self._value_spans.get(path, (0, 0))]
+            if count
+        ]
         self._join_fixed_spans(raw)
         self.layout_changes += 1
 
@@ -324,14 +334,15 @@ class JointReader:
         if measured:
             # Every joint adds a name with its length and three numbers.
             max_size = _HEADER_BYTES + 2 * sum(len(name.encode()) + 32 for name in joint_names)
-        self._reader = TemplateReader(JOINT_STATE, dict.fromkeys(quantities), max_size)
+        self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
+        spans = dict.fromkeys(quantities)
+        self._reader = TemplateReader(JOINT_STATE, spans, max_size, self.values)
         self._known_layout = 0
         self._problem = ""
         self._last_accepted: bytes | None = None
         """Last accepted message: publishers often repeat the same bytes."""
         self._order: npt.NDArray[np.intp] | None = None
-        self._copies: list[tuple[memoryview, slice]] = []
-        self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
+        """Indices of the message's joints in the model; None: it has the model's order."""
 
     def accept(self, raw: bytes) -> int:
         """Read a message into ``values`` and return its stamp in ns.
@@ -346,10 +357,9 @@ class JointReader:
         stamp = self._reader.stamp_ns
         if stamp > LATEST_NS and self._measured:
             raise UnreadableError(f"no command can carry its stamp of {stamp / SECOND:.10g} s")
-        accepted = self._reader.raw  # The message itself may have been big-endian.
-        for target, place in self._copies:
-            target[:] = accepted[place]
-        if self._order is not None:
+        if self._order is None:
+            self._reader.copy()
+        else:
             for name, values in self.values.items():
                 if self._reader.has_values(name):
                     values[self._order] = self._reader.floats(name)
@@ -382,7 +392,7 @@ class JointReader:
     def _check_names_and_lengths(self) -> None:
         """Check joint names and array lengths of a new layout."""
         names = self._reader.texts("name")
-        self._problem, self._order, self._copies = "", None, []
+        self._problem, self._order = "", None
         try:
             order = joint_order(self._joints, names)
             for i, quantity in enumerate(self._quantities):
@@ -395,9 +405,7 @@ class JointReader:
         for values in self.values.values():
             values[:] = 0.0
         # Joints in the model's order, as nodes of the stack send them, are copied as bytes.
-        if names == self._joints:
-            self._copies = self._reader.copies_into(self.values)
-        else:
+        if names != self._joints:
             self._order = order
 
 
@@ -415,14 +423,12 @@ class MessageDecoder:
     def __init__(self, joint_names: Sequence[str]) -> None:
         self._joints = JointReader(joint_names, ["position", "velocity"], measured=True)
         self._references = JointReader(joint_names, ["position", "velocity"])
-        self._odom, self._target = (
-            TemplateReader(ODOMETRY, {_POSE_PATH: 7, _TWIST_PATH: 6}) for _ in range(2)
-        )
+        self._measured = {_POSE_PATH: np.zeros(7), _TWIST_PATH: np.zeros(6)}
+        spans = {path: len(array) for path, array in self._measured.items()}
+        self._odom = TemplateReader(ODOMETRY, spans, arrays=self._measured)
+        self._target = TemplateReader(ODOMETRY, spans)
         self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
         self.check_robot, self.decode_joints = self._joints.require, self._joints.accept
-        self._measured = {_POSE_PATH: np.zeros(7), _TWIST_PATH: np.zeros(6)}
-        self._copies: list[tuple[memoryview, slice]] = []
-        self._known_layout = 0
 
     def decode_base(self, odom: bytes) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an Odometry."""
@@ -431,13 +437,8 @@ class MessageDecoder:
 
     def measured_base(self, odom: bytes) -> tuple[Array, Array]:
         """Return :meth:`decode_base` in arrays that the next call overwrites."""
-        reader = self._odom
-        reader.accept(odom)
-        if reader.layout_changes != self._known_layout:
-            self._known_layout = reader.layout_changes
-            self._copies = reader.copies_into(self._measured)
-        for target, place in self._copies:
-            target[:] = reader.raw[place]
+        self._odom.accept(odom)
+        self._odom.copy()
         return self._measured[_POSE_PATH], self._measured[_TWIST_PATH]
 
     def target(self, odom: bytes) -> tuple[Array, Array]:
@@ -502,9 +503,8 @@ class _WrenchReader:
     def __init__(self, base_link: str, frame_prefix: str) -> None:
         self.values: Array = np.zeros(6)
         self._base_link, self._prefix = base_link, frame_prefix
-        self._reader = TemplateReader(WRENCH, {_WRENCH_PATH: 6})
+        self._reader = TemplateReader(WRENCH, {_WRENCH_PATH: 6}, arrays={_WRENCH_PATH: self.values})
         self._known_layout = 0
-        self._copies: list[tuple[memoryview, slice]] = []
 
     def accept(self, raw: bytes) -> int:
         reader = self._reader
@@ -513,9 +513,7 @@ class _WrenchReader:
             # Messages of one layout name the same frame.
             require_frame(reader.text("header.frame_id"), self._base_link, self._prefix)
             self._known_layout = reader.layout_changes
-            self._copies = reader.copies_into({_WRENCH_PATH: self.values})
-        for target, place in self._copies:
-            target[:] = reader.raw[place]
+        reader.copy()
         return reader.stamp_ns
 
     @property
