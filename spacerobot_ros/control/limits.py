@@ -278,7 +278,7 @@ class JointRateLimits:
         return False
 
     def factors(self) -> tuple[Array, Array]:
-        """Return the factors (n,) of joint rates, and of efforts that are held for a control period.
+        """Return the factors (n,) of joint rates, and of efforts held for one control period.
 
         While a joint's rate and effort times its factors have magnitudes that sum up to 1 at most,
         :meth:`apply` does not change a command because of that joint.
