@@ -335,7 +335,7 @@ class JointReader:
             # Every joint adds a name with its length and three numbers.
             max_size = _HEADER_BYTES + 2 * sum(len(name.encode()) + 32 for name in joint_names)
         self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
-        spans = dict.fromkeys(quantities)
+        spans: dict[str, int | None] = dict.fromkeys(quantities)
         self._reader = TemplateReader(JOINT_STATE, spans, max_size, self.values)
         self._known_layout = 0
         self._problem = ""
