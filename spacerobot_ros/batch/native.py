@@ -36,6 +36,10 @@ from spacerobot_ros.simulation import effort_plant, velocity_plant
 
 _SOURCE_FOLDER = Path(__file__).resolve().parent
 
+_SCHEDULING = ("-fschedule-insns", "-fsched-pressure")
+"""Options of GCC, ignored by Clang: it orders long sums of products such that they do not wait for
+each other, which takes a fifth of the time of flights and changes no number."""
+
 _CASADI_SELECTION = re.compile(r"\((\w+|\(\*\w+\+\+\))\?(\w+(?:\[i\])?):0\)")
 """CasADi's texts for a number, alone or in a loop, that is zero unless a condition holds."""
 
@@ -216,6 +220,10 @@ class CompiledTick:
             **{name: whole.nnz_out(i) for i, name in enumerate(names.outputs)},
             **poses,
         }
+        if not effort:
+            functions["MOMENTUMLESS"] = _momentumless_function(flights, model)
+            arguments["MOMENTUMLESS"] = arguments["FLIGHT"]
+            results["MOMENTUMLESS"] = results["FLIGHT"]
         controller, count = None, flights.thruster_count
         if isinstance(flights.program, ControlledGoals):
             controller = BatchController.of(flights)
@@ -324,14 +332,27 @@ _TICK_VARIABLES = {
 }
 
 
+def _momentumless_function(flights: Flights, model: ModelFunctions) -> ca.Function:
+    """Return the function ``FLIGHT`` of robots that have no angular momentum."""
+    names = _TICK_VARIABLES["velocity"]
+    tick = velocity_plant.tick_function(
+        flights.robot, Composition(model, ca.MX), flights.substeps, momentumless=True
+    )
+    inputs = tick.mx_in()
+    outputs = dict(zip(names.outputs, tick.call(inputs, True, False), strict=True))
+    chosen = [outputs[each] for each in names.results_of_every_tick]
+    return ca.Function("velocity_momentumless", inputs, chosen)
+
+
 def _load_library(
     functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit, thrusters: int
 ) -> ctypes.CDLL:
     """Return the library of ``driver.hpp``, with the C library's vector functions if it has them.
 
     ``functions`` are CasADi's by their names in the driver: ``FLIGHT`` and ``REPORT``, the tick
-    without and with the results of reports; ``CONTROL``, the command for a state, and ``PULSES``,
-    those of thrusters, where there are any.
+    without and with the results of reports; ``MOMENTUMLESS``, the former of robots without angular
+    momentum; ``CONTROL``, the command for a state, and ``PULSES``, those of thrusters, where there
+    are any.
     """
     library = _compile_library(functions, declarations, unit, thrusters)
     names = ["start_flights", "fly_until"]
@@ -360,7 +381,7 @@ def _compile_library(
         *map(_trial_function_source, given),
     ]
     # Vectors as arguments between functions of this file: no other is called with them.
-    flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *unit.flags)
+    flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *_SCHEDULING, *unit.flags)
     name = f"lanes_{given[0].name()}"
     if unit.libmvec:
         source = "\n".join([_define_sizes(given, unit, unit.libmvec, thrusters), *parts])

@@ -50,7 +50,12 @@ from spacerobot_ros.model.inertial_parameters import (
     SymbolicMassProperties,
     possibly_nonzero_entries,
 )
-from spacerobot_ros.model.integration import attitude_step, repeat_step, runge_kutta_step
+from spacerobot_ros.model.integration import (
+    attitude_step,
+    attitude_steps_without_momentum,
+    repeat_step,
+    runge_kutta_step,
+)
 from spacerobot_ros.model.kinematics import tree_kinematics
 from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
@@ -181,6 +186,7 @@ class ModelFunctions:
             "base_twist": self._base_twist,
             "rotate": self._rotate,
             "velocity_step": self._velocity_step,
+            "momentumless_velocity_step": self._momentumless_velocity_step,
             "loaded_velocity_step": self._loaded_velocity_step,
             "total_mass": self._total_mass,
         }
@@ -338,6 +344,9 @@ class ModelFunctions:
         return ca.Function(
             f"velocity_step_{count}", list(inputs.values()), [x], list(inputs), ["x_next"]
         )
+
+    def _momentumless_velocity_step(self, substeps: str) -> ca.Function:
+        return attitude_steps_without_momentum(self._locked_inertia(), int(substeps))
 
     def _loaded_velocity_step(self, substeps: str) -> ca.Function:
         """Return ``(x, qdot, loads, h) -> x`` of :func:`.servo_rate` in some Runge-Kutta steps."""

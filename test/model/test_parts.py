@@ -101,6 +101,32 @@ def test_attitudes_follow_from_rates_and_momenta(with_p: bool) -> None:
     np.testing.assert_allclose(R, exact.y[:, -1].reshape(3, 3), atol=1e-8)
 
 
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_attitudes_without_momentum_follow_from_rates_alone(count: int) -> None:
+    """Against SciPy; and the numbers of steps that are told that the momentum is zero."""
+    q, p = ca.SX.sym("q", 2), ca.SX.sym("p")
+    D = ca.diag(ca.vertcat(4 + q[0], 5.0, 6 - q[1])) * p
+    D_q = ca.horzcat(ca.vertcat(0.3, q[1], 0.1), ca.vertcat(0.2, -0.4, q[0]))
+    locked = ca.Function("locked", [q, p], [D, D_q])
+    start, turned = np.array([0.3, -0.2]), Rotation.from_rotvec([0.4, -0.7, 0.2])
+    qdot, h, x = np.array([0.5, -0.8]), 0.05, np.append([0.3, -0.2], turned.as_quat())
+
+    def rate(t: float, flat: np.ndarray) -> np.ndarray:
+        shape = start + t * qdot
+        columns = [[0.3, shape[1], 0.1], [0.2, -0.4, shape[0]]]
+        moving = np.array(columns).T @ qdot / np.array([4 + shape[0], 5.0, 6 - shape[1]]) / 2.0
+        return np.asarray(flat.reshape(3, 3) @ np.cross(-moving, np.eye(3)).T).ravel()
+
+    exact = solve_ivp(rate, (0, h), turned.as_matrix().ravel(), rtol=1e-12, atol=1e-13)
+    steps = integration.attitude_steps_without_momentum(locked, count)
+    found = np.array(steps(x, qdot, h, 2.0)).ravel()
+    R = Rotation.from_quat(found[2:]).as_matrix()
+    np.testing.assert_allclose(R, exact.y[:, -1].reshape(3, 3), atol=1e-8)
+    told = integration.repeat_step(integration.attitude_step(locked), count)
+    expected = np.array(told(x, qdot, np.zeros(3), h / count, 2.0)).ravel()
+    np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 2, 2], [2, -1, 2]])
 @pytest.mark.parametrize("angle", [1e-9, 0.3, math.pi / 2, 2.2, math.pi - 1e-9, math.pi])
 def test_quaternions_of_matrices_keep_their_digits(axis: list[int], angle: float) -> None:
