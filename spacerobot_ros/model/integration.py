@@ -120,9 +120,7 @@ def attitude_steps_without_momentum(locked_inertia: ca.Function, count: int) -> 
     turned = _turned_quaternion(quaternion, h, lambda stage, at: rates[stage])
     results = ca.cse([ca.vertcat(q + h * qdot, turned, rates[-1])])
     # The state of the steps ends with the body rate of its shape.
-    step = ca.Function(
-        "momentumless_step", [ca.vertcat(x, beginning), qdot, h, p], results
-    )
+    step = ca.Function("momentumless_step", [ca.vertcat(x, beginning), qdot, h, p], results)
     first = ca.Function("body_rate", [q, qdot, p], [ca.cse(body_rate(q))])
     held = [ca.MX.sym(name, size) for name, size in (("qdot", n), ("h", 1), ("p", p.numel()))]
     start = ca.MX.sym("x", n + 4)
