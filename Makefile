@@ -141,6 +141,11 @@ FLOWN_TIMES ?= 10
 flown-times: $(STAMP)/test ## compare the times of FLOWN_TIMES plans each of ten robots with those of the solutions
 	SPACEROBOT_FLOWN_TIMES=$(FLOWN_TIMES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_flown_times.py
 
+LONG_SEARCHES ?= 12
+.PHONY: long-searches
+long-searches: $(STAMP)/test ## compare the durations of LONG_SEARCHES plans each of five robots, with a position or a shape, with those of searches from 60 guesses
+	SPACEROBOT_LONG_SEARCHES=$(LONG_SEARCHES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_long_searches.py
+
 CLEAR_FLIGHTS ?= 100
 .PHONY: clear-flights
 clear-flights: $(STAMP)/test ## fly CLEAR_FLIGHTS draws each of four robots with noise, wrong masses and corrections, and list the smallest distances

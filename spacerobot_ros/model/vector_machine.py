@@ -39,7 +39,7 @@ _OPERATIONS = {
 
 _INPUT, _OUTPUT, _CONST = (_OPERATIONS[name] for name in ("INPUT", "OUTPUT", "CONST"))
 
-_FLAGS = ("-O2", "-fno-math-errno", "-fno-trapping-math")
+_FLAGS = ("-O1", "-fno-math-errno", "-fno-trapping-math")
 
 
 @dataclass(frozen=True)
