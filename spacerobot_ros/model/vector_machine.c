@@ -107,7 +107,6 @@ static inline __attribute__((always_inline)) void run_in_registers(
       case OUTPUT: {
         const long long size = numbers->result_sizes[s.result];
         double *to = numbers->results[s.result];
-        if (!to) break;
         to += begin * size + s.second;
         for (i = 0; i < count; ++i) to[i * size] = ((const double *)a)[i];
         break;
@@ -132,7 +131,7 @@ static inline __attribute__((always_inline)) void run_in_registers(
 }
 
 /* Returns 0, or 1 where memory is short. `sizes` are the nonzeros of the arguments and results at a
- * place; the numbers of a place stand together. Results may be NULL. */
+ * place; the numbers of a place stand together. */
 int run_at_places(const Step *steps, long long step_count, const double *constants,
                   long long memory_size, const double *const *arguments,
                   const long long *argument_sizes, double *const *results,

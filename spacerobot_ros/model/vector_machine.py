@@ -13,7 +13,7 @@ import ctypes
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from spacerobot_ros.model.compilation import (
     native_library,
     processor_features,
 )
+from spacerobot_ros.model.description import Array
 
 _SOURCE_FILE = Path(__file__).with_name("vector_machine.c")
 
@@ -172,10 +173,20 @@ class _MappedFunction(ca.Callback):
 
     def __init__(self, function: ca.Function, tape: _OperationList, run: Any, count: int) -> None:
         ca.Callback.__init__(self)
-        self._function, self._tape, self._run, self._count = function, tape, run, count
+        self._function, self._tape, self._count = function, tape, count
+        # Numbers are copied: that takes less time than to find out where CasADi keeps them.
+        self._memories: tuple[list[Array], list[Array]] = (
+            [np.zeros(count * size) for size in tape.argument_sizes],
+            [np.zeros(count * size) for size in tape.result_sizes],
+        )
+        arguments, results = (_pointers(each) for each in self._memories)
         steps, constants = tape.steps.ctypes.data, tape.constants.ctypes.data
-        self._operations = steps, len(tape.steps), constants, tape.memory_size
-        self._sizes = tape.argument_sizes.ctypes.data, tape.result_sizes.ctypes.data
+        of_arguments, of_results = tape.argument_sizes.ctypes.data, tape.result_sizes.ctypes.data
+        self._run = partial(
+            run,
+            *(steps, len(tape.steps), constants, tape.memory_size),
+            *(arguments, of_arguments, results, of_results, count),
+        )
         self.construct(f"{function.name()}_at_{count}", {})
 
     def get_n_in(self) -> int:
@@ -199,29 +210,23 @@ class _MappedFunction(ca.Callback):
         return True
 
     def eval_buffer(
-        self, arguments: tuple[memoryview, ...], results: tuple[memoryview, ...]
+        self, arguments: tuple[memoryview | None, ...], results: tuple[memoryview | None, ...]
     ) -> int:
         """Compute the results at all places."""
-        of_arguments, of_results = self._sizes
-        return int(
-            self._run(
-                *self._operations,
-                _pointers(arguments),
-                of_arguments,
-                _pointers(results),
-                of_results,
-                self._count,
-            )
-        )
+        own_arguments, own_results = self._memories
+        for own, given in zip(own_arguments, arguments, strict=True):
+            # CasADi has no memory for zeros.
+            own[:] = np.frombuffer(given) if given else 0.0
+        failure = int(self._run())
+        for own, asked in zip(own_results, results, strict=True):
+            if asked:
+                np.frombuffer(asked)[:] = own
+        return failure
 
 
-def _pointers(memories: Sequence[memoryview | None]) -> Any:
-    """Return the addresses of memories, NULL for those without numbers."""
-    found = [
-        np.frombuffer(each).ctypes.data if each is not None and len(each) else None
-        for each in memories
-    ]
-    return (ctypes.c_void_p * max(1, len(found)))(*found)
+def _pointers(memories: Sequence[Array]) -> Any:
+    """Return the addresses of memories."""
+    return (ctypes.c_void_p * max(1, len(memories)))(*(each.ctypes.data for each in memories))
 
 
 @lru_cache

@@ -81,3 +81,24 @@ def test_functions_that_have_other_operations_are_run_by_casadi() -> None:
     x = ca.SX.sym("x")
     function = ca.Function("hyperbolic", [x], [ca.sinh(x)])
     assert not isinstance(mapped(function, 2), vector_machine._MappedFunction)
+
+
+@needs_compiler
+def test_arguments_and_results_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CasADi gives no memory for zeros, nor for results that nobody asks for."""
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
+    x, p, none = ca.SX.sym("x", 2), ca.SX.sym("p", 2), ca.SX.sym("none", 0)
+    function = ca.Function("rows", [x, p, none], [x * p, x + p + 1])
+    at_all = mapped(function, 5)
+    assert isinstance(at_all, vector_machine._MappedFunction)
+    given = ca.MX.sym("given", 2, 5)
+    _, sums = at_all(given, 0, ca.MX(0, 5))
+    values = np.arange(10.0).reshape(2, 5)
+    only = ca.Function("only", [given], [sums])
+    np.testing.assert_array_equal(only(values).full(), values + 1)
+    # Numbers of one call do not stay for the next one.
+    product, _ = at_all(given, ca.DM(values), ca.MX(0, 5))
+    both = ca.Function("both", [given], [product, sums])
+    for of_product, of_sums in (both(values), both(values)):
+        np.testing.assert_array_equal(of_product.full(), values**2)
+        np.testing.assert_array_equal(of_sums.full(), values + 1)
