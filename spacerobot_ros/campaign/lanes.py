@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
 _STATES_PER_FLIGHT = 40
-"""Number of evaluated states of a flight along a schedule, besides its last state."""
+"""Largest number of evaluated states of a flight along a schedule, besides its last state."""
 
 _MAX_BATCH_TICKS = 4_000_000
 """Largest number of ticks of one batch, whose schedules are in memory."""
@@ -296,7 +297,7 @@ class _ScheduledLanes:
             positions = first.positions
         else:
             positions = np.array([_pad_positions(each.schedule.positions, most) for each in batch])
-        instants = np.unique([*np.linspace(0, most, _STATES_PER_FLIGHT).astype(int), *ticks])
+        instants = np.unique(np.concatenate([_evaluated_ticks(each) for each in set(ticks)]))
         return _batch_of_flights(
             [each.flight for each in batch],
             FollowedSchedule(positions, planner.shape_gain, planner.shape_deadband),
@@ -324,8 +325,10 @@ class _ScheduledLanes:
         deviations = np.abs(last - measured_q).max(axis=1, initial=0.0).tolist()
         limited = np.any([x.any(axis=1) for x in result.limited_ticks.values()], axis=0).tolist()
         durations = (result.time[ends] - result.time[0]).tolist()
-        flown = np.arange(len(result.time)) <= ends[:, np.newaxis]
-        drifts = momentum_drift(np.where(flown[..., np.newaxis], result.momentum, np.nan))
+        ticks = [each.schedule.ticks for each in batch]
+        own = {each: np.isin(flights.report_ticks, _evaluated_ticks(each)) for each in set(ticks)}
+        evaluated = np.array([own[each] for each in ticks])
+        drifts = momentum_drift(np.where(evaluated[..., np.newaxis], result.momentum, np.nan))
         for row, ready in enumerate(batch):
             if row in result.failures:
                 yield "was refused by the plant"
@@ -643,6 +646,17 @@ def _first_plan(flight: DrawnFlight) -> _Plan | None:
     if begins_ns or schedule.partial or not schedule.ticks:
         return None
     return _Plan(schedule, first.gait)
+
+
+@lru_cache(maxsize=64)
+def _evaluated_ticks(ticks: int) -> Array:
+    """Return the ticks at which a flight along a schedule of so many ticks is evaluated.
+
+    They depend on nothing else, so that a flight has the same measures in any batch; those of
+    different flights coincide where possible.
+    """
+    spacing = 1 << max(0, math.ceil(math.log2(ticks / _STATES_PER_FLIGHT)))
+    return np.append(np.arange(0, ticks, spacing), ticks)
 
 
 def _pad_positions(positions: Array, ticks: int) -> Array:

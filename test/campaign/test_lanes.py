@@ -6,10 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.campaigns import campaign
 from support.slow import some_fast
 
+from spacerobot_ros.campaign import lanes
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
@@ -35,6 +37,26 @@ DISPERSED: dict[str, Any] = {
 def flown(engine: LanesEngine | FlightsEngine, made: Campaign) -> dict[int, Row]:
     rows = fly_all(engine, made, list(Draws(made)), lambda: False)
     return {row.draw.number: row for row in rows}
+
+
+@pytest.mark.slow
+def test_a_flight_has_the_same_row_in_any_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Schedules to different goals end at different ticks, and batches end where time is up."""
+    goals = {"goal.rotvec.z": {"uniform": [0.05, 0.6]}, "mass.*": {"uniform": [0.95, 0.1]}}
+    made = campaign(disperse=goals, flights=4, seed=3, set={"planner.max_corrections": 0})
+    together = flown(LanesEngine(), made)
+    monkeypatch.setattr(lanes, "_MAX_BATCH_PREPARATION_TIME", 0.0)
+    apart = flown(LanesEngine(), made)
+    assert len({row.metrics["duration_s"] for row in together.values()}) == 4
+    wall = {"wall_time_s", "plan_time_s"}
+    for number, row in together.items():
+        other = apart[number]
+        assert row.engine == other.engine == "lanes"
+        here, there = (
+            {name: x for name, x in each.metrics.items() if name not in wall}
+            for each in (row, other)
+        )
+        np.testing.assert_equal(here, there)
 
 
 @pytest.mark.slow
