@@ -143,7 +143,7 @@ flown-times: $(STAMP)/test ## compare the times of FLOWN_TIMES plans each of ten
 
 LONG_SEARCHES ?= 12
 .PHONY: long-searches
-long-searches: $(STAMP)/test ## compare the durations of LONG_SEARCHES plans each of five robots, with a position or a shape, with those of searches from 60 guesses
+long-searches: $(STAMP)/test ## compare the durations of LONG_SEARCHES plans each of three robots, with a position or a shape, with those of searches from 60 guesses
 	SPACEROBOT_LONG_SEARCHES=$(LONG_SEARCHES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_long_searches.py
 
 CLEAR_FLIGHTS ?= 100

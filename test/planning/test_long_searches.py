@@ -20,8 +20,8 @@ from spacerobot_ros.resources import robot_file
 GOALS = int(os.environ.get("SPACEROBOT_LONG_SEARCHES", "1"))
 """Goals of each robot."""
 
-ROBOTS = ("seven_joint_arm", "servicer", "tender", "solar_booms", "three_joint_arm")
-"""Arms, and trees with sliders and revolute joints."""
+ROBOTS = ("seven_joint_arm", "servicer", "three_joint_arm")
+"""Arms that control the position of the base, and one that does not."""
 
 STARTS = 60
 """Guesses of a long search, which no agreement ends."""
