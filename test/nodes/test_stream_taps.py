@@ -162,7 +162,7 @@ def test_other_topics_are_subscribed(stack: Stack) -> None:
 def test_messages_that_nobody_can_receive_are_not_published(
     ros_context: rclpy.Context, qos: QoSProfile, number: int, looks: bool
 ) -> None:
-    """The middleware numbers what it is given: a late subscription sees what came before.
+    """The middleware numbers its messages: a late subscription sees what came before.
 
     Where the owner ``looks`` for readers, a message before its next look is not published.
     """

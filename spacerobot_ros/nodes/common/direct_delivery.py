@@ -182,12 +182,12 @@ class DirectDelivery:
                 if not self._left % _MESSAGES_PER_LOOK:
                     self._look_for_readers()
                     if not self._left:
-                        # What is published from now on waits until the executor calls again.
+                        # Messages wait from now on until the executor calls again.
                         self._in_turn = False
                 take, raw = queue.popleft()
                 take(raw)
         finally:
-            # What is published by timers and services may be a single message of its topic.
+            # Timers and services may publish a single message of a topic.
             self._look_with_every_message()
         self._in_turn = False
         if self._left <= 0:

@@ -238,7 +238,7 @@ class RawOutput(RawStream):
     def look_for_readers(self) -> None:
         """Look for readers once for all messages until the next look; a latched topic needs none.
 
-        A change of what is done with messages ends that, as :meth:`look_with_every_message` does.
+        A new listener or act ends that, as :meth:`look_with_every_message` does.
         """
         if not self._latched:
             self.take = self._takes[self._count_readers() > 0]
@@ -255,7 +255,7 @@ class RawOutput(RawStream):
             for publish in (self._publish, self._publish_unseen)
         )
         self._takes = unread, read
-        """What is done with a message that has no readers, and with one that has some."""
+        """Functions that take a message without readers, and one with some."""
         self.take = self._looking_take
 
 
