@@ -23,6 +23,8 @@ SOON = 2.0
 HEAD = """
 import hashlib, os, signal, subprocess, sys, time
 from spacerobot_ros.termination import *
+# The tests may have been started by nohup.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 def ready():
     print("ready", flush=True)
 """
