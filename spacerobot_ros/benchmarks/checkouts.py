@@ -40,13 +40,19 @@ class Checkout:
             raise ParameterError(f"There is no checkout in {other}: it has no spacerobot_ros/.")
         return ours, cls(other.resolve())
 
-    def measure(self, name: str, *, cache: str | None = None, **arguments: Any) -> Any:
+    def measure(
+        self, name: str, *, cache: str | None = None, byte_code: str | None = None, **arguments: Any
+    ) -> Any:
         """Call a function of :mod:`.measurements` with this checkout's package, in a process.
 
-        ``cache`` is a folder to use in place of the user's cache.
+        ``cache`` is a folder to use in place of the user's cache, and ``byte_code`` one for the
+        byte code of modules, which is kept there also where PYTHONDONTWRITEBYTECODE is set.
         """
         words = [str(measurements.__file__), name, json.dumps(arguments)]
-        return self.run(words, {} if cache is None else {"SPACEROBOT_CACHE_DIR": cache})
+        variables = {} if cache is None else {"SPACEROBOT_CACHE_DIR": cache}
+        if byte_code is not None:
+            variables |= {"PYTHONPYCACHEPREFIX": byte_code, "PYTHONDONTWRITEBYTECODE": ""}
+        return self.run(words, variables)
 
     def run(self, arguments: Sequence[str], variables: Mapping[str, str] | None = None) -> Any:
         """Run Python with this checkout's package and return the JSON file that it writes.
