@@ -71,6 +71,29 @@ def test_a_folder_without_a_checkout_is_refused(tmp_path: Path) -> None:
         compare(tmp_path, lambda there: {}, print, 1)
 
 
+@pytest.mark.parametrize("forbidden", ["1", None])
+def test_a_measurement_has_a_cache_and_byte_code_of_its_own(
+    forbidden: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The byte code of the measured package is there after one process, also where it is not to be
+    written.
+    """
+    monkeypatch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
+    if forbidden is not None:
+        monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", forbidden)
+    folder, program = checkout(tmp_path, "a"), tmp_path / "measurements.py"
+    program.write_text(
+        "import json, os, sys\nimport spacerobot_ros\n"
+        "found = [*sys.argv[1:3], os.environ['SPACEROBOT_CACHE_DIR']]\n"
+        "open(sys.argv[-1], 'w').write(json.dumps(found))"
+    )
+    monkeypatch.setattr("spacerobot_ros.benchmarks.measurements.__file__", str(program))
+    code = tmp_path / "code"
+    found = Checkout(folder).measure("first_plan", cache="/there", byte_code=str(code), urdf="x")
+    assert found == ["first_plan", '{"urdf": "x"}', "/there"]
+    assert [each.name.split(".")[0] for each in code.rglob("spacerobot_ros/*.pyc")] == ["__init__"]
+
+
 def test_a_measurement_that_fails_is_one_sentence(tmp_path: Path) -> None:
     empty = Checkout(checkout(tmp_path, "c"))
     with pytest.raises(SpaceRobotError, match=r"The benchmark of .* failed: Module") as caught:
