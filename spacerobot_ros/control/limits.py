@@ -292,9 +292,7 @@ class JointRateLimits:
         if not np.isfinite(self.rates).any():
             return ca.SX(0)
         n, tau = self._robot.n, actuation[6:]
-        gained = ca.fabs(tau) * self._per_effort
-        fast = ca.fabs(qdot) * self._per_rate + gained
-        near = ca.sum1(fast > 1.0)
+        near = ca.sum1(_rate_shares(qdot, tau, self._per_rate, self._per_effort) > 1.0)
         flat, Fs, columns = self._dynamics.function(q, omega, qdot)
         Js, G = ca.reshape(flat, n, n).T, ca.reshape(columns, 6, n).T
         qddot = solve_positive_definite(Js, tau + G @ actuation[:6] - Fs)
@@ -413,6 +411,13 @@ class LimitCheck:
         return self._share if self._checked is bounds else None
 
 
+def _rate_shares(
+    qdot: ca.SX, tau: ca.SX, per_rate: ca.SX | Array, per_effort: ca.SX | Array
+) -> ca.SX:
+    """Return numbers (n,) that are 1 at most while a joint cannot reach its largest rate."""
+    return ca.fabs(qdot) * per_rate + ca.fabs(tau) * per_effort
+
+
 @lru_cache
 def _check_function(n: int, m: int) -> ca.Function:
     """Return the function of a :class:`LimitCheck`: ``(sure, largest share, sum of shares)``.
@@ -427,9 +432,9 @@ def _check_function(n: int, m: int) -> ca.Function:
     for k, vector in enumerate((wrench[:3], wrench[3:])):
         none = ca.sum1(ca.fabs(vector)) <= 0.0
         sure = ca.logic_and(sure, ca.logic_or(none, ca.dot(vector, vector) <= thrust[k]))
+    shares = _rate_shares(qdot, tau, per_rate, periods * per_effort)
     for i in range(n):
-        near = ca.fabs(qdot[i]) * per_rate[i] + ca.fabs(tau[i]) * (periods * per_effort[i])
-        sure = ca.logic_and(sure, ca.logic_and(ca.fabs(tau[i]) <= effort[i], near <= 1.0))
+        sure = ca.logic_and(sure, ca.logic_and(ca.fabs(tau[i]) <= effort[i], shares[i] <= 1.0))
     largest, total = ca.SX(0.0), ca.SX(0.0)
     for i in range(m):
         share = ca.fabs(error[i] / bounds[i])
