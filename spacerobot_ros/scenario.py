@@ -153,7 +153,19 @@ class Scenario:
         """
         if node not in self._configs:
             self._configs[node] = self._make_config(node)
-        return self._configs[node]
+        return self._following_plant(node, self._configs[node])
+
+    def _following_plant(self, node: str, config: Any) -> Any:
+        """Return a configuration with what nodes learn of each other instead of "automatic"."""
+        changes: dict[str, Any] = {}
+        if node == "plant" and config.actuation == "auto":
+            efforts = "coordinated_control" in self.commanders
+            return config.decided("effort" if efforts else "")
+        if node in COMMANDERS and not config.tick_rate:
+            changes["tick_rate"] = self.plant.tick_rate
+        if node == "planner" and config.plan_in_background and self.lockstep:
+            changes["plan_in_background"] = False
+        return replaced(config, **changes) if changes else config
 
     def _make_config(self, node: str) -> Any:
         known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
@@ -313,11 +325,9 @@ class Scenario:
         return replaced(self, _configs=configs, _changes=since, **changes)
 
     def in_real_time(self, factor: float) -> Scenario:
-        """Return the scenario in real time times a factor, with planning in the background."""
+        """Return the scenario in real time times a factor."""
         pace = {"time_mode": "realtime", "real_time_factor": factor}
         scenario = self.with_overrides("plant", pace)
-        if "planner" in self.commanders:
-            scenario = scenario.with_overrides("planner", {"plan_in_background": True})
         # Viewers follow wall time, which limits the period of recorded transforms; the plant limits
         # the periods of its own topics.
         shown = {"diagnostics_period": 1.0}

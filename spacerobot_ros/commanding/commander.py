@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from enum import Enum
 from typing import Any, Literal, Protocol
 
@@ -55,6 +56,9 @@ _PROCESS_DELAY_TIME = 0.005
 
 _REPORT_PERIOD = 1.0
 """Shortest wall time between two warnings about ignored states, s."""
+
+_EQUAL_RATES = 0.05
+"""Largest relative difference between two rates that count as one."""
 
 _FAULT_LOG_PERIOD = 5.0
 """Shortest wall time between two log lines about one kind of faulty message, s."""
@@ -181,9 +185,10 @@ class ArrayDecoder:
 class Commander(ABC):
     """Base class of the commanders: planner and controller.
 
-    States are answered while the commander is active and knows its robot, and only those of the
-    plant's present time (:class:`StampFilter`). Goals that come before the robot wait for it. All
-    goals are given up when the plant reports that it does not obey (:class:`PlantListener`).
+    States are answered while the commander is active and knows its robot and the rate of the plant,
+    and only those of the plant's present time (:class:`StampFilter`). Commands follow the rate of
+    the plant, whatever rate is configured. Goals that come before the robot wait for it. All goals
+    are given up when the plant reports that it does not obey (:class:`PlantListener`).
 
     Parameters
     ----------
@@ -211,9 +216,11 @@ class Commander(ABC):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.config, self.host, self._clock = config, host, clock
+        self._given_rate = config.tick_rate
+        """Configured rate, Hz; 0: that of the plant."""
         self.activity = CommanderActivity.INACTIVE
         self.robot: SpaceRobot | None = None
-        self.stamps = StampFilter(config.control_period, clock)
+        self.stamps = StampFilter(clock)
         self.states = StateSynchroniser(pose_required=pose_required)
         self.plant = PlantListener()
         self._decoder: StateDecoder | None = None
@@ -255,6 +262,22 @@ class Commander(ABC):
         waiting, self._waiting_goals = self._waiting_goals, {}
         for key, goal in waiting.items():
             self._submit_goal(key, goal)
+
+    def _follow_rate(self) -> None:
+        """Command at the rate of the plant, as soon as it is known."""
+        rate, present = self.plant.rate or self.stamps.rate, self.config.tick_rate
+        if not rate or abs(rate - present) <= _EQUAL_RATES * present:
+            return
+        self.config = replace(self.config, tick_rate=rate)
+        if self._given_rate and abs(rate - self._given_rate) > _EQUAL_RATES * self._given_rate:
+            self.host.log(
+                "warning",
+                f"Parameter 'tick_rate' is {self._given_rate:g} Hz, and the plant has {rate:g} Hz: "
+                f"commands follow the plant. Set it to {rate:g}, or leave it out.",
+            )
+        if self.robot is not None:
+            self._change_rate(self.robot)
+        self.answer()
 
     def drop_robot(self, why: str) -> None:
         """Give up the goals and the robot; later goals wait for another robot."""
@@ -368,6 +391,8 @@ class Commander(ABC):
         """Raise PlanningError where no goal is taken now."""
         if not self.active:
             raise PlanningError(f"The goal is refused: this node is {self.activity.value}.")
+        if self._actuation_refusal:
+            raise PlanningError(self._actuation_refusal)
         if self.plant.refusal_of_goals:
             raise PlanningError(self.plant.refusal_of_goals)
 
@@ -504,6 +529,8 @@ class Commander(ABC):
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take joints of the present time, and answer their state if complete."""
         self.states.put_joints(stamp_ns, joints)
+        if not self.config.tick_rate:
+            self._follow_rate()
         self.answer()
 
     def take_accepted_jump(self) -> str:
@@ -515,6 +542,7 @@ class Commander(ABC):
             A warning about messages that were ignored, at most once a second; empty: none.
         """
         stamps = self.stamps
+        self._follow_rate()
         # A paused plant publishes no state that could contradict a jump.
         jump = None if self.plant.paused else stamps.accepted_jump()
         if jump is not None:
@@ -585,6 +613,9 @@ class Commander(ABC):
             if self.executive is not None:
                 self._react_to_change(change)
         self._forward_plant_state()
+        if self._actuation_refusal:
+            self._log_fault("actuation", self._actuation_refusal)
+        self._follow_rate()
         if self.plant.payload != self._payload:
             self._payload = self.plant.payload
             if self._described is not None:
@@ -629,6 +660,33 @@ class Commander(ABC):
     @abstractmethod
     def _change_masses(self, robot: SpaceRobot) -> None:
         """Have the executive command a robot of the same joints and other masses."""
+
+    def reconfigure(self, config: Any) -> None:
+        """Use the live parameters of another configuration from now on."""
+        self.config = self._adapted(config)
+        self._configure_executive()
+
+    def _adapted(self, config: Any) -> Any:
+        """Return a configuration with the known rate of the plant."""
+        return replace(config, tick_rate=self.config.tick_rate)
+
+    @property
+    def _knows_rate(self) -> bool:
+        """Whether the rate of the plant is known, so that states can be answered."""
+        return self.config.tick_rate > 0
+
+    @abstractmethod
+    def _configure_executive(self) -> None:
+        """Have the executive use the live parameters of the present configuration."""
+
+    @abstractmethod
+    def _change_rate(self, robot: SpaceRobot) -> None:
+        """Have the executive command at the present rate of the configuration."""
+
+    @property
+    @abstractmethod
+    def _actuation_refusal(self) -> str:
+        """Message on a plant that takes other commands than these; empty: it takes them."""
 
     @abstractmethod
     def _stop_executive(self) -> None:

@@ -73,11 +73,9 @@ class ControllerCommander(Commander):
     def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
 
-    def reconfigure(self, config: ControllerConfig) -> None:
-        """Use other gains, tolerances and times from now on."""
-        self.config = config
+    def _configure_executive(self) -> None:
         if self.executive is not None:
-            self.executive.configure(config)
+            self.executive.configure(self.config)
 
     def activate(self) -> None:
         """Answer states from now on, each with the references that have a publisher."""
@@ -151,6 +149,21 @@ class ControllerCommander(Commander):
         controller = build_controller(robot, self.config, self._own_law)
         self.executive.use_controller(controller, self._held)
 
+    def _change_rate(self, robot: SpaceRobot) -> None:
+        if self.executive is not None:
+            self._change_masses(robot)
+            self.executive.configure(self.config)
+            self._held_velocities = HeldVelocityReference(self.config.control_period)
+
+    @property
+    def _actuation_refusal(self) -> str:
+        if self.plant.actuation != "velocity":
+            return ""
+        return (
+            "The plant takes velocities, and this controller sends efforts and a wrench: start the "
+            "plant with actuation:=effort."
+        )
+
     def _stop_executive(self) -> None:
         assert self.executive is not None
         self.executive.reset()
@@ -214,7 +227,7 @@ class ControllerCommander(Commander):
 
     def answer(self) -> None:
         """Answer a state once, as soon as all its messages are there."""
-        if self.executive is not None and self.activity is _ACTIVE:
+        if self.executive is not None and self.activity is _ACTIVE and self._knows_rate:
             pairing = self.states.take_ready()
             if pairing is not None:
                 self._answer_state(pairing)

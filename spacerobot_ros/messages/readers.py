@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -495,6 +495,19 @@ class CommandReader:
             raise
         except CommandError as error:
             return self._reader.stamp_ns, error
+
+
+def actuation_of(message: Any) -> str:
+    """Return what a JointState commands, ``velocity`` or ``effort``; empty: joints at rest.
+
+    Nodes of this package fill both arrays, one of them with zeros.
+    """
+    moves, pushes = any(message.velocity), any(message.effort)
+    if moves == pushes:
+        moves, pushes = len(message.velocity) > 0, len(message.effort) > 0
+    if moves == pushes:
+        return ""
+    return "velocity" if moves else "effort"
 
 
 class _WrenchReader:

@@ -80,11 +80,11 @@ class CoordinatedControlNode(CommanderNode):
             self._inputs[topic] = self.take_raw(kind, topic, partial(self._on_reference, topic))
 
     def start_message(self) -> str:
-        """Return a log message with robot, law, rate and goal topic."""
+        """Return a log message with robot, law and goal topic."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
-            f"Controls {described_robot(self.commander.robot)} by '{config.law}' at "
-            f"{config.tick_rate:g} Hz; goals on '{topic}' in '{config.world_frame}'."
+            f"Controls {described_robot(self.commander.robot)} by '{config.law}'; goals on "
+            f"'{topic}' in '{config.world_frame}'."
         )
 
     def parameters_changed(self) -> None:

@@ -49,6 +49,7 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatus,
     ScheduleStart,
 )
+from spacerobot_ros.planning.execution.tracker import Setpoint
 from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
 from spacerobot_ros.times import stamp_bytes
 from spacerobot_ros.topics import goal_topic, path_topic, twist_topic
@@ -111,11 +112,11 @@ class PlannerNode(CommanderNode):
         self.create_service(Trigger, "~/statistics", self._on_statistics)
 
     def start_message(self) -> str:
-        """Return a log message with method, robot, rate and goal topic."""
+        """Return a log message with method, robot and goal topic."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
-            f"Plans by '{config.method}' for {described_robot(self.commander.robot)} at "
-            f"{config.tick_rate:g} Hz; goals on '{topic}' in '{config.world_frame}'."
+            f"Plans by '{config.method}' for {described_robot(self.commander.robot)}; goals on "
+            f"'{topic}' in '{config.world_frame}'."
         )
 
     def deactivate(self) -> None:
@@ -150,11 +151,9 @@ class PlannerNode(CommanderNode):
         """Plan for this robot from now on."""
         self._shape = None
         self.commander.use_robot(robot, MessageDecoder(robot.joint_names))
-        setpoint = self.commander.setpoint
         self._message = joint_template(robot.joint_names)
-        if robot.n:
-            self._message.feed("position", setpoint.position)
-            self._message.feed("velocity", setpoint.velocity)
+        self._setpoint: Setpoint | None = None
+        """The setpoint whose arrays the message has."""
 
     # -- inputs -------------------------------------------------------------------------------
 
@@ -233,6 +232,11 @@ class PlannerNode(CommanderNode):
     def send_command(self, stamp_ns: int) -> None:
         """Publish the setpoint as the answer to the state of this stamp."""
         if self._commands is not None:
+            setpoint = self.commander.setpoint
+            if setpoint is not self._setpoint and len(setpoint.position):
+                self._setpoint = setpoint
+                self._message.feed("position", setpoint.position)
+                self._message.feed("velocity", setpoint.velocity)
             self._commands.take(self._message.serialised(stamp_bytes(stamp_ns)))
 
     def publish_status(self, status: Status) -> None:
@@ -242,7 +246,7 @@ class PlannerNode(CommanderNode):
 
     def publish_start(self, start: ScheduleStart) -> None:
         """Publish a schedule, its path and its goal, in a thread if planning runs in a thread."""
-        if not self.config.plan_in_background:
+        if not self.commander.config.plan_in_background:
             self._publish_schedule(start)
             return
         if self._announcement is not None:

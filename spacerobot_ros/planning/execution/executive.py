@@ -301,7 +301,7 @@ class Executive:
         self._goal_file = goal_file or GoalFile("")
         self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
         self._tracker = TrajectoryTracker(robot, config)
-        self._max_gap_ns = round(max(_MAX_GAP, _MAX_GAP_PERIODS * config.control_period) * 1e9)
+        self._max_gap_ns = _max_gap_ns(config)
         self.phase = Phase.IDLE
         """The present phase; :meth:`_change_phase` alone changes it."""
         self.outputs: deque[Output] = deque()
@@ -532,8 +532,10 @@ class Executive:
         before."""
         self._plan_again("The plant was reset: the motion is planned again.")
 
-    def use_robot(self, robot: SpaceRobot, worker: PlanningWorker) -> None:
-        """Plan again for the present goal, if any: the robot has captured or released a body.
+    def use_robot(
+        self, robot: SpaceRobot, worker: PlanningWorker, config: PlannerConfig | None = None
+    ) -> None:
+        """Plan again for the present goal, if any: for another robot, or at another rate.
 
         Parameters
         ----------
@@ -541,12 +543,25 @@ class Executive:
             The robot with its present mass properties.
         worker
             Makes the plans from now on.
+        config
+            Configuration with the present rate of the plant; None: as it was.
         """
-        self._plan_again("The robot has another mass now: the motion is planned again.")
+        what = "The robot has another mass" if config is None else "The plant has another rate"
+        self._plan_again(f"{what} now: the motion is planned again.")
         self._worker.close()
         self._robot, self._worker = robot, worker
         self._average = StateAverage(robot, self.config.averaging, self.config.rest_tolerance)
-        self._tracker.use_robot(robot)
+        if config is None:
+            self._tracker.use_robot(robot)
+            return
+        self.config, self._tracker = config, TrajectoryTracker(robot, config)
+        self._max_gap_ns = _max_gap_ns(config)
+        self._followers.clear()
+
+    def plan_at_once(self) -> None:
+        """Make later plans while states wait for them: the plant is in lockstep."""
+        self.config = replace(self.config, plan_in_background=False)
+        self._worker.plans_in_background = False
 
     def use_obstacles(self, make_worker: Callable[[], PlanningWorker]) -> None:
         """Plan around other obstacles from now on.
@@ -1357,6 +1372,11 @@ class Executive:
             values["notes"] = schedule.notes
         goal = goal_values(aim)
         self.outputs.append(PlannerStatus(state, message, identified.goal_id, goal, **values))
+
+
+def _max_gap_ns(config: PlannerConfig) -> int:
+    """Return the longest time between two states that is no jump of time, ns."""
+    return round(max(_MAX_GAP, _MAX_GAP_PERIODS * config.control_period) * 1e9)
 
 
 def _plan_for(identified: IdentifiedGoal, planned: Planned) -> Planned | Refused:
