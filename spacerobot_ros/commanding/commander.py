@@ -57,6 +57,9 @@ _PROCESS_DELAY_TIME = 0.005
 _REPORT_PERIOD = 1.0
 """Shortest wall time between two warnings about ignored states, s."""
 
+_LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
+"""Time without a state after which states are waited for, wall s, and at least control periods."""
+
 _EQUAL_RATES = 0.05
 """Largest relative difference between two rates that count as one."""
 
@@ -234,7 +237,11 @@ class Commander(ABC):
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
         """Goals that were received before the robot's description."""
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
-        self._answer_time = clock()
+        self._activated = self._answer_time = clock()
+        self.refusal = ""
+        """Why the last joint states were refused, as a clause; empty: they were not."""
+        self._reported_missing = ""
+        """What the last status said is waited for, as a clause; empty: nothing."""
         self._ignored_reported, self._next_report = 0, 0.0
         self._fault_log_times: dict[str, float] = {}
         """Wall time of the last log line by kind of fault, s."""
@@ -294,6 +301,8 @@ class Commander(ABC):
         ParameterError
             The file of goals is refused.
         """
+        self._activated = self._answer_time = self._clock()
+        self._reported_missing = ""
         self._resume_goals(self._goal_file.load())
         self.activity = CommanderActivity.ACTIVE
         # A lockstep plant may already wait for an answer.
@@ -304,7 +313,10 @@ class Commander(ABC):
         if self.activity is not CommanderActivity.INACTIVE and self.executive is not None:
             self._stop_executive()
         self.activity, self._waiting_goals = CommanderActivity.INACTIVE, {}
-        self._fly_to.end_dropped_goals((), "Aborted: this node was deactivated.")
+        later = ""
+        if self.config.resume_file:
+            later = " A goal that came by topic is resumed when it is activated again."
+        self._fly_to.end_dropped_goals((), f"Aborted: this node was deactivated.{later}")
 
     # -- goals --------------------------------------------------------------------------------
 
@@ -335,6 +347,7 @@ class Commander(ABC):
             self._refuse_goal(str(error), goal_id)
             return None
         accepted = IdentifiedGoal(goal, goal_id)
+        self._follow_goal(key, goal_id)
         self._accept_goal(key, accepted)
         return accepted
 
@@ -403,8 +416,11 @@ class Commander(ABC):
             self._report_waiting_goal(goal, "The goal waits for a robot on robot_description.")
         else:
             self._submit_goal(key, goal)
-        if self._fly_to:
-            self._fly_to.end_dropped_goals(self._active_goal_ids())
+        self._fly_to.end_dropped_goals(self._active_goal_ids())
+
+    def _follow_goal(self, key: str, goal_id: str) -> None:
+        """Report the end of a goal that came by topic, whatever ends it."""
+        self._fly_to.begin(goal_id)
 
     def _refuse_goal(self, message: str, goal_id: str) -> None:
         self._publish_decision(self._make_status("refused", message, goal_id))
@@ -425,8 +441,7 @@ class Commander(ABC):
 
     def _publish_status(self, status: Status) -> None:
         # A replaced goal ends before its successor begins: the last status is of the present goal.
-        if self._fly_to:
-            self._fly_to.end_dropped_goals(self._active_goal_ids() | {status.goal_id})
+        self._fly_to.end_dropped_goals(self._active_goal_ids() | {status.goal_id})
         self.host.publish_status(status)
         self._fly_to.update(status)
         if status.state.decided and self.config.stop_when_decided and self.active:
@@ -543,6 +558,7 @@ class Commander(ABC):
         """
         stamps = self.stamps
         self._follow_rate()
+        self._report_missing()
         # A paused plant publishes no state that could contradict a jump.
         jump = None if self.plant.paused else stamps.accepted_jump()
         if jump is not None:
@@ -556,6 +572,38 @@ class Commander(ABC):
             self.host.log("warning", stamps.last_ignored)
             return stamps.last_ignored
         return ""
+
+    @property
+    def missing(self) -> str:
+        """What is waited for before states are answered, as a clause; empty: nothing."""
+        if self.robot is None:
+            return "a robot on 'robot_description'"
+        topics = {"joint_states": self.states.joints, "odom": self.states.odom}
+        absent = [f"'{topic}'" for topic, message in topics.items() if message is None]
+        refused = f", whose messages are refused: {self.refusal}" if self.refusal else ""
+        if absent:
+            return f"states on {' and '.join(absent)}{refused}"
+        silence = self._clock() - self._answer_time
+        longest = max(_LONGEST_SILENCE, _SILENT_PERIODS * self.config.control_period)
+        if silence > longest and not (self.plant.paused or self.plant.in_lockstep):
+            return f"states on 'joint_states'{refused}; the last one came {silence:.1f} s ago"
+        return ""
+
+    def _report_missing(self) -> None:
+        """Report in the status what is missing, and when it is there again."""
+        if not self.active or self._clock() - self._activated < _LONGEST_SILENCE:
+            return
+        missing = self.missing
+        if missing.split(";")[0] == self._reported_missing:
+            return
+        self._reported_missing = missing.split(";")[0]
+        if missing:
+            goal_id = self._pursued_goal_id
+            goes_on = " The goal is pursued when they come." if goal_id else ""
+            message = f"Waiting for {missing}.{goes_on}"
+            self._publish_status(self._make_status("waiting", message, goal_id))
+        else:
+            self._report_present_status()
 
     def _answer_last_state(self, joints: Stamped) -> None:
         """Answer only the last waiting state after this process stood still.
@@ -589,8 +637,10 @@ class Commander(ABC):
             if self._decoder is not None:
                 self._decoder.check_robot(joints)
         except CommandError as error:
+            self.refusal = str(error)
             self._log_fault("joints", f"joint_states: {error}.")
             return False
+        self.refusal = ""
         return True
 
     def _log_fault(self, kind: str, message: str) -> None:
@@ -682,6 +732,15 @@ class Commander(ABC):
     @abstractmethod
     def _change_rate(self, robot: SpaceRobot) -> None:
         """Have the executive command at the present rate of the configuration."""
+
+    @property
+    def _pursued_goal_id(self) -> str:
+        """Id of a goal that is pursued or waits; empty: none is."""
+        return next(iter(sorted(self._active_goal_ids())), "")
+
+    @abstractmethod
+    def _report_present_status(self) -> None:
+        """Publish the status of the goal again: states come again."""
 
     @property
     @abstractmethod

@@ -77,6 +77,10 @@ class ControllerCommander(Commander):
         if self.executive is not None:
             self.executive.configure(self.config)
 
+    def _follow_goal(self, key: str, goal_id: str) -> None:
+        # Goals of base and end-effector are pursued together, under the id of the later one.
+        pass
+
     def activate(self) -> None:
         """Answer states from now on, each with the references that have a publisher."""
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):

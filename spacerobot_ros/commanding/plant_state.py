@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from statistics import median
+from statistics import fmean, median
 from typing import Any, NamedTuple
 
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
@@ -112,8 +112,9 @@ class StampFilter:
             return SECOND / latest[-1]
         if len(steps) < _MEASURED_STEPS:
             return 0.0
-        # Sensors are read at whole rates, with some jitter; losses do not change the median.
-        measured = SECOND / median(steps)
+        # Sensors are read at whole rates, with some jitter; steps with losses are longer.
+        usual = median(steps)
+        measured = SECOND / fmean(step for step in steps if step <= _STEP_SLACK * usual)
         return float(round(measured)) or measured
 
     def accepts_joints(self, stamp_ns: int, joints: Any) -> bool:
@@ -160,6 +161,7 @@ class StampFilter:
         self._origin_wall = self._admission_wall
         if self._steps:
             self._steps.pop()
+        self._max_step_ns = _STEP_SLACK * self._steps[-1] if self._steps else math.inf
 
     def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:
         """Return set-aside odom (or None) and joints once their time is accepted.

@@ -26,7 +26,6 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.messages.readers import (
     WRENCH,
-    MessageDecoder,
     MessageTemplate,
     joint_template,
 )
@@ -94,7 +93,7 @@ class CoordinatedControlNode(CommanderNode):
     def use(self, robot: SpaceRobot) -> None:
         """Control this robot from now on."""
         commander = self.commander
-        commander.use_robot(robot, MessageDecoder(robot.joint_names))
+        commander.use_robot(robot, self.decoder_of(robot))
         self._joint_message = joint_template(robot.joint_names)
         if robot.n:
             self._joint_message.feed("effort", commander.effort)

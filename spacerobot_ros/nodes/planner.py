@@ -25,7 +25,7 @@ from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.trajectory_output import Outcome, TrajectoryEnd, TrajectoryOutput
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.messages.builders import path_message, trajectory_message
-from spacerobot_ros.messages.readers import MessageDecoder, joint_template
+from spacerobot_ros.messages.readers import joint_template
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.nodes.common.commander import CommanderNode
@@ -150,7 +150,7 @@ class PlannerNode(CommanderNode):
     def use(self, robot: SpaceRobot) -> None:
         """Plan for this robot from now on."""
         self._shape = None
-        self.commander.use_robot(robot, MessageDecoder(robot.joint_names))
+        self.commander.use_robot(robot, self.decoder_of(robot))
         self._message = joint_template(robot.joint_names)
         self._setpoint: Setpoint | None = None
         """The setpoint whose arrays the message has."""

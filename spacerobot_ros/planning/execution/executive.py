@@ -172,7 +172,7 @@ _TRANSITION_RULES: tuple[tuple[Iterable[Phase], Event, Iterable[Phase]], ...] = 
     ([Phase.TELEOPERATING], Event.PLANT_RESET, [Phase.IDLE, Phase.MEASURING]),
     (_MOTION_PHASES, Event.ABORTED, [Phase.BRAKING]),
     ((*_REST_PHASES, Phase.PLANNING), Event.ABORTED, [Phase.IDLE]),
-    (set(Phase) - {Phase.IDLE}, Event.PLANT_STOPPED, [Phase.IDLE]),
+    (set(Phase) - {Phase.IDLE}, Event.PLANT_STOPPED, [Phase.IDLE, Phase.MEASURING]),
     (Phase, Event.DEACTIVATED, [Phase.IDLE]),
 )
 TRANSITIONS = frozenset(
@@ -474,7 +474,8 @@ class Executive:
             had. None: it obeys nothing.
         rests_since_ns
             Stamp since which it rests then, ns. A goal goes on for which nothing was commanded
-            until then, and one whose plan has taken so long that no state was answered.
+            until then, and one whose plan has taken so long that no state was answered. A goal that
+            was to replace it is planned for from rest.
 
         Returns
         -------
@@ -485,14 +486,21 @@ class Executive:
             commanded_until_ns, rests_since_ns
         ):
             return False
-        self._goal_file.delete()
+        successor = None
+        if commanded_until_ns is not None:
+            self._drop_plan()
+            successor = self._new_goal
+        if successor is None:
+            self._goal_file.delete()
         if self.phase is Phase.IDLE:
             return False
-        has_goal, goal_id = self._latest_goal() is not None, self._latest_goal_id()
+        goal_id = self._latest_goal_id() if successor is None else self._pursued_id()
+        has_goal = bool(self._latest_goal() if successor is None else self._pursued_goal())
         self._tracker.stop()
         self._average.restart()
         self._forget_goals()
-        self._change_phase(Event.PLANT_STOPPED, Phase.IDLE)
+        self._new_goal = successor
+        self._change_phase(Event.PLANT_STOPPED, self._phase_at_rest())
         if has_goal:
             message = f"Aborted by the plant: {why}"
             self.outputs.append(PlannerStatus(PlannerState.ABORTED, message, goal_id=goal_id))
@@ -1307,6 +1315,10 @@ class Executive:
     def _tolerance_of(self, identified: IdentifiedGoal) -> Tolerance:
         """Return the largest errors with which a goal is reached."""
         return identified.tolerance or self.config.tolerance
+
+    def _pursued_id(self) -> str:
+        pursued = self._pursued_goal()
+        return "" if pursued is None else pursued.goal_id
 
     def _latest_goal_id(self) -> str:
         latest = self._latest_goal()
