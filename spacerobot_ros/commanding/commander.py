@@ -242,6 +242,8 @@ class Commander(ABC):
         """Why the last joint states were refused, as a clause; empty: they were not."""
         self._reported_missing = ""
         """What the last status said is waited for, as a clause; empty: nothing."""
+        self._last_status: Status | None = None
+        """The last status that did not say so."""
         self._ignored_reported, self._next_report = 0, 0.0
         self._fault_log_times: dict[str, float] = {}
         """Wall time of the last log line by kind of fault, s."""
@@ -443,6 +445,8 @@ class Commander(ABC):
         # A replaced goal ends before its successor begins: the last status is of the present goal.
         self._fly_to.end_dropped_goals(self._active_goal_ids() | {status.goal_id})
         self.host.publish_status(status)
+        if status.state.value != "waiting":
+            self._last_status = status
         self._fly_to.update(status)
         if status.state.decided and self.config.stop_when_decided and self.active:
             self.activity = CommanderActivity.DECIDED
@@ -738,9 +742,17 @@ class Commander(ABC):
         """Id of a goal that is pursued or waits; empty: none is."""
         return next(iter(sorted(self._active_goal_ids())), "")
 
-    @abstractmethod
     def _report_present_status(self) -> None:
         """Publish the status of the goal again: states come again."""
+        status = self._last_status
+        if status is None or status.goal_id != self._pursued_goal_id or status.state.decided:
+            status = self._make_status(*self._without_goal, "")
+        self._publish_status(status)
+
+    @property
+    @abstractmethod
+    def _without_goal(self) -> tuple[str, str]:
+        """State and message of a status without a goal."""
 
     @property
     @abstractmethod

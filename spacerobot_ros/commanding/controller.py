@@ -168,6 +168,10 @@ class ControllerCommander(Commander):
             "plant with actuation:=effort."
         )
 
+    @property
+    def _without_goal(self) -> tuple[str, str]:
+        return "holding", "Waiting for a goal; the robot holds its pose."
+
     def _stop_executive(self) -> None:
         assert self.executive is not None
         self.executive.reset()

@@ -209,11 +209,9 @@ class PlannerCommander(Commander):
         self.executive.use_robot(robot, worker, self.config)
         self._forward_outputs()
 
-    def _report_present_status(self) -> None:
-        status = self._status
-        if status is None or status.state.decided or status.goal_id != self._pursued_goal_id:
-            status = PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose.")
-        self._publish_status(status)
+    @property
+    def _without_goal(self) -> tuple[str, str]:
+        return "idle", "Waiting for a goal pose."
 
     @property
     def _actuation_refusal(self) -> str:
