@@ -527,7 +527,8 @@ class Commander(ABC):
     def receive_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take received joints: those of another time are set aside, and late ones skipped."""
         if self._clock() - self._answer_time > _PROCESS_DELAY_TIME:
-            self._answer_last_state(Stamped(stamp_ns, joints))
+            odoms, waiting = self.host.waiting_states()
+            self._answer_last_state([*odoms], [Stamped(stamp_ns, joints), *waiting])
         elif self._is_of_robot(joints) and self.stamps.accepts_joints(stamp_ns, joints):
             self.take_joints(stamp_ns, joints)
         if self._fly_to:
@@ -609,14 +610,22 @@ class Commander(ABC):
         else:
             self._report_present_status()
 
-    def _answer_last_state(self, joints: Stamped) -> None:
-        """Answer only the last waiting state after this process stood still.
+    def answer_latest(self) -> None:
+        """Answer the latest state that has come, after work for which states have waited."""
+        odoms, joints = (list(waiting) for waiting in self.host.waiting_states())
+        if joints:
+            self._answer_last_state(odoms, joints)
+        else:
+            self.answer()
+
+    def _answer_last_state(self, odoms: list[Stamped], states: list[Stamped]) -> None:
+        """Answer only the last of some states after this process stood still.
 
         An answer to one before it comes too late, and the motion of the joints before the first
         answer does not tell whether they obey it.
         """
-        waiting, others = self.host.waiting_states()
-        odoms, skipped = list(waiting), []
+        joints, *others = states
+        skipped = []
         for newer in others:
             ahead = newer.stamp_ns - joints.stamp_ns
             if (

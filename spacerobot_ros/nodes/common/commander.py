@@ -245,7 +245,7 @@ class CommanderNode(FlightNode):
         except SpaceRobotError as error:
             self.get_logger().error(f"robot_description: {error}")
             return
-        self.commander.answer()
+        self.commander.answer_latest()
 
     def _on_goal(self, key: str, message: PoseStamped) -> None:
         self.receive(key, message, lambda: self.read_goal(key, message))

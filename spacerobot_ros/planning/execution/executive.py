@@ -1036,6 +1036,8 @@ class Executive:
         reason = job.reason.value
         message = f"A plan is made: {reason}."
         self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
+        if job.reason is not PlanReason.SHRINKING_HORIZON:
+            self._add_status(PlannerState.PLANNING, message, job.identified, active)
         task = PlanningTask(
             request, braking=braking, rates_after_braking=rates, take_over=take_over
         )
