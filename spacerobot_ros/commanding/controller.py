@@ -99,6 +99,8 @@ class ControllerCommander(Commander):
             return False, "The controller is not active, or has no robot yet."
         if self.plant.refusal_of_goals:
             return False, self.plant.refusal_of_goals
+        if task is Task.APPROACH and self._target is None:
+            return False, "There is no target to approach: none is on 'target/robot_description'."
         self.executive.request(task)
         return True, f"The task '{task.value}' begins; controller/status tells its course."
 

@@ -34,6 +34,7 @@ from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.model.world import obstacles_from_topic, with_obstacles_around
+from spacerobot_ros.parameters import declared, known_values
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
@@ -526,9 +527,9 @@ def _read_statuses(bag: FlightBag, commander: str) -> list[tuple[int, Status]]:
 def _scenario_in_bag(bag: FlightBag) -> Scenario:
     """Return the scenario of a flight, as far as its bag holds it."""
     about = bag.metadata.get("scenario", {})
-    nodes = {
-        node: {name: _parse_json(text) for name, text in bag.metadata[f"parameters/{node}"].items()}
-        for node in CONFIGS
+    nodes: dict[str, dict[str, Any]] = {
+        node: _recorded_values(kind, bag.metadata[f"parameters/{node}"])
+        for node, kind in CONFIGS.items()
         if f"parameters/{node}" in bag.metadata
     }
     for node, parameter in _ABSENT_MEANS_ZERO:
@@ -578,6 +579,21 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
         overrides={},
         has_goal=goal is not None,
     )
+
+
+def _recorded_values(kind: type[Any], texts: Mapping[str, str]) -> dict[str, Any]:
+    """Return the recorded parameters of a node that this version can read.
+
+    Others belong to every node, to another version, or to a method of one's own that is not
+    imported here, whose name is none of the choices: they stop no report.
+    """
+    known = {parameter.name: parameter for parameter in declared(kind)}
+    values = known_values(kind, {name: _parse_json(text) for name, text in texts.items()})
+    return {
+        name: value
+        for name, value in values.items()
+        if not (isinstance(value, str) and known[name].excludes(value))
+    }
 
 
 def recorded_target(robot: RecordedRobot) -> str:
