@@ -535,6 +535,8 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
     for node, parameter in _ABSENT_MEANS_ZERO:
         if node in nodes:
             nodes[node].setdefault(parameter, 0.0)
+    if nodes.get("plant", {}).get("actuation", "auto") == "auto" and "plant" in nodes:
+        nodes["plant"]["actuation"] = recorded_actuation(bag.parts[0])
     target = recorded_target(bag.parts[0])
     if target and "plant" in nodes:
         nodes["plant"] |= target_parameters(target)
@@ -579,6 +581,19 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
         overrides={},
         has_goal=goal is not None,
     )
+
+
+def recorded_actuation(robot: RecordedRobot) -> str:
+    """Return what the commands of a robot in a bag carry: ``velocity``, ``effort``, or nothing.
+
+    The plant's status says so; bags without one have wrenches only beside efforts.
+    """
+    series = robot.get("plant/status")
+    for _, message in reversed(list(series.messages() if series is not None else ())):
+        actuation = read_status(message).values.get("actuation", "")
+        if actuation in ("velocity", "effort"):
+            return actuation
+    return "effort" if robot.get("base_wrench") else "velocity"
 
 
 def _recorded_values(kind: type[Any], texts: Mapping[str, str]) -> dict[str, Any]:

@@ -172,7 +172,8 @@ _TRANSITION_RULES: tuple[tuple[Iterable[Phase], Event, Iterable[Phase]], ...] = 
     ([Phase.TELEOPERATING], Event.PLANT_RESET, [Phase.IDLE, Phase.MEASURING]),
     (_MOTION_PHASES, Event.ABORTED, [Phase.BRAKING]),
     ((*_REST_PHASES, Phase.PLANNING), Event.ABORTED, [Phase.IDLE]),
-    (set(Phase) - {Phase.IDLE}, Event.PLANT_STOPPED, [Phase.IDLE, Phase.MEASURING]),
+    (set(Phase) - {Phase.IDLE}, Event.PLANT_STOPPED, [Phase.IDLE]),
+    ((Phase.MEASURING, Phase.PLANNING, *_MOTION_PHASES), Event.PLANT_STOPPED, [Phase.MEASURING]),
     (Phase, Event.DEACTIVATED, [Phase.IDLE]),
 )
 TRANSITIONS = frozenset(
@@ -1036,7 +1037,7 @@ class Executive:
         reason = job.reason.value
         message = f"A plan is made: {reason}."
         self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
-        if job.reason is not PlanReason.SHRINKING_HORIZON:
+        if job.reason.is_for_new_goal or not self._tracker.is_active:
             self._add_status(PlannerState.PLANNING, message, job.identified, active)
         task = PlanningTask(
             request, braking=braking, rates_after_braking=rates, take_over=take_over
