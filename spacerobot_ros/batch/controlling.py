@@ -148,8 +148,8 @@ class BatchController:
 
     def gains_argument(self, rows: Sequence[int]) -> Array:
         """Return the argument ``gains``, Kp over Kd, of flights: (flights, 2 m)."""
-        selection = self.law.outputs.selection
-        return np.array([np.concatenate(self._gains(row).diagonals(selection)) for row in rows])
+        each = (self.law.gain_arguments(self._gains(row)) for row in rows)
+        return np.array([np.concatenate(pair) for pair in each])
 
     def _gains(self, row: int) -> Gains:
         each = self.program.gains

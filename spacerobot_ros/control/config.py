@@ -56,7 +56,7 @@ class ControllerConfig(CommanderConfig):
     )
     end_effector_outputs: str = parameter("", "axes of the end-effector that are outputs")
     joint_outputs: str = parameter("", "joints that are outputs")
-    profile: str = parameter("step", "how references move to goals", choices=tuple(PROFILES))
+    profile: str = parameter("quintic", "how references move to goals", choices=tuple(PROFILES))
     motion: MotionLimits = group(MotionLimits())
     use_thrusters: bool = parameter(
         True,

@@ -214,7 +214,8 @@ def test_integral_gains_are_not_negative(ki: float) -> None:
 
 
 def test_a_new_goal_and_a_reset_begin_the_integral_anew() -> None:
-    config = ControllerConfig(gains=Gains.uniform(30.0, 60.0, 1.0), tick_rate=100.0, max_force=1e3)
+    gains = Gains.uniform(30.0, 60.0, 1.0)
+    config = ControllerConfig(profile="step", gains=gains, tick_rate=100.0, max_force=1e3)
     controller, state = build_controller(load("planar_manipulator"), config), planar_start()
     far = replace(pose(state.r_WB + np.array([0.02, 0.0, 0.0])), quaternion=state.quaternion_WB)
 
@@ -238,7 +239,8 @@ def test_a_new_goal_and_a_reset_begin_the_integral_anew() -> None:
 
 
 def test_saturated_thrusters_do_not_wind_the_integral_up() -> None:
-    config = ControllerConfig(gains=Gains.uniform(30.0, 60.0, 1.0), tick_rate=100.0, max_force=0.1)
+    gains = Gains.uniform(30.0, 60.0, 1.0)
+    config = ControllerConfig(profile="step", gains=gains, tick_rate=100.0, max_force=0.1)
     controller, state = build_controller(load("planar_manipulator"), config), planar_start()
     far = replace(pose(state.r_WB + np.array([0.5, 0.0, 0.0])), quaternion=state.quaternion_WB)
     controller.set_goals(0.0, state, base=far)
