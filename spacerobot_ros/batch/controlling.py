@@ -126,9 +126,11 @@ class BatchController:
         ``qdot`` (n,) are measured joint rates, ``bounds`` (m,) those of :meth:`begin_flight`.
         """
         controller, time = self.controller, self.time_of_tick(tick)
+        assert controller.reference_ends is not None
         found = monitor.decide(
             time,
             controller.reference_at_rest(time),
+            controller.reference_ends,
             controller.errors(),
             controller.joint_rate_limits.largest_rate_share(qdot),
             self.law.largest_error_share(bounds),
@@ -232,7 +234,13 @@ class BatchController:
             rate_share = ca.fmax(rate_share, ca.fabs(rate) * (1.0 / limit))
         monitor = GoalMonitor(0.0, *ca.vertsplit(memory))
         verdict = monitor.decide(
-            time, time >= profile[0], OutputErrors(**largest), rate_share, error_share, self._config
+            time,
+            time >= profile[0],
+            profile[0],
+            OutputErrors(**largest),
+            rate_share,
+            error_share,
+            self._config,
         )
         command = ca.vertcat(actuation[6:], actuation[:6])
         outputs = command, exact, measured, ca.vertcat(*astuple(monitor)[1:]), verdict

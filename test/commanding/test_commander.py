@@ -185,11 +185,11 @@ def test_goals_of_the_base_are_left_to_a_planner_whose_reference_a_law_of_joints
         return rig
 
     left = told(JOINT_REFERENCE)
-    assert left.host.states == []
+    assert left.host.states == ["waiting"]
     assert left.host.events == []
     assert left.host.lines[-1][1].startswith("The goal is left to the planner. The law 'computed_")
     for refused in (told(), told(JOINT_REFERENCE, action=True)):
-        assert refused.host.states == ["refused"]
+        assert refused.host.states == ["waiting", "refused"]
         assert_one_sentence(refused.host.statuses[0].message)
 
 
@@ -338,13 +338,16 @@ def test_a_pose_is_lost_only_after_odom_was_connected(controller: Rig) -> None:
     controller.host.publishers.clear()
     for tick in range(1, 5):
         controller.joints(tick)
-    assert controller.host.statuses == []
+    assert controller.host.states == ["waiting"]
+    controller.wall += 2.0
+    controller.commander.take_accepted_jump()
+    assert_one_sentence(controller.host.statuses[-1].message, "Waiting for states on odom.")
     controller.host.publishers.add("odom")
     for tick in range(5, 8):
         controller.joints(tick)
     # State 5 was answered a tick late, which nobody is sent; the later ones at once.
     assert controller.host.commands == [6, 7]
-    assert controller.host.states[-1] == "stopped"
+    assert (controller.host.states[-1], controller.host.statuses[-1].state.level) == ("waiting", 0)
 
 
 # -- goals ------------------------------------------------------------------------------------

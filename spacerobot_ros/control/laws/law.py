@@ -434,6 +434,28 @@ class ControlLaw(ABC):
         self._in["reference"][:] = packed
         return self._actuation(_NO_REFERENCE)
 
+    def slowest_decay(self) -> float:
+        """Return the rate (1/s) at which the slowest error decays, near the last state at rest."""
+        Kp, Kd = (np.diag(gains) for gains in self.gain_diagonals)
+        if self.gain_units != ACCELERATION_GAINS and not self._weighs:
+            J, q = self._out["J_z"], self.state.q
+            H = self.robot.inertia_matrix(q)[3:, 3:]
+            mobility = J[:, :3] @ J[:, :3].T / self.robot.total_mass
+            mobility += J[:, 3:] @ np.linalg.solve(H, J[:, 3:].T)
+            Kp, Kd = mobility @ Kp, mobility @ Kd
+        m = self.outputs.m
+        motion = np.block([[np.zeros((m, m)), np.eye(m)], [-Kp, -Kd]])
+        return float(-np.linalg.eigvals(motion).real.max())
+
+    @property
+    def singular_error_share(self) -> float:
+        """Share of the last error (its norm, SI) in directions that no actuator moves."""
+        error = self._out["error"]
+        U, singular_values, _ = np.linalg.svd(self._out["J_z"], full_matrices=False)
+        along = U[:, singular_values < self.singular_value_threshold].T @ error
+        size = float(np.linalg.norm(error))
+        return float(np.linalg.norm(along)) / size if size > 0 else 0.0
+
     def errors_under(self, state: ControlState, pull: Array) -> Array:
         """Return the errors (m,) whose ``Kp e`` is a pull (m,), at rest in the shape of a state."""
         kp, given = self.gain_diagonals[0], self._in["kp"]
