@@ -82,11 +82,14 @@ class ControllerCommander(Commander):
         """Topics of references that are silent: no state waits for them."""
         self._missed_since: dict[str, int] = {}
         """Stamp of the first state without its reference by topic, ns."""
-        self._waited, self._looked = 0.0, clock()
-        """Wall time for which the present state has waited for references, and that of the last
-        look at it, s."""
+        self._waited: dict[str, float] = {}
+        """Wall time for which states have waited since the last message by topic, s."""
+        self._looked = clock()
+        """Wall time of the last look at it, s."""
         self._answered, self._activated_at, self._waiting_for = False, 0.0, ""
         """Whether a state was answered since the activation; the time of that; what was said."""
+        self._came: set[str] = set()
+        """Topics of states with messages since the activation, until a state is answered."""
         self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
         self._measured: ControlState | None = None
@@ -112,6 +115,8 @@ class ControllerCommander(Commander):
             self.states.require(topic, required=self.host.has_publisher(topic))
         self._silent.clear()
         self._missed_since.clear()
+        self._waited.clear()
+        self._came.clear()
         self._answered, self._waiting_for, self._activated_at = False, "", self._clock()
         super().activate()
         self._report_waiting()
@@ -149,8 +154,8 @@ class ControllerCommander(Commander):
     def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Take a reference, and answer its state if complete."""
         self.states.put_required(topic, stamp_ns, message)
-        if self._missed_since:
-            self._missed_since.pop(topic, None)
+        self._missed_since.pop(topic, None)
+        self._waited.pop(topic, None)
         if topic in self._silent:
             self._silent.discard(topic)
             self.host.log("info", f"'{topic}' is not silent any more: it is followed again.")
@@ -158,6 +163,8 @@ class ControllerCommander(Commander):
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
         """Take odom of the present time, after answering a state whose reference never came."""
+        if not self._answered:
+            self._came.add("odom")
         missing = self.states.missing
         if missing and self.activity is _ACTIVE and self.executive is not None:
             pairing = self.states.take_overdue()
@@ -184,17 +191,16 @@ class ControllerCommander(Commander):
 
     def _watch_waiting_state(self) -> None:
         """Do without references for which time stands still for their timeout of wall time."""
-        now, missing = self._clock(), self.states.missing
-        elapsed, self._looked = now - self._looked, now
-        if not missing or self.executive is None:
-            self._waited = 0.0
-            return
-        # A planner that plans for long answers afterwards, unless it is killed meanwhile.
-        if not (self._partner_is_busy() and any(map(self.host.has_publisher, missing))):
-            self._waited += min(elapsed, _LONGEST_CHECK_PERIOD)
-        if self.config.reference_timeout and self._waited >= self.config.reference_timeout:
-            for topic in missing:
+        now, timeout = self._clock(), self.config.reference_timeout
+        elapsed, self._looked = min(now - self._looked, _LONGEST_CHECK_PERIOD), now
+        missing = () if self.executive is None else self.states.missing
+        for topic in missing:
+            # A planner that plans for long answers afterwards, unless it is killed meanwhile.
+            if not (self._partner_is_busy() and self.host.has_publisher(topic)):
+                self._waited[topic] = self._waited.get(topic, 0.0) + elapsed
+            if timeout and self._waited.get(topic, 0.0) >= timeout:
                 self._do_without(topic)
+        if missing:
             self.answer()
 
     def _do_without(self, topic: str) -> None:
@@ -203,8 +209,8 @@ class ControllerCommander(Commander):
         followed = self.states.latest(topic) is not None
         self.states.require(topic, required=False)
         self._missed_since.pop(topic, None)
+        self._waited.pop(topic, None)
         self._silent.add(topic)
-        self._waited = 0.0
         if followed:
             self.executive.reference_ended(Reference())
         self.host.log(
@@ -219,8 +225,7 @@ class ControllerCommander(Commander):
             topics = ["robot_description"]
             message = "Waiting for the robot on robot_description."
         else:
-            given = {"odom": self.states.odom, "joint_states": self.states.joints}
-            topics = [topic for topic, message in given.items() if message is None]
+            topics = [topic for topic in ("odom", "joint_states") if topic not in self._came]
             if len(topics) == 1 and not self._has_waited:
                 return  # The other one is on its way.
             if not topics:
@@ -245,6 +250,8 @@ class ControllerCommander(Commander):
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take joints of the present time, after answering a state whose odom never came."""
+        if not self._answered:
+            self._came.add("joint_states")
         overdue = None
         if self.active and self.executive is not None and not self._waits_for_first_pose():
             overdue = self.states.take_overdue()

@@ -16,6 +16,9 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 _SHORTEST_WINDOW, _LONGEST_WINDOW = 2.0, 10.0
 """Shortest and longest time over which errors are compared, s."""
 
+_LIMITED_WINDOW = 5.0
+"""The same while commands are limited, which makes loops slower, s."""
+
 _LEAST_WINDOW_PERIODS = 20
 """Shortest such time in control periods."""
 
@@ -43,7 +46,7 @@ class StallMonitor:
     """Compares the largest error, as a share of its tolerance, over successive times.
 
     Such a time is as long as the slowest error of the closed loop takes to decay to a third
-    (:meth:`.ControlLaw.slowest_decay`), within 2 to 10 s; 10 s while commands are limited. The
+    (:meth:`.ControlLaw.slowest_decay`), within 2 to 10 s; 5 s while commands are limited. The
     robot is stalled if the largest
     error shrinks from one time to the next by less than 2 %, and by less than before:
 
@@ -95,7 +98,7 @@ class StallMonitor:
     def _begin(
         self, time: float, controller: CoordinatedController, config: ControllerConfig
     ) -> None:
-        rate = 0.0 if self._is_limited else controller.law.slowest_decay()
+        rate = 1 / _LIMITED_WINDOW if self._is_limited else controller.law.slowest_decay()
         shortest = max(_SHORTEST_WINDOW, _LEAST_WINDOW_PERIODS * config.control_period)
         self._window = max(1 / max(rate, 1 / _LONGEST_WINDOW), shortest)
         self._ends = time + self._window
