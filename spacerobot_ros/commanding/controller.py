@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from operator import is_not
 from typing import Any
@@ -40,9 +40,6 @@ TARGET_ODOMETRY = "target/odom"
 _LONGEST_CHECK_PERIOD = 0.2
 """Longest wall time that one look at waiting states counts for, s: this process may have slept."""
 
-_DISCOVERY_TIME = 1.0
-"""Wall time after the activation when messages of connected publishers have come, s."""
-
 # Constants save the slow look-up of enum members for every state.
 _ACTIVE = CommanderActivity.ACTIVE
 _WHOLE = Pairing.WHOLE
@@ -78,6 +75,8 @@ class ControllerCommander(Commander):
     ) -> None:
         super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
         self._own_law, self._partner_is_busy = own_law, partner_is_busy
+        self._ids_by_key: dict[str, str] = {}
+        """Ids of the last goals that came by topic, by the part of the robot that they are for."""
         self._silent: set[str] = set()
         """Topics of references that are silent: no state waits for them."""
         self._missed_since: dict[str, int] = {}
@@ -86,10 +85,6 @@ class ControllerCommander(Commander):
         """Wall time for which states have waited since the last message by topic, s."""
         self._looked = clock()
         """Wall time of the last look at it, s."""
-        self._answered, self._activated_at, self._waiting_for = False, 0.0, ""
-        """Whether a state was answered since the activation; the time of that; what was said."""
-        self._came: set[str] = set()
-        """Topics of states with messages since the activation, until a state is answered."""
         self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
         self._measured: ControlState | None = None
@@ -108,7 +103,8 @@ class ControllerCommander(Commander):
             self.executive.configure(self.config)
 
     def _follow_goal(self, key: str, goal_id: str) -> None:
-        # Goals of base and end-effector are pursued together, under the id of the later one.
+        # Goals of base and end-effector are pursued together, under the id of the later one: a
+        # goal is replaced by one for the same part alone.
         pass
 
     def activate(self) -> None:
@@ -118,10 +114,7 @@ class ControllerCommander(Commander):
         self._silent.clear()
         self._missed_since.clear()
         self._waited.clear()
-        self._came.clear()
-        self._answered, self._waiting_for, self._activated_at = False, "", self._clock()
         super().activate()
-        self._report_waiting()
 
     def dump_momentum(self) -> tuple[bool, str]:
         """Dump the momentum of the reaction wheels; return whether it is done, and a sentence."""
@@ -167,8 +160,6 @@ class ControllerCommander(Commander):
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
         """Take odom of the present time, after answering a state whose reference never came."""
-        if not self._answered:
-            self._came.add("odom")
         missing = self.states.missing
         if missing and self.activity is _ACTIVE and self.executive is not None:
             pairing = self.states.take_overdue()
@@ -182,7 +173,6 @@ class ControllerCommander(Commander):
         warning = super().take_accepted_jump()
         if self.activity is _ACTIVE:
             self._watch_waiting_state()
-            self._report_waiting()
         return warning
 
     def _watch_missed(self, missing: tuple[str, ...]) -> None:
@@ -221,31 +211,6 @@ class ControllerCommander(Commander):
             "warning", f"'{topic}' is silent: the controller goes on without until it comes again."
         )
 
-    def _report_waiting(self) -> None:
-        """Report what is missing before a first state can be answered."""
-        if self._answered:
-            return
-        if self.executive is None:
-            topics = ["robot_description"]
-            message = "Waiting for the robot on robot_description."
-        else:
-            topics = [topic for topic in ("odom", "joint_states") if topic not in self._came]
-            if len(topics) == 1 and not self._has_waited:
-                return  # The other one is on its way.
-            if not topics:
-                topics = list(self.states.missing)
-            if not topics:
-                return
-            message = f"Waiting for states on {' and '.join(topics)}."
-        if message != self._waiting_for:
-            self._waiting_for = message
-            self._publish_status(ControllerStatus(ControllerState.WAITING, message))
-
-    @property
-    def _has_waited(self) -> bool:
-        """Whether messages of connected publishers would have come by now."""
-        return self._clock() - self._activated_at > _DISCOVERY_TIME
-
     def _publish_status(self, status: Status) -> None:
         if self._silent and status.state is not ControllerState.REFUSED:
             silent = " and ".join(sorted(self._silent))
@@ -254,8 +219,6 @@ class ControllerCommander(Commander):
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take joints of the present time, after answering a state whose odom never came."""
-        if not self._answered:
-            self._came.add("joint_states")
         overdue = None
         if self.active and self.executive is not None and not self._waits_for_first_pose():
             overdue = self.states.take_overdue()
@@ -318,13 +281,22 @@ class ControllerCommander(Commander):
 
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None
+        pursued = self.executive.unfinished_goals
         try:
             self.executive.submit(key, goal)
+            self._report_replaced(key, goal, pursued)
         except PlanningError as error:
             if self._leaves_to_planner(key, goal):
                 self.host.log("info", f"The goal is left to the planner. {error}")
             else:
                 self._refuse_goal(str(error), goal.goal_id)
+
+    def _report_replaced(self, key: str, goal: IdentifiedGoal, pursued: Collection[str]) -> None:
+        """Report the end of a goal by topic that a later one for the same part replaces."""
+        earlier = self._ids_by_key.get(key, "")
+        self._ids_by_key[key] = goal.goal_id if goal.resumes else ""
+        if earlier in pursued and earlier not in self._ids_by_key.values():
+            self._report_aborted(earlier, f"Aborted: replaced by goal {goal.goal_id}.")
 
     def _leaves_to_planner(self, key: str, goal: IdentifiedGoal) -> bool:
         """Whether a goal that was sent to all commanders is for the planner whose reference the law
@@ -377,7 +349,6 @@ class ControllerCommander(Commander):
         executive, decoder, states = self.executive, self._decoder, self.states
         assert executive is not None
         assert decoder is not None
-        self._answered = True
         self._pose_has_come = self._pose_has_come or pairing is _WHOLE
         try:
             stamp = decoder.decode_joints(states.joints)

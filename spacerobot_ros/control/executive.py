@@ -670,7 +670,7 @@ class ControlExecutive:
     def _message(self, state: ControllerState) -> str:
         match state:
             case ControllerState.WAITING:
-                return "Waiting for states on odom."
+                return "Waiting for states on 'odom'."
             case ControllerState.HOLDING:
                 away = self.controller.distance_from_reference()
                 if self._guided:

@@ -348,7 +348,7 @@ def test_a_pose_is_lost_only_after_odom_was_connected(controller: Rig) -> None:
     assert controller.host.states == ["waiting"]
     controller.wall += 2.0
     controller.commander.take_accepted_jump()
-    assert_one_sentence(controller.host.statuses[-1].message, "Waiting for states on odom.")
+    assert_one_sentence(controller.host.statuses[-1].message, "Waiting for states on 'odom'.")
     controller.host.publishers.add("odom")
     for tick in range(5, 8):
         controller.joints(tick)
@@ -368,19 +368,23 @@ def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
         return str(rig.host.statuses[-1].message)
 
     rig.commander.activate()
-    assert rig.host.statuses[-1].message == "Waiting for the robot on robot_description."
+    assert rig.host.statuses[-1].message == "Waiting for a robot on 'robot_description'."
     rig.use(arm)
-    assert said() == "Waiting for states on odom and joint_states."
+    assert said() == "Waiting for states on 'joint_states' and 'odom'."
     count = len(rig.host.statuses)
-    assert said() == "Waiting for states on odom and joint_states."
+    assert said() == "Waiting for states on 'joint_states' and 'odom'."
     assert len(rig.host.statuses) == count, "it is said once"
     rig.odom(1)
-    assert said() == "Waiting for states on joint_states."
+    assert said() == "Waiting for states on 'joint_states'."
     rig.joints(1)
     assert rig.host.states[-1] == "holding"
     rig.commander.deactivate()
     rig.commander.activate()
-    assert rig.host.statuses[-1].message == "Waiting for states on odom and joint_states."
+    assert rig.host.states[-1] == "holding"
+    for _ in range(2):
+        rig.wall += 1.0
+        rig.commander.take_accepted_jump()
+    assert rig.host.statuses[-1].message.startswith("Waiting for states on 'joint_states'; the la")
     rig.state(2)
     assert rig.host.states[-1] == "holding"
 
@@ -577,7 +581,7 @@ def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
     GoalFile(str(path)).save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "9.000000000")})
     rig = Rig(PlannerCommander, config(PlannerConfig, resume_file=str(path), **METHOD), robot.n)
     rig.commander.activate()
-    assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("planning", "9.000000000")
+    assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("waiting", "9.000000000")
     rig.commander.on_plant_silent("Node '/plant' is silent.")
     assert_one_sentence(rig.host.statuses[-1].message, "Aborted", "silent")
     assert not path.exists()

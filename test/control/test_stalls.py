@@ -137,7 +137,7 @@ def test_before_a_first_measurement_a_controller_waits() -> None:
     loop = ExecutiveLoop()
     loop.answer(measured=False)
     assert (loop.state, loop.status.state.level) == ("waiting", 0)
-    assert_one_sentence(loop.status.message, "Waiting for states on odom")
+    assert_one_sentence(loop.status.message, "Waiting for states on 'odom'")
     loop.answer()
     assert loop.state == "holding"
     assert_one_sentence(loop.status.message, "Waiting for a goal; holding, 0 m")
