@@ -298,6 +298,7 @@ def test_a_state_without_its_odom_is_answered_when_the_next_comes(
         active=active,
         states=SimpleNamespace(take_overdue=lambda: overdue),
         _waits_for_first_pose=lambda: waits,
+        _answered=True,
     )
     made._answer_state = lambda pairing, send: made.done.append((pairing, send))
     monkeypatch.setattr(controller, "super", lambda: Kept(made.done), raising=False)
