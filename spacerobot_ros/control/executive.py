@@ -317,16 +317,17 @@ class ControlExecutive:
     def reference_ended(self, remaining: Reference) -> None:
         """Go on with the references that remain: to a goal anew, else hold the measured pose."""
         self.controller.follow(remaining)
-        if self._goal_state is ControllerState.TRACKING:
-            self._begin_anew = True
-        else:
-            self._hold_here = True
+        self._begin_anew_or_hold()
 
     def plant_reset(self) -> None:
         """Begin the goal anew at the next measured state; without a goal, hold its pose."""
         self.servicing.end()
         if self._goal_state is ControllerState.TRACKING and self._after_tasks:
             self._pending = {**self._after_tasks, **self._pending}
+        self._begin_anew_or_hold()
+
+    def _begin_anew_or_hold(self) -> None:
+        """Begin the goal anew at the next measured state; without a goal, hold its pose."""
         if self._goal_state is ControllerState.TRACKING:
             self._begin_anew = True
         else:

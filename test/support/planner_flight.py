@@ -103,8 +103,9 @@ class Flight:
 
     @property
     def states(self) -> list[str]:
-        """The states that the planner has been in, as published."""
-        return [values_of(s)["state"] for s in self.probe.messages["planner/status"]]
+        """The states that were published, but for those of waiting and planning."""
+        found = [values_of(s)["state"] for s in self.probe.messages["planner/status"]]
+        return [state for state in found if state not in ("waiting", "planning")]
 
     def wait(self, *states: str) -> DiagnosticStatus:
         """Wait until the planner's latest state is one of these."""
