@@ -186,7 +186,7 @@ def test_the_tolerance_is_a_fiftieth_of_a_small_turn(
     monkeypatch.setattr(own_robot, "first_turn", lambda robot, shape, axes: turn)
     robot: Any = SimpleNamespace(
         lower=np.array([-1.0, 0.0]), upper=np.array([1.0, 1.0]), n=2, joint_names=["a", "b"],
-        description=SimpleNamespace(name="mine"),
+        description=SimpleNamespace(name="mine", size=1.0),
     )  # fmt: skip
     problem = first_problem("first", robot, Path("mine.urdf"))
     assert problem.config.attitude_tolerance == pytest.approx(
