@@ -241,7 +241,7 @@ def test_states_are_answered_at_rest_until_the_plan_is_there() -> None:
     loop = held()
     loop.propose_goal(NEAR)
     loop.tick(40)
-    assert not loop.statuses
+    assert not loop.states
     assert not any(loop.speeds)
     loop.held.release()
     loop.until(PlannerState.REACHED)
