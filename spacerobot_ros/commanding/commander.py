@@ -61,6 +61,9 @@ _REPORT_PERIOD = 1.0
 _LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
 """Time without a state after which states are waited for, wall s, and at least control periods."""
 
+_SUSPENSION_TIME = 0.5
+"""Wall time between two looks beyond which this process itself stood still, s."""
+
 _EQUAL_RATES = 0.05
 """Largest relative difference between two rates that count as one."""
 
@@ -238,7 +241,8 @@ class Commander(ABC):
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
         """Goals that were received before the robot's description."""
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
-        self._activated = self._answer_time = clock()
+        self._activated = self._answer_time = self._heard = self._checked = clock()
+        """Wall times of the activation, the last answer, the last state and the last look, s."""
         self.refusal = ""
         """Why the last joint states were refused, as a clause; empty: they were not."""
         self._reported_missing = ""
@@ -306,7 +310,7 @@ class Commander(ABC):
         ParameterError
             The file of goals is refused.
         """
-        self._activated = self._answer_time = self._clock()
+        self._activated = self._answer_time = self._heard = self._checked = self._clock()
         self._reported_missing = ""
         self._resume_goals(self._goal_file.load())
         self.activity = CommanderActivity.ACTIVE
@@ -536,7 +540,7 @@ class Commander(ABC):
             self.take_joints(stamp_ns, joints)
         if self._fly_to:
             self._watch_fly_to()
-        self._answer_time = self._clock()
+        self._answer_time = self._heard = self._clock()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
         """Take an odom of the present time, and answer its state if complete."""
@@ -593,7 +597,7 @@ class Commander(ABC):
         refused = f", whose messages are refused: {self.refusal}" if self.refusal else ""
         if absent:
             return f"states on {' and '.join(absent)}{refused}"
-        silence = self._clock() - self._answer_time
+        silence = self._clock() - self._heard
         longest = max(_LONGEST_SILENCE, _SILENT_PERIODS * self.config.control_period)
         if silence > longest and not (self.plant.paused or self.plant.in_lockstep):
             return f"states on 'joint_states'{refused}; the last one came {silence:.1f} s ago"
@@ -601,6 +605,10 @@ class Commander(ABC):
 
     def _report_missing(self) -> None:
         """Report in the status what is missing, and when it is there again."""
+        now = self._clock()
+        if now - self._checked > _SUSPENSION_TIME:
+            self._heard += now - self._checked  # This process itself stood still.
+        self._checked = now
         missing = self.missing
         what = missing.partition(";")[0]
         if not self.active or what == self._reported_missing:

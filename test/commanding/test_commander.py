@@ -381,8 +381,11 @@ def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
     rig.commander.deactivate()
     rig.commander.activate()
     assert rig.host.states[-1] == "holding"
-    for _ in range(2):
-        rig.wall += 1.0
+    rig.wall += 5.0
+    rig.commander.take_accepted_jump()
+    assert rig.host.states[-1] == "holding", "this process itself may have stood still"
+    for _ in range(8):
+        rig.wall += 0.3
         rig.commander.take_accepted_jump()
     assert rig.host.statuses[-1].message.startswith("Waiting for states on 'joint_states'; the la")
     rig.state(2)
