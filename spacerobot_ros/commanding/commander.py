@@ -293,7 +293,7 @@ class Commander(ABC):
             )
         if self.robot is not None:
             self._change_rate(self.robot)
-        self.answer()
+        self.answer_latest()
 
     def drop_robot(self, why: str) -> None:
         """Give up the goals and the robot; later goals wait for another robot."""
