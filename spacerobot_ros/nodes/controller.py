@@ -84,7 +84,8 @@ class CoordinatedControlNode(CommanderNode):
         self.take_raw(Odometry, TARGET_ODOMETRY, self._on_target)
         self.subscribe_to_goals("goal_pose")
         self.subscribe_to_goals("end_effector/goal_pose", END_EFFECTOR)
-        self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
+        if self.config.watchdog_timeout:
+            self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
             self._inputs[topic] = self.take_raw(kind, topic, partial(self._on_reference, topic))
 
