@@ -222,7 +222,6 @@ class ControllerCommander(Commander):
         if self._answered:
             return
         if self.executive is None:
-            topics = ["robot_description"]
             message = "Waiting for the robot on robot_description."
         else:
             topics = [topic for topic in ("odom", "joint_states") if topic not in self._came]
@@ -233,6 +232,9 @@ class ControllerCommander(Commander):
             if not topics:
                 return
             message = f"Waiting for states on {' and '.join(topics)}."
+            unheard = [topic for topic in topics if not self.host.has_publisher(topic)]
+            if unheard and self._has_waited:
+                message = f"{message[:-1]}; nobody publishes {' and '.join(unheard)}."
         if message != self._waiting_for:
             self._waiting_for = message
             self._publish_status(ControllerStatus(ControllerState.WAITING, message))

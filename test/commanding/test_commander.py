@@ -341,7 +341,8 @@ def test_a_pose_is_lost_only_after_odom_was_connected(controller: Rig) -> None:
     assert controller.host.states == ["waiting"]
     controller.wall += 2.0
     controller.commander.take_accepted_jump()
-    assert_one_sentence(controller.host.statuses[-1].message, "Waiting for states on odom.")
+    message = "Waiting for states on odom; nobody publishes odom."
+    assert controller.host.statuses[-1].message == message
     controller.host.publishers.add("odom")
     for tick in range(5, 8):
         controller.joints(tick)
@@ -363,10 +364,16 @@ def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
     rig.commander.activate()
     assert rig.host.statuses[-1].message == "Waiting for the robot on robot_description."
     rig.use(arm)
+    rig.host.publishers |= {"joint_states"}
     assert said() == "Waiting for states on odom and joint_states."
     count = len(rig.host.statuses)
     assert said() == "Waiting for states on odom and joint_states."
     assert len(rig.host.statuses) == count, "it is said once"
+    rig.host.publishers -= {"odom", "joint_states"}
+    nobody = "Waiting for states on odom and joint_states; nobody publishes odom and joint_states."
+    assert said() == nobody
+    rig.host.publishers |= {"joint_states"}
+    assert said() == "Waiting for states on odom and joint_states; nobody publishes odom."
     rig.odom(1)
     assert said() == "Waiting for states on joint_states."
     rig.joints(1)
