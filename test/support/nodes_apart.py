@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 START = 120.0
 """Wall s in which a process is up, or has ended, on a machine with other things to do."""
 
-FLIGHT = 40.0
+FLIGHT = 180.0
 """Wall s in which a goal is decided."""
 
 STATUS_OF = {
