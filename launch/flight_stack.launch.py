@@ -90,7 +90,7 @@ def parameters(
         "use_sim_time": is_true(chosen["use_sim_time"]),
         "autostart": is_true(chosen["autostart"]) and section.get("autostart", True),
     }
-    # In real time states are answered while the planner plans, and viewers want to see something.
+    # In real time viewers want to see something.
     live = sections.get("plant", {}).get("time_mode", "realtime") == "realtime"
     if name == "recorder":
         if chosen["bag"]:
@@ -102,8 +102,6 @@ def parameters(
     if chosen["robot"]:
         robot = robot_file(chosen["robot"])  # Refused here, with one sentence.
         given["robot"] = str(robot.resolve())
-    if name == "planner":
-        given["plan_in_background"] = section.get("plan_in_background", live)
     return given
 
 

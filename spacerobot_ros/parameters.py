@@ -23,6 +23,19 @@ Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 """Type of a parameter's value."""
 
 C = TypeVar("C")
+V = TypeVar("V")
+
+_OF_EVERY_NODE = ("autostart", "start_type_description_service", "use_sim_time")
+_GROUP_OF_EVERY_NODE = "qos_overrides."
+
+
+def is_of_every_node(name: str) -> bool:
+    """Whether a parameter belongs to every node, besides those of the node's configuration.
+
+    rclpy declares them, as `ros2 param dump` and the parameters in a bag show; ``autostart`` is
+    this package's. They say nothing about a flight.
+    """
+    return name in _OF_EVERY_NODE or name.startswith(_GROUP_OF_EVERY_NODE)
 
 
 def as_numbers(
@@ -109,10 +122,14 @@ class Parameter:
         if isinstance(default, str):
             if not isinstance(value, str):
                 raise self._refusal(value, "a text")
-            if self.choices and value not in self.choices:
+            if self.excludes(value):
                 raise self._refusal(value, f"one of {', '.join(self.choices)}")
             return value
         return self._check_lines(value) if self.texts else self._check_numbers(value)
+
+    def excludes(self, text: str) -> bool:
+        """Whether a text is none of the choices, where there are any."""
+        return bool(self.choices) and text not in self.choices
 
     def _check_number(self, value: Any, whole: bool) -> int | float:
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
@@ -264,6 +281,12 @@ def reconfigured(config: C, values: Mapping[str, Any]) -> C:
 def values_of(config: Any) -> dict[str, Value]:
     """Return the value of every parameter of a configuration by full name."""
     return {name: value for name, _, value in _parameters_with_values(config)}
+
+
+def known_values(kind: type[Any], values: Mapping[str, V]) -> dict[str, V]:
+    """Return the values whose names are parameters of a configuration."""
+    known = {parameter.name for parameter in declared(kind)}
+    return {name: value for name, value in values.items() if name in known}
 
 
 def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:

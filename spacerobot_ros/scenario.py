@@ -25,6 +25,8 @@ from spacerobot_ros.parameters import (
     Value,
     configured,
     declared,
+    is_of_every_node,
+    known_values,
     reconfigured,
     replaced,
     values_of,
@@ -58,9 +60,6 @@ NODES = tuple(CONFIGS)
 
 COMMANDERS = ("planner", "coordinated_control")
 """Nodes that accept goals; a scenario runs those that have a section in its file."""
-
-_PARAMETERS_OF_EVERY_NODE = ("autostart", "use_sim_time")
-"""Parameters that every node has besides those of its configuration."""
 
 _GOAL_KEYS = ("goal", "end_effector_goal")
 _SCENARIO_KEYS = (
@@ -153,13 +152,25 @@ class Scenario:
         """
         if node not in self._configs:
             self._configs[node] = self._make_config(node)
-        return self._configs[node]
+        return self._following_plant(node, self._configs[node])
+
+    def _following_plant(self, node: str, config: Any) -> Any:
+        """Return a configuration with what nodes learn of each other instead of "automatic"."""
+        changes: dict[str, Any] = {}
+        if node == "plant" and config.actuation == "auto":
+            efforts = "coordinated_control" in self.commanders
+            return config.decided("effort" if efforts else "")
+        if node in COMMANDERS and not config.tick_rate:
+            changes["tick_rate"] = self.plant.tick_rate
+        if node == "planner" and config.plan_in_background and self.lockstep:
+            changes["plan_in_background"] = False
+        return replaced(config, **changes) if changes else config
 
     def _make_config(self, node: str) -> Any:
         known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
         before, values = self._changes.get(node, (None, self._parameters_as_written(node)))
         for name, value in values.items():
-            if name not in (*known, *_PARAMETERS_OF_EVERY_NODE):
+            if name not in known and not is_of_every_node(name):
                 raise ParameterError(f"Node '{node}' has no parameter '{name}'.")
             if isinstance(value, str) and name in known:
                 is_number = isinstance(known[name].default, (int, float))
@@ -313,11 +324,9 @@ class Scenario:
         return replaced(self, _configs=configs, _changes=since, **changes)
 
     def in_real_time(self, factor: float) -> Scenario:
-        """Return the scenario in real time times a factor, with planning in the background."""
+        """Return the scenario in real time times a factor."""
         pace = {"time_mode": "realtime", "real_time_factor": factor}
         scenario = self.with_overrides("plant", pace)
-        if "planner" in self.commanders:
-            scenario = scenario.with_overrides("planner", {"plan_in_background": True})
         # Viewers follow wall time, which limits the period of recorded transforms; the plant limits
         # the periods of its own topics.
         shown = {"diagnostics_period": 1.0}
@@ -423,7 +432,7 @@ class Scenario:
         return heard.with_overrides("plant", {"end_effectors": [*published, *more]})
 
     def require_goal(self) -> None:
-        """Raise an error if the scenario has no goal, such as one made from a robot file.
+        """Raise an error if the scenario has no goal, such as one of a robot file or of a dump.
 
         Raises
         ------
@@ -432,8 +441,8 @@ class Scenario:
         """
         if not self.has_goal:
             raise ParameterError(
-                f"'{self.name}' is a robot and has no goal: give one, for instance "
-                "--goal-rpy-deg 0 0 10, or make a scenario of it with `spacerobot new`."
+                f"'{self.name}' has no goal: give one, for instance --goal-rpy-deg 0 0 10, or "
+                "write a scenario with one (`spacerobot new` writes that of a robot)."
             )
 
 
@@ -466,6 +475,9 @@ def _end_effector_values(goal: Goal) -> dict[str, list[float] | list[list[float]
 def load_scenario(name: str) -> Scenario:
     """Return a scenario of this package by name, or of any parameter file by path.
 
+    A file whose plant has a robot needs no section ``scenario``, as those of ``ros2 param dump``;
+    the scenario has no goal then.
+
     Raises
     ------
     ParameterError
@@ -483,12 +495,16 @@ def load_scenario(name: str) -> Scenario:
     content = _read_content(path)
     section = content.get("scenario")
     values = section.get("ros__parameters") if isinstance(section, dict) else None
+    in_file = _sections(content, path)
+    commanders = tuple(name for name in COMMANDERS if name in in_file) or COMMANDERS[:1]
+    if "scenario" not in content and _names_robot(in_file.get("plant", {})):
+        return replace(
+            _scenario_without_goal(path.stem, path.resolve(), in_file), commanders=commanders
+        )
     if not isinstance(values, dict):
         raise ParameterError(
             f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
         )
-    in_file = _sections(content, path)
-    commanders = tuple(name for name in COMMANDERS if name in in_file) or ("planner",)
     unknown = sorted(set(map(str, values)) - set(_SCENARIO_KEYS))
     if unknown:
         raise ParameterError(
@@ -511,6 +527,10 @@ def load_scenario(name: str) -> Scenario:
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file=in_file,
     )._with_goal_topics()
+
+
+def _names_robot(plant: Mapping[str, Any]) -> bool:
+    return bool(plant.get("robot") or plant.get("robot_description"))
 
 
 def _with_files_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
@@ -568,21 +588,28 @@ def scenario_or_robot(name: str) -> Scenario:
     path = path if path.is_file() else robot_file(name)
     load_robot(path)  # A file that is no robot is refused before its missing goal.
     robot = {"robot": str(path.resolve()) if path == Path(name) else name}
-    return _scenario_without_goal(path.name.split(".")[0], path, robot)
+    return _scenario_without_goal(path.name.split(".")[0], path, _nodes_of(robot))
 
 
 def scenario_of(robot: RobotDescription) -> Scenario:
     """Return a scenario without a goal of a robot alone, as :func:`scenario_or_robot` does."""
-    return _scenario_without_goal(robot.name, Path(), {"robot_description": robot.urdf})
+    nodes = _nodes_of({"robot_description": robot.urdf})
+    return _scenario_without_goal(robot.name, Path(), nodes)
 
 
-def _scenario_without_goal(name: str, path: Path, robot: dict[str, str]) -> Scenario:
+def _nodes_of(robot: dict[str, str]) -> dict[str, dict[str, Any]]:
+    return {"plant": robot, "planner": robot}
+
+
+def _scenario_without_goal(
+    name: str, path: Path, in_file: Mapping[str, Mapping[str, Any]]
+) -> Scenario:
     return Scenario(
         name=name,
         path=path,
         description="",
         goal=Goal.checked([0, 0, 0], [0, 0, 0, 1]),
-        in_file={"plant": robot, "planner": robot},
+        in_file=in_file,
         has_goal=False,
     )
 
@@ -736,9 +763,7 @@ def _parameters_by_node(content: Mapping[str, Any], path: Path) -> dict[str, dic
         chosen = of_all_nodes if node == "**" else by_node.setdefault(node, {})
         chosen.update(_flatten_section(values))
     for node, values in by_node.items():
-        known = {parameter.name for parameter in declared(CONFIGS[node])}
-        shared = {name: value for name, value in of_all_nodes.items() if name in known}
-        by_node[node] = {**shared, **values}
+        by_node[node] = {**known_values(CONFIGS[node], of_all_nodes), **values}
     return by_node
 
 

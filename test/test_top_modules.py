@@ -758,8 +758,8 @@ def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
         with pytest.raises(ParameterError) as refused:
             robot.require_goal()
         assert str(refused.value) == (
-            "'planar_manipulator' is a robot and has no goal: give one, for instance "
-            "--goal-rpy-deg 0 0 10, or make a scenario of it with `spacerobot new`."
+            "'planar_manipulator' has no goal: give one, for instance --goal-rpy-deg 0 0 10, or "
+            "write a scenario with one (`spacerobot new` writes that of a robot)."
         )
 
 

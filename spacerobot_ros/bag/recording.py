@@ -128,6 +128,8 @@ class Recording:
         """Their channels: a list of pairs would keep the garbage collector busy."""
         self._first_times: NDArray[np.int8] = np.zeros(0, np.int8)
         """Values of :class:`FirstTime` by channel."""
+        self.clock_steps_back = 0
+        """How often the clock has gone back: once by a restart, again and again by two clocks."""
         self.lost: Counter[str] = Counter()
         """Number of messages of each topic that were published but never received."""
         self.attached: set[str] = set()
@@ -184,6 +186,7 @@ class Recording:
         self._write_batch()
         if self._time_base is _ON_WALL_TIME:
             return
+        self.clock_steps_back += time_ns < self._now_ns
         self._now_ns = time_ns
         if self.state is _WAITING:
             self._choose_time_base(_ON_CLOCK)
@@ -261,6 +264,7 @@ class Recording:
         clock = np.where(kinds == FirstTime.CLOCK.value, np.arange(len(messages)), -1)
         clock = np.maximum.accumulate(clock)
         logged = np.where(clock >= 0, times[clock], self._now_ns)
+        self.clock_steps_back += int(np.sum(np.diff(logged, prepend=self._now_ns) < 0))
         self._now_ns = int(logged[-1])
         published = np.where(times == 0, logged, times)
         if self.derive is not None:

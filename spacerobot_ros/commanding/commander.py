@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from enum import Enum
 from typing import Any, Literal, Protocol
 
@@ -55,6 +56,12 @@ _PROCESS_DELAY_TIME = 0.005
 
 _REPORT_PERIOD = 1.0
 """Shortest wall time between two warnings about ignored states, s."""
+
+_LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
+"""Time without a state after which states are waited for, wall s, and at least control periods."""
+
+_EQUAL_RATES = 0.05
+"""Largest relative difference between two rates that count as one."""
 
 _FAULT_LOG_PERIOD = 5.0
 """Shortest wall time between two log lines about one kind of faulty message, s."""
@@ -181,9 +188,10 @@ class ArrayDecoder:
 class Commander(ABC):
     """Base class of the commanders: planner and controller.
 
-    States are answered while the commander is active and knows its robot, and only those of the
-    plant's present time (:class:`StampFilter`). Goals that come before the robot wait for it. All
-    goals are given up when the plant reports that it does not obey (:class:`PlantListener`).
+    States are answered while the commander is active and knows its robot and the rate of the plant,
+    and only those of the plant's present time (:class:`StampFilter`). Commands follow the rate of
+    the plant, whatever rate is configured. Goals that come before the robot wait for it. All goals
+    are given up when the plant reports that it does not obey (:class:`PlantListener`).
 
     Parameters
     ----------
@@ -211,9 +219,11 @@ class Commander(ABC):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.config, self.host, self._clock = config, host, clock
+        self._given_rate = config.tick_rate
+        """Configured rate, Hz; 0: that of the plant."""
         self.activity = CommanderActivity.INACTIVE
         self.robot: SpaceRobot | None = None
-        self.stamps = StampFilter(config.control_period, clock)
+        self.stamps = StampFilter(clock)
         self.states = StateSynchroniser(pose_required=pose_required)
         self.plant = PlantListener()
         self._decoder: StateDecoder | None = None
@@ -227,7 +237,13 @@ class Commander(ABC):
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
         """Goals that were received before the robot's description."""
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
-        self._answer_time = clock()
+        self._activated = self._answer_time = clock()
+        self.refusal = ""
+        """Why the last joint states were refused, as a clause; empty: they were not."""
+        self._reported_missing = ""
+        """What the last status said is waited for, as a clause; empty: nothing."""
+        self._last_status: Status | None = None
+        """The last status that did not say so."""
         self._ignored_reported, self._next_report = 0, 0.0
         self._fault_log_times: dict[str, float] = {}
         """Wall time of the last log line by kind of fault, s."""
@@ -256,6 +272,22 @@ class Commander(ABC):
         for key, goal in waiting.items():
             self._submit_goal(key, goal)
 
+    def _follow_rate(self) -> None:
+        """Command at the rate of the plant, as soon as it is known."""
+        rate, present = self.plant.rate or self.stamps.rate, self.config.tick_rate
+        if not rate or abs(rate - present) <= _EQUAL_RATES * present:
+            return
+        self.config = replace(self.config, tick_rate=rate)
+        if self._given_rate and abs(rate - self._given_rate) > _EQUAL_RATES * self._given_rate:
+            self.host.log(
+                "warning",
+                f"Parameter 'tick_rate' is {self._given_rate:g} Hz, and the plant has {rate:g} Hz: "
+                f"commands follow the plant. Set it to {rate:g}, or leave it out.",
+            )
+        if self.robot is not None:
+            self._change_rate(self.robot)
+        self.answer()
+
     def drop_robot(self, why: str) -> None:
         """Give up the goals and the robot; later goals wait for another robot."""
         if self.executive is not None:
@@ -271,6 +303,8 @@ class Commander(ABC):
         ParameterError
             The file of goals is refused.
         """
+        self._activated = self._answer_time = self._clock()
+        self._reported_missing = ""
         self._resume_goals(self._goal_file.load())
         self.activity = CommanderActivity.ACTIVE
         # A lockstep plant may already wait for an answer.
@@ -281,7 +315,10 @@ class Commander(ABC):
         if self.activity is not CommanderActivity.INACTIVE and self.executive is not None:
             self._stop_executive()
         self.activity, self._waiting_goals = CommanderActivity.INACTIVE, {}
-        self._fly_to.end_dropped_goals((), "Aborted: this node was deactivated.")
+        later = ""
+        if self.config.resume_file:
+            later = " A goal that came by topic is resumed when it is activated again."
+        self._fly_to.end_dropped_goals((), f"Aborted: this node was deactivated.{later}")
 
     # -- goals --------------------------------------------------------------------------------
 
@@ -312,6 +349,7 @@ class Commander(ABC):
             self._refuse_goal(str(error), goal_id)
             return None
         accepted = IdentifiedGoal(goal, goal_id)
+        self._follow_goal(key, goal_id)
         self._accept_goal(key, accepted)
         return accepted
 
@@ -368,6 +406,8 @@ class Commander(ABC):
         """Raise PlanningError where no goal is taken now."""
         if not self.active:
             raise PlanningError(f"The goal is refused: this node is {self.activity.value}.")
+        if self._actuation_refusal:
+            raise PlanningError(self._actuation_refusal)
         if self.plant.refusal_of_goals:
             raise PlanningError(self.plant.refusal_of_goals)
 
@@ -378,8 +418,11 @@ class Commander(ABC):
             self._report_waiting_goal(goal, "The goal waits for a robot on robot_description.")
         else:
             self._submit_goal(key, goal)
-        if self._fly_to:
-            self._fly_to.end_dropped_goals(self._active_goal_ids())
+        self._fly_to.end_dropped_goals(self._active_goal_ids())
+
+    def _follow_goal(self, key: str, goal_id: str) -> None:
+        """Report the end of a goal that came by topic, whatever ends it."""
+        self._fly_to.begin(goal_id)
 
     def _refuse_goal(self, message: str, goal_id: str) -> None:
         self._publish_decision(self._make_status("refused", message, goal_id))
@@ -400,9 +443,10 @@ class Commander(ABC):
 
     def _publish_status(self, status: Status) -> None:
         # A replaced goal ends before its successor begins: the last status is of the present goal.
-        if self._fly_to:
-            self._fly_to.end_dropped_goals(self._active_goal_ids() | {status.goal_id})
+        self._fly_to.end_dropped_goals(self._active_goal_ids() | {status.goal_id})
         self.host.publish_status(status)
+        if status.state.value != "waiting":
+            self._last_status = status
         self._fly_to.update(status)
         if status.state.decided and self.config.stop_when_decided and self.active:
             self.activity = CommanderActivity.DECIDED
@@ -483,7 +527,8 @@ class Commander(ABC):
     def receive_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take received joints: those of another time are set aside, and late ones skipped."""
         if self._clock() - self._answer_time > _PROCESS_DELAY_TIME:
-            self._answer_last_state(Stamped(stamp_ns, joints))
+            odoms, waiting = self.host.waiting_states()
+            self._answer_last_state([*odoms], [Stamped(stamp_ns, joints), *waiting])
         elif self._is_of_robot(joints) and self.stamps.accepts_joints(stamp_ns, joints):
             self.take_joints(stamp_ns, joints)
         if self._fly_to:
@@ -504,6 +549,8 @@ class Commander(ABC):
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take joints of the present time, and answer their state if complete."""
         self.states.put_joints(stamp_ns, joints)
+        if not self.config.tick_rate:
+            self._follow_rate()
         self.answer()
 
     def take_accepted_jump(self) -> str:
@@ -515,6 +562,8 @@ class Commander(ABC):
             A warning about messages that were ignored, at most once a second; empty: none.
         """
         stamps = self.stamps
+        self._follow_rate()
+        self._report_missing()
         # A paused plant publishes no state that could contradict a jump.
         jump = None if self.plant.paused else stamps.accepted_jump()
         if jump is not None:
@@ -529,14 +578,54 @@ class Commander(ABC):
             return stamps.last_ignored
         return ""
 
-    def _answer_last_state(self, joints: Stamped) -> None:
-        """Answer only the last waiting state after this process stood still.
+    @property
+    def missing(self) -> str:
+        """What is waited for before states are answered, as a clause; empty: nothing."""
+        if self.robot is None:
+            return "a robot on 'robot_description'"
+        topics = {"joint_states": self.states.joints, "odom": self.states.odom}
+        absent = [f"'{topic}'" for topic, message in topics.items() if message is None]
+        refused = f", whose messages are refused: {self.refusal}" if self.refusal else ""
+        if absent:
+            return f"states on {' and '.join(absent)}{refused}"
+        silence = self._clock() - self._answer_time
+        longest = max(_LONGEST_SILENCE, _SILENT_PERIODS * self.config.control_period)
+        if silence > longest and not (self.plant.paused or self.plant.in_lockstep):
+            return f"states on 'joint_states'{refused}; the last one came {silence:.1f} s ago"
+        return ""
+
+    def _report_missing(self) -> None:
+        """Report in the status what is missing, and when it is there again."""
+        if not self.active or self._clock() - self._activated < _LONGEST_SILENCE:
+            return
+        missing = self.missing
+        if missing.split(";")[0] == self._reported_missing:
+            return
+        self._reported_missing = missing.split(";")[0]
+        if missing:
+            goal_id = self._pursued_goal_id
+            goes_on = " The goal is pursued when they come." if goal_id else ""
+            message = f"Waiting for {missing}.{goes_on}"
+            self._publish_status(self._make_status("waiting", message, goal_id))
+        else:
+            self._report_present_status()
+
+    def answer_latest(self) -> None:
+        """Answer the latest state that has come, after work for which states have waited."""
+        odoms, joints = (list(waiting) for waiting in self.host.waiting_states())
+        if joints:
+            self._answer_last_state(odoms, joints)
+        else:
+            self.answer()
+
+    def _answer_last_state(self, odoms: list[Stamped], states: list[Stamped]) -> None:
+        """Answer only the last of some states after this process stood still.
 
         An answer to one before it comes too late, and the motion of the joints before the first
         answer does not tell whether they obey it.
         """
-        waiting, others = self.host.waiting_states()
-        odoms, skipped = list(waiting), []
+        joints, *others = states
+        skipped = []
         for newer in others:
             ahead = newer.stamp_ns - joints.stamp_ns
             if (
@@ -561,8 +650,10 @@ class Commander(ABC):
             if self._decoder is not None:
                 self._decoder.check_robot(joints)
         except CommandError as error:
+            self.refusal = str(error)
             self._log_fault("joints", f"joint_states: {error}.")
             return False
+        self.refusal = ""
         return True
 
     def _log_fault(self, kind: str, message: str) -> None:
@@ -585,6 +676,9 @@ class Commander(ABC):
             if self.executive is not None:
                 self._react_to_change(change)
         self._forward_plant_state()
+        if self._actuation_refusal:
+            self._log_fault("actuation", self._actuation_refusal)
+        self._follow_rate()
         if self.plant.payload != self._payload:
             self._payload = self.plant.payload
             if self._described is not None:
@@ -629,6 +723,50 @@ class Commander(ABC):
     @abstractmethod
     def _change_masses(self, robot: SpaceRobot) -> None:
         """Have the executive command a robot of the same joints and other masses."""
+
+    def reconfigure(self, config: Any) -> None:
+        """Use the live parameters of another configuration from now on."""
+        self.config = self._adapted(config)
+        self._configure_executive()
+
+    def _adapted(self, config: Any) -> Any:
+        """Return a configuration with the known rate of the plant."""
+        return replace(config, tick_rate=self.config.tick_rate)
+
+    @property
+    def _knows_rate(self) -> bool:
+        """Whether the rate of the plant is known, so that states can be answered."""
+        return self.config.tick_rate > 0
+
+    @abstractmethod
+    def _configure_executive(self) -> None:
+        """Have the executive use the live parameters of the present configuration."""
+
+    @abstractmethod
+    def _change_rate(self, robot: SpaceRobot) -> None:
+        """Have the executive command at the present rate of the configuration."""
+
+    @property
+    def _pursued_goal_id(self) -> str:
+        """Id of a goal that is pursued or waits; empty: none is."""
+        return next(iter(sorted(self._active_goal_ids())), "")
+
+    def _report_present_status(self) -> None:
+        """Publish the status of the goal again: states come again."""
+        status = self._last_status
+        if status is None or status.goal_id != self._pursued_goal_id or status.state.decided:
+            status = self._make_status(*self._without_goal, "")
+        self._publish_status(status)
+
+    @property
+    @abstractmethod
+    def _without_goal(self) -> tuple[str, str]:
+        """State and message of a status without a goal."""
+
+    @property
+    @abstractmethod
+    def _actuation_refusal(self) -> str:
+        """Message on a plant that takes other commands than these; empty: it takes them."""
 
     @abstractmethod
     def _stop_executive(self) -> None:

@@ -73,11 +73,13 @@ class ControllerCommander(Commander):
     def _make_status(self, state: str, message: str, goal_id: str) -> ControllerStatus:
         return ControllerStatus(ControllerState(state), message, goal_id)
 
-    def reconfigure(self, config: ControllerConfig) -> None:
-        """Use other gains, tolerances and times from now on."""
-        self.config = config
+    def _configure_executive(self) -> None:
         if self.executive is not None:
-            self.executive.configure(config)
+            self.executive.configure(self.config)
+
+    def _follow_goal(self, key: str, goal_id: str) -> None:
+        # Goals of base and end-effector are pursued together, under the id of the later one.
+        pass
 
     def activate(self) -> None:
         """Answer states from now on, each with the references that have a publisher."""
@@ -97,6 +99,8 @@ class ControllerCommander(Commander):
             return False, "The controller is not active, or has no robot yet."
         if self.plant.refusal_of_goals:
             return False, self.plant.refusal_of_goals
+        if task is Task.APPROACH and self._target is None:
+            return False, "There is no target to approach: none is on 'target/robot_description'."
         self.executive.request(task)
         return True, f"The task '{task.value}' begins; controller/status tells its course."
 
@@ -150,6 +154,25 @@ class ControllerCommander(Commander):
         assert self.executive is not None
         controller = build_controller(robot, self.config, self._own_law)
         self.executive.use_controller(controller, self._held)
+
+    def _change_rate(self, robot: SpaceRobot) -> None:
+        if self.executive is not None:
+            self._change_masses(robot)
+            self.executive.configure(self.config)
+            self._held_velocities = HeldVelocityReference(self.config.control_period)
+
+    @property
+    def _actuation_refusal(self) -> str:
+        if self.plant.actuation != "velocity":
+            return ""
+        return (
+            "The plant takes velocities, and this controller sends efforts and a wrench: start the "
+            "plant with actuation:=effort."
+        )
+
+    @property
+    def _without_goal(self) -> tuple[str, str]:
+        return "holding", "Waiting for a goal; the robot holds its pose."
 
     def _stop_executive(self) -> None:
         assert self.executive is not None
@@ -214,7 +237,7 @@ class ControllerCommander(Commander):
 
     def answer(self) -> None:
         """Answer a state once, as soon as all its messages are there."""
-        if self.executive is not None and self.activity is _ACTIVE:
+        if self.executive is not None and self.activity is _ACTIVE and self._knows_rate:
             pairing = self.states.take_ready()
             if pairing is not None:
                 self._answer_state(pairing)

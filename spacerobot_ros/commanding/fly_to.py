@@ -190,9 +190,10 @@ class FlyToClient(Protocol):
 class _ActionGoal:
     """A goal with a client that waits for its result."""
 
-    client: FlyToClient
+    client: FlyToClient | None
+    """Who waits for the result; None: nobody does, as the goal came by topic."""
     request: FlyTo | None
-    """None: it is refused."""
+    """None: it is refused, or came by topic."""
     first_state_ns: int | None = None
     """Stamp of the first state after the goal was sent, ns."""
     last_feedback_ns: int | None = None
@@ -204,7 +205,7 @@ class _ActionGoal:
 
 
 class FlyToGoals:
-    """The goals whose clients wait for a result.
+    """The goals that are pursued or wait to be, and the clients that wait for their results.
 
     Parameters
     ----------
@@ -222,16 +223,21 @@ class FlyToGoals:
         self._errors, self._report_aborted = errors, report_aborted
         self._served: dict[str, _ActionGoal] = {}
         """By goal id, in the order in which they came."""
+        self._clients = 0
+        """Number of goals with a client."""
         self._accepted: list[str] = []
         """Ids of the goals that were accepted and not refused, by action or by topic, in order."""
 
     def __bool__(self) -> bool:
         """Whether a client waits."""
-        return bool(self._served)
+        return self._clients > 0
 
-    def begin(self, goal_id: str, client: FlyToClient, request: FlyTo | None) -> None:
-        """Serve a client from now on; ``request`` is None where its goal is refused."""
+    def begin(
+        self, goal_id: str, client: FlyToClient | None = None, request: FlyTo | None = None
+    ) -> None:
+        """Follow a goal from now on; ``request`` is None if the goal of the client is refused."""
         self._served[goal_id] = _ActionGoal(client, request)
+        self._clients += client is not None
 
     def accepted(self, goal_id: str) -> None:
         """Note the goal that was accepted last."""
@@ -307,8 +313,9 @@ class FlyToGoals:
 
     def _end(self, goal_id: str, status: Status) -> None:
         served = self._served.pop(goal_id, None)
-        if served is None:
+        if served is None or served.client is None:
             return
+        self._clients -= 1
         errors = GoalErrors()
         if served.request is not None:
             errors = self._errors(served.request.goal).reported_by(status)

@@ -135,11 +135,16 @@ class PlannerCommander(Commander):
         assert self.executive is not None
         return self.executive.setpoint
 
-    def reconfigure(self, config: PlannerConfig) -> None:
-        """Plan and evaluate with other tolerances from now on."""
-        self.config = config
+    def _adapted(self, config: PlannerConfig) -> PlannerConfig:
+        """Return a configuration for the plant: one in lockstep waits for its plans."""
+        adapted: PlannerConfig = super()._adapted(config)
+        if not self.plant.in_lockstep:
+            return adapted
+        return replace(adapted, plan_in_background=False)
+
+    def _configure_executive(self) -> None:
         if self.executive is not None:
-            self.executive.config = config
+            self.executive.config = self.config
 
     def interrupt(self) -> None:
         """Cancel the requested plan; any thread may call this."""
@@ -195,6 +200,28 @@ class PlannerCommander(Commander):
             worker = self._make_worker(robot, method)
         self.executive.use_robot(robot, worker)
         self._forward_outputs()
+
+    def _change_rate(self, robot: SpaceRobot) -> None:
+        if self.executive is None:
+            return
+        with self._on_long_work():
+            worker = self._make_worker(robot, self._method)
+        self.executive.use_robot(robot, worker, self.config)
+        self._forward_outputs()
+
+    @property
+    def _without_goal(self) -> tuple[str, str]:
+        return "idle", "Waiting for a goal pose."
+
+    @property
+    def _actuation_refusal(self) -> str:
+        if self.config.output != "commands" or self.plant.actuation != "effort":
+            return ""
+        return (
+            "The plant takes efforts, and this planner sends velocities: start the plant with "
+            "actuation:=velocity, or the planner with output:=reference beside a "
+            "coordinated_control."
+        )
 
     def _active_goal_ids(self) -> set[str]:
         pursued = super()._active_goal_ids()
@@ -289,6 +316,10 @@ class PlannerCommander(Commander):
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status of the named plant."""
         super().receive_plant_status(status, name)
+        if self.plant.in_lockstep and self.config.plan_in_background:
+            self.config = self._adapted(self.config)
+            if self.executive is not None:
+                self.executive.plan_at_once()
         begun = [each for each in status.disturbances if each not in self._disturbances]
         self._disturbances = status.disturbances
         if self._status is not None and self._status.state is PlannerState.EXECUTING:
@@ -315,7 +346,7 @@ class PlannerCommander(Commander):
     def answer(self) -> None:
         """Answer a state as soon as its joints are there; only plans need its pose."""
         executive = self.executive
-        if executive is None or self.activity is not _ACTIVE:
+        if executive is None or self.activity is not _ACTIVE or not self._knows_rate:
             return
         states = self.states
         pairing = states.take_ready()

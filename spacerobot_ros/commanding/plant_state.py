@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from statistics import fmean, median
 from typing import Any, NamedTuple
 
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
@@ -43,8 +45,11 @@ _PACE_SLACK = 2.0
 _MIN_CHECKS = 2
 """Number of checks without a state of the old time before a time jump is accepted."""
 
-_MAX_STEP_PERIODS = 100
-"""Largest step of a plant with another rate, in control periods."""
+_EQUAL_STEPS, _MEASURED_STEPS = 2, 8
+"""Number of steps that tell the rate of the states: if they are equal, and if they are not."""
+
+_STEP_ROUNDING_NS = 1_000
+"""Largest difference between equal steps, from stamps that were computed as floating point, ns."""
 
 
 @dataclass
@@ -61,8 +66,10 @@ class _PendingJump:
 class StampFilter:
     """Separates states of the plant's present time from states stamped with another time.
 
-    A stamp is plausible
+    The steps between the states, and so the rate of the plant, are learnt from the stamps. A stamp
+    is plausible
 
+    * if only one state is known and the stamp is not behind it;
     * within 1.5 steps after the state before, or equal to it: no message was lost;
     * further ahead by no more than twice the time that passed in as much wall time before:
       messages were lost, or this process was stopped for a while.
@@ -74,26 +81,21 @@ class StampFilter:
 
     Parameters
     ----------
-    control_period
-        Time between two states, s.
     clock
         Returns the wall time, s.
     """
 
-    def __init__(self, control_period: float, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._period_ns = round(control_period * SECOND)
-        self._step_ns = self._period_ns
-        """Time between two states, as known so far, ns."""
-        self._max_step_ns = -1
-        """Largest plausible step without a loss, ns; negative before the first state."""
+        self._max_step_ns: float = math.inf
+        """Largest plausible step without a loss, ns; infinite while one state is known at most."""
+        self._steps: deque[int] = deque(maxlen=_MEASURED_STEPS)
+        """Latest steps between two states, ns."""
         self._previous_ns, self._admission_wall = _NO_STAMP, 0.0
-        self._origin_ns, self._origin_wall = 0, 0.0
+        self._origin_ns, self._origin_wall = _NO_STAMP, 0.0
         """The first state of the present time, from which the plant's pace is measured."""
         self._pending_jump: _PendingJump | None = None
         self._jump_odom = _NO_MESSAGE
-        self._last_jump_ns = 0
-        """Size of the latest accepted jump, ns."""
         self.now_ns = 0
         """Stamp of the latest admitted state, ns; 0 before the first state."""
         self.ignored = 0
@@ -101,23 +103,41 @@ class StampFilter:
         self.last_ignored = ""
         """Message for the user about the latest ignored state."""
 
+    @property
+    def rate(self) -> float:
+        """Rate of the states by their stamps, Hz; 0 while too few are known."""
+        steps = list(self._steps)
+        latest = steps[-_EQUAL_STEPS:]
+        if len(latest) == _EQUAL_STEPS and max(latest) - min(latest) <= _STEP_ROUNDING_NS:
+            return SECOND / latest[-1]
+        if len(steps) < _MEASURED_STEPS:
+            return 0.0
+        # Sensors are read at whole rates, with some jitter; steps with losses are longer.
+        usual = median(steps)
+        measured = SECOND / fmean(step for step in steps if step <= _STEP_SLACK * usual)
+        return float(round(measured)) or measured
+
     def accepts_joints(self, stamp_ns: int, joints: Any) -> bool:
         """Return whether joints are of the present time; set other joints aside."""
-        if not 0 <= stamp_ns - self.now_ns <= self._max_step_ns and not self._is_explained_by_loss(
-            stamp_ns
-        ):
+        if self._origin_ns == _NO_STAMP:
+            self._begin(stamp_ns)
+        elif 0 <= stamp_ns - self.now_ns <= self._longest_ahead(self._max_step_ns, stamp_ns):
+            step = stamp_ns - self.now_ns
+            if step:
+                self._steps.append(step)
+                self._max_step_ns = round(_STEP_SLACK * step)
+            self._previous_ns, self.now_ns = self.now_ns, stamp_ns
+            self._admission_wall = self._clock()
+        else:
             self._set_aside(Stamped(stamp_ns, joints))
             return False
-        self._previous_ns, self.now_ns = self.now_ns, stamp_ns
-        self._admission_wall = self._clock()
         if self._pending_jump is not None or self._jump_odom.message is not None:
             self._ignore_jump()
         return True
 
     def would_accept(self, stamp_ns: int) -> bool:
         """Return whether joints with a stamp would be admitted, without a change."""
-        ahead = stamp_ns - self.now_ns
-        return 0 <= ahead <= max(self._max_step_ns, self._max_loss_ns(self._clock()))
+        return 0 <= stamp_ns - self.now_ns <= self._longest_ahead(self._max_step_ns, stamp_ns)
 
     def accepts_odom(self, stamp_ns: int, odom: Any) -> bool:
         """Return whether a pose is of the present time; set other poses aside.
@@ -125,9 +145,9 @@ class StampFilter:
         It comes before the joints of its stamp, or after them.
         """
         ahead, longest = stamp_ns - self.now_ns, self._max_step_ns
-        if -longest <= ahead <= longest or longest < 0:
-            return True
-        if 0 <= ahead <= self._max_loss_ns(self._clock()):
+        if self._origin_ns == _NO_STAMP or -longest <= ahead <= self._longest_ahead(
+            longest, stamp_ns
+        ):
             return True
         self._jump_odom = Stamped(stamp_ns, odom)
         return False
@@ -135,10 +155,13 @@ class StampFilter:
     def undo_last(self) -> None:
         """Undo the last admission: the state is not one of the robot."""
         if self._previous_ns == _NO_STAMP:
-            self._max_step_ns, self.now_ns = -1, 0
-        else:
-            self.now_ns = self._origin_ns = self._previous_ns
-            self._origin_wall = self._admission_wall
+            self._origin_ns, self.now_ns = _NO_STAMP, 0
+            return
+        self.now_ns = self._origin_ns = self._previous_ns
+        self._origin_wall = self._admission_wall
+        if self._steps:
+            self._steps.pop()
+        self._max_step_ns = _STEP_SLACK * self._steps[-1] if self._steps else math.inf
 
     def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:
         """Return set-aside odom (or None) and joints once their time is accepted.
@@ -152,33 +175,25 @@ class StampFilter:
         jump.checks += 1
         if jump.checks < _MIN_CHECKS or self._clock() - jump.since < self._jump_confirmation_time:
             return None
-        stamp, now = jump.joints.stamp_ns, self._clock()
-        size = stamp - self.now_ns
-        if size == self._last_jump_ns and 0 < size <= _MAX_STEP_PERIODS * self._period_ns:
-            # The plant's rate differs from this commander's.
-            self._step_ns = size
-            self._max_step_ns = round(_STEP_SLACK * size)
-        self._last_jump_ns = size
-        self._previous_ns, self.now_ns, self._admission_wall = self.now_ns, stamp, now
-        self._origin_ns, self._origin_wall = stamp, now
+        stamp, before = jump.joints.stamp_ns, self.now_ns
         odom, self._pending_jump, self._jump_odom = self._jump_odom, None, _NO_MESSAGE
+        self._begin(stamp)
+        self._previous_ns = before
         return (odom if odom.stamp_ns == stamp else None), jump.joints
 
-    def _is_explained_by_loss(self, stamp_ns: int) -> bool:
-        """Whether a stamp belongs to a first state, or lost messages explain the stamp."""
-        now = self._clock()
-        if self._max_step_ns < 0:
-            self._max_step_ns = round(_STEP_SLACK * self._step_ns)
-            self._origin_ns, self._origin_wall = stamp_ns, now
-            self.now_ns = _NO_STAMP
-            return True
-        return 0 <= stamp_ns - self.now_ns <= self._max_loss_ns(now)
+    def _begin(self, stamp_ns: int) -> None:
+        """Begin a time with its first state."""
+        self._previous_ns, self.now_ns, self._origin_ns = _NO_STAMP, stamp_ns, stamp_ns
+        self._admission_wall = self._origin_wall = self._clock()
+        self._max_step_ns = math.inf
+        self._steps.clear()
 
-    def _max_loss_ns(self, now: float) -> float:
-        """Return the largest plausible step at a wall time where messages were lost, ns."""
-        return self._max_step_ns + _PACE_SLACK * self._simulation_pace * (
-            now - self._admission_wall
-        )
+    def _longest_ahead(self, step_ns: float, stamp_ns: int) -> float:
+        """Return the largest plausible step at present, ns; the clock is read only if it counts."""
+        if stamp_ns - self.now_ns <= step_ns:
+            return step_ns
+        since = self._clock() - self._admission_wall
+        return step_ns + _PACE_SLACK * self._simulation_pace * since
 
     @property
     def _simulation_pace(self) -> float:
@@ -189,13 +204,13 @@ class StampFilter:
     @property
     def _jump_confirmation_time(self) -> float:
         """Wall time (s) without a state of the old time after which a jump is accepted."""
-        pace = self._simulation_pace
-        return max(_MIN_JUMP_CONFIRMATION_TIME, 4 * self._step_ns / pace if pace > 0 else 0.0)
+        step, pace = self._steps[-1] if self._steps else 0, self._simulation_pace
+        return max(_MIN_JUMP_CONFIRMATION_TIME, 4 * step / pace if pace > 0 else 0.0)
 
     def _set_aside(self, joints: Stamped) -> None:
         """Keep a state of another time, in place of an earlier kept state."""
         jump = self._pending_jump
-        if jump is not None and 0 <= joints.stamp_ns - jump.joints.stamp_ns <= self._max_step_ns:
+        if jump is not None and joints.stamp_ns >= jump.joints.stamp_ns:
             jump.joints = joints
         else:
             self._pending_jump = _PendingJump(self._clock(), joints)
@@ -350,7 +365,7 @@ class PlantStopped:
 
     Attributes
     ----------
-    why
+    reason
         Message of the plant.
     commanded_until_ns
         Where it rests because no command came: the stamp of the last one; None: it obeys nothing.
@@ -390,6 +405,22 @@ class PlantListener:
         if status.state is PlantState.FAILED:
             return f"The plant has failed: {status.message}"
         return ""
+
+    @property
+    def rate(self) -> float:
+        """Ticks a second of the plant, Hz; 0: it is not known."""
+        return 0.0 if self._status is None else self._status.tick_rate_hz
+
+    @property
+    def in_lockstep(self) -> bool:
+        """Whether the plant waits for commands."""
+        return self._status is not None and self._status.time_mode == "lockstep"
+
+    @property
+    def actuation(self) -> str:
+        """What the plant takes: ``velocity`` or ``effort``; empty: either, or it is not known."""
+        actuation = "" if self._status is None else self._status.actuation
+        return "" if actuation == "auto" else actuation
 
     @property
     def has_no_command(self) -> bool:

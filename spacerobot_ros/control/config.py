@@ -45,9 +45,6 @@ class ControllerConfig(CommanderConfig):
     """Parameters of a controller: outputs, law, limits, and the decision about goals."""
 
     law: str = parameter("transposed_jacobian", "control law", choices=tuple(LAWS))
-    tick_rate: float = parameter(
-        100.0, "commands per second; that of the plant", unit="Hz", minimum=0.001, maximum=100000.0
-    )
     end_effector_frame: str = parameter(
         "", "link of the end-effector; '': 'end_effector', if there is one"
     )

@@ -118,8 +118,7 @@ def fly(
 def _require_goal(scenario: Scenario) -> None:
     if not scenario.has_goal and not scenario.goal.end_effectors:
         raise ParameterError(
-            f"'{scenario.name}' is a robot and has no goal: give one, for instance "
-            "rotvec=(0, 0, 0.1)."
+            f"'{scenario.name}' has no goal: give one, for instance rotvec=(0, 0, 0.1)."
         )
 
 

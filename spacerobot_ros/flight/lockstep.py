@@ -128,8 +128,6 @@ def require_flyable(scenario: Scenario) -> None:
         why = "it kills nodes on the way"
     elif scenario.plant.resume_bag:
         why = "plant.resume_bag is set"
-    elif "planner" in scenario.commanders and scenario.planner.plan_in_background:
-        why = "planner.plan_in_background is true"
     elif any(scenario.config(name).resume_file for name in scenario.commanders):
         why = "a resume_file is set"
     elif "planner" in scenario.commanders and scenario.planner.output == "trajectory":
@@ -247,7 +245,7 @@ class _LockstepFlight:
         scenario.require_shape_of(robots.plant)
         self._reported = ReportedState(self._plant, config)
         self._commands = CommandValidator(self._plant, config)
-        self._monitor = PlantMonitor(self._commands, self._plant, lockstep=True)
+        self._monitor = PlantMonitor(self._commands, self._plant, config)
         self._injected_seen = self._plant.injected
         self.log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
         self._follower = GoalFollower(GoalIds().of(*_FIRST_GOAL_STAMP))

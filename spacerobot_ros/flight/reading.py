@@ -34,6 +34,7 @@ from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.model.world import obstacles_from_topic, with_obstacles_around
+from spacerobot_ros.parameters import declared, known_values
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
@@ -526,14 +527,16 @@ def _read_statuses(bag: FlightBag, commander: str) -> list[tuple[int, Status]]:
 def _scenario_in_bag(bag: FlightBag) -> Scenario:
     """Return the scenario of a flight, as far as its bag holds it."""
     about = bag.metadata.get("scenario", {})
-    nodes = {
-        node: {name: _parse_json(text) for name, text in bag.metadata[f"parameters/{node}"].items()}
-        for node in CONFIGS
+    nodes: dict[str, dict[str, Any]] = {
+        node: _recorded_values(kind, bag.metadata[f"parameters/{node}"])
+        for node, kind in CONFIGS.items()
         if f"parameters/{node}" in bag.metadata
     }
     for node, parameter in _ABSENT_MEANS_ZERO:
         if node in nodes:
             nodes[node].setdefault(parameter, 0.0)
+    if nodes.get("plant", {}).get("actuation", "auto") == "auto" and "plant" in nodes:
+        nodes["plant"]["actuation"] = recorded_actuation(bag.parts[0])
     target = recorded_target(bag.parts[0])
     if target and "plant" in nodes:
         nodes["plant"] |= target_parameters(target)
@@ -578,6 +581,34 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
         overrides={},
         has_goal=goal is not None,
     )
+
+
+def recorded_actuation(robot: RecordedRobot) -> str:
+    """Return what the commands of a robot in a bag carry: ``velocity``, ``effort``, or nothing.
+
+    The plant's status says so; bags without one have wrenches only beside efforts.
+    """
+    series = robot.get("plant/status")
+    for _, message in reversed(list(series.messages() if series is not None else ())):
+        actuation = read_status(message).values.get("actuation", "")
+        if actuation in ("velocity", "effort"):
+            return actuation
+    return "effort" if robot.get("base_wrench") else "velocity"
+
+
+def _recorded_values(kind: type[Any], texts: Mapping[str, str]) -> dict[str, Any]:
+    """Return the recorded parameters of a node that this version can read.
+
+    Others belong to every node, to another version, or to a method of one's own that is not
+    imported here, whose name is none of the choices: they stop no report.
+    """
+    known = {parameter.name: parameter for parameter in declared(kind)}
+    values = known_values(kind, {name: _parse_json(text) for name, text in texts.items()})
+    return {
+        name: value
+        for name, value in values.items()
+        if not (isinstance(value, str) and known[name].excludes(value))
+    }
 
 
 def recorded_target(robot: RecordedRobot) -> str:

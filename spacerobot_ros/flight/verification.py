@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
 from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.flight.reading import namespaces, recorded_target
+from spacerobot_ros.flight.reading import namespaces, recorded_actuation, recorded_target
 from spacerobot_ros.flight.second_opinion import EngineComparison, EngineFlight
 from spacerobot_ros.messages.readers import CommandReader, UnreadableError
 from spacerobot_ros.messages.statuses import read_status
@@ -290,6 +290,8 @@ def _plant_config(recorded: RecordedRobot) -> PlantConfig:
         if target := recorded_target(recorded):
             values |= target_parameters(target)
         config = configured(PlantConfig, values)
+        if config.actuation == "auto":
+            config = config.decided(recorded_actuation(recorded))
     except (ValueError, RecursionError, ParameterError) as error:
         reason = str(error).removesuffix(".")
         raise RecordingError(

@@ -12,6 +12,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -28,7 +29,9 @@ Fields: TypeAlias = dict[str, tuple[Any, list[tuple[str, Any]]]]
 
 # -- installed types --------------------------------------------------------------------------
 
-_SHORT_TYPE_NAME = re.compile(r"([a-zA-Z]\w*)/(?:msg/)?([a-zA-Z]\w*)", re.ASCII)
+_SHORT_TYPE_NAME = re.compile(
+    r"([a-zA-Z]\w*)/(?:(msg|srv|action)/)?([a-zA-Z][a-zA-Z0-9]*)(\w*)", re.ASCII
+)
 
 # rosbag2's own expression for the type at the start of a field or constant: with any other one the
 # text of a schema could differ from the text that `ros2 bag record` writes.
@@ -41,6 +44,37 @@ _OWN_DEFINITIONS = {
     )
 }
 """Text and hash of types that this package writes even if ROS does not have them installed."""
+
+_EVENT = """\
+service_msgs/ServiceEventInfo info
+{0}_Request[<=1] request
+{0}_Response[<=1] response
+"""
+_PARTS: dict[str, tuple[str, int | str]] = {
+    "_Goal": ("action", 0),
+    "_Result": ("action", 1),
+    "_Feedback": ("action", 2),
+    "_FeedbackMessage": (
+        "action",
+        "unique_identifier_msgs/UUID goal_id\n{0}_Feedback feedback\n",
+    ),
+    "_SendGoal_Request": ("action", "unique_identifier_msgs/UUID goal_id\n{0}_Goal goal\n"),
+    "_SendGoal_Response": ("action", "bool accepted\nbuiltin_interfaces/Time stamp\n"),
+    "_SendGoal_Event": ("action", _EVENT.format("{0}_SendGoal")),
+    "_GetResult_Request": ("action", "unique_identifier_msgs/UUID goal_id\n"),
+    "_GetResult_Response": ("action", "int8 status\n{0}_Result result\n"),
+    "_GetResult_Event": ("action", _EVENT.format("{0}_GetResult")),
+    "_Request": ("srv", 0),
+    "_Response": ("srv", 1),
+    "_Event": ("srv", _EVENT),
+}
+"""Messages that rosidl makes of a service or an action, by the ending of their names.
+
+Each has the suffix of the file that declares it, and its section there, or else its text, in which
+the name of the service or action replaces the braces. Names in interface files have no underscore.
+"""
+
+_SECTION_END = re.compile(r"^---[ \t]*\r?\n?", re.MULTILINE)
 
 _INTEGERS = {f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
 _PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring", *_INTEGERS}
@@ -71,15 +105,15 @@ def message_definition(type_name: str) -> str:
 
 
 def _with_dependencies(type_name: str, seen: set[str]) -> str:
-    package, name = _split_type_name(type_name)
+    name = _InterfaceName.of(type_name)
     try:
-        text = _message_file(package, name).read_bytes().decode()
+        text = name.text()
     except RecordingError:
-        if (package, name) not in _OWN_DEFINITIONS:
+        if (name.package, name.whole) not in _OWN_DEFINITIONS:
             raise
-        text, _ = _OWN_DEFINITIONS[package, name]
+        text, _ = _OWN_DEFINITIONS[name.package, name.whole]
     types = {
-        found if "/" in found else f"{package}/{found}"
+        found if "/" in found else f"{name.package}/{found}"
         for found in _FIELD_TYPE.findall(text)
         if found not in _PRIMITIVES
     }
@@ -100,39 +134,78 @@ def type_hash(type_name: str) -> str:
     description of its types (``share/<package>/msg/<Type>.json``). Raises as
     :func:`message_definition` does.
     """
-    package, name = _split_type_name(type_name)
+    name = _InterfaceName.of(type_name)
     try:
-        description = _message_file(package, name).with_suffix(".json")
+        description = name.file().with_suffix(".json")
     except RecordingError:
-        if (package, name) not in _OWN_DEFINITIONS:
+        if (name.package, name.whole) not in _OWN_DEFINITIONS:
             raise
-        return _OWN_DEFINITIONS[package, name][1]
+        return _OWN_DEFINITIONS[name.package, name.whole][1]
     if not description.is_file():
         return ""
     hashes = json.loads(description.read_bytes())["type_hashes"]
-    return next(
-        (str(h["hash_string"]) for h in hashes if h["type_name"] == f"{package}/msg/{name}"), ""
-    )
+    full = f"{name.package}/{name.kind}/{name.whole}"
+    return next((str(h["hash_string"]) for h in hashes if h["type_name"] == full), "")
 
 
-def _split_type_name(type_name: str) -> tuple[str, str]:
-    match = _SHORT_TYPE_NAME.fullmatch(type_name)
-    if match is None:
-        raise RecordingError(
-            f"{type_name!r} is not the name of a message type: write it as 'package/msg/Type'."
-        )
-    return match[1], match[2]
+def message_module(type_name: str) -> tuple[str, str, str]:
+    """Return the Python module of an installed message type, and the names of two classes in it.
+
+    Those are of the interface that the module exports, in whose own module the other one is, and of
+    the message itself: they differ for parts of services and actions. Raises as
+    :func:`message_definition` does.
+    """
+    message_definition(type_name)
+    name = _InterfaceName.of(type_name)
+    return f"{name.package}.{name.kind}", name.interface, name.whole
 
 
-def _message_file(package: str, name: str) -> Path:
-    share = _share_folder(package)
-    path = share / "msg" / f"{name}.msg"
-    if not path.is_file():
-        raise RecordingError(
-            f"The package {package} in {share} has no message {name}: "
-            "check the name, or install the version that has it."
-        )
-    return path
+@dataclass(frozen=True)
+class _InterfaceName:
+    """The name of a message type: ``pkg/action/Move_Feedback`` is of the interface ``Move``."""
+
+    package: str
+    kind: str
+    """``msg``, ``srv`` or ``action``: folder and suffix of the file that declares the message."""
+    interface: str
+    part: str
+
+    @classmethod
+    def of(cls, type_name: str) -> _InterfaceName:
+        match = _SHORT_TYPE_NAME.fullmatch(type_name)
+        package, given, interface, part = match.groups() if match else ("",) * 4
+        kind = _PARTS[part][0] if part in _PARTS else "msg"
+        if match is None or given not in (None, kind):
+            raise RecordingError(
+                f"{type_name!r} is not the name of a message type: write it as 'package/msg/Type'."
+            )
+        return cls(package, kind, interface if kind != "msg" else interface + part, part)
+
+    @property
+    def whole(self) -> str:
+        """Name of the message without its package."""
+        return self.interface + (self.part if self.kind != "msg" else "")
+
+    def file(self) -> Path:
+        """Return the file that declares the message."""
+        share = _share_folder(self.package)
+        path = share / self.kind / f"{self.interface}.{self.kind}"
+        if not path.is_file():
+            raise RecordingError(
+                f"The package {self.package} in {share} has no message {self.whole}: "
+                "check the name, or install the version that has it."
+            )
+        return path
+
+    def text(self) -> str:
+        """Return the definition of the message without those of the types that it uses."""
+        text = self.file().read_bytes().decode()
+        if self.kind == "msg":
+            return text
+        _, section = _PARTS[self.part]
+        if isinstance(section, str):
+            return section.format(f"{self.package}/{self.interface}")
+        return [*_SECTION_END.split(text), "", ""][section]
 
 
 def _share_folder(package: str) -> Path:
@@ -222,7 +295,10 @@ def _parsed(text: str, type_name: str) -> Any:
     # The parser is slow to import, and tools that read no messages do not need it.
     from rosbags.typesys import get_types_from_msg
 
-    return get_types_from_msg(text, type_name)
+    # It takes messages of services for others: their names as those of messages are left alone.
+    parsed_name = type_name.replace("/srv/", "/msg/")
+    types = get_types_from_msg(text, parsed_name)
+    return {type_name if name == parsed_name else name: of for name, of in types.items()}
 
 
 def _empty_store() -> Typestore:

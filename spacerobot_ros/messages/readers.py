@@ -8,8 +8,10 @@ command is read the same way. The reader learns a new layout where a message has
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Literal
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +41,11 @@ from spacerobot_ros.times import HEADER_STAMP, LATEST_NS, SECOND, unpack_stamp
 JOINT_STATE = "sensor_msgs/msg/JointState"
 ODOMETRY = "nav_msgs/msg/Odometry"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
+
+_OTHER_JOINTS_BYTES = 65536
+"""Size allowed for joints of a measured state that the robot does not have, bytes."""
+
+_NOT_FINITE_RATES = "velocities are not finite"
 
 _MAX_ALIGNMENT = 8
 _MAX_LIST_TEXTS = 10_000
@@ -308,9 +315,11 @@ def _as_little_endian(raw: bytes, type_name: str) -> bytes:
 
 
 class JointReader:
-    """Takes one quantity of JointState messages into the order of the model's joints.
+    """Takes quantities of JointState messages into the order of the model's joints.
 
-    A message must name all joints, in any order.
+    A command names all joints, in any order. A measured state may name other joints too, as those
+    of a broadcaster for a whole machine do: they are ignored. Measured joints may come in several
+    messages (:meth:`joined`).
 
     Parameters
     ----------
@@ -320,6 +329,8 @@ class JointReader:
         What to read; the first is required in every message.
     measured
         Whether messages are measured states, whose stamp and size are bounded.
+    followers
+        Names of joints that follow those of the model, and are no coordinates of their own.
     """
 
     def __init__(
@@ -328,12 +339,17 @@ class JointReader:
         quantities: Sequence[Quantity],
         *,
         measured: bool = False,
+        followers: Collection[str] = (),
     ) -> None:
         self._measured, self._joints, self._quantities = measured, list(joint_names), quantities
+        self._followers = followers
+        self.ignored: Counter[str] = Counter()
+        """Number of ignored parts of accepted messages, by what they are."""
         max_size = math.inf
         if measured:
-            # Every joint adds a name with its length and three numbers.
-            max_size = _HEADER_BYTES + 2 * sum(len(name.encode()) + 32 for name in joint_names)
+            # Every joint adds a name with its length and three numbers; a machine has other joints.
+            own = sum(len(name.encode()) + 32 for name in joint_names)
+            max_size = _HEADER_BYTES + 2 * own + _OTHER_JOINTS_BYTES
         self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
         spans: dict[str, int | None] = dict.fromkeys(quantities)
         self._reader = TemplateReader(JOINT_STATE, spans, max_size, self.values)
@@ -341,8 +357,12 @@ class JointReader:
         self._problem = ""
         self._last_accepted: bytes | None = None
         """Last accepted message: publishers often repeat the same bytes."""
-        self._order: npt.NDArray[np.intp] | None = None
-        """Indices of the message's joints in the model; None: it has the model's order."""
+        self._order: JointOrder | None = None
+        """Joints of the message and of the model; None: they are the same in the same order."""
+        self._missing = ""
+        """A joint that measured states of this layout lack; empty: none."""
+        self._seen = np.zeros(len(joint_names), dtype=np.bool_)
+        """Joints that have come since the last whole state, with their values in ``values``."""
 
     def accept(self, raw: bytes) -> int:
         """Read a message into ``values`` and return its stamp in ns.
@@ -357,13 +377,58 @@ class JointReader:
         stamp = self._reader.stamp_ns
         if stamp > LATEST_NS and self._measured:
             raise UnreadableError(f"no command can carry its stamp of {stamp / SECOND:.10g} s")
-        if self._order is None:
+        self._copy_values()
+        return stamp
+
+    def _copy_values(self) -> None:
+        order = self._order
+        if order is None:
             self._reader.copy()
         else:
             for name, values in self.values.items():
                 if self._reader.has_values(name):
-                    values[self._order] = self._reader.floats(name)
-        return stamp
+                    values[order.of_model] = self._reader.floats(name)[order.of_message]
+            for kind in order.ignored:
+                self.ignored[kind] += 1
+        if self._measured and "velocity" in self.values:
+            rates = self.values["velocity"]
+            if not math.isfinite(sum(rates.tolist())):
+                # Drivers without a measured rate say NaN.
+                rates[~np.isfinite(rates)] = 0.0
+                self.ignored[_NOT_FINITE_RATES] += 1
+
+    def joined(self, raw: bytes) -> bytes | None:
+        """Return a measured state of all joints: this message, or one joined of several.
+
+        None: joints have not come yet since the last whole state.
+
+        Raises
+        ------
+        CommandError
+            The message is refused.
+        """
+        try:
+            self.require(raw)
+        except MissingJointError:
+            pass
+        else:
+            return raw
+        assert self._order is not None
+        self._copy_values()
+        self._seen[self._order.of_model] = True
+        if not self._seen.all():
+            return None
+        self._seen[:] = False
+        template = joint_template(self._joints)
+        for name, values in self.values.items():
+            template.feed(name, values)
+        return template.serialised(bytes(self._reader.raw[HEADER_STAMP]))
+
+    @property
+    def incomplete(self) -> str:
+        """Clause on the joints that have not come since the last whole state."""
+        absent = [n for n, seen in zip(self._joints, self._seen, strict=True) if not seen]
+        return f"no message names {', '.join(absent)}"
 
     def require(self, raw: bytes) -> None:
         """Refuse a message that :meth:`accept` would refuse; ``values`` stay.
@@ -372,6 +437,8 @@ class JointReader:
         ------
         CommandError
             As :meth:`accept` does.
+        MissingJointError
+            A measured state lacks a joint.
         """
         if raw is self._last_accepted:
             return
@@ -382,6 +449,8 @@ class JointReader:
             self._check_names_and_lengths()
         if self._problem:
             raise CommandError(self._problem)
+        if self._missing:
+            raise MissingJointError(f"joint '{self._missing}' is missing")
         self._last_accepted = raw
 
     @property
@@ -392,9 +461,9 @@ class JointReader:
     def _check_names_and_lengths(self) -> None:
         """Check joint names and array lengths of a new layout."""
         names = self._reader.texts("name")
-        self._problem, self._order = "", None
+        self._problem, self._missing, self._order = "", "", None
         try:
-            order = joint_order(self._joints, names)
+            order = JointOrder.of(self._joints, names, self._followers, partial=self._measured)
             for i, quantity in enumerate(self._quantities):
                 count = self._reader.value_count(quantity)
                 if count or i == 0:
@@ -402,11 +471,71 @@ class JointReader:
         except CommandError as error:
             self._problem = str(error)
             return
+        if len(order.of_model) < len(self._joints):
+            present = set(order.of_model.tolist())
+            self._missing = next(n for i, n in enumerate(self._joints) if i not in present)
+            self._order = order
+            return
         for values in self.values.values():
             values[:] = 0.0
         # Joints in the model's order, as nodes of the stack send them, are copied as bytes.
         if names != self._joints:
             self._order = order
+
+
+class MissingJointError(CommandError):
+    """A measured state lacks a joint, which another message may bring."""
+
+
+@dataclass(frozen=True)
+class JointOrder:
+    """Places of the joints of a message among those of a model.
+
+    Attributes
+    ----------
+    of_message, of_model
+        Indices of the joints that both have, in the message and in the model.
+    ignored
+        What the joints of the message are that the model does not have.
+    """
+
+    of_message: npt.NDArray[np.intp]
+    of_model: npt.NDArray[np.intp]
+    ignored: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        joints: Sequence[str],
+        named: Sequence[str],
+        followers: Collection[str] = (),
+        *,
+        partial: bool = False,
+    ) -> JointOrder:
+        """Return the places of named joints; ``partial`` messages may lack joints and name others.
+
+        Raises
+        ------
+        CommandError
+            A joint is named twice; or one is unknown or missing, which partial messages may have,
+            unless they name no joint of the model.
+        """
+        known = [name for name in named if name in joints] if partial else list(named)
+        if not partial or (joints and not known):
+            order = joint_order(joints, named)
+            return cls(np.arange(len(named), dtype=np.intp), order)
+        if len(set(named)) != len(named):
+            raise CommandError(f"a joint is named twice in {list(named)}")
+        places = [i for i, name in enumerate(named) if name in joints]
+        others = [name for name in named if name not in joints]
+        return cls(
+            np.array(places, dtype=np.intp),
+            np.array([list(joints).index(name) for name in known], dtype=np.intp),
+            tuple(
+                f"joint '{name}' {'follows another' if name in followers else 'is unknown'}"
+                for name in others
+            ),
+        )
 
 
 class MessageDecoder:
@@ -418,10 +547,15 @@ class MessageDecoder:
     ----------
     joint_names
         Joints of the robot, in its order.
+    followers
+        Names of joints that follow others.
     """
 
-    def __init__(self, joint_names: Sequence[str]) -> None:
-        self._joints = JointReader(joint_names, ["position", "velocity"], measured=True)
+    def __init__(self, joint_names: Sequence[str], followers: Collection[str] = ()) -> None:
+        quantities: list[Quantity] = ["position", "velocity"]
+        self._joints = JointReader(joint_names, quantities, measured=True, followers=followers)
+        self.ignored, self.joined = self._joints.ignored, self._joints.joined
+        """Ignored parts of joint states, and the function that joins joint states."""
         self._references = JointReader(joint_names, ["position", "velocity"])
         self._measured = {_POSE_PATH: np.zeros(7), _TWIST_PATH: np.zeros(6)}
         spans = {path: len(array) for path, array in self._measured.items()}
@@ -429,6 +563,11 @@ class MessageDecoder:
         self._target = TemplateReader(ODOMETRY, spans)
         self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
         self.check_robot, self.decode_joints = self._joints.require, self._joints.accept
+
+    @property
+    def incomplete(self) -> str:
+        """Clause on joints that have not come yet in joint states."""
+        return self._joints.incomplete
 
     def decode_base(self, odom: bytes) -> tuple[Array, Array]:
         """Return pose (7,) and twist (6,) of an Odometry."""
@@ -495,6 +634,19 @@ class CommandReader:
             raise
         except CommandError as error:
             return self._reader.stamp_ns, error
+
+
+def actuation_of(message: Any) -> str:
+    """Return what a JointState commands, ``velocity`` or ``effort``; empty: joints at rest.
+
+    Nodes of this package fill both arrays, one of them with zeros.
+    """
+    moves, pushes = any(message.velocity), any(message.effort)
+    if moves == pushes:
+        moves, pushes = len(message.velocity) > 0, len(message.effort) > 0
+    if moves == pushes:
+        return ""
+    return "velocity" if moves else "effort"
 
 
 class _WrenchReader:

@@ -14,6 +14,12 @@ from spacerobot_ros.parameters import parameter
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.times import SECOND
 
+DEFAULT_TICK_RATE = 20.0
+"""Ticks a second of a plant whose parameters do not say otherwise, Hz."""
+
+_MIN_RATE = 0.001
+"""Smallest rate of a commander, Hz."""
+
 
 @dataclass(frozen=True)
 class RobotConfig:
@@ -120,10 +126,11 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     """Parameters of the nodes that command a plant: rate, goals, tolerances."""
 
     tick_rate: float = parameter(
-        20.0,
-        "commands per second, equal to the plant's tick_rate",
+        0.0,
+        "commands per second; 0: that of the plant, from its status or from the stamps of its "
+        "states",
         unit="Hz",
-        minimum=0.001,
+        minimum=0.0,
         maximum=100000.0,
     )
     world_frame: str = parameter("world", "frame of goals that name no known frame")
@@ -173,7 +180,14 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
         choices=("report", "abort"),
     )
 
+    def __post_init__(self) -> None:
+        if 0.0 < self.tick_rate < _MIN_RATE:
+            raise ParameterError(
+                f"Parameter 'tick_rate' is {self.tick_rate}; it must be 0 (that of the plant) or "
+                f"at least {_MIN_RATE:g} Hz."
+            )
+
     @property
     def control_period(self) -> float:
         """Duration for which a command is held, a whole number of nanoseconds, s."""
-        return round(SECOND / self.tick_rate) / SECOND
+        return round(SECOND / (self.tick_rate or DEFAULT_TICK_RATE)) / SECOND

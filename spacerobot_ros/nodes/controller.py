@@ -26,7 +26,6 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.messages.readers import (
     WRENCH,
-    MessageDecoder,
     MessageTemplate,
     joint_template,
 )
@@ -80,11 +79,11 @@ class CoordinatedControlNode(CommanderNode):
             self._inputs[topic] = self.take_raw(kind, topic, partial(self._on_reference, topic))
 
     def start_message(self) -> str:
-        """Return a log message with robot, law, rate and goal topic."""
+        """Return a log message with robot, law and goal topic."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
-            f"Controls {described_robot(self.commander.robot)} by '{config.law}' at "
-            f"{config.tick_rate:g} Hz; goals on '{topic}' in '{config.world_frame}'."
+            f"Controls {described_robot(self.commander.robot)} by '{config.law}'; goals on "
+            f"'{topic}' in '{config.world_frame}'."
         )
 
     def parameters_changed(self) -> None:
@@ -94,7 +93,7 @@ class CoordinatedControlNode(CommanderNode):
     def use(self, robot: SpaceRobot) -> None:
         """Control this robot from now on."""
         commander = self.commander
-        commander.use_robot(robot, MessageDecoder(robot.joint_names))
+        commander.use_robot(robot, self.decoder_of(robot))
         self._joint_message = joint_template(robot.joint_names)
         if robot.n:
             self._joint_message.feed("effort", commander.effort)

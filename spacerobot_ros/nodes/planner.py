@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from threading import Thread
 from typing import Any, ClassVar
 
 import numpy as np
-from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Path
-from rclpy.action import ActionClient
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -22,14 +18,12 @@ from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.planner import PlannerCommander
-from spacerobot_ros.commanding.trajectory_output import Outcome, TrajectoryEnd, TrajectoryOutput
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.messages.builders import path_message, trajectory_message
-from spacerobot_ros.messages.readers import MessageDecoder, joint_template
+from spacerobot_ros.messages.readers import joint_template
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.nodes.common.commander import CommanderNode
-from spacerobot_ros.nodes.common.fly_to import action_class
 from spacerobot_ros.nodes.common.messages import (
     end_effector_goal,
     goal_markers,
@@ -39,8 +33,8 @@ from spacerobot_ros.nodes.common.messages import (
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.streams import RawOutput
+from spacerobot_ros.nodes.common.trajectory_clients import TrajectoryClients
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
-from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import (
@@ -49,6 +43,7 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatus,
     ScheduleStart,
 )
+from spacerobot_ros.planning.execution.tracker import Setpoint
 from spacerobot_ros.planning.execution.worker import MAX_THREAD_END_TIME
 from spacerobot_ros.times import stamp_bytes
 from spacerobot_ros.topics import goal_topic, path_topic, twist_topic
@@ -111,11 +106,11 @@ class PlannerNode(CommanderNode):
         self.create_service(Trigger, "~/statistics", self._on_statistics)
 
     def start_message(self) -> str:
-        """Return a log message with method, robot, rate and goal topic."""
+        """Return a log message with method, robot and goal topic."""
         config, topic = self.config, self.resolve_topic_name("goal_pose")
         return (
-            f"Plans by '{config.method}' for {described_robot(self.commander.robot)} at "
-            f"{config.tick_rate:g} Hz; goals on '{topic}' in '{config.world_frame}'."
+            f"Plans by '{config.method}' for {described_robot(self.commander.robot)}; goals on "
+            f"'{topic}' in '{config.world_frame}'."
         )
 
     def deactivate(self) -> None:
@@ -149,12 +144,10 @@ class PlannerNode(CommanderNode):
     def use(self, robot: SpaceRobot) -> None:
         """Plan for this robot from now on."""
         self._shape = None
-        self.commander.use_robot(robot, MessageDecoder(robot.joint_names))
-        setpoint = self.commander.setpoint
+        self.commander.use_robot(robot, self.decoder_of(robot))
         self._message = joint_template(robot.joint_names)
-        if robot.n:
-            self._message.feed("position", setpoint.position)
-            self._message.feed("velocity", setpoint.velocity)
+        self._setpoint: Setpoint | None = None
+        """The setpoint whose arrays the message has."""
 
     # -- inputs -------------------------------------------------------------------------------
 
@@ -233,6 +226,11 @@ class PlannerNode(CommanderNode):
     def send_command(self, stamp_ns: int) -> None:
         """Publish the setpoint as the answer to the state of this stamp."""
         if self._commands is not None:
+            setpoint = self.commander.setpoint
+            if setpoint is not self._setpoint and len(setpoint.position):
+                self._setpoint = setpoint
+                self._message.feed("position", setpoint.position)
+                self._message.feed("velocity", setpoint.velocity)
             self._commands.take(self._message.serialised(stamp_bytes(stamp_ns)))
 
     def publish_status(self, status: Status) -> None:
@@ -242,7 +240,7 @@ class PlannerNode(CommanderNode):
 
     def publish_start(self, start: ScheduleStart) -> None:
         """Publish a schedule, its path and its goal, in a thread if planning runs in a thread."""
-        if not self.config.plan_in_background:
+        if not self.commander.config.plan_in_background:
             self._publish_schedule(start)
             return
         if self._announcement is not None:
@@ -267,118 +265,3 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
-
-
-# -- clients of trajectories ----------------------------------------------------------------------
-
-_OUTCOMES = {
-    GoalStatus.STATUS_SUCCEEDED: Outcome.SUCCEEDED,
-    GoalStatus.STATUS_ABORTED: Outcome.ABORTED,
-    GoalStatus.STATUS_CANCELED: Outcome.CANCELED,
-}
-
-
-class TrajectoryClients:
-    """The clients of FollowJointTrajectory of a planner node, which are there as long as the node.
-
-    An executor may hold an answer for a client that a cleanup of the node would destroy.
-
-    Parameters
-    ----------
-    node
-        The planner's node.
-
-    Raises
-    ------
-    ParameterError
-        The package of the action is not installed.
-    """
-
-    def __init__(self, node: Any) -> None:
-        kind = action_class("control_msgs", "FollowJointTrajectory")
-        if kind is None:
-            raise ParameterError(
-                "Parameter 'output' is 'trajectory', which needs the package control_msgs: install "
-                "it (apt: ros-$ROS_DISTRO-control-msgs), or set another output."
-            )
-        self._kind, self._node = kind, node
-        self._clients: dict[str, ActionClient] = {}
-        """Clients by the name of their action."""
-
-    def connect(self, name: str, on_end: Callable[[TrajectoryEnd], None]) -> TrajectoryOutput:
-        """Return an output to the server of an action, which tells ends as `on_end`."""
-        if name not in self._clients:
-            self._clients[name] = ActionClient(self._node, self._kind, name)
-        connection = _Connection(self._kind, self._clients[name])
-        output = TrajectoryOutput(connection, self._node.resolve_topic_name(name), on_end)
-        connection.output = output
-        return output
-
-    def destroy(self) -> None:
-        """Destroy the clients, with the node."""
-        for client in self._clients.values():
-            client.destroy()
-        self._clients.clear()
-
-
-class _Connection:
-    """Connects one :class:`TrajectoryOutput` with a client."""
-
-    output: TrajectoryOutput
-
-    def __init__(self, kind: Any, client: Any) -> None:
-        self._kind, self._client = kind, client
-        self._handles: dict[int, Any] = {}
-        """Accepted schedules without a result, by number."""
-        self._cancelled: set[int] = set()
-        """Schedules that are cancelled as soon as they are accepted."""
-
-    def is_available(self) -> bool:
-        """Whether the server is there."""
-        return bool(self._client.server_is_ready())
-
-    def send(self, number: int, start: ScheduleStart) -> None:
-        """Send a schedule, which begins when it arrives."""
-        goal = self._kind.Goal(trajectory=joint_trajectory(start.schedule))
-        answer = self._client.send_goal_async(goal)
-        answer.add_done_callback(lambda future: self._on_answer(number, future.result()))
-
-    def cancel(self, number: int) -> None:
-        """Have a schedule cancelled; one that is not accepted yet, when it is."""
-        handle = self._handles.get(number)
-        if handle is None:
-            self._cancelled.add(number)
-        else:
-            handle.cancel_goal_async()
-
-    def _on_answer(self, number: int, handle: Any) -> None:
-        if not handle.accepted:
-            self._cancelled.discard(number)
-            self.output.rejected(number)
-            return
-        self._handles[number] = handle
-        if number in self._cancelled:
-            self._cancelled.discard(number)
-            handle.cancel_goal_async()
-        self.output.accepted(number)
-        handle.get_result_async().add_done_callback(
-            lambda future: self._on_result(number, future.result())
-        )
-
-    def _on_result(self, number: int, response: Any) -> None:
-        self._handles.pop(number, None)
-        outcome = _OUTCOMES.get(response.status, Outcome.ABORTED)
-        result = response.result
-        self.output.ended(number, outcome, result.error_code, result.error_string)
-
-
-def joint_trajectory(schedule: GaitSchedule) -> JointTrajectory:
-    """Return a schedule as a trajectory that begins when it arrives.
-
-    Its points have positions alone: between two of them a controller then interpolates linearly,
-    which is the schedule, whose velocities are constant over a tick.
-    """
-    message = deserialize_message(trajectory_message(schedule, 0, ""), JointTrajectory)
-    for point in message.points:
-        point.velocities = []
-    return message

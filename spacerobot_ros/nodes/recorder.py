@@ -152,6 +152,7 @@ class RecorderNode(FlightNode):
         self.create_timer(config.flush_period, self.flush, clock=steady)
         self.create_timer(_CHECK_PERIOD, self._check_file, clock=steady)
         self._splits = 0
+        self._steps_back_of_one_clock = 0
         asked = Path(config.bag).name
         if asked and not writer.path.name.startswith((f"{Path(asked).stem}_", asked)):
             self.get_logger().warning(
@@ -274,13 +275,23 @@ class RecorderNode(FlightNode):
             clocks = self.count_publishers(self._clock_topic)
             self.recording.flush(clock_is_published=clocks > 0)
             self._publish_losses(self.recording)
-            if clocks > 1:
-                self.get_logger().warning(
-                    f"{clocks} clocks are published on '{self._clock_topic}': the times of the bag "
-                    "jump from one to the other. Give each stack its own namespace and clock "
-                    "(--ros-args -r __ns:=/NAME -r /clock:=clock).",
-                    throttle_duration_sec=_LOSS_LOG_PERIOD,
-                )
+            self._warn_of_clocks(self.recording, clocks)
+
+    def _warn_of_clocks(self, recording: Recording, publishers: int) -> None:
+        """Warn of a second clock, between which the times of the bag jump.
+
+        The middleware lists a killed plant for a while beside the one that is started again, but
+        the clock goes back once only for each plant that is listed after the first.
+        """
+        if publishers < 2:
+            self._steps_back_of_one_clock = recording.clock_steps_back
+        elif recording.clock_steps_back - self._steps_back_of_one_clock >= publishers:
+            self.get_logger().warning(
+                f"More than one clock is published on '{self._clock_topic}': the times of the bag "
+                "jump from one to the other. Give each stack its own namespace and clock "
+                "(--ros-args -r __ns:=/NAME -r /clock:=clock).",
+                throttle_duration_sec=_LOSS_LOG_PERIOD,
+            )
 
     # -- subscriptions ------------------------------------------------------------------------
 

@@ -80,6 +80,8 @@ class MissionClient:
         self.node: Node = rclpy.create_node(name, namespace=namespace, context=context)
         self.status: Status | None = None
         """Last status of the commander that decides the goal."""
+        self.message = ""
+        """Message of the last status that another goal is not the subject of; empty before."""
         self._done = rclpy.task.Future(executor=None)
         self._frame, self._now = world_frame, now
         self._joint_names, self._on_end = joint_names, on_end
@@ -129,11 +131,6 @@ class MissionClient:
         return self._done.result()
 
     @property
-    def message(self) -> str:
-        """Message of the last status; empty before the first status."""
-        return "" if self.status is None else self.status.message
-
-    @property
     def ends_at(self) -> float:
         """Simulated time at which the present schedule of the planner ends, s; else 0."""
         return self.status.ends_at_s if isinstance(self.status, PlannerStatus) else 0.0
@@ -181,6 +178,7 @@ class MissionClient:
         message = goal_message(goal, self._frame, time_ns)
         stamp = message.header.stamp
         self._follower = GoalFollower(GoalIds().of(stamp.sec, stamp.nanosec))
+        self.message = ""
         if self._shape_topic is not None and self._joint_names is not None:
             self._shape_topic.publish(shape_message(goal, self._joint_names()))
         if goal.base:
@@ -251,5 +249,13 @@ class MissionClient:
     def _on_status(self, received: DiagnosticStatus) -> None:
         message = read_status(received)
         self.status = self._read(dict(message.values), message.message)
+        if not self._is_about_another_goal(self.status):
+            self.message = self.status.message
         if self._follower.update(self.status):
             self._end(Outcome(self.status.state.value))
+
+    def _is_about_another_goal(self, status: Status) -> bool:
+        """Whether a status, such as the verdict on an earlier goal, says nothing about this one."""
+        if self.goal_id is None or self._follower.is_about_goal(status):
+            return False
+        return bool(status.goal_id) or status.state.decided

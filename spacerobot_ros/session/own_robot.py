@@ -236,7 +236,7 @@ def scenario_text(problem: PlanningProblem, method: str, robot_path: str) -> str
     assert problem.initial.joint_positions is not None
     shape = ", ".join(repr(float(q)) for q in problem.initial.joint_positions)
     joints = ", ".join(problem.robot.joint_names)
-    rate, config = problem.config.tick_rate, problem.config
+    rate, config = 1.0 / problem.control_period, problem.config
     turn = rotvec_from_quaternion(problem.goal.quaternion)
     angle = math.degrees(float(np.linalg.norm(turn)))
     axis = ", ".join(f"{each:.3g}" for each in turn / np.linalg.norm(turn) + 0.0)
@@ -261,7 +261,6 @@ scenario:
 /**/planner:
   ros__parameters:
     robot: {robot_path}
-    tick_rate: {rate!r}
     method: {method}
     attitude_tolerance: {config.attitude_tolerance!r}   # rad
     position_tolerance: {config.position_tolerance!r}   # m

@@ -159,6 +159,8 @@ class Stack(ABC):
 
         try:
             self.client.follow(self.executor, on_look)
+            if self.client.outcome is Outcome.ABORTED:
+                on_look()  # A commander that fails aborts its goal.
         except SpaceRobotError:
             with suppress(SpaceRobotError):
                 self.finish()

@@ -465,6 +465,7 @@ def build_plant(
         The integration step is too short, or the initial state, the target, a thruster, a fault or
         a disturbance is refused.
     """
+    config = config.decided()
     kind, step = PLANTS[config.actuation], config.integration_step
     control_period = config.control_period
     if 0.0 < step < _MIN_STEP:

@@ -263,6 +263,12 @@ class CommandValidator:
         self.last_stamp_ns: float = NO_STAMP
         """Stamp of the command before the latest one."""
 
+    def succeed(self, before: CommandValidator) -> None:
+        """Go on with the faults and counts of the validator of the same plant so far."""
+        self.counts, self.timeouts = before.counts, before.timeouts
+        self.fault, self.fault_reason = before.fault, before.fault_reason
+        self.last_stamp_ns, self._earliest = before.last_stamp_ns, before._earliest
+
     @property
     def complete(self) -> bool:
         """Whether all commands that a lockstep plant waits for have arrived."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from spacerobot_ros.model.shared_parameters import RobotConfig, WatchdogConfig
+from spacerobot_ros.model.shared_parameters import DEFAULT_TICK_RATE, RobotConfig, WatchdogConfig
 from spacerobot_ros.parameters import group, parameter
 from spacerobot_ros.times import SECOND
 
@@ -255,7 +255,9 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     """Parameters of a plant: actuation, time, limits, initial state, faults, sensors."""
 
     actuation: str = parameter(
-        "velocity", "what joint_commands carry", choices=("velocity", "effort")
+        "auto",
+        "what joint_commands carry; auto: what the first command carries that moves anything",
+        choices=("auto", "velocity", "effort"),
     )
     engine: str = parameter(
         "exact",
@@ -265,7 +267,11 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     time_mode: str = parameter("realtime", "who drives time", choices=("realtime", "lockstep"))
     tick_rate: float = parameter(
-        20.0, "ticks a second of simulated time", unit="Hz", minimum=0.001, maximum=100000.0
+        DEFAULT_TICK_RATE,
+        "ticks a second of simulated time",
+        unit="Hz",
+        minimum=0.001,
+        maximum=100000.0,
     )
     real_time_factor: float = parameter(
         1.0, "simulated over wall time", minimum=0.001, maximum=1000.0
@@ -422,6 +428,17 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     sensors: SensorConfig = group(SensorConfig())
     target: TargetConfig = group(TargetConfig())
     capture: CaptureConfig = group(CaptureConfig())
+
+    def decided(self, actuation: str = "") -> PlantConfig:
+        """Return the configuration with an actuation in place of ``auto``.
+
+        ``actuation`` is what commands carry; empty: velocities, unless thrusters or moving joints
+        need efforts.
+        """
+        if self.actuation != "auto":
+            return self
+        needs_efforts = bool(self.thrusters) or any(self.initial_joint_velocities)
+        return replace(self, actuation=actuation or ("effort" if needs_efforts else "velocity"))
 
     @property
     def period_ns(self) -> int:

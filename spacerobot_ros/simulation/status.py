@@ -15,10 +15,12 @@ from spacerobot_ros.events import (
     KeyValueFormat,
     choice_format,
     list_format,
+    number_format,
 )
 from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.capture import CaptureReport, ReleaseReport
 from spacerobot_ros.simulation.commands import CommandValidator
+from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.times import SECOND
 
 
@@ -70,6 +72,13 @@ class PlantStatus:
         Number of times that the joints were brought to rest because no command came in time.
     last_command_s
         Stamp of the last command before the latest of these, s; None: there was none.
+    actuation
+        What joint_commands carry: ``velocity`` or ``effort``; ``auto``: either, until a command
+        decides; empty: the plant is not configured.
+    tick_rate_hz
+        Ticks a second of simulated time, Hz; 0: the plant is not configured.
+    time_mode
+        Who drives time: ``realtime`` or ``lockstep``; empty: the plant is not configured.
     """
 
     state: PlantState
@@ -84,6 +93,9 @@ class PlantStatus:
     timeouts: int = 0
     last_command_s: float | None = None
     payload: str = ""
+    actuation: str = ""
+    tick_rate_hz: float = 0.0
+    time_mode: str = ""
 
     @property
     def level(self) -> int:
@@ -121,6 +133,9 @@ _FORMAT = KeyValueFormat(
     KeyValueField("faults", list_format("; "), always=True),
     KeyValueField("disturbances", list_format("; ")),
     KeyValueField("payload"),
+    KeyValueField("actuation"),
+    KeyValueField("tick_rate_hz", number_format(".15g")),
+    KeyValueField("time_mode"),
 )
 
 
@@ -131,20 +146,26 @@ class PlantMonitor:
     ----------
     commands, plant
         The plant and the validator of its commands.
-    lockstep
-        Whether the plant waits for commands, and so never rests without one.
+    config
+        Configuration of the plant. In lockstep it waits for commands, and so never rests.
     """
 
     def __init__(
-        self, commands: CommandValidator, plant: PlantWithFaults, *, lockstep: bool
+        self, commands: CommandValidator, plant: PlantWithFaults, config: PlantConfig
     ) -> None:
-        self._commands, self._plant, self._lockstep = commands, plant, lockstep
+        self.observe(commands, plant, config)
         self.rearms = self.resets = 0
         """Number of rearms and resets, counted by the owner."""
         self.status = PlantStatus(PlantState.INACTIVE, "The plant is inactive.")
         """Status of the last update."""
         self.failure = "", ""
         """Reason and message of the error that stopped the plant, set by the owner."""
+
+    def observe(
+        self, commands: CommandValidator, plant: PlantWithFaults, config: PlantConfig
+    ) -> None:
+        """Derive later statuses from these."""
+        self._commands, self._plant, self._config = commands, plant, config
 
     def update(self, activity: PlantState, time_s: float) -> list[Event]:
         """Update the status.
@@ -174,6 +195,9 @@ class PlantMonitor:
             faults=tuple(str(fault) for fault in self._plant.active),
             disturbances=tuple(str(each) for each in self._plant.disturbances),
             payload=self._payload(),
+            actuation=self._config.actuation,
+            tick_rate_hz=self._config.tick_rate,
+            time_mode=self._config.time_mode,
         )
         captures = [report.event(time_s) for report in reports]
         if now == before:
@@ -212,7 +236,7 @@ class PlantMonitor:
             case _ if fault:
                 activity = PlantState.LATCHED
                 message = f"Nothing moves until '~/rearm' is called: {fault}"
-            case _ if self._lockstep:
+            case _ if self._config.time_mode == "lockstep":
                 message = "Every tick takes the command that answers its state"
             case _ if commands.in_force:
                 message = "A command is in force"

@@ -28,10 +28,8 @@ from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
-from spacerobot_ros.simulation.config import period_ns
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
-from spacerobot_ros.times import SECOND
 
 _MAX_SCHEDULES = 1000
 """Largest number of successive schedules of a method that plans in stages."""
@@ -65,7 +63,7 @@ class PlanningProblem:
     @property
     def control_period(self) -> float:
         """Duration for which a command is held, s."""
-        return period_ns(self.config.tick_rate) / SECOND
+        return self.config.control_period
 
     def method(self, name: str) -> GaitMethod:
         """Build a gait method with its options."""

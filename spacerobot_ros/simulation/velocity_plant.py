@@ -21,6 +21,9 @@ from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
+_ROUNDING = 1e-9
+"""Share of a rate, and motion in a tick (m or rad), beyond a limit that count as rounding."""
+
 
 class VelocityPlant:
     """A free-floating robot whose servos realise held joint velocities.
@@ -163,7 +166,8 @@ def tick_function(
     duration = ca.fmax(h, 1e-12)
     to_lower, to_upper = (ca.DM(robot.lower) - q) / duration, (ca.DM(robot.upper) - q) / duration
     qdot = ca.fmin(ca.fmax(rate, to_lower), to_upper)
-    by_rate, by_stroke = command != rate, rate != qdot
+    by_rate = ca.fabs(command - rate) > _ROUNDING * ca.DM(robot.velocity_limit)
+    by_stroke = ca.fabs(rate - qdot) * duration > _ROUNDING
     limited = ca.vertcat(ca.sum1(by_rate) + ca.sum1(by_stroke), by_rate, by_stroke)
 
     loads: list[ca.MX] = []

@@ -157,7 +157,10 @@ def _assert_same(expected: Any, actual: Any) -> None:
 def prefix_with_package(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[str, dict[str, str]], None]:
-    """Install a message package, given its name and the texts of its messages, for one test."""
+    """Install a message package, given its name and the texts of its messages, for one test.
+
+    Actions and services have the paths of their files for names.
+    """
     prefix = tmp_path_factory.mktemp("prefix")
     known = os.environ.get("AMENT_PREFIX_PATH")
     monkeypatch.setenv("AMENT_PREFIX_PATH", os.pathsep.join(filter(None, (str(prefix), known))))
@@ -169,6 +172,8 @@ def prefix_with_package(
         folder.mkdir(parents=True)
         (index / package).touch()
         for name, text in messages.items():
-            (folder / f"{name}.msg").write_bytes(text.encode())
+            path = folder.parent / name if "/" in name else folder / f"{name}.msg"
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(text.encode())
 
     return install

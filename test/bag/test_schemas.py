@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib
 import json
 import struct
 import sys
@@ -12,6 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from spacerobot_ros.bag import RecordingError, message_definition, type_hash
 from spacerobot_ros.messages.definitions import MessageTypes, _type_store
+from spacerobot_ros.nodes.common.messages import message_class
 
 TYPES = [
     "diagnostic_msgs/msg/DiagnosticArray",
@@ -107,6 +109,66 @@ def test_only_types_of_fields_count_as_dependencies(prefix_with_package: Install
     ]
 
 
+ACTION = """\
+# Where to.
+Leaf goal
+---
+uint8 NONE=0
+bool arrived
+---
+float64 distance
+Leaf[] passed
+"""
+
+
+@pytest.mark.parametrize(
+    ("part", "text", "used"),
+    [
+        ("Goal", "# Where to.\nLeaf goal\n", ["Leaf"]),
+        ("Result", "uint8 NONE=0\nbool arrived\n", []),
+        ("Feedback", "float64 distance\nLeaf[] passed\n", ["Leaf"]),
+        (
+            "FeedbackMessage",
+            "unique_identifier_msgs/UUID goal_id\nrosbag2_like_e/Move_Feedback feedback\n",
+            ["Move_Feedback", "Leaf"],
+        ),
+        (
+            "SendGoal_Request",
+            "unique_identifier_msgs/UUID goal_id\nrosbag2_like_e/Move_Goal goal\n",
+            ["Move_Goal", "Leaf"],
+        ),
+    ],
+)
+def test_messages_of_actions_are_defined_by_their_files(
+    part: str, text: str, used: list[str], prefix_with_package: Install
+) -> None:
+    prefix_with_package("rosbag2_like_e", {"Leaf": "bool green\n", "action/Move.action": ACTION})
+    name = f"rosbag2_like_e/action/Move_{part}"
+    message_definition.cache_clear()
+    definition = message_definition(name)
+    assert definition == message_definition(f"rosbag2_like_e/Move_{part}")
+    assert definition.startswith(text)
+    own = [each for each in _sections(definition) if each.startswith("rosbag2_like_e")]
+    assert own == [f"rosbag2_like_e/{each}" for each in used]
+    assert set(get_types_from_msg(definition, name)) >= {name}
+    assert type_hash(name) == ""
+
+
+@pytest.mark.parametrize("service", ["std_srvs/srv/SetBool", "nav_msgs/srv/GetMap"])
+@pytest.mark.parametrize("part", ["Request", "Response", "Event"])
+def test_messages_of_services_have_the_fields_of_their_classes(service: str, part: str) -> None:
+    package, _, name = service.split("/")
+    kind = getattr(getattr(importlib.import_module(f"{package}.srv"), name), part)
+    type_name = f"{service}_{part}"
+    plain = type_name.replace("/srv/", "/msg/")
+    _, fields = get_types_from_msg(message_definition(type_name), plain)[plain]
+    dummy = {"structure_needs_at_least_one_member"}
+    assert {name for name, _ in fields} - dummy == set(kind.get_fields_and_field_types())
+    assert message_class(type_name) is kind
+    described = json.loads(_installed(f"{service}.json").read_text())["type_hashes"]
+    assert {"type_name": type_name, "hash_string": type_hash(type_name)} in described
+
+
 def test_a_type_may_be_named_without_its_folder() -> None:
     assert message_definition("std_msgs/String") == message_definition("std_msgs/msg/String")
     assert type_hash("std_msgs/String") == type_hash("std_msgs/msg/String")
@@ -130,6 +192,8 @@ def test_a_package_without_descriptions_has_no_hashes(prefix_with_package: Insta
     ("type_name", "words"),
     [
         ("Odometry", "'Odometry' is not the name of a message type"),
+        ("std_srvs/action/SetBool_Event", "'std_srvs/action/SetBool_Event' is not the name of"),
+        ("nav_msgs/srv/NoSuch_Event", "has no message NoSuch_Event"),
         ("nav_msgs/srv/GetMap", "'nav_msgs/srv/GetMap' is not the name of a message type"),
         ("../etc/msg/passwd", "is not the name of a message type"),
         ("no_such_msgs/msg/A", "no_such_msgs is neither on AMENT_PREFIX_PATH nor in"),

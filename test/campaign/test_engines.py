@@ -759,8 +759,6 @@ def test_what_cannot_be_flown_without_ros_is_said() -> None:
     kills = replace(START, kills=("planner at 1",))  # type: ignore[arg-type]
     assert RosEngine().refusal(replace(PLANNED, scenario=kills)) == "it kills nodes on the way"
     assert RosEngine().refusal(PLANNED) == FlightsEngine().refusal(PLANNED) == ""
-    background = START.with_overrides("planner", {"plan_in_background": True})
-    assert "background" in FlightsEngine().refusal(replace(PLANNED, scenario=background))
 
 
 @pytest.mark.parametrize(("duration", "interrupted"), [(7.5, False), (7.625, True)])

@@ -273,7 +273,5 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
     ):
         other = campaign(disperse={name: {"choice": values}})
         assert select_engine(other, "auto").name == "flights"
-    background = campaign(set={"planner.plan_in_background": True})
-    assert select_engine(background, "auto").name == "ros"
     for given in ({"plant.sensors.joint_noise": 1e-3}, {"planner.averaging": 3}):
         assert select_engine(campaign(set=given), "auto").name == "flights"

@@ -77,7 +77,7 @@ CASES: dict[str, tuple[float, str, dict[str, Any]]] = {
     "plant.initial_joint_velocities[0]": (
         0.25,
         "m/s or rad/s",
-        {"plant.initial_joint_velocities": (0.25, 0.0, 0.0)},
+        {"plant.initial_joint_velocities": (0.25, 0.0, 0.0), "plant.actuation": "effort"},
     ),
     "plant.initial_position[2]": (5.5, "m", {"plant.initial_position": (1.0, 2.0, 5.5)}),
     "initial.position.y": (0.25, "m", {"plant.initial_position": (1.0, 2.25, 3.0)}),

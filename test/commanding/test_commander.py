@@ -149,7 +149,12 @@ class Rig:
         self.commander.use_robot(robot, OneRobotDecoder(self.n))
 
 
-METHOD = {"method": "lie_bracket", "lie_bracket.t1": 2.0, "lie_bracket.n1": 1}
+METHOD = {
+    "method": "lie_bracket",
+    "lie_bracket.t1": 2.0,
+    "lie_bracket.n1": 1,
+    "plan_in_background": False,
+}
 
 
 @pytest.fixture
@@ -288,16 +293,18 @@ def test_a_jump_is_answered_with_its_pose_once_its_time_is_accepted(controller: 
 
 
 def test_while_the_plant_is_paused_no_jump_is_accepted(planner: Rig) -> None:
+    planner.state(0)
     planner.state(1)
     planner.commander.receive_plant_status(PlantStatus(PlantState.PAUSED, "Time stands still."))
     planner.state(5000)
     for _ in range(10):
         planner.wall += 0.1
         planner.commander.take_accepted_jump()
-    assert planner.host.commands == [1]
+    assert planner.host.commands == [0, 1]
 
 
 def test_ignored_states_are_reported_once_a_second(planner: Rig) -> None:
+    planner.state(0)
     planner.state(1)
     warned = []
     for tick in range(2, 32):

@@ -19,7 +19,7 @@ class Listener:
 
     def __init__(self, pace: float = 1.0) -> None:
         self.wall, self.pace, self.time = 100.0, pace, 40.0
-        self.times = StampFilter(PERIOD, clock=lambda: self.wall)
+        self.times = StampFilter(clock=lambda: self.wall)
         self.believed: list[float] = []
         """The times of the states that were admitted, s."""
 
@@ -136,21 +136,52 @@ def test_a_node_that_stood_still_itself_believes_no_other_time() -> None:
     assert listener.look() is None
 
 
-def test_a_plant_of_another_rate_is_understood_after_two_states() -> None:
-    listener = Listener()
-    listener.states(1)
-    step = 4 * PERIOD
-    for _ in range(2):
-        # In lockstep every state comes as soon as the one before is answered.
-        listener.time += step
-        assert not listener.joints(listener.time)
-        for _ in range(3):
-            listener.wall += 0.1
-            listener.look()
-    for _ in range(50):
-        listener.time += step
-        listener.wall += 1e-4
+@pytest.mark.parametrize("rate", [0.5, 5.0, 200.0])
+@pytest.mark.parametrize("pace", [1.0, 500.0])
+def test_the_rate_of_any_plant_is_known_after_three_states(rate: float, pace: float) -> None:
+    listener = Listener(pace)
+    for number in range(50):
+        assert (listener.times.rate > 0) == (number > 2)
+        listener.time += 1 / rate
+        listener.wait(1 / rate / pace)
+        assert listener.odom(listener.time)
         assert listener.joints(listener.time)
+    assert listener.times.rate == pytest.approx(rate, rel=1e-6)
+
+
+def test_a_plant_that_is_restarted_with_another_rate_is_followed() -> None:
+    listener = Listener()
+    listener.states(20)
+    believed, time = 0, 0.0
+    for _ in range(40):
+        time += 10 * PERIOD
+        listener.wait(10 * PERIOD)
+        believed += listener.joints(time)
+    assert believed >= 37
+    assert listener.times.rate == pytest.approx(0.1 / PERIOD)
+
+
+def test_the_rate_of_a_driver_with_jitter_and_losses_is_that_of_most_states() -> None:
+    listener = Listener()
+    jitter = [0.0, 0.003, -0.002, 0.001, -0.003, 0.002, 0.0, 0.004, -0.001, 0.002]
+    for number, off in enumerate(jitter):
+        listener.wait(PERIOD)
+        listener.time += PERIOD
+        if number != 4:
+            assert listener.joints(listener.time + off)
+    assert listener.times.rate == 20.0
+
+
+@pytest.mark.parametrize("step", [0.001, 0.0123456789, 2.0])
+def test_bad_states_between_good_ones_do_not_change_the_rate(step: float) -> None:
+    listener = Listener()
+    for _ in range(5):
+        listener.wall += step
+        listener.time += step
+        assert listener.joints(listener.time)
+        assert listener.joints(listener.time + step / 2)
+        listener.times.undo_last()
+    assert listener.times.rate == pytest.approx(1 / step, rel=1e-6)
 
 
 def test_the_first_state_is_believed_whatever_its_stamp() -> None:
@@ -182,7 +213,7 @@ class Exact:
 
     def __init__(self, pace: float = 1.0) -> None:
         self.wall = 64.0
-        self.times = StampFilter(self.PERIOD, clock=lambda: self.wall)
+        self.times = StampFilter(clock=lambda: self.wall)
         for tick in range(1, 17):
             self.wall += self.PERIOD / pace
             assert self.times.accepts_joints(round(tick * self.PERIOD * SECOND), "joints")

@@ -131,7 +131,7 @@ def test_what_is_no_goal_is_refused_in_one_sentence(given: Any) -> None:
 
 
 def test_a_robot_alone_asks_for_a_goal_in_the_words_of_python() -> None:
-    with pytest.raises(ParameterError, match=r"'dual_arm' is a robot.*rotvec=\(0, 0, 0\.1\)"):
+    with pytest.raises(ParameterError, match=r"'dual_arm' has no goal.*rotvec=\(0, 0, 0\.1\)"):
         fly("dual_arm")
 
 
@@ -319,7 +319,7 @@ def test_a_plan_takes_the_parameters_that_a_flight_takes() -> None:
     words: dict[str, Any]
     for words, message in (
         ({"planer.x": 1}, "'planer.x' is not a parameter: give node.parameter"),
-        ({}, "'surveyor' is a robot and has no goal: give one"),
+        ({}, "'surveyor' has no goal: give one"),
     ):
         with pytest.raises(ParameterError, match=message):
             plan("surveyor", parameters=words)

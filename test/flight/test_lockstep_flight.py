@@ -169,7 +169,6 @@ def test_a_saved_flight_with_another_number_is_not_verified(
     ("settings", "word"),
     [
         (["plant.time_mode=realtime"], "time_mode"),
-        (["planner.plan_in_background=true"], "plan_in_background"),
         (["plant.resume_bag=some.mcap"], "resume_bag"),
         (["planner.resume_file=some.json"], "resume_file"),
         (["planner.output=commands"], "both command"),

@@ -215,9 +215,7 @@ def test_contacts_are_among_the_events_of_their_time(engine: str) -> None:
         ({"lockstep": False}, "plant.time_mode is realtime"),
         ({"kills": (1,)}, "it kills nodes on the way"),
         ({"resume_bag": "a.mcap"}, "plant.resume_bag is set"),
-        ({"plan_in_background": True}, "planner.plan_in_background is true"),
         ({"output": "trajectory"}, "planner.output is trajectory"),
-        ({"plan_in_background": True, "commanders": ("coordinated_control",)}, ""),
         ({"resume_file": "a"}, "a resume_file is set"),
         ({"output": "commands"}, "planner and controller both command the joints"),
         ({"output": "commands", "commanders": ("planner",)}, ""),
@@ -225,7 +223,7 @@ def test_contacts_are_among_the_events_of_their_time(engine: str) -> None:
 )
 def test_flights_that_need_nodes_say_why(changes: dict[str, Any], why: str) -> None:
     given = {
-        **{"lockstep": True, "kills": (), "resume_bag": "", "plan_in_background": False},
+        **{"lockstep": True, "kills": (), "resume_bag": ""},
         **{
             "resume_file": "",
             "output": "reference",
@@ -239,9 +237,7 @@ def test_flights_that_need_nodes_say_why(changes: dict[str, Any], why: str) -> N
         kills=given["kills"],
         commanders=given["commanders"],
         plant=SimpleNamespace(resume_bag=given["resume_bag"]),
-        planner=SimpleNamespace(
-            plan_in_background=given["plan_in_background"], output=given["output"]
-        ),
+        planner=SimpleNamespace(output=given["output"]),
         config=lambda name: SimpleNamespace(
             resume_file=given["resume_file"] if name == given["commanders"][-1] else ""
         ),

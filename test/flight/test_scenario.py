@@ -199,7 +199,7 @@ def test_a_robot_beside_its_scenario_is_found_and_integers_go_with_floats(tmp_pa
 
 def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
     alone = scenario_or_robot("three_joint_arm")
-    with pytest.raises(ParameterError, match="'three_joint_arm' is a robot and has no goal"):
+    with pytest.raises(ParameterError, match="'three_joint_arm' has no goal"):
         alone.require_goal()
     there = alone.with_goal(rpy_deg=(0.0, 0.0, 90.0))
     there.require_goal()

@@ -14,7 +14,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 
-from spacerobot_ros.errors import CommandError
+from spacerobot_ros.errors import CommandError, RecordingError
 from spacerobot_ros.messages import definitions
 from spacerobot_ros.messages.definitions import fields_of
 from spacerobot_ros.messages.layout import (
@@ -103,15 +103,10 @@ def test_errors_are_one_line(length: int, cut: bool) -> None:
     assert definitions._error_in_one_line(ValueError("a \n  b")) == "a b"
 
 
-@pytest.mark.parametrize(
-    ("given", "short"),
-    [("std_msgs/msg/String", ("std_msgs", "String")), ("std_msgs/String", ("std_msgs", "String"))],
-)
-def test_short_names_of_types_are_known(given: str, short: tuple[str, str]) -> None:
-    assert definitions._split_type_name(given) == short
-    for wrong in ("String", "std_msgs/msg/", "a/msg/B/c", "/String"):
-        with pytest.raises(Exception, match="is not the name of a message type"):
-            definitions._split_type_name(wrong)
+@pytest.mark.parametrize("wrong", ["String", "std_msgs/msg/", "a/msg/B/c", "/String"])
+def test_names_that_are_none_of_types_are_refused(wrong: str) -> None:
+    with pytest.raises(RecordingError, match="is not the name of a message type"):
+        definitions.message_definition(wrong)
 
 
 # -- messages -----------------------------------------------------------------------------------

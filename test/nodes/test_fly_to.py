@@ -15,13 +15,15 @@ import numpy.typing as npt
 import pytest
 from builtin_interfaces.msg import Duration
 from geometry_msgs.msg import PoseStamped
+from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import JointState
 from support.action_clients import Sender, SentGoal, base_at
 from support.hand_motion import end_of_motion
 from support.planner_flight import HERE, NEAR, PLANT, TURNED, Flight, goal_at, values_of
 from support.ros_harness import Harness
 
-from spacerobot_ros.nodes import CoordinatedControlNode, PlantNode
+from spacerobot_ros.bag import read_bag
+from spacerobot_ros.nodes import CoordinatedControlNode, PlantNode, RecorderNode, ReplayNode
 from spacerobot_ros.nodes.common.fly_to import action_class
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
@@ -108,6 +110,51 @@ def test_a_goal_of_fly_to_is_flown_and_told(harness: Harness) -> None:
     ]
     assert moving == sorted(moving, reverse=True)
     assert moving[0] > 2.0
+
+
+def test_feedback_is_recorded_and_replayed(
+    harness: Harness, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    flight = ActionFlight(harness)
+    bag = tmp_path / "flight.mcap"
+    recorder = harness.make(RecorderNode, {"bag": str(bag)})
+    feedback, status = (f"/planner/fly_to/_action/{name}" for name in ("feedback", "status"))
+    harness.spin_until(lambda: {feedback, status, "/odom"} <= recorder.topics, "the recorder")
+    harness.connect()
+    flight.start()
+    sent = flight.fly_to.send(**base_at(goal_at(TURNED)))
+    assert flight.check(sent) == "reached"
+    flight.plant.trigger_deactivate()
+    harness.settle(flight.probe)
+    recorder.trigger_deactivate()
+    recorder.trigger_cleanup()
+    assert "is not recorded" not in capfd.readouterr().err
+    with AnyReader([bag]) as reader:
+        connections = [each for each in reader.connections if each.topic == feedback]
+        assert [each.msgtype for each in connections] == [
+            "spacerobot_msgs/action/FlyTo_FeedbackMessage"
+        ]
+        read: list[Any] = [
+            reader.deserialize(raw, connection.msgtype)
+            for connection, _, raw in reader.messages(connections)
+        ]
+    assert [each.feedback.phase for each in read] == [each.phase for each in sent.feedback]
+    assert [each.feedback.errors.position for each in read] == [
+        each.errors.position for each in sent.feedback
+    ]
+    phases = read_bag(bag)[feedback].field("feedback.phase")
+    assert list(phases) == [each.phase for each in sent.feedback]
+
+    replayed: list[str] = []
+    again = {"bag": str(bag), "topics": feedback, "remap": f"{feedback}:=/again", "rate": 10.0}
+    harness.make(ReplayNode, again)
+    assert FLY_TO is not None
+    kind = FLY_TO.Impl.FeedbackMessage
+    flight.probe.create_subscription(
+        kind, "/again", lambda message: replayed.append(message.feedback.phase), 1000
+    )
+    harness.spin_until(lambda: len(replayed) == len(read), "the replay")
+    assert replayed == [each.phase for each in sent.feedback]
 
 
 def test_a_cancelled_goal_is_aborted(harness: Harness) -> None:

@@ -315,30 +315,6 @@ def test_a_recorder_waits_for_messages_that_are_on_their_way(
     assert not steps
 
 
-@pytest.mark.parametrize("clocks", [0, 1, 2])
-def test_a_second_clock_is_warned_of(clocks: int) -> None:
-    done: list[Any] = []
-    log = Calls(done, "log")
-    node: Any = SimpleNamespace(
-        recording=Calls(done, "recording"),
-        _clock_topic="/left/clock",
-        count_publishers={"/left/clock": clocks}.get,
-        _publish_losses=lambda recording: done.append("losses"),
-        get_logger=lambda: log,
-    )
-    RecorderNode.flush(node)
-    assert done[:2] == [("recording.flush", clocks > 0), "losses"]
-    if clocks < 2:
-        assert len(done) == 2
-        return
-    _, text, throttle = done[2]
-    assert text.startswith("2 clocks are published on '/left/clock': the times of the bag jump")
-    assert throttle == 5.0
-    node.recording = None
-    RecorderNode.flush(node)
-    assert len(done) == 3
-
-
 @pytest.mark.parametrize(
     ("failure", "code", "ended", "line"),
     [(None, 0, 0, ""), (None, 3, 3, ""), ("It is full.", 0, 1, "It is full.\n"),

@@ -1,4 +1,4 @@
-"""A planner that plans beside the flight: states are answered meanwhile, from a robot at rest."""
+"""A planner that plans beside a flight in real time: states are answered meanwhile, at rest."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from support.ros_harness import Harness
 from spacerobot_ros.planning import METHODS, GaitSchedule
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
+REAL_TIME = {"time_mode": "realtime"}
 FAR = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 
 
@@ -45,7 +46,7 @@ def gate(monkeypatch: pytest.MonkeyPatch) -> Iterator[Gate]:
 
 @pytest.fixture
 def flight(harness: Harness) -> Flight:
-    return Flight(harness, {"plan_in_background": True, "abort_time": 0.5})
+    return Flight(harness, {"abort_time": 0.5}, REAL_TIME)
 
 
 def speeds(flight: Flight, since: int = 0) -> list[float]:
@@ -91,13 +92,15 @@ def test_an_abort_drops_what_is_being_planned(flight: Flight, gate: Gate) -> Non
 
 def test_a_node_that_ends_has_its_search_given_up(harness: Harness) -> None:
     flight = Flight(
-        harness, {"plan_in_background": True, "method": "optimal", "optimal.cache": 0}, {}
+        harness,
+        {"method": "optimal", "optimal.cache": 0, "optimal.answers": 9999, "optimal.starts": 9999},
+        REAL_TIME,
     )
     flight.send(([0.0, 0.0, 0.0], [0.05, -0.03, 0.02]))
     flight.start()
     before = threading.active_count()
     flight.harness.spin_until(lambda: threading.active_count() > before, "the search")
-    flight.ticks(200)
+    flight.ticks(10)
     assert flight.states[-1] != "executing", "it searches still"
     began = time.monotonic()
     flight.planner.trigger_deactivate()

@@ -61,7 +61,9 @@ class FakePlant:
 
     def __init__(self, harness: Harness, parameters: dict[str, Any]) -> None:
         self.harness = harness
-        self.planner = harness.make(PlannerNode, {**PLANNER, **parameters}, autostart=False)
+        self.planner = harness.make(
+            PlannerNode, {**PLANNER, "plan_in_background": False, **parameters}, autostart=False
+        )
         topics = {"joint_commands": JointState, "planner/status": DiagnosticStatus, "/rosout": Log}
         self.probe: Probe = harness.probe(topics)
         self.goals = self.probe.create_publisher(PoseStamped, "goal_pose", 10)

@@ -77,6 +77,10 @@ def test_a_bad_start_ends_with_a_sentence_and_exit_code_2(
         ("planner", (*robot, "--params-file", missing), [missing]),
         ("recorder", ("-p", f"bag:={tmp_path}"), [str(tmp_path)]),
     ]
+    if find_spec("control_msgs") is None:
+        cases.append(
+            ("planner", (*robot, "-p", "output:=trajectory"), ["'output'", "control_msgs"])
+        )
     environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain)}
     for node, arguments, mentions in cases:
         words = ("-m", NODE_TYPES[node].__module__, "--ros-args", *arguments)

@@ -11,13 +11,17 @@ import pytest
 from mcap.reader import make_reader
 from nav_msgs.msg import Odometry
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.qos import qos_profile_system_default
+from rclpy.serialization import deserialize_message
+from rclpy.service_introspection import ServiceIntrospectionState
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
+from std_srvs.srv import SetBool
 from support.planner_flight import PLANNER
 from support.recorded_stack import LATCHED_TOPICS, PLANT, STREAMS, BagContent, Stack, parameters_of
 from support.ros_harness import LATCHED, Harness, nanoseconds
 
-from spacerobot_ros import __version__
+from spacerobot_ros import __version__, read_bag
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 
@@ -132,6 +136,44 @@ def test_named_objects_of_a_file_are_metadata_and_the_wait_for_a_clock_is_as_giv
     recorder.trigger_shutdown()
     metadata = BagContent(bag).metadata
     assert {name: metadata[name] for name in about} == about
+
+
+def test_events_of_services_are_recorded(
+    harness: Harness, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """They are published by services with introspection, with messages that rosidl makes."""
+    server = harness.probe({}, name="server")
+
+    def answer(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        response.success, response.message = request.data, "so it is"
+        return response
+
+    service = server.create_service(SetBool, "ask", answer)
+    service.configure_introspection(
+        server.get_clock(), qos_profile_system_default, ServiceIntrospectionState.CONTENTS
+    )
+    bag = tmp_path / "events.mcap"
+    chosen = {"bag": str(bag), "topics": "/ask/_service_event", "clock_wait": 0.0}
+    recorder = harness.make(RecorderNode, chosen)
+    harness.spin_until(lambda: "/ask/_service_event" in recorder.topics, "the subscription")
+    harness.connect()
+    client = server.create_client(SetBool, "ask")
+    assert harness.call(client, SetBool.Request(data=True)).success
+    harness.spin_until(lambda: recorder.messages_recorded >= 2, "both events")
+    recorder.trigger_shutdown()
+    assert "is not recorded" not in capfd.readouterr().err
+    events = [event for _, event in read_bag(bag)["/ask/_service_event"].messages()]
+    received, sent = events
+    assert (received.info.event_type, received.request[0].data) == (1, True)
+    assert (sent.info.event_type, sent.response[0].message) == (2, "so it is")
+    with bag.open("rb") as file:
+        raw = [
+            (schema.name, deserialize_message(message.data, SetBool.Event))
+            for schema, _, message in make_reader(file).iter_messages("/ask/_service_event")
+            if schema is not None
+        ]
+    assert {name for name, _ in raw} == {"std_srvs/srv/SetBool_Event"}
+    assert [event.info.event_type for _, event in raw] == [1, 2]
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.control_loop import TICK_NS, Loop
 from support.ros_harness import Harness
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.nodes.common.node import LATCHED
 from spacerobot_ros.resources import share_directory
@@ -21,6 +22,15 @@ BLOCK = (share_directory() / "config" / "targets" / "block.urdf").read_text()
 def asked(loop: Loop, task: str) -> Any:
     client = loop.probe.create_client(Trigger, f"control/{task}")
     return loop.harness.call(client, Trigger.Request())
+
+
+def test_an_approach_without_a_target_is_refused(harness: Harness) -> None:
+    loop = Loop(harness)
+    loop.answer()
+    refused = asked(loop, "approach")
+    assert not refused.success
+    assert_one_sentence(refused.message, "no target to approach", "'target/robot_description'")
+    assert asked(loop, "detumble").success, "which needs none"
 
 
 def test_tasks_are_done_on_request(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:

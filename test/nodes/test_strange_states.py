@@ -103,7 +103,7 @@ def test_a_plant_whose_time_no_stamp_carries_says_so(
     last = SimpleNamespace(time_ns=LAST // 1000 * 1000 * SECOND)
     monkeypatch.setattr(PlantNode, "_last_state", lambda self, robot: last)
     monkeypatch.setattr(
-        PlantNode, "_resumed_plant", lambda self, robot, state: build_plant(robot, self.config)
+        PlantNode, "_resumed_plant", lambda self, robot, config, state: build_plant(robot, config)
     )
     plant = harness.make(
         PlantNode,

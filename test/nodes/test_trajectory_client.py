@@ -15,9 +15,9 @@ from support.ros_harness import Harness
 from spacerobot_ros.commanding.trajectory_output import TrajectoryEnd, TrajectoryOutput
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlannerNode
-from spacerobot_ros.nodes import planner as planner_module
+from spacerobot_ros.nodes.common import trajectory_clients
 from spacerobot_ros.nodes.common.fly_to import action_class
-from spacerobot_ros.nodes.planner import TrajectoryClients
+from spacerobot_ros.nodes.common.trajectory_clients import TrajectoryClients
 from spacerobot_ros.planning import PlanRequest, RobotState, Tolerance
 from spacerobot_ros.planning.execution.status import ScheduleStart
 
@@ -74,8 +74,8 @@ class Client:
 @pytest.fixture
 def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
     kind = SimpleNamespace(Goal=lambda **fields: SimpleNamespace(**fields))
-    monkeypatch.setattr(planner_module, "action_class", lambda package, name: kind)
-    monkeypatch.setattr(planner_module, "ActionClient", Client)
+    monkeypatch.setattr(trajectory_clients, "action_class", lambda package, name: kind)
+    monkeypatch.setattr(trajectory_clients, "ActionClient", Client)
 
 
 def start() -> ScheduleStart:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
+from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 from support.ros_harness import Harness, Probe, nanoseconds
@@ -134,13 +135,33 @@ def test_a_recorder_of_no_namespace_keeps_to_its_own_clock(
     assert verify_bag(stack.bag).difference is None
 
 
+@pytest.mark.parametrize("recorded", [True, False], ids=["recorded", "followed"])
 def test_two_clocks_on_one_topic_are_reported(
-    harness: Harness, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    recorded: bool, harness: Harness, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    recorder = harness.make(RecorderNode, {"bag": str(tmp_path / "a.mcap")})
-    clocks = harness.probe({}, name="clocks")
-    for _ in range(2):
-        clocks.create_publisher(Clock, "/clock", 10)
+    """Not a plant that is started again while the middleware still lists the killed one."""
+    topics = {} if recorded else {"topics": "/a"}
+    recorder = harness.make(RecorderNode, {"bag": str(tmp_path / "a.mcap"), **topics})
+    recording = recorder.recording
+    assert recording is not None
+    publishers = harness.probe({}, name="clocks")
+    killed, again = (publishers.create_publisher(Clock, "/clock", 10) for _ in range(2))
+    for clock in (killed, again):
+        harness.matched(clock)
     harness.spin_until(lambda: recorder.count_publishers("/clock") == 2)
+
+    def tick(clock: Publisher, sec: int) -> None:
+        message = Clock()
+        message.clock.sec = sec
+        clock.publish(message)
+        harness.spin_until(lambda: recording.now_ns == sec * 10**9, f"the time {sec} s")
+
+    for clock, seconds in ((killed, (100, 101, 102)), (again, (0, 1, 2))):
+        for sec in seconds:
+            tick(clock, sec)
     recorder.flush()
-    assert "2 clocks" in capfd.readouterr().err
+    assert "More than one" not in capfd.readouterr().err
+    for sec in (103, 3, 104, 4):
+        tick(killed if sec > 100 else again, sec)
+    recorder.flush()
+    assert "More than one clock is published on '/clock'" in capfd.readouterr().err

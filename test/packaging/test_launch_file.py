@@ -157,22 +157,3 @@ def test_what_is_not_there_is_one_sentence(description: Noted, chosen: dict[str,
     with pytest.raises(ParameterError) as caught:
         launched(description, **chosen)
     assert_one_sentence(str(caught.value), "nonsense")
-
-
-def test_the_planner_answers_while_it_plans_in_real_time_only(
-    description: Noted, tmp_path: Path
-) -> None:
-    assert given(launched(description)["planner"])["plan_in_background"] is True
-    held = tmp_path / "held.yaml"
-    sections: dict[str, dict[str, Any]] = {
-        "plant": {"ros__parameters": {"time_mode": "lockstep", "robot": "sliding_masses"}},
-        "planner": {"ros__parameters": {"robot": "sliding_masses"}},
-    }
-    held.write_text(yaml.safe_dump(sections))
-    nodes = launched(description, params_file=str(held))
-    assert given(nodes["planner"])["plan_in_background"] is False
-    # The file may say otherwise.
-    sections["planner"]["ros__parameters"]["plan_in_background"] = True
-    held.write_text(yaml.safe_dump(sections))
-    nodes = launched(description, params_file=str(held))
-    assert given(nodes["planner"])["plan_in_background"] is True

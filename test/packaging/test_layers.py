@@ -188,6 +188,19 @@ def test_modules_do_not_import_each_other_in_a_circle() -> None:
         visit(module, ())
 
 
+def test_programs_run_once_their_module_is_whole() -> None:
+    """What follows the guard is not defined while ``python -m`` runs the module."""
+    guards = {
+        module: tree_of(module).body[-1]
+        for module in sources()
+        for node in tree_of(module).body
+        if isinstance(node, ast.If) and "__name__ == '__main__'" in ast.unparse(node.test)
+    }
+    assert len(guards) > 5
+    for module, last in guards.items():
+        assert "__name__ == '__main__'" in ast.unparse(last), f"{module}: code follows the guard"
+
+
 # -- values -----------------------------------------------------------------------------------
 
 MUTABLE = {

@@ -91,6 +91,13 @@ def stopped_plant(loop: Loop) -> None:
     loop._take()
 
 
+def late_command(loop: Loop) -> None:
+    """Let the plant rest because no command has come in time for the goal that is pursued."""
+    now = loop.measured.stamp_ns
+    loop.executive.plant_stopped("The last command is too old.", now, now + 1)
+    loop._take()
+
+
 def obstacles(*, near: bool) -> Act:
     """Let other obstacles be there, which the rest of the schedule comes too near to, or not."""
     clearance: Any = SimpleNamespace(
@@ -194,6 +201,7 @@ HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
             (E.ABORTED, P.BRAKING, (start, abort)),
             (E.OBSTACLES, P.EXECUTING, (start, obstacles(near=False))),
             (E.PLANT_STOPPED, P.IDLE, (start, stopped_plant)),
+            (E.PLANT_STOPPED, P.MEASURING, (start, late_command)),
             (E.DEACTIVATED, P.IDLE, (start, stop)),
         )
     },
@@ -214,6 +222,14 @@ HAPPENS: dict[tuple[Phase, Event, Phase], tuple[Callable[..., Any], ...]] = {
     ),
     (P.EVALUATING, E.ABORTED, P.IDLE): (evaluating, abort),
     (P.MEASURING, E.PLANT_STOPPED, P.IDLE): (measuring, stopped_plant),
+    (P.MEASURING, E.PLANT_STOPPED, P.MEASURING): (evaluating, propose_goal(OTHER), late_command),
+    (P.PLANNING, E.PLANT_STOPPED, P.MEASURING): (
+        *(lambda: executing(held=True), propose_goal(OTHER), to(P.PLANNING), late_command),
+    ),
+    (P.EXECUTING, E.PLANT_STOPPED, P.MEASURING): (executing, propose_goal(OTHER), late_command),
+    (P.BRAKING, E.PLANT_STOPPED, P.MEASURING): (
+        *(lambda: executing(held=True), propose_goal(OTHER), tick, late_command),
+    ),
     (P.PLANNING, E.PLANT_STOPPED, P.IDLE): (planning, stopped_plant),
     (P.EXECUTING, E.PLANT_STOPPED, P.IDLE): (executing, stopped_plant),
     (P.BRAKING, E.PLANT_STOPPED, P.IDLE): (braking, stopped_plant),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -94,12 +95,18 @@ def test_only_the_status_of_the_goal_that_was_sent_decides_it(
         if decider == "planner"
         else (ControllerStatus, ControllerStatus(ControllerState.FAILED), ControllerState.REACHED)
     )
-    mission.report(failed)
+    mission.report(replace(failed, message="Failed."))
+    assert mission.client.message == "Failed.", "there is no goal to follow yet"
     first = mission.send(GOAL)
+    assert mission.client.message == ""
     assert first == "12.000000346"
     for other in ("", "unstamped-1", "12.000000345", "12.346"):
         mission.report(kind(reached, f"Reached {other}.", goal_id=other))  # type: ignore[arg-type]
         assert mission.client.outcome is None
+        assert mission.client.message == ""
+    waiting = PlannerState.IDLE if decider == "planner" else ControllerState.HOLDING
+    mission.report(kind(waiting, "Waiting for the plant."))  # type: ignore[arg-type]
+    assert mission.client.message == "Waiting for the plant."
     mission.report(kind(reached, "Reached.", goal_id=first))  # type: ignore[arg-type]
     assert mission.client.outcome is Outcome.REACHED
     assert mission.client.message == "Reached."

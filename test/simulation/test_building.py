@@ -61,4 +61,4 @@ def test_thrusters_need_a_plant_that_takes_a_wrench() -> None:
         "effort": True,
     }
     with pytest.raises(ParameterError, match="has no wrench on the base"):
-        build_plant(ARM, config(thrusters="urdf"))
+        build_plant(ARM, config(actuation="velocity", thrusters="urdf"))

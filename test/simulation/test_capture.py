@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -386,7 +387,9 @@ def test_the_state_and_the_status_tell_of_a_capture() -> None:
     assert "target/odom" in names
     assert "momentum_expected" in names
 
-    monitor = PlantMonitor(CommandValidator(plant, config), plant, lockstep=True)
+    monitor = PlantMonitor(
+        CommandValidator(plant, config), plant, replace(config, time_mode="lockstep")
+    )
     assert [each.kind for each in monitor.update(PlantState.RUNNING, 0.0)] == [EventKind.RUNNING]
     assert monitor.status.payload == ""
     assert "payload" not in monitor.status.to_values()

@@ -200,7 +200,7 @@ def test_a_reset_keeps_time_and_disturbances() -> None:
 def test_status_and_events_name_disturbances() -> None:
     config = PlantConfig(time_mode="lockstep", disturbances=(f"{LINK} torque 0 0 0.5 until 0.1",))
     plant = build_plant(SLIDERS, config)
-    monitor = PlantMonitor(CommandValidator(plant, config), plant, lockstep=True)
+    monitor = PlantMonitor(CommandValidator(plant, config), plant, config)
     line = f"{LINK} torque 0 0 0.5 in world at 0 until 0.1"
     event, running = monitor.update(PlantState.RUNNING, 0.0)
     assert (event.kind, event.level) == (EventKind.DISTURBANCE, 1)

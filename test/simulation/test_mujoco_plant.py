@@ -328,7 +328,7 @@ def test_bad_commands_and_robots_have_their_sentence(monkeypatch: pytest.MonkeyP
     with pytest.raises(CommandError, match="not finite"):
         flown.step(np.array([0.0, np.nan, 0.0]))
     with pytest.raises(ParameterError, match="Joints under velocity commands start at rest"):
-        plant(**ARM, initial_joint_velocities=[0.1, 0.0, 0.0])
+        plant(**ARM, actuation="velocity", initial_joint_velocities=[0.1, 0.0, 0.0])
     text = PUCKS.format(
         sliders="".join(
             SLIDER.format(name=n, y=0, mass=1, shape='<sphere radius="0.1"/>', effort=1, upper=1)

@@ -28,7 +28,7 @@ class Rig:
         config = PlantConfig(time_mode=time_mode, command_timeout=0.5, **parameters)
         self.plant = build_plant(SLIDERS, config)
         self.commands = CommandValidator(self.plant, config)
-        self.monitor = PlantMonitor(self.commands, self.plant, lockstep=time_mode == "lockstep")
+        self.monitor = PlantMonitor(self.commands, self.plant, config)
         self.now = 0
 
     def events(self, activity: PlantState = PlantState.RUNNING) -> list[EventKind]:

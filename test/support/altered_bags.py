@@ -31,12 +31,13 @@ def altered(
     urdf: tuple[bytes, bytes] = (b"", b""),
     injected: dict[int, str] | None = None,
     begin_ns: int = 0,
+    node: str = "plant",
 ) -> Path:
     """Copy a bag with something changed.
 
-    The message of that number on a topic, some of the plant's parameters, or one text in its URDF
-    that another takes the place of. ``injected`` adds messages on /fault_injection, by log time;
-    what was logged before ``begin_ns`` is left out.
+    The message of that number on a topic, some of the parameters of a ``node``, or one text in the
+    URDF that another takes the place of. ``injected`` adds messages on /fault_injection, by log
+    time; what was logged before ``begin_ns`` is left out.
     """
     count = 0
     with bag.open("rb") as source, out.open("wb") as target:
@@ -50,7 +51,7 @@ def altered(
             writer.add_attachment(0, 0, attachment.name, attachment.media_type, data)
         for metadata in reader.iter_metadata():
             values = dict(metadata.metadata)
-            if metadata.name == "parameters/plant":
+            if metadata.name == f"parameters/{node}":
                 values |= parameters or {}
             if metadata.name != "rosbag2":
                 writer.add_metadata(metadata.name, values)

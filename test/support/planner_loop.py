@@ -53,6 +53,7 @@ TURNED: Place = ([0.02, -0.03, 0.01], [0.01, -0.005, 0.015])
 QUICK = {
     "method": "lie_bracket",
     "tick_rate": 1 / TICK,
+    "plan_in_background": False,
     "lie_bracket.t1": 2.0,
     "lie_bracket.n1": 1,
     "lie_bracket.cycle_period": 1.0,
@@ -128,12 +129,11 @@ class MovingStub(StubMethod):
 class HeldWorker(PlanningWorker):
     """A worker in the background whose plans are there when a test says so: no thread."""
 
-    plans_in_background = True
-
     def __init__(
         self, robot: SpaceRobot, config: PlannerConfig, method: GaitMethod | None = None
     ) -> None:
         super().__init__(robot, config, method)
+        self.plans_in_background = True
         self.task: PlanningTask | None = None
         self.cancelled = self.released = False
         self.tasks: list[PlanningTask] = []
@@ -309,7 +309,8 @@ class Loop:
 
     @property
     def states(self) -> list[str]:
-        return [status.state.value for status in self.statuses]
+        """The states that were reported, but for those of plans that are being made."""
+        return [s.state.value for s in self.statuses if s.state is not PlannerState.PLANNING]
 
     @property
     def starts(self) -> list[ScheduleStart]:

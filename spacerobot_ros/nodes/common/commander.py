@@ -31,6 +31,7 @@ from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.messages.builders import StateFrames, robot_frames
+from spacerobot_ros.messages.readers import MessageDecoder
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -81,6 +82,7 @@ class CommanderNode(FlightNode):
     """Commander of the node, created whenever the node is configured."""
 
     _statuses: Subscription | None = None
+    _decoder: MessageDecoder | None = None
     _goal_actions: GoalActions | None = None
     """The action servers, once they are created."""
 
@@ -125,7 +127,7 @@ class CommanderNode(FlightNode):
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         self.create_service(Trigger, "~/abort", self._on_abort)
-        self._description = ""
+        self._description, self._decoder = "", None
         robot = robot_of(config)
         if robot is None:
             self.create_subscription(String, "robot_description", self._on_description, LATCHED)
@@ -141,6 +143,13 @@ class CommanderNode(FlightNode):
     @abstractmethod
     def use(self, robot: SpaceRobot) -> None:
         """Use this robot from now on."""
+
+    def decoder_of(self, robot: SpaceRobot) -> MessageDecoder:
+        """Return the decoder of a robot, which joins its joint states from now on."""
+        joints = robot.description.moving_joints
+        followers = [joint.name for joint in joints if joint.mimic is not None]
+        self._decoder = MessageDecoder(robot.joint_names, followers)
+        return self._decoder
 
     def activate(self) -> None:
         """Start answering states with commands."""
@@ -215,11 +224,12 @@ class CommanderNode(FlightNode):
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
         """Return the messages that wait in the subscriptions of odom and joint_states."""
-        odoms, joints = (
-            [Stamped(first_time_ns(raw), raw) for raw in self._inputs[topic].waiting()]
-            for topic in ("odom", "joint_states")
+        odoms = self._inputs["odom"].waiting()
+        joints = map(self._joined, self._inputs["joint_states"].waiting())
+        return (
+            [Stamped(first_time_ns(raw), raw) for raw in odoms],
+            [Stamped(first_time_ns(raw), raw) for raw in joints if raw is not None],
         )
-        return odoms, joints
 
     # -- inputs -------------------------------------------------------------------------------
 
@@ -235,7 +245,7 @@ class CommanderNode(FlightNode):
         except SpaceRobotError as error:
             self.get_logger().error(f"robot_description: {error}")
             return
-        self.commander.answer()
+        self.commander.answer_latest()
 
     def _on_goal(self, key: str, message: PoseStamped) -> None:
         self.receive(key, message, lambda: self.read_goal(key, message))
@@ -347,9 +357,23 @@ class CommanderNode(FlightNode):
     def _on_odom(self, raw: bytes) -> None:
         self.commander.receive_odom(first_time_ns(raw), raw)
 
+    def _joined(self, raw: bytes) -> bytes | None:
+        """Return joint states of all joints; None: some have not come yet."""
+        if self._decoder is None:
+            return raw
+        try:
+            whole = self._decoder.joined(raw)
+        except CommandError:
+            return raw  # The commander refuses it.
+        if whole is None:
+            self.commander.refusal = self._decoder.incomplete
+        return whole
+
     def _on_joints(self, raw: bytes) -> None:
-        commander = self.commander
-        commander.receive_joints(first_time_ns(raw), raw)
+        commander, whole = self.commander, self._joined(raw)
+        if whole is None:
+            return
+        commander.receive_joints(first_time_ns(whole), whole)
         now_ns = commander.stamps.now_ns
         if not 0 <= now_ns - self._diagnosed_ns < self._diagnostics_period_ns:
             self._publish_diagnostics()
@@ -412,9 +436,14 @@ class CommanderNode(FlightNode):
         robot, stamps = self.commander.robot, self.commander.stamps
         full = self.get_fully_qualified_name()
         hardware = robot.description.name if robot is not None else ""
-        level = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
-        name, values = diagnostic_name(full, "states"), {"ignored": stamps.ignored}
-        states = diagnostic_status(name, level, warning or "states are answered", values, hardware)
+        missing = self.commander.missing
+        level = DiagnosticStatus.WARN if warning or missing else DiagnosticStatus.OK
+        values = {"ignored": stamps.ignored}
+        if self._decoder is not None:
+            values |= {f"ignored: {what}": count for what, count in self._decoder.ignored.items()}
+        message = warning or (f"waiting for {missing}" if missing else "states are answered")
+        name = diagnostic_name(full, "states")
+        states = diagnostic_status(name, level, message, values, hardware)
         array, last = DiagnosticArray(status=[states]), self._last_status
         if last is not None and not warning:
             array.status.append(

@@ -20,7 +20,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError, printable
 from spacerobot_ros.messages.builders import STATIC_TRANSFORMS, TRANSFORM_TYPE, TRANSFORMS
-from spacerobot_ros.messages.definitions import message_definition
+from spacerobot_ros.messages.definitions import message_module
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
 from spacerobot_ros.model.rotations import (
     compose_poses,
@@ -61,21 +61,21 @@ def message_class(type_name: str) -> Any:
     SpaceRobotError
         Its package is not installed; the message completes a sentence about a topic.
     """
-    kind = None
     try:
-        message_definition(type_name)
-        package, _, name = type_name.split("/")
+        module, interface, name = message_module(type_name)
     except (ValueError, RecordingError):
-        pass
+        kind = None
     else:
-        kind = interface_class(f"{package}.msg", name)
+        kind = interface_class(module, interface)
+    if kind is not None and name != interface:
+        kind = interface_class(kind.__module__, name)
     if kind is None:
         raise SpaceRobotError(f"its type {type_name} is not installed here.")
     return kind
 
 
 def interface_class(module: str, name: str) -> Any | None:
-    """Return the class of a message or an action; None if its package is not installed whole."""
+    """Return the class of an interface; None if its package is not installed whole."""
     try:
         kind = getattr(importlib.import_module(module), name)
         check_for_type_support(kind)

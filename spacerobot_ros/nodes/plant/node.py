@@ -12,7 +12,9 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.experimental import EventsExecutor
+from rclpy.serialization import deserialize_message
 from rclpy.timer import Timer
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -23,7 +25,7 @@ from spacerobot_ros.errors import (
     SpaceRobotError,
     printable,
 )
-from spacerobot_ros.messages.readers import CommandReader
+from spacerobot_ros.messages.readers import CommandReader, actuation_of
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.grasp import BodyMotion, Payload
@@ -43,7 +45,7 @@ from spacerobot_ros.nodes.plant.publisher import (
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.capture import CapturePlant, CaptureReport, ReleaseReport
-from spacerobot_ros.simulation.commands import CommandValidator, PublisherTracker
+from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
@@ -72,6 +74,9 @@ _REPORT_PERIOD_NS = 950_000_000
 
 _LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD, _LONGEST_CLEARANCE_PERIOD = 0.5, 0.1, 0.5
 """Longest wall time between two publications in real time, s: of markers, of /tf, of clearances."""
+
+_CARRIED = {"velocity": "velocities", "effort": "efforts", "auto": "velocities or efforts"}
+"""What commands carry, by the parameter ``actuation``."""
 
 # Module names are faster than enum members, which are looked up for every command.
 _RUNNING, _PAUSED, _RESTING = PlantState.RUNNING, PlantState.PAUSED, PlantState.RESTING
@@ -141,14 +146,17 @@ class PlantNode(FlightNode):
                 "robot of this package, or 'robot_description' to a URDF text."
             )
         self._period_ns = config.period_ns
+        decided = config.decided()
+        # Joints that move, and thrusters, are there for efforts alone.
+        self._undecided = config.actuation == "auto" and decided.actuation == "velocity"
         last = self._last_state(robot)
         self._tick = 0 if last is None else round(last.time_ns / self._period_ns)
-        self.plant = (
-            build_plant(robot, config) if last is None else self._resumed_plant(robot, last)
+        self._use_plant(
+            build_plant(robot, decided)
+            if last is None
+            else self._resumed_plant(robot, decided, last),
+            decided,
         )
-        self.plant.tick = self._tick
-        self._reported = ReportedState(self.plant, config)
-        self._commands = CommandValidator(self.plant, config)
         self._lockstep: Lockstep | None = None
         self._real_time: RealTime | None = None
         if config.time_mode == "lockstep":
@@ -156,7 +164,7 @@ class PlantNode(FlightNode):
         else:
             self._real_time = RealTime(self._period_ns, config.real_time_factor)
         self._monitor = PlantMonitor(
-            self._commands, self.plant, lockstep=self._lockstep is not None
+            self._commands, self.plant, config if self._undecided else decided
         )
         self._publisher = StatePublisher(self, robot, self._reported, config)
         self._transforms = TransformPublisher(self, robot, self._reported, config)
@@ -181,24 +189,19 @@ class PlantNode(FlightNode):
         self._obstacles: str | None = None
         """The text on the topic obstacles; None: the robot has its own."""
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
-        for source in self._commands.sources:
-            reader = CommandReader(source, robot, config.frame_prefix)
+        for topic in (*self._readers, *(["base_wrench"] if self._undecided else [])):
             stream = self.take_raw(
-                message_class(TOPICS[source.topic].type),
-                source.topic,
-                partial(self._on_command, reader),
+                message_class(TOPICS[topic].type),
+                topic,
+                partial(self._on_command, topic),
                 # In lockstep the first command of a tick counts, whichever node publishes it.
-                number=(
-                    None
-                    if self._real_time is None
-                    else self._message_number_callback(source.senders)
-                ),
+                number=None if self._real_time is None else partial(self._on_number, topic),
             )
             # Commands are recorded as the plant receives them.
             self.raw_streams.append(stream)
         for topic, inject in (
-            ("fault_injection", self.plant.inject),
-            ("disturbance_injection", self.plant.disturb),
+            ("fault_injection", lambda text: self.plant.inject(text)),
+            ("disturbance_injection", lambda text: self.plant.disturb(text)),
         ):
             self.create_subscription(String, topic, partial(self._on_injection, inject), STREAM)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -207,9 +210,72 @@ class PlantNode(FlightNode):
         self.create_service(Trigger, "~/rearm", self._on_rearm)
         self.create_service(Trigger, "~/capture", self._on_capture)
         self.create_service(Trigger, "~/release", self._on_release)
-        self._capturing = self.plant.capturing
-        self._injected_seen = self.plant.injected
         self._publish_status(self._monitor.status)
+
+    def _use_plant(self, plant: PlantWithFaults, config: PlantConfig) -> None:
+        """Simulate this plant from the present tick on."""
+        self.plant, plant.tick = plant, self._tick
+        self._reported = ReportedState(plant, config)
+        self._commands = CommandValidator(plant, config)
+        self._readers = {
+            source.topic: CommandReader(source, plant.robot, config.frame_prefix)
+            for source in self._commands.sources
+        }
+        self._capturing = plant.capturing
+        self._injected_seen = plant.injected
+
+    def _decide_actuation(self, topic: str, raw: bytes) -> None:
+        """Take the actuation of a command that moves anything for that of the plant."""
+        actuation = "effort"
+        if topic == "joint_commands":
+            try:
+                actuation = actuation_of(deserialize_message(raw, JointState))
+            except RuntimeError:
+                return  # The reader refuses what is no message.
+        if not actuation:
+            return
+        assert self._monitor is not None
+        self._undecided, config = False, self.config.decided(actuation)
+        if actuation == "effort":
+            commands, robot = self._commands, self.plant.robot
+            self._use_plant(self._plant_now(robot, config), config)
+            self._commands.succeed(commands)
+            if self._lockstep is not None:
+                self._lockstep = Lockstep(self._commands)
+            self._publisher.observe(self._reported)
+            self._transforms.observe(self._reported)
+            self._markers.observe(self.plant)
+            self._report.observe(self._commands, self.plant)
+            if self._clearance is not None:
+                self._clearance.observe(self.plant)
+            self._count_commanders()
+        self._monitor.observe(self._commands, self.plant, config)
+        self.get_logger().info(f"Commands carry {_CARRIED[actuation]}: the plant takes these.")
+        self._publish_changed_status()
+
+    def _plant_now(self, robot: SpaceRobot, config: PlantConfig) -> PlantWithFaults:
+        """Return a plant of another actuation in the present state, in which the joints rest."""
+        plant, capturing = self.plant, self.plant.capturing
+        if capturing is None and not np.any(plant.momentum[:6]):
+            return build_plant(robot, config)  # It rests where it began.
+        from spacerobot_ros.bag.salvage import LastState  # Few plants drift before they move.
+
+        target = None
+        if capturing is not None:
+            target = np.concatenate([capturing.target_pose, capturing.target_twist])
+        payload = None if capturing is None else capturing.payload
+        state = LastState(
+            time_ns=self.time_ns,
+            position=plant.pose[:3].copy(),
+            quaternion=plant.pose[3:].copy(),
+            joint_names=list(robot.joint_names),
+            joints=plant.q.copy(),
+            rates=plant.qdot.copy(),
+            momenta=plant.momentum[:6].copy(),
+            target=target,
+            payload="" if payload is None else payload.to_text(),
+        )
+        return self._resumed_plant(robot, config, state)
 
     def activate(self) -> None:
         """Publish the robot and its present state, and start stepping."""
@@ -250,9 +316,10 @@ class PlantNode(FlightNode):
         pace = "in lockstep"
         if self._real_time is not None:
             pace = f"in real time times {config.real_time_factor:g}"
+        carried = _CARRIED["auto" if self._undecided else config.decided().actuation]
         return (
-            f"Simulates {described_robot(self.plant.robot)} under {config.actuation} commands at "
-            f"{config.tick_rate:g} Hz {pace}."
+            f"Simulates {described_robot(self.plant.robot)} at {config.tick_rate:g} Hz {pace}; "
+            f"commands carry {carried}."
         )
 
     def on_failure(self, message: str, error: Exception) -> None:
@@ -332,10 +399,12 @@ class PlantNode(FlightNode):
             )
         return state
 
-    def _resumed_plant(self, robot: SpaceRobot, state: LastState) -> PlantWithFaults:
-        """Return the plant in the last state of a bag."""
+    def _resumed_plant(
+        self, robot: SpaceRobot, config: PlantConfig, state: LastState
+    ) -> PlantWithFaults:
+        """Return the plant in a recorded state."""
         # Servos hold the rates that they are commanded: only motors leave joints moving.
-        moving = self.config.actuation == "effort"
+        moving = config.actuation == "effort"
         initial = InitialState(
             position=state.position,
             quaternion=state.quaternion,
@@ -345,8 +414,8 @@ class PlantNode(FlightNode):
             joint_velocities=state.rates if moving else None,
         )
         if state.target is None:
-            return build_plant(robot, self.config, initial)
-        plant = build_plant(robot, self.config)
+            return build_plant(robot, config, initial)
+        plant = build_plant(robot, config)
         assert plant.capturing is not None
         payload = Payload.from_text(state.payload) if state.payload else None
         plant.capturing.resume(initial, payload, BodyMotion.of(state.target[:7], state.target[7:]))
@@ -445,13 +514,20 @@ class PlantNode(FlightNode):
 
     # -- commands -----------------------------------------------------------------------------
 
-    def _message_number_callback(self, senders: PublisherTracker) -> Callable[[int], None]:
-        note = senders.note
-        return lambda number: note(number, self._tick * self._period_ns)
+    def _on_number(self, topic: str, number: int) -> None:
+        """Note the number of the next message on a topic of commands."""
+        reader = self._readers.get(topic)
+        if reader is not None:
+            reader.source.senders.note(number, self._tick * self._period_ns)
 
-    def _on_command(self, reader: CommandReader, raw: bytes) -> None:
+    def _on_command(self, topic: str, raw: bytes) -> None:
         if self._active is not _RUNNING and self._active is not _PAUSED:
             return
+        if self._undecided:
+            self._decide_actuation(topic, raw)
+        reader = self._readers.get(topic)
+        if reader is None:
+            return  # Servos take no wrench.
         refusal = reader.offer(self._commands, raw, self._tick * self._period_ns)
         if refusal is not None:
             self._report.refused(reader.source, refusal)

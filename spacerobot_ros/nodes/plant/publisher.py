@@ -83,8 +83,8 @@ class PlantReport:
         commands: CommandValidator,
         real_time: RealTime | None,
     ) -> None:
-        self._node, self._plant, self._commands = node, plant, commands
-        self._real_time, self._thrusters = real_time, thrusters_in(plant)
+        self._node, self._real_time = node, real_time
+        self.observe(commands, plant)
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
         self._command_timeouts = 0
         self._last_refusal = ""
@@ -92,6 +92,10 @@ class PlantReport:
         self._unmet_reported = 0
         if self._thrusters is not None and self._thrusters.missing:
             node.get_logger().warning(f"The thrusters cannot give {self._thrusters.missing}.")
+
+    def observe(self, commands: CommandValidator, plant: PlantWithFaults) -> None:
+        """Report on these from now on."""
+        self._commands, self._plant, self._thrusters = commands, plant, thrusters_in(plant)
 
     def refused(self, source: CommandSource, refusal: Refusal) -> None:
         """Log a refused command, which its validator has counted."""
@@ -330,6 +334,11 @@ class StatePublisher:
             )
         self.rebuild()
 
+    def observe(self, state: ReportedState) -> None:
+        """Publish another state from now on."""
+        self._state = state
+        self.rebuild()
+
     def rebuild(self) -> None:
         """Create the messages of the quantities that the state has now."""
         clock = TOPICS["/clock"]
@@ -436,6 +445,10 @@ class TransformPublisher:
         if self._frames.static_message(0) is not None:
             self._static = node.send_raw(self._kind, STATIC_TRANSFORMS, LATCHED)
 
+    def observe(self, state: ReportedState) -> None:
+        """Publish the frames of another state from now on."""
+        self._state = state
+
     def publish_static(self, time_ns: int) -> None:
         """Publish the transforms of fixed links."""
         if self._static is not None:
@@ -502,6 +515,10 @@ class ClearancePublisher:
             return None
         return cls(node, plant, monitor, None if before is None else before._stream)
 
+    def observe(self, plant: Plant) -> None:
+        """Measure another plant of the same robot from now on."""
+        self._plant = plant
+
     def publish(self, time_ns: int) -> None:
         """Publish the present clearance, and events of contacts that have begun or ended."""
         plant = self._plant
@@ -530,6 +547,10 @@ class LinkMarkers:
         self._drawn: set[tuple[str, int]] = set()
         """Namespaces and numbers of all markers so far."""
         self.use_obstacles(plant.robot.description.world)
+
+    def observe(self, plant: PlantWithFaults) -> None:
+        """Draw another plant of the same robot from now on."""
+        self._plant = plant
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
         """Draw other obstacles from now on; None: none."""

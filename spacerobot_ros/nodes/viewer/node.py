@@ -387,11 +387,11 @@ class ViewerNode(FlightNode):
         if self._robot is None or values is None:
             self._page.faults.offer(FaultTargets())
             return
-        effort = json.loads(values.get("actuation", '""')) == "effort"
+        takes_wrench = json.loads(values.get("actuation", '""')) in ("auto", "effort")
         table = self._thruster_table(json.loads(values.get("thrusters", '""')))
         nozzles = () if table is None else table.names
         self._page.show_thrusters(table)
-        self._page.faults.offer(FaultTargets(self._robot.joint_names, effort, nozzles))
+        self._page.faults.offer(FaultTargets(self._robot.joint_names, takes_wrench, nozzles))
 
     def _thruster_table(self, source: str) -> ThrusterTable | None:
         if not source or self._robot is None:

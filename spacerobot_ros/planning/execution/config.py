@@ -120,8 +120,9 @@ class PlannerConfig(CommanderConfig):
         maximum=1000000.0,
     )
     plan_in_background: bool = parameter(
-        False,
-        "plan in a thread, from rest, while states are answered; false: states wait (lockstep)",
+        True,
+        "plan in a thread while states are answered; false, and with a plant in lockstep: states "
+        "wait",
     )
     options: Mapping[str, Any] = registered(METHODS)
 

@@ -173,6 +173,7 @@ _TRANSITION_RULES: tuple[tuple[Iterable[Phase], Event, Iterable[Phase]], ...] = 
     (_MOTION_PHASES, Event.ABORTED, [Phase.BRAKING]),
     ((*_REST_PHASES, Phase.PLANNING), Event.ABORTED, [Phase.IDLE]),
     (set(Phase) - {Phase.IDLE}, Event.PLANT_STOPPED, [Phase.IDLE]),
+    ((Phase.MEASURING, Phase.PLANNING, *_MOTION_PHASES), Event.PLANT_STOPPED, [Phase.MEASURING]),
     (Phase, Event.DEACTIVATED, [Phase.IDLE]),
 )
 TRANSITIONS = frozenset(
@@ -301,7 +302,7 @@ class Executive:
         self._goal_file = goal_file or GoalFile("")
         self._average = StateAverage(robot, config.averaging, config.rest_tolerance)
         self._tracker = TrajectoryTracker(robot, config)
-        self._max_gap_ns = round(max(_MAX_GAP, _MAX_GAP_PERIODS * config.control_period) * 1e9)
+        self._max_gap_ns = _max_gap_ns(config)
         self.phase = Phase.IDLE
         """The present phase; :meth:`_change_phase` alone changes it."""
         self.outputs: deque[Output] = deque()
@@ -474,7 +475,8 @@ class Executive:
             had. None: it obeys nothing.
         rests_since_ns
             Stamp since which it rests then, ns. A goal goes on for which nothing was commanded
-            until then, and one whose plan has taken so long that no state was answered.
+            until then, and one whose plan has taken so long that no state was answered. A goal that
+            was to replace it is planned for from rest.
 
         Returns
         -------
@@ -485,14 +487,21 @@ class Executive:
             commanded_until_ns, rests_since_ns
         ):
             return False
-        self._goal_file.delete()
+        successor = None
+        if commanded_until_ns is not None:
+            self._drop_plan()
+            successor = self._new_goal
+        if successor is None:
+            self._goal_file.delete()
         if self.phase is Phase.IDLE:
             return False
-        has_goal, goal_id = self._latest_goal() is not None, self._latest_goal_id()
+        goal_id = self._latest_goal_id() if successor is None else self._pursued_id()
+        has_goal = bool(self._latest_goal() if successor is None else self._pursued_goal())
         self._tracker.stop()
         self._average.restart()
         self._forget_goals()
-        self._change_phase(Event.PLANT_STOPPED, Phase.IDLE)
+        self._new_goal = successor
+        self._change_phase(Event.PLANT_STOPPED, self._phase_at_rest())
         if has_goal:
             message = f"Aborted by the plant: {why}"
             self.outputs.append(PlannerStatus(PlannerState.ABORTED, message, goal_id=goal_id))
@@ -532,8 +541,10 @@ class Executive:
         before."""
         self._plan_again("The plant was reset: the motion is planned again.")
 
-    def use_robot(self, robot: SpaceRobot, worker: PlanningWorker) -> None:
-        """Plan again for the present goal, if any: the robot has captured or released a body.
+    def use_robot(
+        self, robot: SpaceRobot, worker: PlanningWorker, config: PlannerConfig | None = None
+    ) -> None:
+        """Plan again for the present goal, if any: for another robot, or at another rate.
 
         Parameters
         ----------
@@ -541,12 +552,25 @@ class Executive:
             The robot with its present mass properties.
         worker
             Makes the plans from now on.
+        config
+            Configuration with the present rate of the plant; None: as it was.
         """
-        self._plan_again("The robot has another mass now: the motion is planned again.")
+        what = "The robot has another mass" if config is None else "The plant has another rate"
+        self._plan_again(f"{what} now: the motion is planned again.")
         self._worker.close()
         self._robot, self._worker = robot, worker
         self._average = StateAverage(robot, self.config.averaging, self.config.rest_tolerance)
-        self._tracker.use_robot(robot)
+        if config is None:
+            self._tracker.use_robot(robot)
+            return
+        self.config, self._tracker = config, TrajectoryTracker(robot, config)
+        self._max_gap_ns = _max_gap_ns(config)
+        self._followers.clear()
+
+    def plan_at_once(self) -> None:
+        """Make later plans while states wait for them: the plant is in lockstep."""
+        self.config = replace(self.config, plan_in_background=False)
+        self._worker.plans_in_background = False
 
     def use_obstacles(self, make_worker: Callable[[], PlanningWorker]) -> None:
         """Plan around other obstacles from now on.
@@ -1013,6 +1037,8 @@ class Executive:
         reason = job.reason.value
         message = f"A plan is made: {reason}."
         self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
+        if job.reason.is_for_new_goal or not self._tracker.is_active:
+            self._add_status(PlannerState.PLANNING, message, job.identified, active)
         task = PlanningTask(
             request, braking=braking, rates_after_braking=rates, take_over=take_over
         )
@@ -1293,6 +1319,10 @@ class Executive:
         """Return the largest errors with which a goal is reached."""
         return identified.tolerance or self.config.tolerance
 
+    def _pursued_id(self) -> str:
+        pursued = self._pursued_goal()
+        return "" if pursued is None else pursued.goal_id
+
     def _latest_goal_id(self) -> str:
         latest = self._latest_goal()
         return "" if latest is None else latest.goal_id
@@ -1357,6 +1387,11 @@ class Executive:
             values["notes"] = schedule.notes
         goal = goal_values(aim)
         self.outputs.append(PlannerStatus(state, message, identified.goal_id, goal, **values))
+
+
+def _max_gap_ns(config: PlannerConfig) -> int:
+    """Return the longest time between two states that is no jump of time, ns."""
+    return round(max(_MAX_GAP, _MAX_GAP_PERIODS * config.control_period) * 1e9)
 
 
 def _plan_for(identified: IdentifiedGoal, planned: Planned) -> Planned | Refused:

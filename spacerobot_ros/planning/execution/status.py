@@ -30,6 +30,8 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
 class PlannerState(str, Enum):
     """The value of ``state`` in planner/status."""
 
+    WAITING = "waiting"
+    """States, or the robot, are missing."""
     IDLE = "idle"
     PLANNING = "planning"
     EXECUTING = "executing"

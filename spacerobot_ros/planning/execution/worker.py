@@ -170,6 +170,8 @@ class PlanningWorker:
         described: RobotDescription | None = None,
     ) -> None:
         self._robot, self._config, self._long_work = robot, config, long_work
+        self.plans_in_background = config.plan_in_background
+        """Whether plans are made in a thread."""
         self.clearance = Clearance.wanted(described or robot.description, config.clearance)
         """Distances that plans keep; None: any."""
         self._method = method or build_method(
@@ -183,11 +185,6 @@ class PlanningWorker:
         self._remaining_joints: tuple[PlanningTask, GaitMethod] | None = None
         """The latest method without stuck joints, and its task."""
         self._job: _PlanThread | None = None
-
-    @property
-    def plans_in_background(self) -> bool:
-        """Whether plans are made in a thread."""
-        return self._config.plan_in_background
 
     @property
     def is_busy(self) -> bool:

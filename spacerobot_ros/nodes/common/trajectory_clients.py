@@ -1,0 +1,133 @@
+"""Clients of FollowJointTrajectory, the action by which a robot's own controller takes schedules.
+
+Its type ``control_msgs/action/FollowJointTrajectory`` is found at run time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient
+from rclpy.serialization import deserialize_message
+from trajectory_msgs.msg import JointTrajectory
+
+from spacerobot_ros.commanding.trajectory_output import Outcome, TrajectoryEnd, TrajectoryOutput
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.messages.builders import trajectory_message
+from spacerobot_ros.nodes.common.fly_to import action_class
+from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.planning.execution.status import ScheduleStart
+
+_OUTCOMES = {
+    GoalStatus.STATUS_SUCCEEDED: Outcome.SUCCEEDED,
+    GoalStatus.STATUS_ABORTED: Outcome.ABORTED,
+    GoalStatus.STATUS_CANCELED: Outcome.CANCELED,
+}
+
+
+class TrajectoryClients:
+    """The clients of FollowJointTrajectory of a planner node, which are there as long as the node.
+
+    An executor may hold an answer for a client that a cleanup of the node would destroy.
+
+    Parameters
+    ----------
+    node
+        The planner's node.
+
+    Raises
+    ------
+    ParameterError
+        The package of the action is not installed.
+    """
+
+    def __init__(self, node: Any) -> None:
+        kind = action_class("control_msgs", "FollowJointTrajectory")
+        if kind is None:
+            raise ParameterError(
+                "Parameter 'output' is 'trajectory', which needs the package control_msgs: install "
+                "it (apt: ros-$ROS_DISTRO-control-msgs), or set another output."
+            )
+        self._kind, self._node = kind, node
+        self._clients: dict[str, ActionClient] = {}
+        """Clients by the name of their action."""
+
+    def connect(self, name: str, on_end: Callable[[TrajectoryEnd], None]) -> TrajectoryOutput:
+        """Return an output to the server of an action, which tells ends as `on_end`."""
+        if name not in self._clients:
+            self._clients[name] = ActionClient(self._node, self._kind, name)
+        connection = _Connection(self._kind, self._clients[name])
+        output = TrajectoryOutput(connection, self._node.resolve_topic_name(name), on_end)
+        connection.output = output
+        return output
+
+    def destroy(self) -> None:
+        """Destroy the clients, with the node."""
+        for client in self._clients.values():
+            client.destroy()
+        self._clients.clear()
+
+
+class _Connection:
+    """Connects one :class:`TrajectoryOutput` with a client."""
+
+    output: TrajectoryOutput
+
+    def __init__(self, kind: Any, client: Any) -> None:
+        self._kind, self._client = kind, client
+        self._handles: dict[int, Any] = {}
+        """Accepted schedules without a result, by number."""
+        self._cancelled: set[int] = set()
+        """Schedules that are cancelled as soon as they are accepted."""
+
+    def is_available(self) -> bool:
+        """Whether the server is there."""
+        return bool(self._client.server_is_ready())
+
+    def send(self, number: int, start: ScheduleStart) -> None:
+        """Send a schedule, which begins when it arrives."""
+        goal = self._kind.Goal(trajectory=joint_trajectory(start.schedule))
+        answer = self._client.send_goal_async(goal)
+        answer.add_done_callback(lambda future: self._on_answer(number, future.result()))
+
+    def cancel(self, number: int) -> None:
+        """Have a schedule cancelled; one that is not accepted yet, when it is."""
+        handle = self._handles.get(number)
+        if handle is None:
+            self._cancelled.add(number)
+        else:
+            handle.cancel_goal_async()
+
+    def _on_answer(self, number: int, handle: Any) -> None:
+        if not handle.accepted:
+            self._cancelled.discard(number)
+            self.output.rejected(number)
+            return
+        self._handles[number] = handle
+        if number in self._cancelled:
+            self._cancelled.discard(number)
+            handle.cancel_goal_async()
+        self.output.accepted(number)
+        handle.get_result_async().add_done_callback(
+            lambda future: self._on_result(number, future.result())
+        )
+
+    def _on_result(self, number: int, response: Any) -> None:
+        self._handles.pop(number, None)
+        outcome = _OUTCOMES.get(response.status, Outcome.ABORTED)
+        result = response.result
+        self.output.ended(number, outcome, result.error_code, result.error_string)
+
+
+def joint_trajectory(schedule: GaitSchedule) -> JointTrajectory:
+    """Return a schedule as a trajectory that begins when it arrives.
+
+    Its points have positions alone: between two of them a controller then interpolates linearly,
+    which is the schedule, whose velocities are constant over a tick.
+    """
+    message = deserialize_message(trajectory_message(schedule, 0, ""), JointTrajectory)
+    for point in message.points:
+        point.velocities = []
+    return message

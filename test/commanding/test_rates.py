@@ -1,0 +1,163 @@
+"""Commanders and plants of any rate: the parameter tick_rate, the plant's status, stamps alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from support.sentences import assert_one_sentence
+
+from spacerobot_ros.commanding.commander import ArrayDecoder, StateArrays
+from spacerobot_ros.commanding.controller import ControllerCommander
+from spacerobot_ros.commanding.planner import PlannerCommander
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.urdf import load_robot
+from spacerobot_ros.parameters import configured
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
+
+KINDS = {
+    "planner": (PlannerCommander, PlannerConfig, "sliding_masses", "velocity"),
+    "controller": (ControllerCommander, ControllerConfig, "planar_manipulator", "effort"),
+}
+GOAL = Goal.checked([0.05, -0.03, 0.02], [0.0, 0.0, 0.0, 1.0])
+
+
+class Host:
+    """Keeps what a commander does."""
+
+    def __init__(self) -> None:
+        self.commands: list[float] = []
+        self.statuses: list[Any] = []
+        self.lines: list[tuple[str, str]] = []
+        self.starts: list[Any] = []
+
+    def send_command(self, stamp_ns: int) -> None:
+        self.commands.append(stamp_ns / 1e9)
+
+    def publish_status(self, status: Any) -> None:
+        self.statuses.append(status)
+
+    def report_event(self, event: Any) -> None:
+        pass
+
+    def publish_start(self, start: Any) -> None:
+        self.starts.append(start)
+
+    def log(self, level: str, message: str) -> None:
+        self.lines.append((level, message))
+
+    log_about_goals = log
+
+    def has_publisher(self, topic: str) -> bool:
+        return topic == "odom"
+
+    def waiting_states(self) -> tuple[list[Any], list[Any]]:
+        return [], []
+
+
+class Rig:
+    """A commander, and a robot at rest whose states come at a rate, on a clock by hand."""
+
+    def __init__(self, kind: str, **settings: Any) -> None:
+        make, config, robot, self.actuation = KINDS[kind]
+        self.wall, self.time, self.host = 10.0, 40.0, Host()
+        model = SpaceRobot(load_robot(robot_file(robot)))
+        self.n = model.n
+        made: Any = make
+        self.commander: Any = made(configured(config, settings), self.host, clock=lambda: self.wall)
+        self.commander.use_robot(model, ArrayDecoder())
+        self.commander.activate()
+
+    def states(self, count: int, rate: float) -> None:
+        for _ in range(count):
+            self.time += 1 / rate
+            self.wall += 1 / rate
+            stamp, zeros = round(self.time * 1e9), np.zeros(self.n)
+            pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+            state = StateArrays(stamp, zeros, zeros, pose, np.zeros(6))
+            self.commander.receive_odom(stamp, state)
+            self.commander.receive_joints(stamp, state)
+            self.commander.take_accepted_jump()
+
+    def plant_says(self, **about: Any) -> None:
+        given = {"actuation": self.actuation, "time_mode": "realtime", **about}
+        self.commander.receive_plant_status(PlantStatus(PlantState.RUNNING, "A test.", **given))
+
+    @property
+    def warnings(self) -> list[str]:
+        return [line for level, line in self.host.lines if level in ("warning", "error")]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("rate", [2.0, 10.0, 50.0, 200.0])
+def test_states_of_any_rate_are_answered_from_the_third_on(kind: str, rate: float) -> None:
+    rig = Rig(kind)
+    rig.states(30, rate)
+    assert len(rig.host.commands) == 28
+    assert rig.commander.config.control_period == pytest.approx(1 / rate, rel=1e-6)
+    assert not rig.warnings
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_rate_that_differs_from_the_parameter_is_followed_and_said_once(kind: str) -> None:
+    rig = Rig(kind, tick_rate=100.0)
+    rig.states(60, 20.0)
+    assert len(rig.host.commands) == 60
+    assert rig.commander.config.tick_rate == pytest.approx(20.0)
+    (line,) = rig.warnings
+    assert_one_sentence(line.split(". Set")[0] + ".", "'tick_rate'", "100 Hz", "20 Hz")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_first_state_of_a_plant_in_lockstep_is_answered(kind: str) -> None:
+    rig = Rig(kind)
+    rig.plant_says(tick_rate_hz=25.0, time_mode="lockstep")
+    rig.states(1, 25.0)
+    assert len(rig.host.commands) == 1
+    assert rig.commander.config.tick_rate == 25.0
+    assert not rig.warnings
+
+
+@pytest.mark.parametrize(("rate", "other"), [(5.0, 40.0), (40.0, 8.0)])
+def test_plans_have_the_period_of_the_plant(rate: float, other: float) -> None:
+    """Also one that is restarted with another rate."""
+    method = {"method": "lie_bracket", "lie_bracket.t1": 2.0, "lie_bracket.n1": 1}
+    rig = Rig("planner", **method)
+    for each in (rate, other):
+        rig.plant_says(tick_rate_hz=each, time_mode="lockstep")
+        rig.states(3, each)
+        stamp = round(rig.time)
+        rig.commander.receive_goal(BASE_GOAL_KEY, stamp, 0, lambda: GOAL)
+        rig.states(2, each)
+        assert rig.host.starts[-1].schedule.control_period == pytest.approx(1 / each)
+    assert rig.host.statuses[-1].state.value == "executing"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_plant_of_other_commands_is_named_once_and_goals_are_refused(kind: str) -> None:
+    rig = Rig(kind)
+    rig.plant_says(actuation="auto")
+    assert not rig.warnings
+    other = "velocity" if rig.actuation == "effort" else "effort"
+    for _ in range(3):
+        rig.plant_says(actuation=other, tick_rate_hz=20.0)
+        rig.states(5, 20.0)
+    (line,) = rig.warnings
+    assert_one_sentence(line, "actuation:=")
+    rig.commander.receive_goal(BASE_GOAL_KEY, 7, 0, lambda: GOAL)
+    assert rig.host.statuses[-1].state.value == "refused"
+    assert rig.host.statuses[-1].message == line
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_rate_near_zero_is_refused(kind: str) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        configured(KINDS[kind][1], {"tick_rate": 1e-4})
+    assert_one_sentence(str(refusal.value), "'tick_rate'", "Hz")
