@@ -54,7 +54,7 @@ def robot_given(name: str, folder: Path) -> str:
 
 
 def check_record(apart: NodesApart, python: WarmPython) -> None:
-    """Verify, report, draw and replay the only bag in the folder."""
+    """Report, draw and replay the only bag in the folder; verification says that it cannot."""
     (bag,) = apart.folder.glob("*.mcap")
     environment = {
         **os.environ,
@@ -63,12 +63,13 @@ def check_record(apart: NodesApart, python: WarmPython) -> None:
         "MPLBACKEND": "agg",
     }
 
-    def spacerobot(*words: str) -> str:
+    def spacerobot(*words: str, code: int = 0) -> str:
         done = python.run([*COMMAND, *words], apart.folder, environment, timeout=300.0)
-        assert done.returncode == 0, (words, done.stdout, done.stderr)
-        return done.stdout
+        assert done.returncode == code, (words, done.stdout, done.stderr)
+        return done.stdout + done.stderr
 
-    assert "verified" in spacerobot("verify", bag.name)
+    # Nothing records which command a plant held in which tick of the wall clock.
+    assert "only flights in lockstep can be verified" in spacerobot("verify", bag.name, code=2)
     spacerobot("report", bag.name)
     assert bag.with_suffix(".html").stat().st_size > 10_000
     spacerobot("figures", bag.name, "--format", "svg", "--out", "figures")

@@ -114,7 +114,7 @@ def come_late(apart: NodesApart, commander: str, late: str, seconds: float) -> N
     assert apart.complaints == []
 
 
-@pytest.mark.parametrize("commander", some_fast(ROBOTS, "coordinated_control"))
+@pytest.mark.parametrize("commander", some_fast(list(ROBOTS), "coordinated_control"))
 @pytest.mark.parametrize("node", ["plant", "commander"])
 def test_silent_publishers_do_not_hold_a_node_that_is_activated_again(
     apart: NodesApart, commander: str, node: str

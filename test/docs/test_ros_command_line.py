@@ -9,9 +9,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rclpy
@@ -64,8 +65,8 @@ def test_commands_are_read_as_a_shell_reads_them() -> None:
 class Terminals:
     """Commands in terminals of their own, each a process group; Ctrl-C reaches all of a group."""
 
-    def __init__(self, folder: Path, domain: int) -> None:
-        self.folder = folder
+    def __init__(self, harness: Harness, folder: Path, domain: int) -> None:
+        self.harness, self.folder = harness, folder
         prefixes = os.environ.get("AMENT_PREFIX_PATH", "")
         self.environment = {
             **os.environ,
@@ -103,6 +104,13 @@ class Terminals:
         )
         assert done.returncode == 0, (command, done.stdout, done.stderr, self.said)
 
+    def wait(self, predicate: Callable[[], Any], what: str) -> None:
+        """Wait for something that a probe hears."""
+        try:
+            self.harness.spin_until(predicate, what, LONGEST)
+        except AssertionError as error:
+            raise AssertionError(f"{error}\n{self.said}") from None
+
     @property
     def said(self) -> str:
         return "\n".join(f"--- {log.stem}\n{log.read_text()}" for log in self.logs)
@@ -134,8 +142,8 @@ class Terminals:
 
 
 @pytest.fixture
-def terminals(tmp_path: Path, ros_domain: int) -> Iterator[Terminals]:
-    opened = Terminals(tmp_path, ros_domain)
+def terminals(harness: Harness, tmp_path: Path, ros_domain: int) -> Iterator[Terminals]:
+    opened = Terminals(harness, tmp_path, ros_domain)
     yield opened
     opened.close()
 
@@ -176,10 +184,9 @@ def test_nodes_that_are_run_one_by_one_fly_to_a_goal(
     for line in lines:
         if "coordinated_control" not in line:  # It is shown as another flight.
             terminals.do(line)
-    harness.spin_until(
+    terminals.wait(
         lambda: state(probe, "planner/status") in ("reached", "failed", "refused", "aborted"),
-        f"the goal is decided {terminals.said}",
-        LONGEST,
+        "the goal is decided",
     )
     assert state(probe, "planner/status") == "reached", terminals.said
     assert abs(probe.last("odom").pose.pose.position.x - 0.05) < 2e-3
@@ -197,9 +204,7 @@ def test_the_controller_that_is_run_beside_a_plant_holds(
     (line,) = (each for each in lines if each.startswith("ros2 run") and "coordinated" in each)
     terminals.do("ros2 run spacerobot_ros plant --ros-args -p robot:=planar_manipulator")
     terminals.do(line)
-    harness.spin_until(
-        lambda: state(probe, "controller/status") == "holding", "the robot is held", LONGEST
-    )
+    terminals.wait(lambda: state(probe, "controller/status") == "holding", "the robot is held")
     assert set(terminals.interrupt().values()) <= {0, -signal.SIGINT}, terminals.said
 
 
@@ -208,10 +213,9 @@ def test_the_launch_file_starts_a_scenario(
     terminals: Terminals, harness: Harness, probe: Probe, page: str
 ) -> None:
     terminals.do(commands(page, "ros2 topic pub", "ros2 launch")[-1])
-    harness.spin_until(
+    terminals.wait(
         lambda: state(probe, "controller/status") == "holding" and probe.count("odom") > 200,
         "the robot is held",
-        LONGEST,
     )
     (code,) = terminals.interrupt().values()
     assert code == 0, terminals.said
@@ -227,11 +231,9 @@ def test_two_launches_fly_in_namespaces(terminals: Terminals, harness: Harness) 
     for line in lines:
         if line.startswith("ros2 launch"):
             terminals.do(line)
-    harness.spin_until(lambda: all(both.count(topic) > 20 for topic in topics), "states", LONGEST)
+    terminals.wait(lambda: all(both.count(topic) > 20 for topic in topics), "states")
     goals.publish(goal(0.05)) if harness.matched(goals, 2) else None
-    harness.spin_until(
-        lambda: state(both, "/robot_1/planner/status") == "reached", "the goal", LONGEST
-    )
+    terminals.wait(lambda: state(both, "/robot_1/planner/status") == "reached", "the goal")
     assert abs(both.last("/robot_2/odom").pose.pose.position.x) < 0.02
     assert set(terminals.interrupt().values()) == {0}, terminals.said
 
@@ -251,14 +253,12 @@ def test_parameters_are_set_between_two_lives(
 ) -> None:
     terminals.do("ros2 run spacerobot_ros plant --ros-args -p robot:=sliding_masses")
     probe.watch("joint_states", JointState)
-    harness.spin_until(lambda: probe.count("joint_states") > 0, "states", LONGEST)
+    terminals.wait(lambda: probe.count("joint_states") > 0, "states")
     assert len(probe.last("joint_states").name) == 3
     terminals.do("ros2 param dump /plant")
     for line in commands("docs/operation.md", "ros2 lifecycle set", "ros2 param set"):
         terminals.do(line)
-    harness.spin_until(
-        lambda: len(probe.last("joint_states").name) == 6, "states of the other robot", LONGEST
-    )
+    terminals.wait(lambda: len(probe.last("joint_states").name) == 6, "states of the other robot")
     assert set(terminals.interrupt().values()) <= {0, -signal.SIGINT}, terminals.said
 
 
@@ -273,9 +273,9 @@ def test_a_planner_is_run_beside_a_trajectory_controller(
     terminals.do("ros2 run spacerobot_ros plant --ros-args -p robot:=sliding_masses")
     terminals.do(line)
     goals = probe.create_publisher(PoseStamped, "goal_pose", 10)
-    harness.spin_until(lambda: goals.get_subscription_count() > 0, "the planner", LONGEST)
+    terminals.wait(lambda: goals.get_subscription_count() > 0, "the planner")
     goals.publish(goal(0.05))
-    harness.spin_until(lambda: probe.count(topic) > 0, f"a schedule {terminals.said}", LONGEST)
+    terminals.wait(lambda: probe.count(topic) > 0, "a schedule")
     assert len(probe.last(topic).points) > 2
     assert set(terminals.interrupt().values()) <= {0, -signal.SIGINT}, terminals.said
 
@@ -289,8 +289,8 @@ def test_a_goal_is_sent_as_an_action(terminals: Terminals, harness: Harness, pro
         terminals.environment[name] = os.pathsep.join(filter(None, (path, before)))
     terminals.do("ros2 run spacerobot_ros plant --ros-args -p robot:=sliding_masses")
     terminals.do("ros2 run spacerobot_ros planner")
-    harness.spin_until(lambda: state(probe, "planner/status") == "idle", "the planner", LONGEST)
+    terminals.wait(lambda: state(probe, "planner/status") == "idle", "the planner")
     (line,) = commands("docs/actions.md", "ros2 action send_goal")
     terminals.do(line)
-    assert state(probe, "planner/status") == "reached"
+    terminals.wait(lambda: state(probe, "planner/status") == "reached", "the goal")
     assert set(terminals.interrupt().values()) <= {0, -signal.SIGINT}, terminals.said
