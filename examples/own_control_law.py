@@ -53,7 +53,9 @@ def main() -> None:
         forces = []
         for law in (TransposedJacobianLaw, SoftLaw):
             outputs = law.default_outputs(robot, "end_effector")
-            command = law(robot, outputs, Gains()).command(state, Reference(base, now.end_effector))
+            command = law(robot, outputs, Gains.uniform(30.0, 60.0)).command(
+                state, Reference(base, now.end_effector)
+            )
             forces.append(f"{law.name} {command.wrench_B[0]:.3f} N")
         print(f"{distance:g} m from the goal: {', '.join(forces)}")
 

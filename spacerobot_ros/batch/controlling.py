@@ -126,9 +126,11 @@ class BatchController:
         ``qdot`` (n,) are measured joint rates, ``bounds`` (m,) those of :meth:`begin_flight`.
         """
         controller, time = self.controller, self.time_of_tick(tick)
+        assert controller.reference_ends is not None
         found = monitor.decide(
             time,
             controller.reference_at_rest(time),
+            controller.reference_ends,
             controller.errors(),
             controller.joint_rate_limits.largest_rate_share(qdot),
             self.law.largest_error_share(bounds),
@@ -148,8 +150,8 @@ class BatchController:
 
     def gains_argument(self, rows: Sequence[int]) -> Array:
         """Return the argument ``gains``, Kp over Kd, of flights: (flights, 2 m)."""
-        selection = self.law.outputs.selection
-        return np.array([np.concatenate(self._gains(row).diagonals(selection)) for row in rows])
+        each = (self.law.gain_arguments(self._gains(row)) for row in rows)
+        return np.array([np.concatenate(pair) for pair in each])
 
     def _gains(self, row: int) -> Gains:
         each = self.program.gains
@@ -232,7 +234,13 @@ class BatchController:
             rate_share = ca.fmax(rate_share, ca.fabs(rate) * (1.0 / limit))
         monitor = GoalMonitor(0.0, *ca.vertsplit(memory))
         verdict = monitor.decide(
-            time, time >= profile[0], OutputErrors(**largest), rate_share, error_share, self._config
+            time,
+            time >= profile[0],
+            profile[0],
+            OutputErrors(**largest),
+            rate_share,
+            error_share,
+            self._config,
         )
         command = ca.vertcat(actuation[6:], actuation[:6])
         outputs = command, exact, measured, ca.vertcat(*astuple(monitor)[1:]), verdict

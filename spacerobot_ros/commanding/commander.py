@@ -307,6 +307,7 @@ class Commander(ABC):
         self._reported_missing = ""
         self._resume_goals(self._goal_file.load())
         self.activity = CommanderActivity.ACTIVE
+        self._report_missing()
         # A lockstep plant may already wait for an answer.
         self.answer()
 
@@ -551,6 +552,8 @@ class Commander(ABC):
         self.states.put_joints(stamp_ns, joints)
         if not self.config.tick_rate:
             self._follow_rate()
+        if self._reported_missing:
+            self._report_missing()
         self.answer()
 
     def take_accepted_jump(self) -> str:
@@ -596,12 +599,13 @@ class Commander(ABC):
 
     def _report_missing(self) -> None:
         """Report in the status what is missing, and when it is there again."""
-        if not self.active or self._clock() - self._activated < _LONGEST_SILENCE:
-            return
         missing = self.missing
-        if missing.split(";")[0] == self._reported_missing:
+        what = missing.partition(";")[0]
+        if not self.active or what == self._reported_missing:
             return
-        self._reported_missing = missing.split(";")[0]
+        if what and self._reported_missing and self._clock() - self._activated < _LONGEST_SILENCE:
+            return  # The rest is on its way.
+        self._reported_missing = what
         if missing:
             goal_id = self._pursued_goal_id
             goes_on = " The goal is pursued when they come." if goal_id else ""
@@ -753,10 +757,11 @@ class Commander(ABC):
 
     def _report_present_status(self) -> None:
         """Publish the status of the goal again: states come again."""
-        status = self._last_status
-        if status is None or status.goal_id != self._pursued_goal_id or status.state.decided:
-            status = self._make_status(*self._without_goal, "")
-        self._publish_status(status)
+        status, goal_id = self._last_status, self._pursued_goal_id
+        if not goal_id:
+            self._publish_status(self._make_status(*self._without_goal, ""))
+        elif status is not None and status.goal_id == goal_id and not status.state.decided:
+            self._publish_status(status)
 
     @property
     @abstractmethod

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from operator import is_not
 from typing import Any
 
@@ -15,6 +16,7 @@ from spacerobot_ros.commanding.commander import (
     CommanderHost,
     StateDecoder,
 )
+from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.plant_state import Pairing, PlantChange, Stamped
 from spacerobot_ros.control import ControlState, NotFiniteError, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
@@ -35,6 +37,9 @@ JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
 TARGET_ODOMETRY = "target/odom"
 """Topic of the measured motion of the target."""
 
+_LONGEST_CHECK_PERIOD = 0.2
+"""Longest wall time that one look at waiting states counts for, s: this process may have slept."""
+
 # Constants save the slow look-up of enum members for every state.
 _ACTIVE = CommanderActivity.ACTIVE
 _WHOLE = Pairing.WHOLE
@@ -45,6 +50,15 @@ class ControllerCommander(Commander):
 
     ``effort`` (n,), N m or N, and ``wrench`` (6,), N and N m in the base frame, are the values of
     the last command.
+
+    Parameters
+    ----------
+    config, host, clock
+        See :class:`Commander`.
+    own_law
+        A law that is in no registry.
+    partner_is_busy
+        Whether a planner is known to plan for long: states then wait for its reference.
     """
 
     config: ControllerConfig
@@ -57,9 +71,20 @@ class ControllerCommander(Commander):
         *,
         own_law: OwnLaw | None = None,
         clock: Callable[[], float] = time.monotonic,
+        partner_is_busy: Callable[[], bool] = lambda: False,
     ) -> None:
         super().__init__(config, host, GOAL_KEYS, pose_required=True, clock=clock)
-        self._own_law = own_law
+        self._own_law, self._partner_is_busy = own_law, partner_is_busy
+        self._ids_by_key: dict[str, str] = {}
+        """Ids of the last goals that came by topic, by the part of the robot that they are for."""
+        self._silent: set[str] = set()
+        """Topics of references that are silent: no state waits for them."""
+        self._missed_since: dict[str, int] = {}
+        """Stamp of the first state without its reference by topic, ns."""
+        self._waited: dict[str, float] = {}
+        """Wall time for which states have waited since the last message by topic, s."""
+        self._looked = clock()
+        """Wall time of the last look at it, s."""
         self._pose_has_come = self._odom_was_connected = False
         self.effort, self.wrench = np.zeros(0), np.zeros(6)
         self._measured: ControlState | None = None
@@ -78,13 +103,17 @@ class ControllerCommander(Commander):
             self.executive.configure(self.config)
 
     def _follow_goal(self, key: str, goal_id: str) -> None:
-        # Goals of base and end-effector are pursued together, under the id of the later one.
+        # Goals of base and end-effector are pursued together, under the id of the later one: a
+        # goal is replaced by one for the same part alone.
         pass
 
     def activate(self) -> None:
         """Answer states from now on, each with the references that have a publisher."""
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):
             self.states.require(topic, required=self.host.has_publisher(topic))
+        self._silent.clear()
+        self._missed_since.clear()
+        self._waited.clear()
         super().activate()
 
     def dump_momentum(self) -> tuple[bool, str]:
@@ -122,7 +151,71 @@ class ControllerCommander(Commander):
     def receive_reference(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Take a reference, and answer its state if complete."""
         self.states.put_required(topic, stamp_ns, message)
+        self._missed_since.pop(topic, None)
+        self._waited.pop(topic, None)
+        if topic in self._silent:
+            self._silent.discard(topic)
+            self.host.log("info", f"'{topic}' is not silent any more: it is followed again.")
         self.answer()
+
+    def take_odom(self, stamp_ns: int, odom: Any) -> None:
+        """Take odom of the present time, after answering a state whose reference never came."""
+        missing = self.states.missing
+        if missing and self.activity is _ACTIVE and self.executive is not None:
+            pairing = self.states.take_overdue()
+            assert pairing is not None
+            self._answer_state(pairing)
+            self._watch_missed(missing)
+        super().take_odom(stamp_ns, odom)
+
+    def take_accepted_jump(self) -> str:
+        """Take a set-aside state once its time is accepted, and look at what states wait for."""
+        warning = super().take_accepted_jump()
+        if self.activity is _ACTIVE:
+            self._watch_waiting_state()
+        return warning
+
+    def _watch_missed(self, missing: tuple[str, ...]) -> None:
+        """Do without references that states have missed for their timeout of simulated time."""
+        now, timeout = self.stamps.now_ns, self.config.reference_timeout
+        for topic in missing:
+            since = self._missed_since.setdefault(topic, now)
+            if timeout and now - since >= timeout * SECOND:
+                self._do_without(topic)
+
+    def _watch_waiting_state(self) -> None:
+        """Do without references for which time stands still for their timeout of wall time."""
+        now, timeout = self._clock(), self.config.reference_timeout
+        elapsed, self._looked = min(now - self._looked, _LONGEST_CHECK_PERIOD), now
+        missing = () if self.executive is None else self.states.missing
+        for topic in missing:
+            # A planner that plans for long answers afterwards, unless it is killed meanwhile.
+            if not (self._partner_is_busy() and self.host.has_publisher(topic)):
+                self._waited[topic] = self._waited.get(topic, 0.0) + elapsed
+            if timeout and self._waited.get(topic, 0.0) >= timeout:
+                self._do_without(topic)
+        if missing:
+            self.answer()
+
+    def _do_without(self, topic: str) -> None:
+        """Let states no longer wait for a reference that is silent."""
+        assert self.executive is not None
+        followed = self.states.latest(topic) is not None
+        self.states.require(topic, required=False)
+        self._missed_since.pop(topic, None)
+        self._waited.pop(topic, None)
+        self._silent.add(topic)
+        if followed:
+            self.executive.reference_ended(Reference())
+        self.host.log(
+            "warning", f"'{topic}' is silent: the controller goes on without until it comes again."
+        )
+
+    def _publish_status(self, status: Status) -> None:
+        if self._silent and status.state is not ControllerState.REFUSED:
+            silent = " and ".join(sorted(self._silent))
+            status = replace(status, message=f"{status.message} No reference comes on {silent}.")
+        super()._publish_status(status)
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
         """Take joints of the present time, after answering a state whose odom never came."""
@@ -188,13 +281,22 @@ class ControllerCommander(Commander):
 
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None
+        pursued = self.executive.unfinished_goals
         try:
             self.executive.submit(key, goal)
+            self._report_replaced(key, goal, pursued)
         except PlanningError as error:
             if self._leaves_to_planner(key, goal):
                 self.host.log("info", f"The goal is left to the planner. {error}")
             else:
                 self._refuse_goal(str(error), goal.goal_id)
+
+    def _report_replaced(self, key: str, goal: IdentifiedGoal, pursued: Collection[str]) -> None:
+        """Report the end of a goal by topic that a later one for the same part replaces."""
+        earlier = self._ids_by_key.get(key, "")
+        self._ids_by_key[key] = goal.goal_id if goal.resumes else ""
+        if earlier in pursued and earlier not in self._ids_by_key.values():
+            self._report_aborted(earlier, f"Aborted: replaced by goal {goal.goal_id}.")
 
     def _leaves_to_planner(self, key: str, goal: IdentifiedGoal) -> bool:
         """Whether a goal that was sent to all commanders is for the planner whose reference the law

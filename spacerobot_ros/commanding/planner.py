@@ -242,7 +242,8 @@ class PlannerCommander(Commander):
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         goal = saved.get(BASE_GOAL_KEY)
         if goal is None:
-            self._publish_status(PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose."))
+            if not self.missing:
+                self._report_present_status()
             return
         self._accept_goal(BASE_GOAL_KEY, goal)
         self._report_waiting_goal(goal, "Resuming an earlier goal.")

@@ -315,6 +315,16 @@ class StateSynchroniser:
         self.joints, self._joints_ns = joints, stamp_ns
         self._joints_fresh = True
 
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Topics for whose messages a state waits that has everything else."""
+        if not (self._required and self._joints_fresh):
+            return ()
+        stamp = self._joints_ns
+        if not (self._without_pose or (self._odom_fresh and self._odom_ns == stamp)):
+            return ()
+        return tuple(name for name, given in self._required.items() if given.stamp_ns != stamp)
+
     def put_required(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Accept a message of a further topic, and require the topic from now on."""
         self._required[topic] = Stamped(stamp_ns, message)

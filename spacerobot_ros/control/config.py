@@ -53,7 +53,7 @@ class ControllerConfig(CommanderConfig):
     )
     end_effector_outputs: str = parameter("", "axes of the end-effector that are outputs")
     joint_outputs: str = parameter("", "joints that are outputs")
-    profile: str = parameter("step", "how references move to goals", choices=tuple(PROFILES))
+    profile: str = parameter("quintic", "how references move to goals", choices=tuple(PROFILES))
     motion: MotionLimits = group(MotionLimits())
     use_thrusters: bool = parameter(
         True,
@@ -75,6 +75,13 @@ class ControllerConfig(CommanderConfig):
     estimation_time: float = parameter(
         1.0, "time for which the base is estimated while odom is missing", unit="s", minimum=0.0
     )
+    reference_timeout: float = parameter(
+        1.0,
+        "time for which states wait for a silent publisher of joint_reference or base_reference, "
+        "simulated, and while time stands still of the wall; 0: for ever",
+        unit="s",
+        minimum=0.0,
+    )
     settle_time: float = parameter(
         1.0,
         "time for which all errors must stay within the tolerances",
@@ -84,7 +91,8 @@ class ControllerConfig(CommanderConfig):
     )
     time_limit: float = parameter(
         0.0,
-        "time after which a goal that is not reached has failed; 0: never",
+        "time after which a goal that is not reached has failed; 0: 300 s after the end of its "
+        "reference",
         unit="s",
         minimum=0.0,
     )

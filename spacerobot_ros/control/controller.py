@@ -499,7 +499,14 @@ def build_controller(
     if not thrust:
         _require_torque(outputs, robot, wheels)
     return CoordinatedController(
-        law_type(robot, outputs, config.gains, options, thrust=thrust),
+        law_type(
+            robot,
+            outputs,
+            config.gains,
+            options,
+            thrust=thrust,
+            control_period=config.control_period,
+        ),
         ActuatorLimits(force, torque, robot.effort_limit),
         JointRateLimits(robot, config.joint_rates * robot.velocity_limit, config.control_period),
         PROFILES[config.profile],

@@ -14,6 +14,7 @@ from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.servicing import Servicing, Task, TaskProgress, TaskState
+from spacerobot_ros.control.stall_monitor import StallMonitor
 from spacerobot_ros.control.state import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError
@@ -41,8 +42,10 @@ class ControlExecutive:
     For every state the owner calls :meth:`command`, sends the result to the actuators, and then
     calls :meth:`evaluate`. The state of the goal is one of
 
+    * ``WAITING``: the base has not been measured yet.
     * ``HOLDING``: no goal was accepted; the robot holds the pose of its first state.
-    * ``TRACKING``: a goal is pursued. ``REACHED`` once all errors have stayed within the tolerances
+    * ``TRACKING``: a goal is pursued; ``STALLED`` while the robot comes no nearer to it
+      (:class:`.StallMonitor`). ``REACHED`` once all errors have stayed within the tolerances
       for the settling time after the reference has come to rest; ``FAILED`` if that does not happen
       within the time limit. In both cases the robot then holds the goal.
     * ``ABORTED``: the goal was given up; the robot holds the pose of the next measured state. After
@@ -110,7 +113,9 @@ class ControlExecutive:
         self._abort_requested = False
         self._goal_state = self._reported_state = ControllerState.HOLDING
         self._goal_id = ""
-        self._monitor = GoalMonitor()
+        self._monitor, self._stall = GoalMonitor(), StallMonitor()
+        self._was_measured = False
+        """Whether the base has been measured."""
         self.servicing.end()
         self._resumes = True
         """Whether the present goal is saved in the file of goals."""
@@ -132,13 +137,17 @@ class ControlExecutive:
         self._take_tolerance(self._goal_tolerance)
         self.servicing.configure(config)
         self.controller.set_gains(config.gains)
+        self._stall.restart()
 
     @property
     def state(self) -> ControllerState:
         """The state that statuses report."""
         mode = self.controller.mode
+        if not self._was_measured:
+            return ControllerState.WAITING
         if mode is _MEASURED:
-            return self._goal_state
+            stalled = self._stall.cause and self._goal_state is _TRACKING
+            return ControllerState.STALLED if stalled else self._goal_state
         estimated = mode is Mode.ESTIMATED
         return ControllerState.ESTIMATING if estimated else ControllerState.STOPPED
 
@@ -302,6 +311,14 @@ class ControlExecutive:
         """Hold the pose of the next measured state, not an earlier one."""
         self._hold_here = True
 
+    def reference_ended(self, remaining: Reference) -> None:
+        """Go on with the references that remain: to a goal anew, else hold the measured pose."""
+        self.controller.follow(remaining)
+        if self._goal_state is ControllerState.TRACKING:
+            self._begin_anew = True
+        else:
+            self._hold_here = True
+
     def plant_reset(self) -> None:
         """Begin the goal anew at the next measured state; without a goal, hold its pose."""
         self.servicing.end()
@@ -369,6 +386,7 @@ class ControlExecutive:
             self.controller.shift_time(jump)
             self.servicing.restart()
             self._monitor.shift_time(jump)
+            self._stall.restart()
             self._next_report += jump
         self._time = time
         wheels = self.controller.wheels
@@ -379,11 +397,13 @@ class ControlExecutive:
             reference = wheels.reference(reference)
         self._guided = reference is not None
         if measured is not None:
+            self._was_measured = True
             if self._abort_requested or self._hold_here or self.plant_blocked:
                 self._hold_pose(time, measured)
             elif self._begin_anew:
                 self.controller.restart_motion(time, measured)
                 self._monitor.restart_settling()
+                self._stall.restart()
                 self._error_bounds = None
             self._begin_anew = False
             too_fast = self.controller.coming_to_rest and self._monitor.fast_states
@@ -416,6 +436,8 @@ class ControlExecutive:
         pursued = self._goal_state is _TRACKING and self.servicing.task is None
         if self.controller.mode is _MEASURED and pursued:
             self._decide(time)
+            if self._goal_state is _TRACKING and not self._is_moved_otherwise:
+                self._stall.observe(time, self.controller, result, self._goal_config)
         state = self.state
         if (
             state is self._reported_state
@@ -431,12 +453,13 @@ class ControlExecutive:
     def _decide(self, time: float) -> None:
         """Report the decision about the goal, if this state brings it."""
         controller, monitor, config = self.controller, self._monitor, self._goal_config
-        at_rest = controller.reference_at_rest(time)
-        if not at_rest and not monitor.is_late(time, config):
+        at_rest, ends = controller.reference_at_rest(time), controller.reference_ends
+        assert ends is not None
+        if not at_rest and not monitor.is_late(time, ends, config):
             # Errors decide nothing while the reference moves.
             monitor.restart_settling()
             return
-        decision = monitor.decide_by_errors(time, at_rest, controller.errors(), config)
+        decision = monitor.decide_by_errors(time, at_rest, ends, controller.errors(), config)
         if decision != _NO_DECISION:
             self._goal_state, kind = _STATE_AND_EVENT_OF_DECISION[Decision(int(decision))]
             self._file.delete()
@@ -528,6 +551,7 @@ class ControlExecutive:
             self._report_acceptance()
         self._goal_state = ControllerState.TRACKING
         self._monitor.begin(time)
+        self._stall.restart()
         self._next_report, self._error_bounds = time, None
         self._save(self._pending)
 
@@ -571,6 +595,7 @@ class ControlExecutive:
             self._report_acceptance()
         self._goal_state = ControllerState.TRACKING
         self._monitor.begin(time)
+        self._stall.restart()
         self._next_report, self._error_bounds = time, None
         self._save(self._goals_to_save())
 
@@ -644,16 +669,24 @@ class ControlExecutive:
 
     def _message(self, state: ControllerState) -> str:
         match state:
+            case ControllerState.WAITING:
+                return "Waiting for states on 'odom'."
             case ControllerState.HOLDING:
                 away = self.controller.distance_from_reference()
-                return f"Holding; {away} from the reference."
+                if self._guided:
+                    return f"Following references; {away} from them."
+                return f"Waiting for a goal; holding, {away} from the reference."
             case ControllerState.TRACKING if self.servicing.task is not None:
                 return self.servicing.message
             case ControllerState.TRACKING:
                 away = self.controller.distance_from_reference()
                 return f"Flying to the goal; {away} from the reference."
+            case ControllerState.STALLED:
+                away = self.controller.distance_from_reference()
+                return f"Stalled {away} from the reference: {self._stall.cause}."
             case ControllerState.REACHED | ControllerState.FAILED:
-                return decided_message(state, self.controller.distance_to_goal(), self._goal_config)
+                away, config = self.controller.distance_to_goal(), self._goal_config
+                return decided_message(state, away, config, self._stall.cause)
             case ControllerState.ABORTED:
                 return self._abort_message
             case ControllerState.ESTIMATING:
@@ -666,10 +699,15 @@ class ControlExecutive:
 
 
 def decided_message(
-    state: ControllerState, distance: OutputDistance, config: ControllerConfig
+    state: ControllerState, distance: OutputDistance, config: ControllerConfig, cause: str = ""
 ) -> str:
-    """Return the message about a goal that is reached or failed, at a distance from the goal."""
-    reached = "reached" if state is ControllerState.REACHED else "not reached in time"
+    """Return the message about a goal that is reached or failed, at a distance from the goal.
+
+    ``cause`` is why the robot came no nearer, as far as is known.
+    """
+    reached = "reached"
+    if state is not ControllerState.REACHED:
+        reached = f"not reached in time, as {cause}" if cause else "not reached in time"
     tolerance = OutputDistance(
         *(
             math.nan if math.isnan(off) else largest

@@ -23,6 +23,9 @@ LOST_RATE = 1.5
 LOST_STATES = 3
 """Consecutive states beyond a bound after which control is lost: one may be a bad measurement."""
 
+AUTOMATIC_TIME_LIMIT = 300.0
+"""Time (s) after the end of its reference after which a goal without a time limit has failed."""
+
 _ROUNDING = 1e-9
 """Largest rounding of a sum of control periods, s."""
 
@@ -91,12 +94,19 @@ class GoalMonitor:
         self.large_error_states = (largest_share > 1.0) * (self.large_error_states + 1)
         return self.large_error_states >= LOST_STATES
 
-    def is_late(self, time: Scalar, config: ControllerConfig) -> Scalar:
-        """Whether the goal should have been reached by a time (s)."""
-        return config.time_limit and time - self.started >= config.time_limit - _ROUNDING
+    def is_late(self, time: Scalar, ends: Scalar, config: ControllerConfig) -> Scalar:
+        """Whether a goal is late at a time (s), whose reference ``ends`` at another (s)."""
+        if config.time_limit:
+            return time - self.started >= config.time_limit - _ROUNDING
+        return time - ends >= AUTOMATIC_TIME_LIMIT - _ROUNDING
 
     def decide_by_errors(
-        self, time: Scalar, at_rest: Scalar, errors: OutputErrors, config: ControllerConfig
+        self,
+        time: Scalar,
+        at_rest: Scalar,
+        ends: Scalar,
+        errors: OutputErrors,
+        config: ControllerConfig,
     ) -> Scalar:
         """Return the :class:`Decision` about a goal under control, by the errors of a state.
 
@@ -106,6 +116,8 @@ class GoalMonitor:
             Time of the state, s.
         at_rest
             Whether the reference has come to rest in the goal.
+        ends
+            Time at which it does, s.
         errors
             Largest errors of the outputs by their kind.
         config
@@ -122,13 +134,14 @@ class GoalMonitor:
         since = was_within * self.within_since + (1 - was_within) * time
         self.within_since = within * since + (1 - within) * _NOT_WITHIN_TOLERANCE
         settled = within * (time - since >= config.settle_time - _ROUNDING)
-        failed = (1 - settled) * self.is_late(time, config)
+        failed = (1 - settled) * self.is_late(time, ends, config)
         return settled * Decision.REACHED + failed * Decision.FAILED
 
     def decide(
         self,
         time: Scalar,
         at_rest: Scalar,
+        ends: Scalar,
         errors: OutputErrors,
         rate_share: Scalar,
         error_share: Scalar,
@@ -137,5 +150,5 @@ class GoalMonitor:
         """Return the :class:`Decision` by one state: lost, or else :meth:`decide_by_errors`."""
         rates, lost = self.check_rates(rate_share), self.check_errors(error_share)
         controlled = (1 - rates) * (1 - lost)
-        outcome = self.decide_by_errors(time, at_rest, errors, config)
+        outcome = self.decide_by_errors(time, at_rest, ends, errors, config)
         return (1 - controlled) * Decision.LOST + controlled * outcome

@@ -307,7 +307,7 @@ class JointRateLimits:
     def largest_rate_share(self, qdot: Array) -> float:
         """Return the largest of rates (n,) as a share of its limit."""
         # Python numbers: arrays of a few joints take longer, and every state calls this.
-        return max(0.0, *map(abs, map(mul, qdot.tolist(), self._inverse)))
+        return max((0.0, *map(abs, map(mul, qdot.tolist(), self._inverse))))
 
     def braking_command(self, state: ControlState) -> Actuation:
         """Return the command, not limited, under which joint rates and momenta decay.

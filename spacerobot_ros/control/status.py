@@ -19,8 +19,12 @@ from spacerobot_ros.planning.core.goal import Controlled
 class ControllerState(str, Enum):
     """The value of ``state`` in controller/status."""
 
+    WAITING = "waiting"
+    """No state has been measured yet."""
     HOLDING = "holding"
     TRACKING = "tracking"
+    STALLED = "stalled"
+    """A goal is tracked, and the robot comes no nearer."""
     REACHED = "reached"
     FAILED = "failed"
     REFUSED = "refused"
@@ -44,7 +48,7 @@ class ControllerState(str, Enum):
         match self:
             case ControllerState.FAILED | ControllerState.REFUSED | ControllerState.STOPPED:
                 return 2
-            case ControllerState.ABORTED | ControllerState.ESTIMATING:
+            case ControllerState.ABORTED | ControllerState.ESTIMATING | ControllerState.STALLED:
                 return 1
             case _:
                 return 0

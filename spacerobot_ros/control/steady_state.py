@@ -62,5 +62,5 @@ def steady_errors(
             f"The wrench on link '{link}' moves what the outputs of the law '{law.name}' do not "
             f"hold: there is no steady state. The outputs are {', '.join(law.outputs.labels)}."
         )
-    errors: Array = pull / law.gain_diagonals[0]
+    errors = law.errors_under(state, pull)
     return np.where(law.integral_gains > 0.0, 0.0, errors)

@@ -6,6 +6,7 @@ import sys
 from functools import partial
 from typing import Any, ClassVar
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
@@ -34,6 +35,8 @@ from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.commander import CommanderNode
 from spacerobot_ros.nodes.common.node import LATCHED, described_robot
 from spacerobot_ros.nodes.common.process import run_node
+from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, HeartbeatState, Role
+from spacerobot_ros.nodes.common.watchdog import TOPIC as HEARTBEAT
 from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.times import first_time_ns, stamp_bytes
 
@@ -59,7 +62,9 @@ class CoordinatedControlNode(CommanderNode):
 
     def make_commander(self) -> ControllerCommander:
         """Return the controller behind this node, which is independent of ROS."""
-        return ControllerCommander(self.config, self)
+        self._busy: set[str] = set()
+        """Nodes that plan or compile, by their heartbeats."""
+        return ControllerCommander(self.config, self, partner_is_busy=lambda: bool(self._busy))
 
     def configure(self) -> None:
         """Create the topics; without a robot of its own the node waits for robot_description."""
@@ -75,6 +80,7 @@ class CoordinatedControlNode(CommanderNode):
         self.take_raw(Odometry, TARGET_ODOMETRY, self._on_target)
         self.subscribe_to_goals("goal_pose")
         self.subscribe_to_goals("end_effector/goal_pose", END_EFFECTOR)
+        self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
             self._inputs[topic] = self.take_raw(kind, topic, partial(self._on_reference, topic))
 
@@ -100,6 +106,16 @@ class CoordinatedControlNode(CommanderNode):
         header = {"frame_id": robot.base_link}
         self._wrench_message = MessageTemplate(WRENCH, encode(WRENCH, {"header": header}))
         self._wrench_message.feed("wrench.force.x", commander.wrench)
+
+    def _on_heartbeat(self, message: DiagnosticStatus) -> None:
+        if (
+            message.hardware_id == Role.COMMANDER.value
+            and message.name != self.get_fully_qualified_name()
+        ):
+            if message.message == HeartbeatState.BUSY.value:
+                self._busy.add(message.name)
+            else:
+                self._busy.discard(message.name)
 
     def _on_reference(self, topic: str, raw: bytes) -> None:
         self.commander.receive_reference(topic, first_time_ns(raw), raw)

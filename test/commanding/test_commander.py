@@ -190,11 +190,11 @@ def test_goals_of_the_base_are_left_to_a_planner_whose_reference_a_law_of_joints
         return rig
 
     left = told(JOINT_REFERENCE)
-    assert left.host.states == []
+    assert left.host.states == ["waiting"]
     assert left.host.events == []
     assert left.host.lines[-1][1].startswith("The goal is left to the planner. The law 'computed_")
     for refused in (told(), told(JOINT_REFERENCE, action=True)):
-        assert refused.host.states == ["refused"]
+        assert refused.host.states == ["waiting", "refused"]
         assert_one_sentence(refused.host.statuses[0].message)
 
 
@@ -345,13 +345,87 @@ def test_a_pose_is_lost_only_after_odom_was_connected(controller: Rig) -> None:
     controller.host.publishers.clear()
     for tick in range(1, 5):
         controller.joints(tick)
-    assert controller.host.statuses == []
+    assert controller.host.states == ["waiting"]
+    controller.wall += 2.0
+    controller.commander.take_accepted_jump()
+    assert_one_sentence(controller.host.statuses[-1].message, "Waiting for states on 'odom'.")
     controller.host.publishers.add("odom")
     for tick in range(5, 8):
         controller.joints(tick)
     # State 5 was answered a tick late, which nobody is sent; the later ones at once.
     assert controller.host.commands == [6, 7]
-    assert controller.host.states[-1] == "stopped"
+    assert (controller.host.states[-1], controller.host.statuses[-1].state.level) == ("waiting", 0)
+
+
+def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
+    rig = Rig(ControllerCommander, config(ControllerConfig), arm.n)
+
+    def said() -> str:
+        rig.wall += 2.0
+        rig.commander.take_accepted_jump()
+        assert set(rig.host.states) == {"waiting"}
+        assert {status.state.level for status in rig.host.statuses} == {0}
+        return str(rig.host.statuses[-1].message)
+
+    rig.commander.activate()
+    assert rig.host.statuses[-1].message == "Waiting for a robot on 'robot_description'."
+    rig.use(arm)
+    assert said() == "Waiting for states on 'joint_states' and 'odom'."
+    count = len(rig.host.statuses)
+    assert said() == "Waiting for states on 'joint_states' and 'odom'."
+    assert len(rig.host.statuses) == count, "it is said once"
+    rig.odom(1)
+    assert said() == "Waiting for states on 'joint_states'."
+    rig.joints(1)
+    assert rig.host.states[-1] == "holding"
+    rig.commander.deactivate()
+    rig.commander.activate()
+    assert rig.host.states[-1] == "holding"
+    for _ in range(2):
+        rig.wall += 1.0
+        rig.commander.take_accepted_jump()
+    assert rig.host.statuses[-1].message.startswith("Waiting for states on 'joint_states'; the la")
+    rig.state(2)
+    assert rig.host.states[-1] == "holding"
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_states_wait_for_the_reference_of_a_planner_that_is_busy(
+    arm: SpaceRobot, busy: bool
+) -> None:
+    settings = config(ControllerConfig, law="computed_torque", reference_timeout=1.0)
+    rig = Rig(ControllerCommander, settings, arm.n, partner_is_busy=lambda: busy)
+    rig.use(arm)
+    rig.host.publishers.add(JOINT_REFERENCE)
+    rig.commander.activate()
+    rig.state(1)
+    for _ in range(30):
+        rig.wall += 0.1
+        rig.commander.take_accepted_jump()
+    assert rig.host.commands == ([] if busy else [1])
+    if busy:
+        # It is killed while it plans.
+        rig.host.publishers.discard(JOINT_REFERENCE)
+        for _ in range(30):
+            rig.wall += 0.1
+            rig.commander.take_accepted_jump()
+        assert rig.host.commands == [1]
+    (line,) = (text for level, text in rig.host.lines if level == "warning")
+    assert_one_sentence(line, "'joint_reference' is silent")
+
+
+def test_a_process_that_slept_does_not_count_it_as_silence(arm: SpaceRobot) -> None:
+    settings = config(ControllerConfig, law="computed_torque", reference_timeout=1.0)
+    rig = Rig(ControllerCommander, settings, arm.n)
+    rig.use(arm)
+    rig.host.publishers.add(JOINT_REFERENCE)
+    rig.commander.activate()
+    rig.state(1)
+    rig.wall += 60.0
+    rig.commander.take_accepted_jump()
+    assert rig.host.commands == []
+    rig.commander.receive_reference(JOINT_REFERENCE, *rig.stamped(1))
+    assert rig.host.commands == [1]
 
 
 # -- goals ------------------------------------------------------------------------------------
@@ -507,7 +581,7 @@ def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
     GoalFile(str(path)).save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "9.000000000")})
     rig = Rig(PlannerCommander, config(PlannerConfig, resume_file=str(path), **METHOD), robot.n)
     rig.commander.activate()
-    assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("planning", "9.000000000")
+    assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("waiting", "9.000000000")
     rig.commander.on_plant_silent("Node '/plant' is silent.")
     assert_one_sentence(rig.host.statuses[-1].message, "Aborted", "silent")
     assert not path.exists()

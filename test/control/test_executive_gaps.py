@@ -93,7 +93,8 @@ def test_without_odom_from_the_beginning_nothing_is_thrust_and_the_goal_waits() 
     loop.aim(base=goal_at([1.0, 0.0, 0.0]))
     for _ in range(3):
         np.testing.assert_array_equal(loop.answer(measured=False)[0], np.zeros(6))
-    assert loop.state == "stopped"
+    assert (loop.state, loop.status.state.level) == ("waiting", 0)
+    assert_one_sentence(loop.status.message, "Waiting for states on 'odom'")
     np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
     assert loop.state == "tracking"
 

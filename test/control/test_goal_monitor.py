@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
+from spacerobot_ros.control.goal_monitor import AUTOMATIC_TIME_LIMIT, Decision, GoalMonitor
 from spacerobot_ros.control.reference import OutputErrors
 
 CONFIG = dataclasses.replace(
@@ -24,12 +24,14 @@ WITHIN, ASTRAY = OutputErrors(0.02, 0.03, 0.05), OutputErrors(0.02, 0.031, 0.05)
 
 
 def decisions(
-    states: list[tuple[float, OutputErrors, float, float]], config: ControllerConfig = CONFIG
+    states: list[tuple[float, OutputErrors, float, float]],
+    config: ControllerConfig = CONFIG,
+    ends: float = 0.0,
 ) -> list[int]:
     """Return the decision at each state of (at rest, errors, rate share, error share)."""
     monitor, found = GoalMonitor(), []
     for tick, (at_rest, errors, rate, error) in enumerate(states):
-        found.append(int(monitor.decide(0.1 * tick, at_rest, errors, rate, error, config)))
+        found.append(int(monitor.decide(0.1 * tick, at_rest, ends, errors, rate, error, config)))
     return found
 
 
@@ -55,18 +57,24 @@ def test_a_goal_fails_at_its_time_limit_unless_it_is_reached_then() -> None:
     assert decisions([(1.0, ASTRAY, 0.0, 0.0)] * 11) == [0] * 10 + [Decision.FAILED]
     last = [(1.0, ASTRAY, 0.0, 0.0)] * 7 + [(1.0, WITHIN, 0.0, 0.0)] * 4
     assert decisions(last)[-1] == Decision.REACHED
-    forever = dataclasses.replace(CONFIG, time_limit=0.0)
-    assert not any(decisions([(1.0, ASTRAY, 0.0, 0.0)] * 30, forever))
+
+
+def test_without_a_time_limit_a_goal_fails_300_s_after_the_end_of_its_reference() -> None:
+    automatic = dataclasses.replace(CONFIG, time_limit=0.0)
+    found = decisions([(1.0, ASTRAY, 0.0, 0.0)] * 3030, automatic, ends=2.5)
+    assert found == [0] * 3025 + [Decision.FAILED] * 5
 
 
 def test_the_time_limit_counts_from_the_beginning_of_the_goal_and_not_through_jumps() -> None:
     monitor = GoalMonitor()
     monitor.begin(5.0)
-    assert monitor.decide_by_errors(5.9, 1.0, ASTRAY, CONFIG) == Decision.NONE
-    monitor.decide_by_errors(5.95, 1.0, WITHIN, CONFIG)
+    assert monitor.decide_by_errors(5.9, 1.0, 5.0, ASTRAY, CONFIG) == Decision.NONE
+    monitor.decide_by_errors(5.95, 1.0, 5.0, WITHIN, CONFIG)
     monitor.shift_time(100.0)
-    assert monitor.decide_by_errors(105.9, 1.0, WITHIN, CONFIG) == Decision.NONE, "it settles anew"
-    assert monitor.decide_by_errors(106.0, 1.0, ASTRAY, CONFIG) == Decision.FAILED
+    assert monitor.decide_by_errors(105.9, 1.0, 105.0, WITHIN, CONFIG) == Decision.NONE, (
+        "it settles anew"
+    )
+    assert monitor.decide_by_errors(106.0, 1.0, 105.0, ASTRAY, CONFIG) == Decision.FAILED
 
 
 @pytest.mark.parametrize(("rate", "error"), [(1.51, 0.0), (0.0, 1.01)])
@@ -85,12 +93,14 @@ def test_a_new_goal_forgets_errors_and_not_joints_that_are_too_fast() -> None:
     assert monitor.check_rates(2.0)
 
 
-def test_symbols_give_the_decisions_of_numbers() -> None:
+@pytest.mark.parametrize("limit", [1.0, 0.0])
+def test_symbols_give_the_decisions_of_numbers(limit: float) -> None:
     """As SIMD lanes compile it: memory in, memory and decision out."""
+    config, ends = dataclasses.replace(CONFIG, time_limit=limit), 1.0 - AUTOMATIC_TIME_LIMIT
     memory, state = ca.SX.sym("memory", 4), ca.SX.sym("state", 7)
     monitor = GoalMonitor(*ca.vertsplit(memory))
     time, at_rest, *errors, rate, error = ca.vertsplit(state)
-    decision = monitor.decide(time, at_rest, OutputErrors(*errors), rate, error, CONFIG)
+    decision = monitor.decide(time, at_rest, ends, OutputErrors(*errors), rate, error, config)
     after = ca.vertcat(*dataclasses.astuple(monitor))
     function = ca.Function("monitor", [memory, state], [after, decision])
     rng = np.random.default_rng(7)
@@ -106,7 +116,13 @@ def test_symbols_give_the_decisions_of_numbers() -> None:
             rest = float(tick > 2)
             position, attitude, joints, rate_, error_ = values.tolist()
             found = numbers.decide(
-                *(0.1 * tick, rest, OutputErrors(position, attitude, joints), rate_, error_, CONFIG)
+                0.1 * tick,
+                rest,
+                ends,
+                OutputErrors(position, attitude, joints),
+                rate_,
+                error_,
+                config,
             )
             symbols, other = function(symbols, [0.1 * tick, rest, *values])
             assert int(found) == int(other)

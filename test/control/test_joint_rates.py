@@ -255,7 +255,7 @@ class LateFlight:
         self.executive.submit("base", IdentifiedGoal(goal, goal_id))
 
 
-PLANAR: dict[str, Any] = {
+PLANAR: dict[str, Any] = {"profile": "step"} | {
     f"gains.{group}.{name}": gain
     for group in ("base_position", "base_attitude", "end_effector_position")
     for name, gain in (("kp", 30.0), ("kd", 60.0))
@@ -505,7 +505,9 @@ def test_a_robot_with_smooth_references_is_held_where_it_is(stopped: str) -> Non
 
 
 def test_what_is_held_does_not_change_with_the_arrays_of_a_state() -> None:
-    config = configured(ControllerConfig, {"law": "computed_torque", "tick_rate": 100.0})
+    config = configured(
+        ControllerConfig, {"law": "computed_torque", "tick_rate": 100.0, "gains.joints.kp": 4.0}
+    )
     controller = build_controller(load("planar_manipulator"), config)
     q = np.array([-1.0, 1.0])
     state = replace(planar_start(), q=q)

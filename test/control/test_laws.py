@@ -86,7 +86,7 @@ def test_a_law_without_its_reference_says_which() -> None:
         law.command(state, Reference(base=pose([0, 0, 0])))
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
 def test_gains_that_are_refused(value: float) -> None:
     with pytest.raises(ParameterError, match=r"base_position\.kp"):
         Gains.uniform(value, 1.0)

@@ -39,7 +39,7 @@ def test_the_distances_of_a_message_are_euclidean_and_each_of_its_kind() -> None
     loop.answer()
     loop.place = np.array([0.03, -0.04, 0.0])
     loop.answer(3)
-    assert loop.status.message == "Holding; 0.05 m, 0 rad from the reference."
+    assert loop.status.message == "Waiting for a goal; holding, 0.05 m, 0 rad from the reference."
     loop.place = np.zeros(3)
     loop.aim(base=goal_at([0.3, 0.4, 0.0]), end_effector=goal_at(TIP))
     loop.answer()

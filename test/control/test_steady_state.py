@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -99,6 +100,21 @@ def test_the_robot_rests_where_it_is_said_to(name: str, ki: float) -> None:
         law.integrate_error(30.0 / ki)
         np.testing.assert_allclose(steady_errors(law, state, "link_1", wrench), 0.0)
         errors = np.zeros(5)
+    assert_rests(law, errors, wrench)
+
+
+@pytest.mark.parametrize("given", [{}, {"base_position": GainPair(30.0, 60.0)}])
+def test_the_robot_rests_where_it_is_said_to_with_automatic_gains(given: dict[str, Any]) -> None:
+    robot, wrench = load("planar_manipulator"), np.array([0.7, -0.4, 0.0, 0.0, 0.0, 0.3])
+    law = law_of("transposed_jacobian", robot, Gains(**given))
+    errors = steady_errors(law, planar_start(), "link_1", wrench)
+    assert np.abs(errors).max() > 1e-4
+    assert_rests(law, errors, wrench)
+
+
+def assert_rests(law: ControlLaw, errors: Array, wrench: Array) -> None:
+    """The plant stays at rest under the command for errors, and a wrench on a link."""
+    robot, state = law.robot, planar_start()
     actuation = law.command(state, displaced(law, state, errors))
     start = InitialState(state.r_WB, state.quaternion_WB, state.q)
     plant, loads = EffortPlant(robot, 0.01, start), PlantLoads(robot)
@@ -214,7 +230,8 @@ def test_integral_gains_are_not_negative(ki: float) -> None:
 
 
 def test_a_new_goal_and_a_reset_begin_the_integral_anew() -> None:
-    config = ControllerConfig(gains=Gains.uniform(30.0, 60.0, 1.0), tick_rate=100.0, max_force=1e3)
+    gains = Gains.uniform(30.0, 60.0, 1.0)
+    config = ControllerConfig(profile="step", gains=gains, tick_rate=100.0, max_force=1e3)
     controller, state = build_controller(load("planar_manipulator"), config), planar_start()
     far = replace(pose(state.r_WB + np.array([0.02, 0.0, 0.0])), quaternion=state.quaternion_WB)
 
@@ -238,7 +255,8 @@ def test_a_new_goal_and_a_reset_begin_the_integral_anew() -> None:
 
 
 def test_saturated_thrusters_do_not_wind_the_integral_up() -> None:
-    config = ControllerConfig(gains=Gains.uniform(30.0, 60.0, 1.0), tick_rate=100.0, max_force=0.1)
+    gains = Gains.uniform(30.0, 60.0, 1.0)
+    config = ControllerConfig(profile="step", gains=gains, tick_rate=100.0, max_force=0.1)
     controller, state = build_controller(load("planar_manipulator"), config), planar_start()
     far = replace(pose(state.r_WB + np.array([0.5, 0.0, 0.0])), quaternion=state.quaternion_WB)
     controller.set_goals(0.0, state, base=far)

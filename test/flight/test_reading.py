@@ -171,7 +171,9 @@ def test_reports_of_a_flight_are_those_of_its_last_goal(bag: FlightBag, flight: 
     assert flight.scenario.published == ()
 
 
-def test_commands_are_counted_in_ticks_of_the_recorded_period(flight: Flight) -> None:
+def test_commands_are_counted_in_ticks_of_the_recorded_period(folder: Path) -> None:
+    path = write(folder / "velocities.mcap", parameters={"actuation": json.dumps("velocity")})
+    flight = read_flight(open_flight_bag(path, "/a/"))
     assert sorted(flight.commands) == ["base_wrench", "joint_commands"]
     assert flight.commands["joint_commands"].tick.tolist() == [2, 3]
     assert flight.commands["joint_commands"].values.tolist() == [[1.0, 7.0], [1.5, 7.0]]

@@ -53,7 +53,7 @@ def test_without_odom_from_the_beginning_nothing_is_thrust(harness: Harness) -> 
     loop.show(odom=False)
     for _ in range(3):
         np.testing.assert_array_equal(loop.answer(odom=False)[0], np.zeros(6))
-    loop.wait_for("stopped")
+    assert loop.wait_for("waiting").level == DiagnosticStatus.OK
     loop.show(odom=True)
     loop.wait_for("tracking")
     np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
@@ -72,4 +72,11 @@ def test_a_pose_that_was_never_met_is_not_lost(harness: Harness) -> None:
         joints.publish(message)
         harness.settle(probe)
     assert node.is_active
-    assert not probe.messages[STATUS], "nothing is stopped before anything began"
+    states = {
+        pair.value
+        for status in probe.messages[STATUS]
+        for pair in status.values
+        if pair.key == "state"
+    }
+    assert states == {"waiting"}, "nothing is stopped before anything began"
+    assert {status.level for status in probe.messages[STATUS]} == {DiagnosticStatus.OK}

@@ -15,6 +15,7 @@ from nav_msgs.msg import Odometry
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.control_loop import SHAPE, STATUS, TIP, URDF, Loop, pose
+from support.executive_loop import STEP
 from support.ros_harness import LATCHED, Harness, Probe, construction, nanoseconds
 from support.sentences import assert_one_sentence
 from support.warm_python import WarmPython
@@ -41,7 +42,7 @@ def kill(harness: Harness, probe: Probe, node: FlightNode) -> None:
 def replaced(loop: Loop, file: Path, **settings: Any) -> None:
     """Kill the node of a loop, and start another in its place."""
     kill(loop.harness, loop.probe, loop.node)
-    defaults = {"robot": "planar_manipulator", "tick_rate": 100.0, "status_period": 0.01}
+    defaults = {"robot": "planar_manipulator", "tick_rate": 100.0, "status_period": 0.01, **STEP}
     loop.node = loop.harness.make(
         CoordinatedControlNode,
         {**defaults, "resume_file": str(file), **settings},

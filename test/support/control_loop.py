@@ -13,7 +13,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
-from support.executive_loop import KD, KP, SHAPE, TIP, URDF, Array
+from support.executive_loop import KD, KP, SHAPE, STEP, TIP, URDF, Array
 from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import CoordinatedControlNode
@@ -43,7 +43,12 @@ class Loop:
 
     def __init__(self, harness: Harness, *, activate: bool = True, **settings: Any) -> None:
         self.harness = harness
-        defaults = {"robot": "planar_manipulator", "tick_rate": 100.0, "status_period": 0.01}
+        defaults = {
+            "robot": "planar_manipulator",
+            "tick_rate": 100.0,
+            "status_period": 0.01,
+            **STEP,
+        }
         self.node = harness.make(
             CoordinatedControlNode, {**defaults, **settings}, name="control", autostart=False
         )

@@ -31,6 +31,23 @@ SHAPE_IS_CONTROLLED: dict[str, Any] = {"base_outputs": "x y rz", "joint_outputs"
 # The links are a metre long and the shoulder is half a metre from the centre of the base.
 TIP = np.array([0.5 + math.cos(-1.0) + 1.0, math.sin(-1.0), 0.0])
 KP, KD = 30.0, 60.0
+STEP: dict[str, Any] = {
+    "profile": "step",
+    **{
+        f"gains.{group}.{name}": gain
+        for group in (
+            "base_position",
+            "base_attitude",
+            "end_effector_position",
+            "end_effector_attitude",
+        )
+        for name, gain in (("kp", KP), ("kd", KD))
+    },
+    "gains.joints.kp": 4.0,
+    "gains.joints.kd": 4.0,
+}
+"""Parameters of the controller whose commands tests compute: goals at once, gains given."""
+
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 PERIOD = 0.01
 
@@ -54,7 +71,7 @@ class ExecutiveLoop:
     """
 
     def __init__(self, goal_file: Path | None = None, **settings: Any) -> None:
-        defaults = {"tick_rate": 1 / PERIOD, "status_period": 0.01}
+        defaults = {"tick_rate": 1 / PERIOD, "status_period": 0.01, **STEP}
         self.config = configured(ControllerConfig, {**defaults, **settings})
         self.statuses: list[ControllerStatus] = []
         self.warnings: list[str] = []

@@ -171,13 +171,15 @@ def with_interfaces(*packages: InterfacePackage) -> dict[str, str]:
     }
 
 
-def _build(packages: Sequence[InterfacePackage], folder: Path) -> None:
-    """Build and install packages into ``install`` below a folder."""
-    tools, prefix = folder / "tools", folder / "install"
+def generators(tools: Path, *others: str) -> dict[str, str]:
+    """Install the wheels' generators of interfaces, and other wheels, into a new environment.
+
+    Returns the environment variables by which CMake finds them.
+    """
     venv.create(tools, with_pip=True)
     python = str(tools / "bin" / "python3")
     wheels = [f"ros-jazzy-{name}" for name in _GENERATORS]
-    _run(python, "-m", "pip", "install", "-q", "numpy", "catkin_pkg", *wheels)
+    _run(python, "-m", "pip", "install", "-q", "numpy", "catkin_pkg", *wheels, *others)
     # The exported targets name the Python of the machine that the wheels were made on.
     here = {
         "/numpy/_core/include": np.get_include(),
@@ -191,12 +193,18 @@ def _build(packages: Sequence[InterfacePackage], folder: Path) -> None:
                 paths = [new if p.startswith("/opt/") and p.endswith(old) else p for p in paths]
             words[i] = ";".join(paths)
         file.write_text('"'.join(words))
-    found = {
+    return {
         "AMENT_PREFIX_PATH": str(tools),
         "CMAKE_PREFIX_PATH": str(tools),
         "LD_LIBRARY_PATH": str(tools / "lib"),
         "PATH": f"{tools / 'bin'}:{os.environ['PATH']}",
     }
+
+
+def _build(packages: Sequence[InterfacePackage], folder: Path) -> None:
+    """Build and install packages into ``install`` below a folder."""
+    found, prefix = generators(folder / "tools"), folder / "install"
+    python = str(folder / "tools" / "bin" / "python3")
     options = [f"-DCMAKE_INSTALL_PREFIX={prefix}", "-DBUILD_TESTING=OFF"]
     options.append(f"-DPython3_EXECUTABLE={python}")
     for package in packages:

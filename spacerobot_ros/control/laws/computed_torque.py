@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from spacerobot_ros.control.laws.law import ControlLaw
+from spacerobot_ros.control.laws.law import ACCELERATION_GAINS, ControlLaw
 from spacerobot_ros.control.outputs import OutputSelection
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.dynamics import solve_positive_definite
@@ -25,7 +25,7 @@ class ComputedTorqueLaw(ControlLaw):
     """
 
     name: ClassVar[str] = "computed_torque"
-    gain_units: ClassVar[tuple[str, str]] = ("1/s^2", "1/s")
+    gain_units: ClassVar[tuple[str, str]] = ACCELERATION_GAINS
 
     @classmethod
     def accepted_outputs(cls, robot: SpaceRobot, outputs: OutputSelection) -> OutputSelection:

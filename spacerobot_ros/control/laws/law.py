@@ -22,8 +22,29 @@ from spacerobot_ros.control.state import Actuation, ControlState, Reference
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.compilation import dense_function
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import configured, group, parameter, values_of
+
+FORCE_GAINS = "N/m or N m/rad", "N s/m or N m s/rad"
+"""Units of Kp and Kd of laws that command forces."""
+
+ACCELERATION_GAINS = "1/s^2", "1/s"
+"""Units of Kp and Kd of laws that command accelerations."""
+
+_FASTEST_DAMPING = 2.0
+"""Largest automatic Kd of accelerations, 1/s: errors decay within seconds."""
+
+_DAMPING_PER_PERIOD = 0.4
+"""Largest product of automatic Kd and the control period: 1 is unstable if commands come a period
+late, and 2 if they do not."""
+
+_CRITICAL_STIFFNESS = 1 / 4
+"""Automatic Kp of accelerations over the square of Kd: critical damping."""
+
+_SINGULAR_DAMPING = 0.02
+"""Share that is added to the mobility of each output, so that automatic gains stay bounded at
+singularities."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +54,8 @@ class GainPair:
     Their units are the law's (:attr:`ControlLaw.gain_units`): a force or torque per error and per
     error rate with ``transposed_jacobian``, an acceleration per error and per error rate with the
     laws that know the inertia. The unit of Ki is that of Kp over seconds.
+
+    An automatic gain follows the robot and the control period (:meth:`ControlLaw.set_gains`).
 
     The integral gain removes the steady-state error under constant disturbances. With the laws
     that know the inertia, each error is stable for ``ki < kp kd``; take much less.
@@ -44,20 +67,22 @@ class GainPair:
     """
 
     kp: float = parameter(
-        30.0,
-        "proportional gain; N/m or N m/rad with laws that command forces (transposed_jacobian), "
+        0.0,
+        "proportional gain; 0: automatic, by masses and control period. N/m or N m/rad with "
+        "laws that command forces (transposed_jacobian), "
         "1/s^2 with laws that command accelerations (model_based, computed_torque)",
         unit="by law",
-        minimum=1e-9,
+        minimum=0.0,
         maximum=1e9,
         read_only=False,
     )
     kd: float = parameter(
-        60.0,
-        "derivative gain; N s/m or N m s/rad with laws that command forces (transposed_jacobian), "
+        0.0,
+        "derivative gain; 0: automatic, by masses and control period. N s/m or N m s/rad "
+        "with laws that command forces (transposed_jacobian), "
         "1/s with laws that command accelerations (model_based, computed_torque)",
         unit="by law",
-        minimum=1e-9,
+        minimum=0.0,
         maximum=1e9,
         read_only=False,
     )
@@ -74,32 +99,29 @@ class GainPair:
 
 @dataclass(frozen=True)
 class Gains:
-    """The diagonals of Kp and Kd (paper 4, eqs 27 and 29), positive definite, and of Ki.
+    """The diagonals of Kp, Kd (paper 4, eqs 27 and 29) and Ki; 0 in Kp or Kd: automatic.
 
     Raises
     ------
     ParameterError
-        A gain is not positive and finite, or an integral gain negative; the message names it.
+        A gain is negative or not finite; the message names it.
     """
 
-    base_position: GainPair = group(GainPair(30.0, 60.0))
-    base_attitude: GainPair = group(GainPair(30.0, 60.0))
-    end_effector_position: GainPair = group(GainPair(30.0, 60.0))
-    end_effector_attitude: GainPair = group(GainPair(30.0, 60.0))
-    joints: GainPair = group(GainPair(4.0, 4.0))
+    base_position: GainPair = group(GainPair())
+    base_attitude: GainPair = group(GainPair())
+    end_effector_position: GainPair = group(GainPair())
+    end_effector_attitude: GainPair = group(GainPair())
+    joints: GainPair = group(GainPair())
 
     def __post_init__(self) -> None:
         for each in fields(self):
             pair: GainPair = getattr(self, each.name)
-            for name, value in (("kp", pair.kp), ("kd", pair.kd)):
-                if not (math.isfinite(value) and value > 0):
+            for name, value in vars(pair).items():
+                if not (math.isfinite(value) and value >= 0):
                     raise ParameterError(
-                        f"The gain {each.name}.{name} is {value}; it must be positive and finite."
+                        f"The gain {each.name}.{name} is {value}; it must be finite and not "
+                        "negative."
                     )
-            if not (math.isfinite(pair.ki) and pair.ki >= 0):
-                raise ParameterError(
-                    f"The gain {each.name}.ki is {pair.ki}; it must be finite and not negative."
-                )
 
     @classmethod
     def uniform(cls, kp: float, kd: float, ki: float = 0.0) -> Gains:
@@ -107,7 +129,7 @@ class Gains:
         return cls(*(GainPair(kp, kd, ki) for _ in fields(cls)))
 
     def diagonals(self, selection: OutputSelection) -> tuple[Array, Array]:
-        """Return the diagonals of Kp and Kd (m,) of the selected outputs."""
+        """Return the diagonals of Kp and Kd (m,) of the selected outputs; 0: automatic."""
         pairs = self._pairs(selection)
         return np.array([pair.kp for pair in pairs]), np.array([pair.kd for pair in pairs])
 
@@ -175,6 +197,8 @@ class ControlLaw(ABC):
         An instance of the law's ``Options``; None: their defaults.
     thrust
         Whether thrusters push the base; otherwise the law commands no force.
+    control_period
+        Time for which a command is held, s: automatic gains are the lower, the longer it is.
 
     Raises
     ------
@@ -196,26 +220,49 @@ class ControlLaw(ABC):
         options: LawOptions | None = None,
         *,
         thrust: bool = True,
+        control_period: float = 0.0,
     ) -> None:
         self.robot = robot
+        self._damping_rate = _FASTEST_DAMPING
+        """Automatic Kd per unit of mass, 1/s."""
+        if control_period > 0:
+            self._damping_rate = min(_FASTEST_DAMPING, _DAMPING_PER_PERIOD / control_period)
         accepted = self.accepted_outputs(robot, outputs)
         self.outputs = OutputVector(robot, accepted, thrust=thrust)
         self.options: Any = configured(self.Options, values_of(options or self.Options()))
         self.singular_value_threshold: float = self.options.singular_value_threshold
+        self._integral = np.zeros(self.outputs.m)
+        """Integral of the errors (m,), m s or rad s."""
+        self._use_function(weighs=self._has_automatic(gains))
+        self.set_gains(gains)
+
+    def _use_function(self, *, weighs: bool) -> None:
+        """Build the function of the law; one that ``weighs`` outputs computes automatic gains."""
+        self._weighs, robot = weighs, self.robot
+        self._mobility: ca.SX | None = None
         inputs = {name: np.asarray(value) for name, value in self._inputs().items()}
-        key = (type(self), accepted, thrust, self.options)
+        key: tuple[Any, ...] = (
+            type(self),
+            self.outputs.selection,
+            self.outputs.thrust,
+            self.options,
+        )
+        if weighs:
+            key += (self._damping_rate,)
         self.function, self._has_integral = robot.cached_object(
             key, lambda: self._make_function(inputs)
         )
         self._function = robot.view(self.function, ("compiled", *key))
-        self._integral = np.zeros(self.outputs.m)
-        """Integral of the errors (m,), m s or rad s."""
         names = self.function.name_in()[: self.function.n_in() - len(robot.mass_arguments)]
         self._in = dict(zip(names, self._function.inputs, strict=True))
         self._out = dict(zip(self.function.name_out(), self._function.outputs, strict=True))
         for name, value in inputs.items():
             self._in[name][:] = value
-        self.set_gains(gains)
+
+    def _has_automatic(self, gains: Gains) -> bool:
+        """Whether gains are automatic that depend on the masses."""
+        force = self.gain_units != ACCELERATION_GAINS
+        return force and not all(each.all() for each in gains.diagonals(self.outputs.selection))
 
     def _make_function(self, inputs: Mapping[str, Array]) -> tuple[ca.Function, bool]:
         """Return the law as expressions of state, reference, kp, kd, integral and its own inputs,
@@ -236,9 +283,42 @@ class ControlLaw(ABC):
             "J_z": self.outputs.J_z,
             **self._results(symbols),
         }
+        if self._mobility is not None:
+            results["mobility"] = self._mobility
+        elif self._weighs:
+            gains = ca.vertcat(symbols["kp"], symbols["kd"])
+            if ca.depends_on(results["actuation"], gains):
+                raise ParameterError(
+                    f"The law '{self.name}' has no automatic gains: set kp and kd of all "
+                    f"groups of its outputs ({', '.join(self.outputs.labels)})."
+                )
         function = dense_function(f"law_{self.name}", symbols | weights, results)
         has_integral = bool(ca.depends_on(results["actuation"], symbols["integral"]))
         return function, has_integral
+
+    def automatic_effort(self, symbols: Mapping[str, ca.SX]) -> ca.SX:
+        """Return the efforts (m,) of automatic gains, for a law that commands forces; else zeros.
+
+        They give the outputs whose ``kp`` and ``kd`` are 0 the accelerations of critically damped
+        errors: ``Htilde (z1ddot_des + Kd edot + Kp e)``, with the mass matrix ``Htilde`` of the
+        outputs (eq. 25), slightly damped so that singularities do no harm.
+        """
+        z1 = self.outputs
+        if not self._weighs:
+            return ca.SX(z1.m, 1)
+        H = z1.model("inertia_matrix", z1.q)
+        # The translation of the centre of mass decouples (eq. 15).
+        moved = ca.vertcat(
+            z1.J_z[:, :3].T / z1.model.total_mass,
+            solve_positive_definite(H[3:, 3:], z1.J_z[:, 3:].T),
+        )
+        mobility = z1.J_z @ moved
+        self._mobility = mobility + _SINGULAR_DAMPING * ca.diag(ca.diag(mobility))
+        Kd = self._damping_rate
+        Kp = _CRITICAL_STIFFNESS * Kd**2
+        damping = ca.if_else(symbols["kd"] > 0, 0, Kd * z1.error_rate)
+        stiffness = ca.if_else(symbols["kp"] > 0, 0, z1.acceleration + Kp * z1.error)
+        return solve_positive_definite(self._mobility, damping + stiffness)
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
@@ -259,6 +339,9 @@ class ControlLaw(ABC):
     def set_gains(self, gains: Gains) -> None:
         """Change the gains from the next command on.
 
+        Automatic gains damp every error critically, as fast as the control period permits: those
+        of a law that commands forces through the masses (:meth:`automatic_effort`).
+
         Raises
         ------
         ParameterError
@@ -272,9 +355,28 @@ class ControlLaw(ABC):
             raise ParameterError(
                 f"The law '{self.name}' has no integral term: its gains ki must be 0."
             )
-        self._in["kp"][:], self._in["kd"][:] = gains.diagonals(selection)
+        if self._has_automatic(gains) and not self._weighs:
+            before = self._in
+            self._use_function(weighs=True)
+            for name, value in before.items():
+                self._in[name][:] = value
+        self._in["kp"][:], self._in["kd"][:] = self.gain_arguments(gains)
         self._integral[self._ki == 0.0] = 0.0
         self._in["integral"][:] = self._ki * self._integral
+
+    def gain_arguments(self, gains: Gains) -> tuple[Array, Array]:
+        """Return the arguments ``kp`` and ``kd`` (m,) of :attr:`function`.
+
+        Zeros among them are automatic gains that the function computes from the masses.
+        """
+        kp, kd = gains.diagonals(self.outputs.selection)
+        return (kp, kd) if self.gain_units != ACCELERATION_GAINS else self._filled(kp, kd)
+
+    def _filled(self, kp: Array, kd: Array) -> tuple[Array, Array]:
+        """Return gains (m,) with those of accelerations in place of zeros."""
+        rate = self._damping_rate
+        filled_kp = np.where(kp > 0, kp, _CRITICAL_STIFFNESS * rate**2)
+        return filled_kp, np.where(kd > 0, kd, rate)
 
     def integrate_error(self, duration: float, *, limited: bool = False) -> None:
         """Add the error of the last command, which is held for ``duration`` (s), to the integral.
@@ -295,8 +397,11 @@ class ControlLaw(ABC):
 
     @property
     def gain_diagonals(self) -> tuple[Array, Array]:
-        """The diagonals of Kp and Kd (m,), in the order of ``outputs.labels``."""
-        return self._in["kp"].copy(), self._in["kd"].copy()
+        """The diagonals of Kp and Kd (m,), in the order of ``outputs.labels``.
+
+        Automatic ones are per unit of mass or inertia.
+        """
+        return self._filled(self._in["kp"], self._in["kd"])
 
     @property
     def integral_gains(self) -> Array:
@@ -329,22 +434,55 @@ class ControlLaw(ABC):
         self._in["reference"][:] = packed
         return self._actuation(_NO_REFERENCE)
 
+    def slowest_decay(self) -> float:
+        """Return the rate (1/s) at which the slowest error decays, near the last state at rest."""
+        Kp, Kd = (np.diag(gains) for gains in self.gain_diagonals)
+        if self.gain_units != ACCELERATION_GAINS and not self._weighs:
+            J, q = self._out["J_z"], self.state.q
+            H = self.robot.inertia_matrix(q)[3:, 3:]
+            mobility = J[:, :3] @ J[:, :3].T / self.robot.total_mass
+            mobility += J[:, 3:] @ np.linalg.solve(H, J[:, 3:].T)
+            Kp, Kd = mobility @ Kp, mobility @ Kd
+        m = self.outputs.m
+        motion = np.block([[np.zeros((m, m)), np.eye(m)], [-Kp, -Kd]])
+        return float(-np.linalg.eigvals(motion).real.max())
+
+    @property
+    def singular_error_share(self) -> float:
+        """Share of the last error (its norm, SI) in directions that no actuator moves."""
+        error = self._out["error"]
+        U, singular_values, _ = np.linalg.svd(self._out["J_z"], full_matrices=False)
+        along = U[:, singular_values < self.singular_value_threshold].T @ error
+        size = float(np.linalg.norm(error))
+        return float(np.linalg.norm(along)) / size if size > 0 else 0.0
+
+    def errors_under(self, state: ControlState, pull: Array) -> Array:
+        """Return the errors (m,) whose ``Kp e`` is a pull (m,), at rest in the shape of a state."""
+        kp, given = self.gain_diagonals[0], self._in["kp"]
+        if not self._weighs:
+            return np.asarray(pull / kp)
+        mobility = self._evaluate_at(state, self._in["integral"])["mobility"]
+        # Automatic gains act through the mass matrix of all outputs.
+        Kp = np.diag(given) + np.linalg.solve(mobility, np.diag(np.where(given > 0, 0.0, kp)))
+        return np.asarray(np.linalg.solve(Kp, pull))
+
     def command_per_error(self, state: ControlState) -> Array:
         """Return the command (6 + n, m) at rest per unit of ``Kp e``, in the shape of a state."""
+        units = np.vstack([np.zeros(self.outputs.m), np.eye(self.outputs.m)])
+        at_rest, *each = (self._evaluate_at(state, unit)["actuation"].ravel() for unit in units)
+        return np.array(each).T - at_rest[:, np.newaxis]
+
+    def _evaluate_at(self, state: ControlState, integral: Array) -> dict[str, Array]:
+        """Return the results of the function at rest, in the shape of a state, without errors."""
         state = ControlState.at_rest(state.r_WB, state.quaternion_WB, state.q)
         selection = self.outputs.selection
         reference = Reference.present(self.robot, state, selection.end_effector_link)
         given = {name: memory.copy() for name, memory in self._in.items()}
         self.outputs.pack_state(state, given["state"])
         self.outputs.pack_reference(reference, given["reference"])
-        columns = []
-        for unit in np.vstack([np.zeros(self.outputs.m), np.eye(self.outputs.m)]):
-            given["integral"] = unit
-            results = self.function(*given.values(), *self.robot.mass_arguments.values())
-            actuation = dict(zip(self.function.name_out(), results, strict=True))["actuation"]
-            columns.append(np.array(actuation).ravel())
-        at_rest, *each = columns
-        return np.array(each).T - at_rest[:, np.newaxis]
+        given["integral"] = integral
+        results = self.function(*given.values(), *self.robot.mass_arguments.values())
+        return dict(zip(self.function.name_out(), map(np.array, results), strict=True))
 
     @property
     def state(self) -> ControlState:

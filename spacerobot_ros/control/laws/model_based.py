@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
+from spacerobot_ros.control.laws.law import ACCELERATION_GAINS, ControlLaw, LawOptions
 from spacerobot_ros.control.state import Actuation, Reference
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
@@ -69,7 +69,7 @@ class ModelBasedLaw(ControlLaw):
     """
 
     name: ClassVar[str] = "model_based"
-    gain_units: ClassVar[tuple[str, str]] = ("1/s^2", "1/s")
+    gain_units: ClassVar[tuple[str, str]] = ACCELERATION_GAINS
     Options: ClassVar[Any] = ModelBasedOptions
 
     def _damping(self, singular_value: float) -> float:

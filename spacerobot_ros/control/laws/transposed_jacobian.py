@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy.typing as npt
 
-from spacerobot_ros.control.laws.law import ControlLaw, LawOptions
+from spacerobot_ros.control.laws.law import FORCE_GAINS, ControlLaw, LawOptions
 from spacerobot_ros.parameters import parameter
 
 
@@ -44,7 +44,7 @@ class TransposedJacobianLaw(ControlLaw):
     """
 
     name: ClassVar[str] = "transposed_jacobian"
-    gain_units: ClassVar[tuple[str, str]] = ("N/m or N m/rad", "N s/m or N m s/rad")
+    gain_units: ClassVar[tuple[str, str]] = FORCE_GAINS
     Options: ClassVar[Any] = TransposedJacobianOptions
 
     def _inputs(self) -> Mapping[str, npt.ArrayLike]:
@@ -53,5 +53,6 @@ class TransposedJacobianLaw(ControlLaw):
     def _results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         z1 = self.outputs
         effort = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate + symbols["integral"]
+        effort += self.automatic_effort(symbols)
         friction = ca.vertcat(ca.SX(6, 1), symbols["joint_damping"] * z1.qdot)
         return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ effort - friction}

@@ -32,7 +32,7 @@ _SUSPENSION_TIME = 0.3
 _REPORT_PERIOD = 1.0
 """Wall s between two diagnostics while a node is silent."""
 
-_HEARTBEAT_QOS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
+HEARTBEAT_QOS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Role(str, Enum):
@@ -159,7 +159,7 @@ class Liveness:
         on_silence: Callable[[SilenceReport], None],
     ) -> None:
         self._node, self._role, self._on_silence = node, role, on_silence
-        self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, _HEARTBEAT_QOS)
+        self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, HEARTBEAT_QOS)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers: list[Timer] = []
         self._watched = {each.value for each in depends_on}
@@ -176,9 +176,9 @@ class Liveness:
         self._timeout = timeout
         if self._watched and timeout:
             node = self._node
-            node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, _HEARTBEAT_QOS)
+            node.create_subscription(DiagnosticStatus, TOPIC, self._on_heartbeat, HEARTBEAT_QOS)
             self._diagnostics = node.create_publisher(
-                DiagnosticArray, "/diagnostics", _HEARTBEAT_QOS
+                DiagnosticArray, "/diagnostics", HEARTBEAT_QOS
             )
 
     def begin(self) -> None:

@@ -357,7 +357,7 @@ class Listener:
         match status:
             case (
                 PlannerStatus(state=PlannerState.EXECUTING)
-                | ControllerStatus(state=ControllerState.TRACKING)
+                | ControllerStatus(state=ControllerState.TRACKING | ControllerState.STALLED)
             ):
                 if pursued is None or pursued.goal_id != status.goal_id:
                     self._pursued_goals = dict(self._goals)

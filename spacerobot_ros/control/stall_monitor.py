@@ -1,0 +1,183 @@
+"""Whether a controller still comes nearer to its goal, and if not, why: a report, no decision."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.controller import CoordinatedController
+from spacerobot_ros.control.limits import Saturated
+from spacerobot_ros.control.reference import OutputErrors
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.space_robot import SpaceRobot
+
+_SHORTEST_WINDOW, _LONGEST_WINDOW = 2.0, 10.0
+"""Shortest and longest time over which errors are compared, s."""
+
+_LIMITED_WINDOW = 5.0
+"""The same while commands are limited, which makes loops slower, s."""
+
+_LEAST_WINDOW_PERIODS = 20
+"""Shortest such time in control periods."""
+
+_SAMPLES = 32
+"""Number of states in such a time whose errors are looked at."""
+
+_LEAST_PROGRESS = 0.02
+"""Share by which errors shrink at least from one time to the next; in a time constant, linear loops
+shrink them by 0.6."""
+
+_LAG_SHARE = 0.5
+"""Share of the way of a reference that a robot without trouble does not lag behind."""
+
+_LEAST_SMALLEST_TOLERANCE = 1e-9
+"""Tolerance (m, rad) that stands for zero."""
+
+_STOP_SHARE = 0.005
+"""Distance from a stop at which a joint is at it, as a share of its range."""
+
+_SINGULAR_SHARE = 0.7
+"""Share of the error in singular directions that makes them the cause."""
+
+
+class StallMonitor:
+    """Compares the largest error, as a share of its tolerance, over successive times.
+
+    Such a time is as long as the slowest error of the closed loop takes to decay to a third
+    (:meth:`.ControlLaw.slowest_decay`), within 2 to 10 s; 5 s while commands are limited. The
+    robot is stalled if the largest
+    error shrinks from one time to the next by less than 2 %, and by less than before:
+
+    * after the reference has come to rest, and while an error is beyond its tolerance;
+    * on its way, if the robot lags behind it by more than half of the way.
+
+    It is no longer stalled when the errors shrink again.
+    """
+
+    def __init__(self) -> None:
+        self.cause = ""
+        """Why the robot is stalled, as the second half of a sentence; empty: it is not."""
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew: at a new goal, and after a jump of time or of the robot."""
+        self.cause = ""
+        self._ends = self._next_sample = -math.inf
+        self._window = 0.0
+        self._at_rest = False
+        """Whether the reference was at rest since the present time began."""
+        self._largest: list[float] = []
+        """Largest shares in the present time and in those before, the latest first."""
+        self._lag = 0.0
+        self._samples = self._limited = 0
+
+    def observe(
+        self,
+        time: float,
+        controller: CoordinatedController,
+        result: Saturated,
+        config: ControllerConfig,
+    ) -> None:
+        """Take the state, and the command for it, at a time (s)."""
+        if time < self._next_sample:
+            return
+        if not self._largest:
+            self._begin(time, controller, config)
+        self._next_sample = time + self._window / _SAMPLES
+        errors = controller.errors()
+        self._largest[0] = max(self._largest[0], _largest_share(errors, config))
+        self._lag = max(self._lag, _lag(errors, controller, config))
+        self._samples += 1
+        self._limited += result.limited
+        if time >= self._ends:
+            self._compare(controller, result)
+            self._begin(time, controller, config)
+
+    def _begin(
+        self, time: float, controller: CoordinatedController, config: ControllerConfig
+    ) -> None:
+        rate = 1 / _LIMITED_WINDOW if self._is_limited else controller.law.slowest_decay()
+        shortest = max(_SHORTEST_WINDOW, _LEAST_WINDOW_PERIODS * config.control_period)
+        self._window = max(1 / max(rate, 1 / _LONGEST_WINDOW), shortest)
+        self._ends = time + self._window
+        self._at_rest = controller.reference_at_rest(time)
+        self._largest = [0.0, *self._largest[:2]]
+        self._lag = 0.0
+        self._samples = self._limited = 0
+
+    @property
+    def _is_limited(self) -> bool:
+        """Whether commands were limited for most of the present time."""
+        return 2 * self._limited > self._samples
+
+    def _compare(self, controller: CoordinatedController, result: Saturated) -> None:
+        if len(self._largest) < 2:
+            return
+        now, before = self._largest[:2]
+        progress = before - now
+        earlier = self._largest[2] - before if len(self._largest) > 2 else 0.0
+        if now <= 1.0 or progress >= _LEAST_PROGRESS * before:
+            self.cause = ""
+        # Robots with little thrust begin slowly, and make more and more way.
+        elif progress > max(earlier, 0.0) and not self.cause:
+            pass
+        elif self._at_rest or (self._lag > _LAG_SHARE and progress <= 0.0):
+            self.cause = self._find_cause(controller, result)
+
+    def _find_cause(self, controller: CoordinatedController, result: Saturated) -> str:
+        """Return the first of the known causes."""
+        law, limited = controller.law, self._is_limited
+        stop = _joint_at_stop(law.robot, law.state.q)
+        if stop and limited:
+            return stop
+        if law.singular_error_share > _SINGULAR_SHARE:
+            return "the arm is stretched out or folded (singular)"
+        if limited:
+            for part, name in (
+                (result.excess.wrench_B[:3], "the force of the thrusters is at its limit"),
+                (result.excess.wrench_B[3:], "the torque on the base is at its limit"),
+            ):
+                if np.any(part):
+                    return name
+            return "joint efforts are at their limits"
+        return stop or "its errors no longer shrink"
+
+
+def _joint_at_stop(robot: SpaceRobot, q: Array) -> str:
+    """Return that a joint is at a stop; empty: none is."""
+    span = robot.upper - robot.lower
+    margin = _STOP_SHARE * np.where(np.isfinite(span), span, 0.0)
+    for name, at_stop in zip(
+        robot.joint_names, (q <= robot.lower + margin) | (q >= robot.upper - margin), strict=True
+    ):
+        if at_stop:
+            return f"joint '{name}' is at its stop"
+    return ""
+
+
+def _largest_share(errors: OutputErrors, config: ControllerConfig) -> float:
+    """Return the largest error as a share of its tolerance."""
+    return max(
+        error / max(tolerance, _LEAST_SMALLEST_TOLERANCE)
+        for error, tolerance in (
+            (errors.position, config.position_tolerance),
+            (errors.attitude, config.attitude_tolerance),
+            (errors.joints, config.joint_tolerance),
+        )
+    )
+
+
+def _lag(
+    errors: OutputErrors, controller: CoordinatedController, config: ControllerConfig
+) -> float:
+    """Return the largest error as a share of the way of its reference."""
+    assert controller.profile is not None
+    ways = controller.profile.distances()
+    pairs = (
+        (errors.position, ways.position, config.position_tolerance),
+        (errors.attitude, ways.attitude, config.attitude_tolerance),
+        (errors.joints, ways.joints, config.joint_tolerance),
+    )
+    return max((error / way for error, way, tolerance in pairs if way > tolerance), default=0.0)

@@ -1,0 +1,162 @@
+"""Controllers with nothing but a robot and a rate: robots fly to goals, or say why they do not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from spacerobot_ros.control import ControlState, Reference
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.flight.flight import Flight
+from spacerobot_ros.flight.lockstep import fly_scenario
+from spacerobot_ros.measures import Outcome
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.scenario import load_scenario
+
+CUBE = """<robot name="cube"><link name="hull"><inertial><mass value="16"/>
+  <inertia ixx="0.18" iyy="0.18" izz="0.18" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+BASE, TURN = np.array([0.3, 0.1, 0.0]), np.array([0.0, 0.0, 0.3])
+
+SHAPES: dict[str, list[float]] = {
+    "planar_manipulator": [-1.0, 1.0],
+    "servicer": [0.0, -1.2, 2.0, 0.0, 0.8, 0.0],
+    "planar_chain": [1.0, 1.2],
+    "three_joint_arm": [0.5, -0.8, 1.2],
+    "dual_arm": [0.0] * 14,
+    "free_flyer": [0.0] * 6,
+    "cube": [],
+}
+
+HANDS = ("planar_manipulator", "servicer", "three_joint_arm")
+"""Robots whose end-effector is controlled by default."""
+
+
+def flown(
+    folder: Path,
+    robot: str,
+    rate: float,
+    *,
+    base: np.ndarray[Any, Any] = BASE,
+    turn: np.ndarray[Any, Any] = TURN,
+    hand: np.ndarray[Any, Any] | None = None,
+    **settings: Any,
+) -> Flight:
+    """Fly the base to a pose, and the hand to where it is carried, away by ``hand``."""
+    file, shape = folder / "flight.yaml", SHAPES[robot]
+    if robot == "cube":
+        (folder / "cube.urdf").write_text(CUBE, "utf-8")
+        robot = str(folder / "cube.urdf")
+    goals: dict[str, Any] = {"goal_position": base.tolist(), "goal_rotvec": turn.tolist()}
+    if hand is not None:
+        model = SpaceRobot.from_file(robot_file(robot))
+        state = ControlState.at_rest(np.zeros(3), UPRIGHT, np.array(shape))
+        now = Reference.present(model, state, "end_effector").end_effector
+        assert now is not None
+        turned = Rotation.from_rotvec(turn)
+        attitude = turned * Rotation.from_quat(now.quaternion)
+        goals["end_effector_goal_position"] = (base + turned.apply(now.position) + hand).tolist()
+        goals["end_effector_goal_rotvec"] = attitude.as_rotvec().tolist()
+    plant = {"robot": robot, "actuation": "effort", "tick_rate": rate}
+    if shape:
+        plant["initial_joint_positions"] = shape
+    sections = {
+        "scenario": {"description": "a goal", **goals},
+        "/**/plant": plant,
+        "/**/coordinated_control": {"robot": robot, "tick_rate": rate, **settings},
+    }
+    text = yaml.safe_dump({name: {"ros__parameters": of} for name, of in sections.items()})
+    file.write_text(text, "utf-8")
+    return fly_scenario(load_scenario(str(file)), longest=600.0, contacts=False)
+
+
+def statuses(flight: Flight) -> list[tuple[float, ControllerStatus]]:
+    return [(t / 1e9, each) for t, each in flight.statuses if isinstance(each, ControllerStatus)]
+
+
+def turns_of_sign(values: np.ndarray[Any, Any]) -> int:
+    """Return how often large steps of a command are followed by large steps back."""
+    steps = np.diff(values, axis=0) / (np.abs(values).max(axis=0) + 1e-12)
+    large = np.abs(steps) > 0.05
+    return int(((steps[1:] * steps[:-1] < 0) & large[1:] & large[:-1]).sum(axis=0).max(initial=0))
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [5.0, pytest.param(10.0, marks=pytest.mark.slow), 20.0]
+    + [pytest.param(rate, marks=pytest.mark.slow) for rate in (50.0, 200.0)],
+)
+@pytest.mark.parametrize("robot", SHAPES)
+def test_goals_are_reached_by_default(tmp_path: Path, robot: str, rate: float) -> None:
+    hand = np.array([0.1, 0.1, 0.0]) if robot in HANDS else None
+    flight = flown(tmp_path, robot, rate, hand=hand)
+    assert flight.outcome is Outcome.REACHED, flight.message
+    np.testing.assert_allclose(flight.pose[-1][:3], BASE, atol=1e-3)
+    turned = Rotation.from_quat(flight.pose[-1][3:]) * Rotation.from_rotvec(TURN).inv()
+    assert turned.magnitude() < 2e-3
+    assert len(flight.pose) / rate < 30.0, "the reference takes 6 to 14 s"
+    words = [each.state.value for _, each in statuses(flight)]
+    assert words == ["waiting", *["tracking"] * (len(words) - 2), "reached"]
+    assert all(each.state.level == 0 for _, each in statuses(flight))
+    for given in flight.commands.values():
+        assert turns_of_sign(given.values) <= 4, "it does not chatter"
+
+
+# -- robots that come no nearer ---------------------------------------------------------------
+
+
+def stalls(flight: Flight) -> tuple[float, ControllerStatus]:
+    """Return time and status of the first stall; check the end of the flight."""
+    found = [each for each in statuses(flight) if each[1].state is ControllerState.STALLED]
+    assert {each.state.level for _, each in found} == {1}
+    assert flight.outcome is Outcome.FAILED, flight.message
+    cause = found[-1][1].message.removesuffix(".").split("reference: ")[1]
+    assert flight.message.startswith(f"The goal is not reached in time, as {cause}: ")
+    return found[0]
+
+
+@pytest.mark.parametrize("robot", ["planar_manipulator", "three_joint_arm"])
+def test_a_hand_out_of_reach_is_stalled_with_its_cause(tmp_path: Path, robot: str) -> None:
+    flight = flown(tmp_path, robot, 20.0, hand=np.array([2.0, 0.0, 0.0]), time_limit=100.0)
+    time, _ = stalls(flight)
+    assert time < 60.0
+    last = [each for _, each in statuses(flight) if each.state is ControllerState.STALLED][-1]
+    assert last.message.endswith(": the arm is stretched out or folded (singular).")
+
+
+def test_a_base_that_leaves_its_hand_behind_is_stalled(tmp_path: Path) -> None:
+    """The end-effector has no goal, and stays where it is."""
+    away = np.array([-2.5, 0.0, 0.0])
+    flight = flown(tmp_path, "planar_manipulator", 20.0, base=away, turn=np.zeros(3), time_limit=90)
+    time, status = stalls(flight)
+    assert time < 75.0
+    assert status.message.endswith(": the arm is stretched out or folded (singular).")
+
+
+def test_a_robot_that_chatters_ends_with_its_cause(tmp_path: Path) -> None:
+    """Gains far too high for a cube at 10 Hz: its torque flips at every tick."""
+    gains = {
+        f"gains.{group}.{name}": value
+        for group in ("base_position", "base_attitude")
+        for name, value in (("kp", 30.0), ("kd", 60.0))
+    }
+    flight = flown(tmp_path, "cube", 10.0, profile="step", max_torque=2.0, **gains)
+    assert turns_of_sign(flight.commands["base_wrench"].values) > 1000, "so the test is sharp"
+    time, status = stalls(flight)
+    assert time < 30.0
+    assert status.message.endswith(": the torque on the base is at its limit.")
+    assert len(flight.pose) / 10.0 == pytest.approx(300.0, abs=1.0), "the default limit"
+
+
+def test_a_reference_that_takes_longer_extends_the_default_limit(tmp_path: Path) -> None:
+    far = np.array([20.0, 0.0, 0.0])
+    flight = flown(tmp_path, "cube", 5.0, base=far, **{"motion.speed": 0.1})
+    assert flight.outcome is Outcome.REACHED, flight.message
+    assert len(flight.pose) / 5.0 > 300.0
