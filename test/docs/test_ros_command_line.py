@@ -58,7 +58,7 @@ def commands(page: str, *words: str) -> list[str]:
 
 def test_commands_are_read_as_a_shell_reads_them() -> None:
     read = commands("README.md", "ros2 topic pub")
-    assert [each.split()[1] for each in read][-2:] == ["topic", "launch"]
+    assert [each.split()[1] for each in read] == ["run", "run", "run", "topic"]
     assert all(each.count("'") % 2 == 0 for each in read)
 
 
@@ -176,20 +176,21 @@ def goal(x: float) -> PoseStamped:
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/operation.md"])
+@pytest.mark.parametrize(
+    ("node", "topic", "x"),
+    [("planner", "planner/status", 0.05), ("coordinated_control", "controller/status", 0.2)],
+)
 def test_nodes_that_are_run_one_by_one_fly_to_a_goal(
-    terminals: Terminals, harness: Harness, probe: Probe, page: str
+    terminals: Terminals, probe: Probe, page: str, node: str, topic: str, x: float
 ) -> None:
-    *lines, launch = commands(page, "ros2 topic pub", "ros2 launch")
-    assert launch.startswith("ros2 launch")
-    for line in lines:
-        if "coordinated_control" not in line:  # It is shown as another flight.
-            terminals.do(line)
+    for line in commands(page, "ros2 topic pub", f"spacerobot_ros {node}\n"):
+        terminals.do(line)
     terminals.wait(
-        lambda: state(probe, "planner/status") in ("reached", "failed", "refused", "aborted"),
-        "the goal is decided",
+        lambda: state(probe, topic) in ("reached", "failed", "refused", "aborted"), "a decision"
     )
-    assert state(probe, "planner/status") == "reached", terminals.said
-    assert abs(probe.last("odom").pose.pose.position.x - 0.05) < 2e-3
+    assert state(probe, topic) == "reached", terminals.said
+    terminals.wait(lambda: probe.count("odom") > 0, "the base where it has come to")
+    assert abs(probe.last("odom").pose.pose.position.x - x) < 2e-3
     # `ros2 run` ends as its node, or by the signal that the terminal has sent it, too.
     assert set(terminals.interrupt().values()) <= {0, -signal.SIGINT}, terminals.said
     assert terminals.complaints == []
@@ -197,22 +198,10 @@ def test_nodes_that_are_run_one_by_one_fly_to_a_goal(
     assert len(read_bag(bag)["/odom"]) > 10
 
 
-def test_the_controller_that_is_run_beside_a_plant_holds(
-    terminals: Terminals, harness: Harness, probe: Probe
-) -> None:
-    lines = commands("README.md", "ros2 run", "coordinated_control")
-    (line,) = (each for each in lines if each.startswith("ros2 run") and "coordinated" in each)
-    terminals.do("ros2 run spacerobot_ros plant --ros-args -p robot:=planar_manipulator")
+def test_the_launch_file_starts_a_scenario(terminals: Terminals, probe: Probe) -> None:
+    (line,) = commands("docs/operation.md", "scenario:=coordinated_control")
+    assert f"`{line}`" in (ROOT / "README.md").read_text("utf-8")
     terminals.do(line)
-    terminals.wait(lambda: state(probe, "controller/status") == "holding", "the robot is held")
-    assert set(terminals.interrupt().values()) <= {0, -signal.SIGINT}, terminals.said
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/operation.md"])
-def test_the_launch_file_starts_a_scenario(
-    terminals: Terminals, harness: Harness, probe: Probe, page: str
-) -> None:
-    terminals.do(commands(page, "ros2 topic pub", "ros2 launch")[-1])
     terminals.wait(
         lambda: state(probe, "controller/status") == "holding" and probe.count("odom") > 200,
         "the robot is held",
