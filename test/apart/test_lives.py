@@ -142,9 +142,8 @@ def publish_nothing(apart: NodesApart, node: str) -> None:
         package, _, name = kind.split("/")
         if topic == "/parameter_events":
             continue
-        (reader,) = (
-            each for each in probe.get_subscriptions_info_by_topic(topic) if each.node_name == node
-        )
+        readers = probe.get_subscriptions_info_by_topic(topic)
+        reader = next(each for each in readers if each.node_name == node)
         qos = QoSProfile(
             depth=1, reliability=reader.qos_profile.reliability,
             durability=reader.qos_profile.durability,
