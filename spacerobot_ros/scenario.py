@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,11 @@ from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionErr
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
-from spacerobot_ros.model.urdf import load_world
+from spacerobot_ros.model.shared_parameters import (
+    DEFAULT_POSITION_TOLERANCE,
+    automatic_tolerance,
+)
+from spacerobot_ros.model.urdf import load_world, parse_robot
 from spacerobot_ros.parameters import (
     Value,
     configured,
@@ -164,6 +169,8 @@ class Scenario:
             changes["tick_rate"] = self.plant.tick_rate
         if node == "planner" and config.plan_in_background and self.lockstep:
             changes["plan_in_background"] = False
+        if node in COMMANDERS and not config.position_tolerance:
+            changes["position_tolerance"] = self._automatic_tolerance(config)
         return replaced(config, **changes) if changes else config
 
     def _make_config(self, node: str) -> Any:
@@ -181,6 +188,17 @@ class Scenario:
             return configured(CONFIGS[node], values)
         except ParameterError as error:
             raise ParameterError(f"Node '{node}': {error}") from error
+
+    def _automatic_tolerance(self, config: Any) -> float:
+        """Return the position tolerance of the robot of a commander, m."""
+        named = config if config.robot_description or config.robot else self.plant
+        try:
+            text, file = named.robot_description, Path()
+            if not text:
+                file = robot_file(named.robot)
+            return automatic_tolerance(_described(text, file, 0.0 if text else _changed(file)))
+        except (ParameterError, RobotDescriptionError):
+            return DEFAULT_POSITION_TOLERANCE  # The robot is refused where it is built.
 
     def _parameters_as_written(self, node: str) -> dict[str, Any]:
         """Return the parameters of a node in the file and the overrides, before type conversion."""
@@ -444,6 +462,20 @@ class Scenario:
                 f"'{self.name}' has no goal: give one, for instance --goal-rpy-deg 0 0 10, or "
                 "write a scenario with one (`spacerobot new` writes that of a robot)."
             )
+
+
+@lru_cache(maxsize=64)
+def _described(text: str, file: Path, changed: float) -> RobotDescription:
+    """Return the robot of a URDF text, or of a file that was ``changed`` at a time."""
+    return parse_robot(text) if text else load_robot(file)
+
+
+def _changed(file: Path) -> float:
+    """Return the time at which a file was changed last; 0: it cannot be read."""
+    try:
+        return file.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def scenario_text(scenario: Scenario) -> str:

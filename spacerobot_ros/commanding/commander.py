@@ -37,6 +37,7 @@ from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.shared_parameters import DEFAULT_POSITION_TOLERANCE
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -219,8 +220,8 @@ class Commander(ABC):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.config, self.host, self._clock = config, host, clock
-        self._given_rate = config.tick_rate
-        """Configured rate, Hz; 0: that of the plant."""
+        self._given = config
+        """The configuration without what is learnt of robot and plant."""
         self.activity = CommanderActivity.INACTIVE
         self.robot: SpaceRobot | None = None
         self.stamps = StampFilter(clock)
@@ -264,6 +265,7 @@ class Commander(ABC):
             The configuration does not go with the robot.
         """
         self._described, self._payload = robot, self.plant.payload
+        self.config = self._adapted(self._given)
         robot = self._with_payload(robot)
         self._build_executive(robot, decoder)
         self.robot, self._decoder = robot, decoder
@@ -278,10 +280,11 @@ class Commander(ABC):
         if not rate or abs(rate - present) <= _EQUAL_RATES * present:
             return
         self.config = replace(self.config, tick_rate=rate)
-        if self._given_rate and abs(rate - self._given_rate) > _EQUAL_RATES * self._given_rate:
+        given = self._given.tick_rate
+        if given and abs(rate - given) > _EQUAL_RATES * given:
             self.host.log(
                 "warning",
-                f"Parameter 'tick_rate' is {self._given_rate:g} Hz, and the plant has {rate:g} Hz: "
+                f"Parameter 'tick_rate' is {given:g} Hz, and the plant has {rate:g} Hz: "
                 f"commands follow the plant. Set it to {rate:g}, or leave it out.",
             )
         if self.robot is not None:
@@ -514,9 +517,8 @@ class Commander(ABC):
     def _default_tolerance(self) -> Tolerance:
         """Return the largest errors of a reached goal that has none of its own."""
         config = self.config
-        return Tolerance(
-            config.position_tolerance, config.attitude_tolerance, config.joint_tolerance
-        )
+        position = config.position_tolerance or DEFAULT_POSITION_TOLERANCE
+        return Tolerance(position, config.attitude_tolerance, config.joint_tolerance)
 
     # -- states -------------------------------------------------------------------------------
 
@@ -730,12 +732,13 @@ class Commander(ABC):
 
     def reconfigure(self, config: Any) -> None:
         """Use the live parameters of another configuration from now on."""
-        self.config = self._adapted(config)
+        self._given, self.config = config, self._adapted(config)
         self._configure_executive()
 
     def _adapted(self, config: Any) -> Any:
-        """Return a configuration with the known rate of the plant."""
-        return replace(config, tick_rate=self.config.tick_rate)
+        """Return a configuration with the known rate of the plant, for the robot."""
+        config = replace(config, tick_rate=self.config.tick_rate)
+        return config if self._described is None else config.for_robot(self._described.description)
 
     @property
     def _knows_rate(self) -> bool:

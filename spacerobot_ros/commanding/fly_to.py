@@ -269,7 +269,7 @@ class FlyToGoals:
         ``progress`` returns the course of a goal by its id, its goal, and the stamp of its begin.
         """
         for goal_id, served in self._served.items():
-            if served.request is None:
+            if served.request is None or served.client is None:
                 continue
             if served.first_state_ns is None or now_ns < served.first_state_ns:
                 served.first_state_ns, served.last_feedback_ns = (

@@ -84,6 +84,7 @@ class ControlExecutive:
         report_event: Callable[[Event], None] = lambda event: None,
     ) -> None:
         self.controller = controller
+        config = config.for_robot(controller.law.robot.description)
         self._config = self._goal_config = config
         self._goal_tolerance: Tolerance | None = None
         """Tolerances of the present goal; None: those of the parameters."""
@@ -91,7 +92,7 @@ class ControlExecutive:
         self._file = goal_file if goal_file is not None else GoalFile("", GOAL_KEYS)
         self.servicing = Servicing(config)
         """The tasks before goals, with the target; the owner tells it the body that is held."""
-        self._longest_gap = max(_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS * config.control_period)
+        self._longest_gap = _longest_gap(config)
         self.reset()
 
     def reset(self) -> None:
@@ -133,7 +134,9 @@ class ControlExecutive:
 
     def configure(self, config: ControllerConfig) -> None:
         """Use other tolerances, times and gains from the next state on."""
+        config = config.for_robot(self.controller.law.robot.description)
         self._config = config
+        self._longest_gap = _longest_gap(config)
         self._take_tolerance(self._goal_tolerance)
         self.servicing.configure(config)
         self.controller.set_gains(config.gains)
@@ -314,16 +317,17 @@ class ControlExecutive:
     def reference_ended(self, remaining: Reference) -> None:
         """Go on with the references that remain: to a goal anew, else hold the measured pose."""
         self.controller.follow(remaining)
-        if self._goal_state is ControllerState.TRACKING:
-            self._begin_anew = True
-        else:
-            self._hold_here = True
+        self._begin_anew_or_hold()
 
     def plant_reset(self) -> None:
         """Begin the goal anew at the next measured state; without a goal, hold its pose."""
         self.servicing.end()
         if self._goal_state is ControllerState.TRACKING and self._after_tasks:
             self._pending = {**self._after_tasks, **self._pending}
+        self._begin_anew_or_hold()
+
+    def _begin_anew_or_hold(self) -> None:
+        """Begin the goal anew at the next measured state; without a goal, hold its pose."""
         if self._goal_state is ControllerState.TRACKING:
             self._begin_anew = True
         else:
@@ -729,6 +733,10 @@ _STATE_AND_EVENT_OF_DECISION = {
     Decision.FAILED: (ControllerState.FAILED, EventKind.GOAL_FAILED),
 }
 """State and event of decisions, except for a loss of control, which is an abort."""
+
+
+def _longest_gap(config: ControllerConfig) -> float:
+    return max(_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS * config.control_period)
 
 
 def _command_report(controller: CoordinatedController, result: Saturated) -> CommandReport:

@@ -227,6 +227,18 @@ class RobotDescription:
         """Mass of the whole system, kg."""
         return float(sum(body.inertia.mass for body in self.bodies))
 
+    @cached_property
+    def size(self) -> float:
+        """Diameter of gyration of the whole system with all joints at zero, m."""
+        poses = [Pose()]
+        for body in self.bodies[1:]:
+            poses.append(poses[body.parent] @ body.origin)
+        masses = np.array([body.inertia.mass for body in self.bodies])
+        at = np.array([p.r + p.R @ b.inertia.com for p, b in zip(poses, self.bodies, strict=True)])
+        away = at - masses @ at / masses.sum()
+        moments = sum(np.trace(body.inertia.about_com) for body in self.bodies)
+        return float(2 * np.sqrt((moments / 2 + masses @ np.sum(away**2, axis=1)) / masses.sum()))
+
     def limits(self, kind: str) -> Array:
         """Return one limit (n,) of the movable joints: lower, upper, velocity or effort.
 

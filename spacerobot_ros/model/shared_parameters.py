@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model.description import RobotDescription
@@ -10,7 +11,7 @@ from spacerobot_ros.model.model_functions import SymbolicModels
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot, load_world, parse_robot
 from spacerobot_ros.model.world import with_world
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import parameter, replaced
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.times import SECOND
 
@@ -19,6 +20,23 @@ DEFAULT_TICK_RATE = 20.0
 
 _MIN_RATE = 0.001
 """Smallest rate of a commander, Hz."""
+
+DEFAULT_POSITION_TOLERANCE = 1e-3
+"""Automatic position tolerance where no robot is known, m."""
+
+_TOLERANCE_SHARE = 1e-3
+"""Automatic position tolerance as a share of the size of a robot."""
+
+_SMALLEST_TOLERANCE, _LARGEST_TOLERANCE = 1e-4, 1e-2
+"""Bounds of automatic position tolerances, m."""
+
+Config = TypeVar("Config", bound="CommanderConfig")
+
+
+def automatic_tolerance(robot: RobotDescription) -> float:
+    """Return the largest position error of a goal that a robot reaches, m, of one digit."""
+    tolerance = min(max(_TOLERANCE_SHARE * robot.size, _SMALLEST_TOLERANCE), _LARGEST_TOLERANCE)
+    return float(f"{tolerance:.1g}")
 
 
 @dataclass(frozen=True)
@@ -148,8 +166,9 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
         minimum=0.0,
     )
     position_tolerance: float = parameter(
-        0.001,
-        "largest position error at a goal that is reached",
+        0.0,
+        "largest position error at a goal that is reached; 0: a thousandth of the diameter of "
+        "gyration of the robot",
         unit="m",
         minimum=0.0,
         read_only=False,
@@ -186,6 +205,12 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
                 f"Parameter 'tick_rate' is {self.tick_rate}; it must be 0 (that of the plant) or "
                 f"at least {_MIN_RATE:g} Hz."
             )
+
+    def for_robot(self: Config, robot: RobotDescription) -> Config:
+        """Return the configuration with the tolerance of a robot in place of an automatic one."""
+        if self.position_tolerance:
+            return self
+        return replaced(self, position_tolerance=automatic_tolerance(robot))
 
     @property
     def control_period(self) -> float:

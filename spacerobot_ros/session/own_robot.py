@@ -198,7 +198,7 @@ def first_problem(name: str, robot: SpaceRobot, file: Path) -> PlanningProblem:
     turn = first_turn(robot, shape, turning.axes)
     angle = float(np.linalg.norm(turn))
     goal = Goal.checked([0.0, 0.0, 0.0], quaternion_from_rotvec(turn))
-    config = PlannerConfig(robot=str(file))
+    config = PlannerConfig(robot=str(file)).for_robot(robot.description)
     tolerance = min(config.attitude_tolerance, float(f"{angle / _ROTATION_TO_TOLERANCE:.1g}"))
     config = replace(config, attitude_tolerance=tolerance)
     return PlanningProblem(name, robot, InitialState(joint_positions=shape), goal, config)

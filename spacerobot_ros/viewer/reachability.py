@@ -32,7 +32,11 @@ from spacerobot_ros.errors import GoalError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_quaternion
-from spacerobot_ros.model.shared_parameters import robot_from_text
+from spacerobot_ros.model.shared_parameters import (
+    DEFAULT_POSITION_TOLERANCE,
+    automatic_tolerance,
+    robot_from_text,
+)
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.planning import Goal, PoseError
@@ -193,12 +197,17 @@ def planner_config(parameters: Mapping[str, str]) -> PlannerConfig:
     return configured(PlannerConfig, {**values, **elsewhere})
 
 
-def goal_tolerance(parameters: Mapping[str, str] | None) -> Tolerance | None:
+def goal_tolerance(
+    parameters: Mapping[str, str] | None, robot: RobotDescription | None
+) -> Tolerance | None:
     """Return the tolerance of goals in the parameters of a planner or controller, if known."""
     names = ("position_tolerance", "attitude_tolerance", "joint_tolerance")
     if parameters is None or not all(name in parameters for name in names):
         return None
-    return Tolerance(*(float(json.loads(parameters[name])) for name in names))
+    position, attitude, joints = (float(json.loads(parameters[name])) for name in names)
+    if not position and robot is not None:
+        position = automatic_tolerance(robot)
+    return Tolerance(position or DEFAULT_POSITION_TOLERANCE, attitude, joints)
 
 
 def planned_links(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -83,6 +84,10 @@ def test_at_a_singularity_commands_stay_bounded() -> None:
     assert np.linalg.norm(command.wrench_B) + np.linalg.norm(command.tau) < 47.0
 
 
+def automatic_gains(*groups: str) -> dict[str, Any]:
+    return {f"gains.{group}.{name}": 0.0 for group in groups for name in ("kp", "kd")}
+
+
 def test_gains_become_automatic_in_flight_and_back() -> None:
     loop = ExecutiveLoop()
     loop.aim(base=goal_at(AIM))
@@ -90,9 +95,7 @@ def test_gains_become_automatic_in_flight_and_back() -> None:
     loop.configure(gains=Gains())
     automatic = np.concatenate(loop.answer())
     assert np.linalg.norm(automatic - given) > 1.0
-    fresh = ExecutiveLoop(
-        **{f"gains.{group}.{k}": 0.0 for group in vars(Gains()) for k in ("kp", "kd")}
-    )
+    fresh = ExecutiveLoop(**automatic_gains(*vars(Gains())))
     fresh.aim(base=goal_at(AIM))
     np.testing.assert_allclose(automatic, np.concatenate(fresh.answer()), rtol=1e-9)
     loop.configure(gains=Gains.uniform(KP, 2 * KP))
@@ -101,8 +104,8 @@ def test_gains_become_automatic_in_flight_and_back() -> None:
 
 def test_a_group_with_gains_keeps_them() -> None:
     """At rest the force on the base is the sum of those on both poses."""
-    groups = [group for group in vars(Gains()) if group != "base_position"]
-    loop = ExecutiveLoop(**{f"gains.{group}.{k}": 0.0 for group in groups for k in ("kp", "kd")})
+    others = [group for group in vars(Gains()) if group != "base_position"]
+    loop = ExecutiveLoop(**automatic_gains(*others))
     loop.aim(base=goal_at(AIM))
     np.testing.assert_allclose(loop.answer()[0][:3], KP * AIM, rtol=1e-9, atol=1e-9)
 

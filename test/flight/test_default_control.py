@@ -142,7 +142,7 @@ def test_a_base_that_leaves_its_hand_behind_is_stalled(tmp_path: Path) -> None:
 
 def test_a_robot_that_chatters_ends_with_its_cause(tmp_path: Path) -> None:
     """Gains far too high for a cube at 10 Hz: its torque flips at every tick."""
-    gains = {
+    gains: dict[str, Any] = {
         f"gains.{group}.{name}": value
         for group in ("base_position", "base_attitude")
         for name, value in (("kp", 30.0), ("kd", 60.0))
@@ -157,6 +157,7 @@ def test_a_robot_that_chatters_ends_with_its_cause(tmp_path: Path) -> None:
 
 def test_a_reference_that_takes_longer_extends_the_default_limit(tmp_path: Path) -> None:
     far = np.array([20.0, 0.0, 0.0])
-    flight = flown(tmp_path, "cube", 5.0, base=far, **{"motion.speed": 0.1})
+    slow: dict[str, Any] = {"motion.speed": 0.1}
+    flight = flown(tmp_path, "cube", 5.0, base=far, **slow)
     assert flight.outcome is Outcome.REACHED, flight.message
     assert len(flight.pose) / 5.0 > 300.0

@@ -334,7 +334,8 @@ def bag_of(metadata: dict[str, Any], target: str = "", urdf: bytes | None = b"<r
 
 
 def test_a_scenario_is_what_its_bag_holds_of_it() -> None:
-    plant = {"robot": '"a.urdf"', "tick_rate": "20.0", "clearance_period": "0.5", "bad": "{"}
+    plant = {"robot": '"a.urdf"', "tick_rate": "20.0", "clearance_period": "0.5", "faults": "{"}
+    plant["of_a_newer_version"] = "1"
     own = {"robot": '"other.urdf"'}
     about = {
         "name": "named",
@@ -362,8 +363,8 @@ def test_a_scenario_is_what_its_bag_holds_of_it() -> None:
     nodes = {name: dict(values) for name, values in found.in_file.items()}
     assert nodes["plant"]["target.robot_description"] == "<target/>"
     assert (nodes["plant"]["clearance_period"], nodes["planner"]["clearance"]) == (0.5, 0.0)
-    assert nodes["plant"]["tick_rate"] == 20.0
-    assert "bad" not in nodes["plant"]
+    assert (nodes["plant"]["tick_rate"], nodes["plant"]["faults"]) == (20.0, None)
+    assert "of_a_newer_version" not in nodes["plant"]
     assert nodes["plant"]["robot_description"] == nodes["planner"]["robot_description"]
     assert nodes["plant"]["robot_description"] == "<robot/>"
     assert "robot_description" not in nodes["coordinated_control"]

@@ -51,6 +51,7 @@ def test_without_odom_from_the_beginning_nothing_is_thrust(harness: Harness) -> 
     loop = Loop(harness)
     loop.aim(base=pose([1.0, 0.0, 0.0]))
     loop.show(odom=False)
+    harness.settle(loop.probe)
     for _ in range(3):
         np.testing.assert_array_equal(loop.answer(odom=False)[0], np.zeros(6))
     assert loop.wait_for("waiting").level == DiagnosticStatus.OK

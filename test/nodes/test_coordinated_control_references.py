@@ -59,8 +59,9 @@ def test_a_silent_reference_is_done_without_until_it_comes_again(harness: Harnes
     loop = Referenced(harness, reference_timeout=0.3)
     # Its publisher has sent nothing yet.
     np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-9)
-    status = loop.wait_for("holding")
-    assert status.message.endswith(" No reference comes on base_reference.")
+    said = " No reference comes on base_reference."
+    harness.spin_until(lambda: loop.probe.last(STATUS).message.endswith(said), "a status")
+    assert loop.status["state"] == "holding"
     loop.place = np.array([0.1, 0.0, 0.0])
     assert abs(loop.answer()[0][0]) > 1.0, "the pose of the first state is held, without a delay"
     loop.refer(loop.tick, 0.0)

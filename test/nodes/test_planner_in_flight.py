@@ -153,7 +153,8 @@ def stamped(place: Place, sec: int, nanosec: int) -> PoseStamped:
 def ids_of(flight: Flight) -> list[tuple[str, str]]:
     """States with the ids of the goals that they speak of."""
     values = [values_of(status) for status in flight.probe.messages["planner/status"]]
-    return [(value["state"], value.get("goal_id", "")) for value in values]
+    found = [(value["state"], value.get("goal_id", "")) for value in values]
+    return [each for each in found if each[0] not in ("planning", "waiting")]
 
 
 def test_statuses_name_the_goal_by_its_stamp(harness: Harness) -> None:
@@ -164,7 +165,6 @@ def test_statuses_name_the_goal_by_its_stamp(harness: Harness) -> None:
     refused.header.frame_id = "moon"
     flight.decide(refused)
     assert ids_of(flight) == [
-        ("idle", ""),
         ("executing", "3.000000005"),
         ("reached", "3.000000005"),
         ("executing", "unstamped-1"),

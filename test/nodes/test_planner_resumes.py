@@ -21,7 +21,7 @@ def interrupted(harness: Harness, path: Path) -> Flight:
     goal = goal_of(goal_at(TURNED), "world")
     GoalFile(str(path)).save({BASE_GOAL_KEY: IdentifiedGoal(goal, "7.000000000")})
     flight = Flight(harness, {"robot": "", "resume_file": str(path)})
-    status = flight.wait("planning")
+    status = flight.wait("waiting")
     assert values_of(status)["goal_id"] == "7.000000000"
     assert path.exists()
     return flight

@@ -241,7 +241,7 @@ def test_states_are_answered_at_rest_until_the_plan_is_there() -> None:
     loop = held()
     loop.propose_goal(NEAR)
     loop.tick(40)
-    assert not loop.statuses
+    assert not loop.states
     assert not any(loop.speeds)
     loop.held.release()
     loop.until(PlannerState.REACHED)
@@ -334,7 +334,7 @@ def test_a_worker_that_is_closed_has_its_search_end_soon() -> None:
     loop.propose_goal(NEAR)
     loop.tick(200)
     assert threading.active_count() == before + 1
-    assert not loop.statuses, "it searches still"
+    assert not loop.states, "it searches still"
     loop.stop()
     assert threading.active_count() == before
     # It plans again when it is wanted again.

@@ -124,7 +124,7 @@ def test_a_goal_that_takes_over_a_schedule_begins_with_no_correction() -> None:
     assert (last.goal_id, last.corrections) == ("goal-2", 0)
     # Another goal in motion: its plan takes over, and nothing of the first is counted for it.
     loop.propose_goal(OTHER)
-    while loop.statuses[-1].goal_id != "goal-3":
+    while (loop.statuses[-1].goal_id, loop.statuses[-1].state.value) != ("goal-3", "executing"):
         loop.tick()
     assert loop.statuses[-1].corrections == 0
     assert loop.statuses[-1].manoeuvre_time_s == pytest.approx(40 * TICK)

@@ -17,6 +17,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.session import own_robot
 from spacerobot_ros.session.own_robot import first_problem, first_shape, first_turn, urdf_remarks
+from spacerobot_ros.simulation.config import PlantConfig
 
 
 def joint(**limits: Any) -> Any:
@@ -186,7 +187,7 @@ def test_the_tolerance_is_a_fiftieth_of_a_small_turn(
     monkeypatch.setattr(own_robot, "first_turn", lambda robot, shape, axes: turn)
     robot: Any = SimpleNamespace(
         lower=np.array([-1.0, 0.0]), upper=np.array([1.0, 1.0]), n=2, joint_names=["a", "b"],
-        description=SimpleNamespace(name="mine"),
+        description=SimpleNamespace(name="mine", size=1.0),
     )  # fmt: skip
     problem = first_problem("first", robot, Path("mine.urdf"))
     assert problem.config.attitude_tolerance == pytest.approx(
@@ -208,6 +209,6 @@ def test_the_tolerance_is_a_fiftieth_of_a_small_turn(
     assert read["/**/planner"]["attitude_tolerance"] == problem.config.attitude_tolerance
     for node in ("/**/plant", "/**/planner"):
         assert read[node]["robot"] == "../mine.urdf"
-        assert read[node]["tick_rate"] == PlannerConfig().tick_rate
+    assert read["/**/plant"]["tick_rate"] == PlantConfig().tick_rate
     robot.n = 0
     assert "initial_joint" not in own_robot.scenario_text(problem, "optimal", "a")

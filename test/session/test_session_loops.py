@@ -483,7 +483,7 @@ def test_a_commander_that_has_failed_with_a_goal_ends_the_flight(
 
     some = SimpleNamespace(
         scenario=SimpleNamespace(commanders=("planner",)),
-        client=SimpleNamespace(goal_id=goal_id, failures=failures, follow=follow),
+        client=SimpleNamespace(goal_id=goal_id, failures=failures, follow=follow, outcome=None),
         executor=None,
         finish=finish,
         _supervise=lambda: done.append("supervised"),

@@ -103,13 +103,23 @@ class Flight:
 
     @property
     def states(self) -> list[str]:
+        """The published states: idle while states are waited for, and without those of planning."""
+        found = ["idle" if state == "waiting" else state for state in self.all_states]
+        return [
+            state
+            for before, state in zip(["", *found], found, strict=False)
+            if state != "planning" and (state, before) != ("idle", "idle")
+        ]
+
+    @property
+    def all_states(self) -> list[str]:
         """The states that the planner has been in, as published."""
         return [values_of(s)["state"] for s in self.probe.messages["planner/status"]]
 
     def wait(self, *states: str) -> DiagnosticStatus:
         """Wait until the planner's latest state is one of these."""
         self.harness.spin_until(
-            lambda: self.states and self.states[-1] in states,
+            lambda: self.all_states and self.all_states[-1] in states,
             f"the planner is {' or '.join(states)}",
         )
         return self.probe.last("planner/status")
@@ -128,7 +138,7 @@ class Flight:
         if not self.plant.is_active:
             self.start()
         self.harness.spin_until(
-            lambda: any(s in ("reached", "failed", "refused") for s in self.states[before:]),
+            lambda: any(s in ("reached", "failed", "refused") for s in self.all_states[before:]),
             "the goal is decided",
         )
         return self.probe.last("planner/status")

@@ -372,7 +372,8 @@ class ViewerNode(FlightNode):
             if key == "planner":
                 self._offer_end_effectors()
             known = self._remote_values
-            self._page.show_tolerance(goal_tolerance(known.get("planner", known.get("controller"))))
+            parameters = known.get("planner", known.get("controller"))
+            self._page.show_tolerance(goal_tolerance(parameters, self._robot))
             self._page.editor.touch(time.monotonic())
 
     def _offer_end_effectors(self) -> None:

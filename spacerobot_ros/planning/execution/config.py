@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
-from spacerobot_ros.model.shared_parameters import CommanderConfig
+from spacerobot_ros.model.shared_parameters import DEFAULT_POSITION_TOLERANCE, CommanderConfig
 from spacerobot_ros.model.srdf import with_srdf
 from spacerobot_ros.parameters import parameter, registered
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE
@@ -161,4 +161,5 @@ class PlannerConfig(CommanderConfig):
     @property
     def tolerance(self) -> Tolerance:
         """Largest errors at which a goal is reached."""
-        return Tolerance(self.position_tolerance, self.attitude_tolerance, self.joint_tolerance)
+        position = self.position_tolerance or DEFAULT_POSITION_TOLERANCE
+        return Tolerance(position, self.attitude_tolerance, self.joint_tolerance)
