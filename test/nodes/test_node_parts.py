@@ -99,7 +99,7 @@ def test_a_recorder_tells_how_its_bag_does(
 def test_a_recorder_reports_lost_messages_in_order() -> None:
     node = reporting()
     RecorderNode._publish_losses(node, node.recording)
-    said = "3 messages were lost on their way to the recorder."
+    said = "Messages were lost on their way to the recorder: 1 on '/a', 2 on '/b'."
     assert node.log.lines == [("warning", said)]
     ((what, level, message, counts),) = node.shown
     assert (what, level, message) == ("lost messages", DiagnosticStatus.WARN, said)

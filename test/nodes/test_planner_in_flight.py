@@ -154,7 +154,7 @@ def ids_of(flight: Flight) -> list[tuple[str, str]]:
     """States with the ids of the goals that they speak of."""
     values = [values_of(status) for status in flight.probe.messages["planner/status"]]
     found = [(value["state"], value.get("goal_id", "")) for value in values]
-    return [each for each in found if each[0] not in ("planning", "waiting")]
+    return [each for each in found if each[0] not in ("idle", "planning", "waiting")]
 
 
 def test_statuses_name_the_goal_by_its_stamp(harness: Harness) -> None:

@@ -229,7 +229,6 @@ def test_the_present_goal_once_more_goes_on_under_its_new_id(tmp_path: Path) -> 
     assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
     assert len(loop.starts) == 1
     assert [(s.state.value, s.goal_id) for s in loop.statuses] == [
-        ("planning", "goal-1"),
         ("executing", "goal-1"),
         ("executing", "goal-2"),
         ("reached", "goal-2"),

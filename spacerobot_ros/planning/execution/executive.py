@@ -1037,7 +1037,8 @@ class Executive:
         reason = job.reason.value
         message = f"A plan is made: {reason}."
         self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
-        if job.reason.is_for_new_goal or not self._tracker.is_active:
+        fresh = job.reason.is_for_new_goal or not self._tracker.is_active
+        if fresh and self._worker.plans_in_background:
             self._add_status(PlannerState.PLANNING, f"Planning: {reason}.", job.identified, active)
         task = PlanningTask(
             request, braking=braking, rates_after_braking=rates, take_over=take_over
