@@ -61,6 +61,9 @@ _REPORT_PERIOD = 1.0
 _LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
 """Time without a state after which states are waited for, wall s, and at least control periods."""
 
+_SUSPENSION_TIME = 0.5
+"""Wall time between two looks beyond which this process itself stood still, s."""
+
 _EQUAL_RATES = 0.05
 """Largest relative difference between two rates that count as one."""
 
@@ -238,7 +241,8 @@ class Commander(ABC):
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
         """Goals that were received before the robot's description."""
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
-        self._activated = self._answer_time = clock()
+        self._activated = self._answer_time = self._heard = self._checked = clock()
+        """Wall times of the activation, the last answer, the last state and the last look, s."""
         self.refusal = ""
         """Why the last joint states were refused, as a clause; empty: they were not."""
         self._reported_missing = ""
@@ -289,7 +293,7 @@ class Commander(ABC):
             )
         if self.robot is not None:
             self._change_rate(self.robot)
-        self.answer()
+        self.answer_latest()
 
     def drop_robot(self, why: str) -> None:
         """Give up the goals and the robot; later goals wait for another robot."""
@@ -306,7 +310,7 @@ class Commander(ABC):
         ParameterError
             The file of goals is refused.
         """
-        self._activated = self._answer_time = self._clock()
+        self._activated = self._answer_time = self._heard = self._checked = self._clock()
         self._reported_missing = ""
         self._resume_goals(self._goal_file.load())
         self.activity = CommanderActivity.ACTIVE
@@ -536,7 +540,7 @@ class Commander(ABC):
             self.take_joints(stamp_ns, joints)
         if self._fly_to:
             self._watch_fly_to()
-        self._answer_time = self._clock()
+        self._answer_time = self._heard = self._clock()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
         """Take an odom of the present time, and answer its state if complete."""
@@ -589,25 +593,32 @@ class Commander(ABC):
         if self.robot is None:
             return "a robot on 'robot_description'"
         topics = {"joint_states": self.states.joints, "odom": self.states.odom}
-        absent = [f"'{topic}'" for topic, message in topics.items() if message is None]
+        absent = [topic for topic, message in topics.items() if message is None]
         refused = f", whose messages are refused: {self.refusal}" if self.refusal else ""
         if absent:
-            return f"states on {' and '.join(absent)}{refused}"
-        silence = self._clock() - self._answer_time
+            waited = self._clock() - self._activated >= _LONGEST_SILENCE
+            unheard = [topic for topic in absent if waited and not self.host.has_publisher(topic)]
+            nobody = f", and no node publishes {_quoted(unheard)}" if unheard else ""
+            return f"states on {_quoted(absent)}{refused}{nobody}"
+        silence = self._clock() - self._heard
         longest = max(_LONGEST_SILENCE, _SILENT_PERIODS * self.config.control_period)
         if silence > longest and not (self.plant.paused or self.plant.in_lockstep):
-            return f"states on 'joint_states'{refused}; the last one came {silence:.1f} s ago"
+            ceased = "" if refused else ", which have ceased"
+            return f"states on 'joint_states'{refused}{ceased}"
         return ""
 
     def _report_missing(self) -> None:
         """Report in the status what is missing, and when it is there again."""
+        now = self._clock()
+        if now - self._checked > _SUSPENSION_TIME:
+            self._heard += now - self._checked  # This process itself stood still.
+        self._checked = now
         missing = self.missing
-        what = missing.partition(";")[0]
-        if not self.active or what == self._reported_missing:
+        if not self.active or missing == self._reported_missing:
             return
-        if what and self._reported_missing and self._clock() - self._activated < _LONGEST_SILENCE:
+        if missing and self._reported_missing and now - self._activated < _LONGEST_SILENCE:
             return  # The rest is on its way.
-        self._reported_missing = what
+        self._reported_missing = missing
         if missing:
             goal_id = self._pursued_goal_id
             goes_on = " The goal is pursued when they come." if goal_id else ""
@@ -813,3 +824,7 @@ class Commander(ABC):
 
     def _forward_outputs(self) -> None:  # noqa: B027
         """Pass the collected outputs of the executive to the host."""
+
+
+def _quoted(topics: Iterable[str]) -> str:
+    return " and ".join(f"'{topic}'" for topic in topics)

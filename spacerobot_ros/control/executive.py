@@ -151,8 +151,12 @@ class ControlExecutive:
         if mode is _MEASURED:
             stalled = self._stall.cause and self._goal_state is _TRACKING
             return ControllerState.STALLED if stalled else self._goal_state
-        estimated = mode is Mode.ESTIMATED
-        return ControllerState.ESTIMATING if estimated else ControllerState.STOPPED
+        if mode is not Mode.ESTIMATED:
+            return ControllerState.STOPPED
+        # One pose alone may come late.
+        elapsed = self.controller.time_since_measurement
+        late = elapsed <= _LATE_POSE_PERIODS * self._config.control_period
+        return self._goal_state if late else ControllerState.ESTIMATING
 
     # -- goals --------------------------------------------------------------------------------
 
@@ -727,6 +731,9 @@ def decided_message(
 
 _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
 """Longest gap between two states, s, and in control periods; longer gaps are jumps of time."""
+
+_LATE_POSE_PERIODS = 1.5
+"""Longest time without a measured base that is not reported, in control periods."""
 
 _STATE_AND_EVENT_OF_DECISION = {
     Decision.REACHED: (ControllerState.REACHED, EventKind.GOAL_REACHED),

@@ -246,6 +246,8 @@ class PlantMonitor:
                     message = "The joints are brought to rest: the last command is too old"
                     return PlantStatus(activity, f"{message}.", "timeout")
                 message = "The joints rest until a command arrives"
+                if not any(source.commanders for source in commands.sources):
+                    message += f"; no node publishes '{commands.sources[0].topic}'"
                 return PlantStatus(activity, f"{message}.", "no_command")
         return PlantStatus(activity, f"{message}.", commands.fault_reason, fault)
 

@@ -38,10 +38,12 @@ def test_the_base_is_estimated_for_a_while_and_then_the_thrusters_are_off() -> N
     loop = ExecutiveLoop(estimation_time=0.05)
     loop.aim(base=goal_at([1.0, 0.0, 0.0], "3"))
     measured = loop.answer()[0]
-    for _ in range(5):
+    for tick in range(5):
         wrench, _ = loop.answer(measured=False)
         np.testing.assert_allclose(wrench, measured, atol=0.15 * np.abs(measured).max())
-        assert (loop.state, loop.status.state.level) == ("estimating", 1)
+        # A single pose may be late.
+        reported = ("estimating", 1) if tick else ("tracking", 0)
+        assert (loop.state, loop.status.state.level) == reported
         assert loop.status.goal_id == "3"
     loop.rates = np.array([0.1, -0.2])
     for _ in range(4):
@@ -104,7 +106,7 @@ def test_an_abort_without_odom_holds_where_the_robot_is_seen_again() -> None:
     loop.aim(base=goal_at([1.0, 0.0, 0.0]))
     loop.answer()
     loop.executive.abort()
-    loop.answer(measured=False)
+    loop.answer(2, measured=False)
     assert loop.state == "estimating"
     loop.place = np.array([0.25, 0.0, 0.0])
     np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
@@ -114,7 +116,7 @@ def test_an_abort_without_odom_holds_where_the_robot_is_seen_again() -> None:
 def test_a_robot_that_held_still_holds_after_a_gap() -> None:
     loop = ExecutiveLoop()
     loop.answer()
-    loop.answer(measured=False)
+    loop.answer(2, measured=False)
     assert loop.state == "estimating"
     loop.answer()
     assert loop.state == "holding"
@@ -136,7 +138,7 @@ def test_a_reached_goal_does_not_fail_after_a_gap() -> None:
     loop.aim(base=goal_at([0.0, 0.0, 0.0]))
     loop.answer(20)
     assert loop.state == "reached"
-    loop.answer(measured=False)
+    loop.answer(2, measured=False)
     assert loop.state == "estimating"
     # It has drifted in the meantime.
     loop.place = np.array([0.01, 0.0, 0.0])

@@ -502,6 +502,8 @@ class PlantNode(FlightNode):
 
     def _on_commander_check(self) -> None:
         self._count_commanders()
+        if self.status.reason == "no_command":
+            self._publish_changed_status()
         self._report_on_wall_clock()
 
     def _check_for_commanders(self) -> None:
