@@ -87,7 +87,7 @@ def test_a_goal_on_the_topic_is_reached(
     apart.start(node)
     apart.start("recorder")
     place = (PLANNED if node == "planner" else CONTROLLED)[robot]
-    apart.fly(node, place, readers=2)
+    apart.fly(node, place)
     apart.end()
     assert apart.complaints == []
     check_record(apart, warm_python)

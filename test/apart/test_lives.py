@@ -60,7 +60,7 @@ def test_a_node_that_is_killed_and_started_again_flies_on(
     if phase in AT_REST[commander]:
         apart.wait_state(commander, phase)
     else:
-        apart.send(FAR[commander], readers=2)
+        apart.send(FAR[commander])
         apart.wait_state(commander, phase)
     apart.kill(killed)
     if killed == "plant":
@@ -74,7 +74,7 @@ def test_a_node_that_is_killed_and_started_again_flies_on(
         apart.wait_state(commander, *AT_REST[commander])
     else:
         apart.start("recorder")
-    apart.fly(commander, NEW[commander], readers=2)
+    apart.fly(commander, NEW[commander])
     assert apart.status("plant")["state"] == "running"
     apart.end()
     assert not any("Traceback" in line for line in apart.complaints), apart.said
@@ -109,7 +109,7 @@ def come_late(apart: NodesApart, commander: str, late: str, seconds: float) -> N
         assert apart.wait_state("plant", "resting")["reason"] == "no_command"
     apart.harness.spin_for(seconds)
     starts[late]()
-    apart.fly(commander, NEW[commander], readers=2)
+    apart.fly(commander, NEW[commander])
     apart.end()
     assert apart.complaints == []
 
@@ -120,7 +120,7 @@ def test_silent_publishers_do_not_hold_a_node_that_is_activated_again(
     apart: NodesApart, commander: str, node: str
 ) -> None:
     begin(apart, commander)
-    apart.fly(commander, NEW[commander], readers=2)
+    apart.fly(commander, NEW[commander])
     name = commander if node == "commander" else node
     publish_nothing(apart, name)
     assert apart.change(name, Transition.TRANSITION_DEACTIVATE)
@@ -129,7 +129,7 @@ def test_silent_publishers_do_not_hold_a_node_that_is_activated_again(
         apart.wait_state(commander, "waiting", timeout=20.0)
     assert apart.change(name, Transition.TRANSITION_ACTIVATE)
     apart.wait_state(commander, *AT_REST[commander], timeout=20.0)
-    apart.fly(commander, FAR[commander], readers=2)
+    apart.fly(commander, FAR[commander])
     apart.end()
     assert not any("Traceback" in line for line in apart.complaints), apart.said
 

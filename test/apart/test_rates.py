@@ -24,7 +24,7 @@ def test_a_plant_of_any_rate_is_followed(apart: NodesApart, node: str, rate: flo
     apart.start("plant", robot=robot, tick_rate=rate)
     apart.start(node)
     apart.start("recorder")
-    apart.fly(node, place, readers=2)
+    apart.fly(node, place)
     assert apart.status("plant")["tick_rate_hz"] == f"{rate:g}"
     apart.end()
     assert apart.complaints == []

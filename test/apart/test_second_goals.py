@@ -25,12 +25,12 @@ def slid(k: int) -> Place:
 
 def replace_in_motion(apart: NodesApart, first: Place, second: Place) -> None:
     """Send a goal while the robot moves to another; the second is flown, the first replaced."""
-    began = apart.send(first, readers=1)
+    began = apart.send(first)
     apart.wait(
         lambda: any(state == "executing" for state, _ in apart.told("planner", began)),
         "the robot moves",
     )
-    then = apart.send(second, readers=1)
+    then = apart.send(second)
     state, message = apart.decision("planner", then)
     assert state == "reached", f"{message}\n{apart.said}"
     apart.wait(lambda: replaced(apart, began), "the first goal is reported as replaced", 5.0)

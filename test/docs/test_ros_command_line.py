@@ -283,3 +283,25 @@ def test_a_goal_is_sent_as_an_action(terminals: Terminals, harness: Harness, pro
     terminals.do(line)
     terminals.wait(lambda: state(probe, "planner/status") == "reached", "the goal")
     assert set(terminals.interrupt().values()) <= {0, -signal.SIGINT}, terminals.said
+
+
+@pytest.mark.parametrize(
+    ("page", "topic", "key"),
+    [
+        ("docs/faults.md", "/fault_injection", "faults"),
+        ("docs/disturbances.md", "/disturbance_injection", "disturbances"),
+    ],
+)
+def test_lines_that_are_published_act_on_the_plant(
+    terminals: Terminals, probe: Probe, page: str, topic: str, key: str
+) -> None:
+    for line in commands(page, "ros2 run", topic):
+        terminals.do(line)
+    terminals.wait(
+        lambda: any(
+            "until 60" in values_of(status).get(key, "")
+            for status in probe.messages["plant/status"]
+        ),
+        f"the plant's {key}",
+    )
+    assert set(terminals.interrupt().values()) <= {0, -signal.SIGINT}, terminals.said

@@ -139,6 +139,10 @@ class NodesApart:
         self.running: dict[str, NodeProcess] = {}
         self.all: list[NodeProcess] = []
         """Every process that was started, dead ones too."""
+        self._lives: dict[str, int] = {}
+        """How many statuses of each node came from earlier processes."""
+        self._dead: set[tuple[int, ...]] = set()
+        """Readers of goals of processes that were killed, which discovery goes on to name."""
 
     # -- processes ----------------------------------------------------------------------------
 
@@ -148,11 +152,14 @@ class NodesApart:
         process = NodeProcess(self.folder, self.domain, node, words, environment=self.environment)
         self.running[node] = process
         self.all.append(process)
+        if node in STATUS_OF:
+            self._lives[node] = self.probe.count(STATUS_OF[node])
         return process
 
     def kill(self, node: str) -> None:
         """End a process by SIGKILL."""
         self.running.pop(node).kill()
+        self._dead |= self._readers()[node]
 
     def end(self) -> None:
         """Interrupt all nodes; each ends with 0, and leaves no process."""
@@ -206,8 +213,8 @@ class NodesApart:
             raise AssertionError(f"{error}\n{self.statuses()}\n{self.said}") from None
 
     def status(self, node: str) -> dict[str, str]:
-        """Return the values of a node's last status, with its message; empty: there is none."""
-        kept = self.probe.messages[STATUS_OF[node]]
+        """Return the values of the last status of a process, with its message; empty: none."""
+        kept = self.probe.messages[STATUS_OF[node]][self._lives.get(node, 0) :]
         return {**values_of(kept[-1]), "message": kept[-1].message} if kept else {}
 
     def statuses(self) -> str:
@@ -228,16 +235,29 @@ class NodesApart:
 
     # -- goals --------------------------------------------------------------------------------
 
-    def send(self, place: Place | PoseStamped, readers: int) -> str:
-        """Publish a goal once it has so many readers; return its id."""
-        self.wait(
-            lambda: self.goals.get_subscription_count() >= readers, f"{readers} readers", START
-        )
+    def send(self, place: Place | PoseStamped) -> str:
+        """Publish a goal once every node that runs and reads goals has been met; return its id."""
+        self.wait(self._are_met, "readers of goals", START)
         goal = place if isinstance(place, PoseStamped) else goal_at(place)
         sec, nanosec = divmod(time.time_ns(), 1_000_000_000)
         goal.header.stamp.sec, goal.header.stamp.nanosec = sec, nanosec
         self.goals.publish(goal)
         return f"{sec}.{nanosec:09d}"
+
+    def _readers(self) -> dict[str, set[tuple[int, ...]]]:
+        """Return the endpoints of each node that read goals."""
+        found: dict[str, set[tuple[int, ...]]] = {node: set() for node in (*STATUS_OF, "recorder")}
+        for each in self.probe.get_subscriptions_info_by_topic("goal_pose"):
+            found.setdefault(each.node_name, set()).add(tuple(each.endpoint_gid))
+        return found
+
+    def _are_met(self) -> bool:
+        """Whether goals reach every process that runs; dead ones count until they are missed."""
+        readers = self._readers()
+        known = sum(map(len, readers.values()))
+        return self.goals.get_subscription_count() >= known and all(
+            readers[node] - self._dead for node in self.running if node != "plant"
+        )
 
     def told(self, node: str, goal_id: str) -> list[tuple[str, str]]:
         """Return states and messages of the statuses about a goal."""
@@ -258,9 +278,9 @@ class NodesApart:
         self.wait(decided, f"{node} decides about goal {goal_id}")
         return found[0]
 
-    def fly(self, node: str, place: Place | PoseStamped, readers: int = 1) -> None:
+    def fly(self, node: str, place: Place | PoseStamped) -> None:
         """Send a goal, and have it reached."""
-        state, message = self.decision(node, self.send(place, readers))
+        state, message = self.decision(node, self.send(place))
         assert state == "reached", f"{message}\n{self.said}"
 
     # -- life ---------------------------------------------------------------------------------
