@@ -559,6 +559,7 @@ class Commander(ABC):
         if not self.config.tick_rate:
             self._follow_rate()
         if self._reported_missing:
+            self._heard = self._clock()
             self._report_missing()
         self.answer()
 
