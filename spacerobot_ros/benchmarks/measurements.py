@@ -340,12 +340,11 @@ def requests(robot: SpaceRobot, case: Case, count: int, seed: int) -> Iterator[P
 
 
 def plans(
-    urdf: str, case: str, count: int, seed: int, options: dict[str, Any], library: int = 0
+    urdf: str, case: str, count: int, seed: int, options: dict[str, Any]
 ) -> dict[str, list[float]]:
     """Return the CPU time (s) and the duration (s; NaN: refused) of each plan of a case.
 
-    Functions that are built for the first goal do not count, nor does a library of the manoeuvres
-    to ``library`` other goals.
+    Functions that are built for the first goal do not count.
     """
     from spacerobot_ros.planning.methods.optimal.method import OptimalGait
     from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions
@@ -357,14 +356,6 @@ def plans(
         chosen["time_budget"] = 1e6
     method = OptimalGait(robot, _PLAN_CONTROL_PERIOD, options=OptimalOptions(**chosen))
     goals = list(requests(robot, chosen_case, count + 1, seed))
-    if library:
-        solutions = method.build_library(requests(robot, chosen_case, library, seed + 1))
-        assert solutions is not None
-        with tempfile.TemporaryDirectory(prefix="spacerobot_") as folder:
-            file = Path(folder, "library.npz")
-            file.write_bytes(solutions.to_bytes())
-            chosen["library"] = str(file)
-            method = OptimalGait(robot, _PLAN_CONTROL_PERIOD, options=OptimalOptions(**chosen))
     times: list[float] = []
     durations: list[float] = []
     for request in goals:

@@ -37,7 +37,6 @@ def planning_benchmark(
     goals: int,
     other: Path | None,
     starts: int | None,
-    library: int | None,
     show: Callable[[str], None],
 ) -> dict[str, Any]:
     """Plan goals of several robots and return the figures by the robot's name.
@@ -52,9 +51,6 @@ def planning_benchmark(
         Folder of a checkout that plans the same goals; None: no comparison.
     starts
         Number of initial guesses of a long search, whose durations are compared; None: no search.
-    library
-        Number of other goals, with a library of whose manoeuvres the goals are planned as well;
-        None: no library.
     show
         Called with lines for the user.
 
@@ -74,20 +70,12 @@ def planning_benchmark(
             f"{name}: {here:.3f} s of CPU time in the median of {goals} goals, the slowest "
             f"{slowest:.1f} times as long"
         )
-        without_library = here
         if theirs is not None:
             robot["there"] = _measured_plans(theirs, name, goals)
-            there = without_library = statistics.median(robot["there"]["cpu_s"])
+            there = statistics.median(robot["there"]["cpu_s"])
             robot["times_faster"] = there / here
             show(f"... there {there:.3f} s: {there / here:.2f} times faster here")
             robot["durations_to_there"] = _compare_durations(plans, robot["there"], "there", show)
-        if library is not None:
-            with_library = _measured_plans(ours, name, goals, library=library)
-            median = statistics.median(with_library["cpu_s"])
-            ratio = without_library / median
-            robot |= {"with_library": with_library, "library_times_faster": ratio}
-            show(f"... with a library {median:.3f} s: {ratio:.2f} times faster")
-            _compare_durations(with_library, plans, "without it", show)
         if starts is not None:
             options = {"starts": starts, "answers": starts, "agreeing": 0}
             robot["long_search"] = _measured_plans(ours, name, goals, options=options)

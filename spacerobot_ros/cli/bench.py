@@ -165,18 +165,11 @@ def viewer(seconds: float, no_priorities: bool, json_file: Path | None) -> None:
     metavar="N",
     help="Compare the durations with those of a search from N initial guesses.",
 )
-@click.option(
-    "--library",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Plan also with a library of the manoeuvres to N other goals.",
-)
 @_against_option("Plan the same goals by CHECKOUT, and compare CPU times and durations.")
 @_json_option
 def planning(
     goals: int,
     starts: int | None,
-    library: int | None,
     against: Path | None,
     json_file: Path | None,
 ) -> None:
@@ -186,7 +179,7 @@ def planning(
     """
     from spacerobot_ros.benchmarks.planning import planning_benchmark
 
-    _write_figures(json_file, planning_benchmark(goals, against, starts, library, click.echo))
+    _write_figures(json_file, planning_benchmark(goals, against, starts, click.echo))
 
 
 @bench_command.command("refusals")

@@ -16,7 +16,7 @@ _COMMAND_NAMES_BY_MODULE = {
     "bench": ("bench",),
     "campaign": ("campaign",),
     "flights": ("goal", "run", "scenarios", "up"),
-    "plan": ("library", "plan"),
+    "plan": ("plan",),
     "robots": ("analyze", "new", "robots"),
 }
 """Names of the commands in each module of this folder: ``NAME_command`` is the attribute."""

@@ -430,10 +430,4 @@ ATTACKS = (
         "There is no checkout in /etc",
         "bench ticks --against /etc",
     ),
-    of_option(
-        "libraries",
-        "goals that are nowhere",
-        "Random goals lie within nan m and 60 deg of the start",
-        "library sliding_masses --within nan 60",
-    ),
 )

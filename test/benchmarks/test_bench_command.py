@@ -32,10 +32,10 @@ CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
         {"seconds": 6.5, "priorities": False},
     ),
     "viewer 5.5": ("real_time.viewer_benchmark", "", {"seconds": 5.5, "priorities": True}),
-    f"planning 3 --long-search 17 --library 9 --against {OTHER}": (
+    f"planning 3 --long-search 17 --against {OTHER}": (
         "planning.planning_benchmark",
         "",
-        {"goals": 3, "other": OTHER, "starts": 17, "library": 9},
+        {"goals": 3, "other": OTHER, "starts": 17},
     ),
     f"first-plans --against {OTHER}": (
         "planning.first_plan_benchmark",

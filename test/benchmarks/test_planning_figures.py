@@ -7,7 +7,6 @@ import logging
 import math
 import runpy
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +49,7 @@ class Checkout:
                 "cpu_s": self.factor * (99.0, 12.34, 1.5, 1.75, 1.0)[process],
                 "plan_cpu_s": self.factor * 0.5,
             }
-        each = self.factor * (0.5 if arguments.get("library") else 1.0)
+        each = self.factor
         longer = self.longer - (0.025 if arguments["options"] else 0.0)
         return {
             "cpu_s": [each * x for x in (0.1, 0.25, 7.0)],
@@ -72,51 +71,40 @@ def test_goals_are_counted_and_compared_with_everything(monkeypatch: pytest.Monk
     ours, theirs = Checkout(1.0), Checkout(3.0, longer=-0.015)
     stand_in(monkeypatch, ours, theirs)
     lines: list[str] = []
-    figures = planning.planning_benchmark(3, Path("there"), 17, 9, lines.append)
+    figures = planning.planning_benchmark(3, Path("there"), 17, lines.append)
     percent = "0 % at most 1 %, 100 % at most 2 %, 100 % at most 3 % longer; at most 1.015"
-    assert lines[:6] == [
+    assert lines[:4] == [
         "planar_chain: 0.250 s of CPU time in the median of 3 goals, the slowest 28.0 times as "
         "long",
         "... there 0.750 s: 3.00 times faster here",
         f"... durations beside those there: {percent}",
-        "... with a library 0.125 s: 6.00 times faster",
-        "... durations beside those without it: 100 % at most 1 %, 100 % at most 2 %, "
-        "100 % at most 3 % longer; at most 1.000",
         "... durations beside those by a search from 17 guesses: 0 % at most 1 %, 0 % at most 2 %, "
         "100 % at most 3 % longer; at most 1.026",
     ]
-    assert len(lines) == 24
+    assert len(lines) == 16
     assert tuple(figures) == CASES
     for name, robot in figures.items():
         assert robot["median_cpu_s"] == 0.25
         assert robot["slowest_to_median"] == 28.0
         assert robot["times_faster"] == pytest.approx(3.0)
-        assert robot["library_times_faster"] == pytest.approx(6.0)
         assert robot["durations_to_there"]["worst"] == pytest.approx(1 / 0.985)
         assert robot["durations_to_long_search"]["best"] == pytest.approx(1 / 0.975)
         about = {"urdf": str(robot_file(name)), "case": name, "count": 3, "seed": 7}
         search = {"starts": 17, "answers": 17, "agreeing": 0}
         asked = [arguments for _, arguments in ours.asked if arguments["case"] == name]
         plain = about | {"options": {}}
-        assert asked == [plain, plain | {"library": 9}, about | {"options": search}]
+        assert asked == [plain, about | {"options": search}]
         assert ("plans", plain) in theirs.asked
 
 
 def test_goals_alone_are_one_line_a_robot(monkeypatch: pytest.MonkeyPatch) -> None:
     stand_in(monkeypatch, Checkout(2.0), None)
     lines: list[str] = []
-    figures = planning.planning_benchmark(3, None, None, None, lines.append)
+    figures = planning.planning_benchmark(3, None, None, lines.append)
     line = "0.500 s of CPU time in the median of 3 goals, the slowest 28.0 times as long"
     assert lines == [f"{name}: {line}" for name in CASES]
     names = {"median_cpu_s", "slowest_to_median", "cpu_s", "duration_s"}
     assert all(each.keys() == names for each in figures.values())
-
-
-def test_a_library_is_compared_with_plans_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    stand_in(monkeypatch, Checkout(2.0), None)
-    lines: list[str] = []
-    planning.planning_benchmark(3, None, None, 4, lines.append)
-    assert lines[1] == "... with a library 0.250 s: 2.00 times faster"
 
 
 def test_first_plans_here_and_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,10 +219,6 @@ class Gait:
             raise PlanningError("too far")
         return named(duration=10.0 * len(self.requests))
 
-    def build_library(self, requests: Iterator[Any]) -> Any:
-        count = len(list(requests))
-        return named(to_bytes=lambda: b"manoeuvres" * count)
-
 
 @pytest.fixture
 def gait(monkeypatch: pytest.MonkeyPatch) -> type[Gait]:
@@ -244,10 +228,9 @@ def gait(monkeypatch: pytest.MonkeyPatch) -> type[Gait]:
     return Gait
 
 
-@pytest.mark.parametrize("library", [0, 2])
-def test_plans_are_timed_after_the_first_goal(gait: type[Gait], library: int) -> None:
+def test_plans_are_timed_after_the_first_goal(gait: type[Gait]) -> None:
     urdf = str(robot_file("sliding_masses"))
-    found = measurements.plans(urdf, "sliding_masses", 3, 7, {"starts": 4}, library)
+    found = measurements.plans(urdf, "sliding_masses", 3, 7, {"starts": 4})
     assert found["cpu_s"] == pytest.approx([0.3, 0.4, 0.5])
     assert found["duration_s"] == pytest.approx([20.0, math.nan, 40.0], nan_ok=True)
     *_, last = gait.made
@@ -255,8 +238,7 @@ def test_plans_are_timed_after_the_first_goal(gait: type[Gait], library: int) ->
     assert (last.options.starts, last.options.cache) == (4, 0)
     assert tuple(last.options.max_velocity) == (0.0647, 0.1871, 0.6550)
     assert tuple(last.options.max_acceleration) == (0.228, 0.643, 3.564)
-    assert len(gait.made) == 1 + bool(library)
-    assert bool(last.options.library) == bool(library)
+    assert len(gait.made) == 1
     case, robot = measurements.CASES["sliding_masses"], SpaceRobot.from_file(urdf)
     first, *_ = measurements.requests(robot, case, 1, 7)
     np.testing.assert_array_equal(first.goal.quaternion, last.requests[0].goal.quaternion)

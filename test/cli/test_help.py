@@ -57,7 +57,7 @@ def test_the_help_of_campaigns_is_that_of_all_their_commands(word: str) -> None:
         (["--rate=200", "--real-time=1"], "real-time"),
         (["--soak", "1"], "soak"),
         (["--no-priorities", "--viewer", "1"], "viewer"),
-        (["--planning", "0", "--long-search", "8", "--library", "8"], "planning"),
+        (["--planning", "0", "--long-search", "8"], "planning"),
         (["--ticks", "1"], "ticks"),
     ],
 )

@@ -79,10 +79,10 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
         ("soak 10", ("soak_benchmark", 10.0, None)),
         ("viewer", ("viewer_benchmark", 60.0, True)),
         ("viewer 5 --no-priorities", ("viewer_benchmark", 5.0, False)),
-        ("planning", ("planning_benchmark", 20, None, None, None)),
+        ("planning", ("planning_benchmark", 20, None, None)),
         (
-            "planning 1 --long-search 1 --library 1 --against x",
-            ("planning_benchmark", 1, Path("x"), 1, 1),
+            "planning 1 --long-search 1 --against x",
+            ("planning_benchmark", 1, Path("x"), 1),
         ),
         ("first-plans", ("first_plan_benchmark", None)),
         ("first-plans --against x", ("first_plan_benchmark", Path("x"))),
@@ -109,7 +109,7 @@ def test_benchmarks_are_given_their_numbers(
     [
         *("ticks 99", "real-time 4.9", "real-time --rate 0.9", "real-time --rate 10001"),
         *("soak 9.9", "viewer 4.9", "planning 0", "planning --long-search 0"),
-        *("planning --library 0", "ticks --rounds 0"),
+        *("planning --long-search 0", "ticks --rounds 0"),
     ],
 )
 def test_benchmarks_of_nothing_are_refused(asked: list[Any], words: str) -> None:
