@@ -243,8 +243,6 @@ class Scenario:
         typed = {name: values[name] for name in written if values.get(name, ()) != ()}
         if "use_sim_time" in written:
             typed["use_sim_time"] = bool(written["use_sim_time"])
-        if node == "planner" and self.lockstep:
-            typed["plan_in_background"] = False  # Known before the plant says so.
         return typed
 
     def records(self, nodes: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -62,6 +62,11 @@ class BatchController:
         self.program, self.controller, self.law = program, controller, controller.law
         self._config, self._n = program.config, controller.law.robot.n
         self._period_ns = round(program.config.control_period * SECOND)
+        for gains in program.gains:
+            if self.law.has_automatic_gains(gains):
+                # From then on its function computes them, for all flights.
+                self.law.set_gains(gains)
+                break
         selection = self.law.outputs.selection
         self._groups = (
             bool(selection.base),

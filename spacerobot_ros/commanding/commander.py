@@ -593,14 +593,18 @@ class Commander(ABC):
         if self.robot is None:
             return "a robot on 'robot_description'"
         topics = {"joint_states": self.states.joints, "odom": self.states.odom}
-        absent = [f"'{topic}'" for topic, message in topics.items() if message is None]
+        absent = [topic for topic, message in topics.items() if message is None]
         refused = f", whose messages are refused: {self.refusal}" if self.refusal else ""
         if absent:
-            return f"states on {' and '.join(absent)}{refused}"
+            waited = self._clock() - self._activated >= _LONGEST_SILENCE
+            unheard = [topic for topic in absent if waited and not self.host.has_publisher(topic)]
+            nobody = f", and no node publishes {_quoted(unheard)}" if unheard else ""
+            return f"states on {_quoted(absent)}{refused}{nobody}"
         silence = self._clock() - self._heard
         longest = max(_LONGEST_SILENCE, _SILENT_PERIODS * self.config.control_period)
         if silence > longest and not (self.plant.paused or self.plant.in_lockstep):
-            return f"states on 'joint_states'{refused}; the last one came {silence:.1f} s ago"
+            ceased = "" if refused else ", which have ceased"
+            return f"states on 'joint_states'{refused}{ceased}"
         return ""
 
     def _report_missing(self) -> None:
@@ -610,12 +614,11 @@ class Commander(ABC):
             self._heard += now - self._checked  # This process itself stood still.
         self._checked = now
         missing = self.missing
-        what = missing.partition(";")[0]
-        if not self.active or what == self._reported_missing:
+        if not self.active or missing == self._reported_missing:
             return
-        if what and self._reported_missing and self._clock() - self._activated < _LONGEST_SILENCE:
+        if missing and self._reported_missing and now - self._activated < _LONGEST_SILENCE:
             return  # The rest is on its way.
-        self._reported_missing = what
+        self._reported_missing = missing
         if missing:
             goal_id = self._pursued_goal_id
             goes_on = " The goal is pursued when they come." if goal_id else ""
@@ -821,3 +824,7 @@ class Commander(ABC):
 
     def _forward_outputs(self) -> None:  # noqa: B027
         """Pass the collected outputs of the executive to the host."""
+
+
+def _quoted(topics: Iterable[str]) -> str:
+    return " and ".join(f"'{topic}'" for topic in topics)

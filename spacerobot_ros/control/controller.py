@@ -138,6 +138,13 @@ class CoordinatedController:
         if self.wheels is not None:
             self.wheels.reset()
 
+    def prepare_for_losses(self) -> None:
+        """Build the functions for missing measurements, which would delay a command then."""
+        n = self.law.robot.n
+        DeadReckoning(self.law.robot, self._control_period)
+        self._braking_command(np.zeros(n), np.zeros(n))
+        self._brake = None
+
     def take_over_goals(self, other: CoordinatedController) -> None:
         """Pursue the goals of another controller from now on."""
         self.profile, self._began = other.profile, other._began
@@ -457,6 +464,8 @@ class CoordinatedController:
     def _braking_command(self, q: Array, qdot: Array) -> Actuation:
         """Return a command with thrusters off and joints to rest, whatever the pose of the base."""
         robot = self.law.robot
+        if not robot.n:
+            return Actuation(np.zeros(6), np.zeros(0))
         if self._brake is None:
             outputs = ComputedTorqueLaw.default_outputs(robot, "")
             gains = Gains.uniform(_BRAKE_RATE**2, 2 * _BRAKE_RATE)

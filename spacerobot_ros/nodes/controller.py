@@ -23,6 +23,7 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.executive import END_EFFECTOR
 from spacerobot_ros.control.servicing import Task
+from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.messages.readers import (
@@ -62,6 +63,8 @@ class CoordinatedControlNode(CommanderNode):
 
     def make_commander(self) -> ControllerCommander:
         """Return the controller behind this node, which is independent of ROS."""
+        self._published: Any = None
+        """State of the last status."""
         self._busy: set[str] = set()
         """Nodes that plan or compile, by their heartbeats."""
         return ControllerCommander(self.config, self, partner_is_busy=lambda: bool(self._busy))
@@ -80,7 +83,8 @@ class CoordinatedControlNode(CommanderNode):
         self.take_raw(Odometry, TARGET_ODOMETRY, self._on_target)
         self.subscribe_to_goals("goal_pose")
         self.subscribe_to_goals("end_effector/goal_pose", END_EFFECTOR)
-        self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
+        if self.config.watchdog_timeout:
+            self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
             self._inputs[topic] = self.take_raw(kind, topic, partial(self._on_reference, topic))
 
@@ -100,6 +104,8 @@ class CoordinatedControlNode(CommanderNode):
         """Control this robot from now on."""
         commander = self.commander
         commander.use_robot(robot, self.decoder_of(robot))
+        if commander.executive is not None:
+            commander.executive.controller.prepare_for_losses()
         self._joint_message = joint_template(robot.joint_names)
         if robot.n:
             self._joint_message.feed("effort", commander.effort)
@@ -150,7 +156,9 @@ class CoordinatedControlNode(CommanderNode):
     def publish_status(self, status: Status) -> None:
         """Publish a status of the goal, and log it where something is wrong."""
         super().publish_status(status)
-        if status.state.level:
+        lasts, self._published = self._published is status.state, status.state
+        # One lost message is no matter for the log.
+        if status.state.level and (lasts or status.state is not ControllerState.ESTIMATING):
             self.get_logger().warning(status.message, throttle_duration_sec=5.0)
 
     def publish_start(self, start: ScheduleStart) -> None:

@@ -158,7 +158,7 @@ class MultiProcessStack(Stack):
 
     def launch(self, name: str, **parameters: Any) -> None:
         """Start one node of the scenario, for the first time or again, with more parameters."""
-        overrides: dict[str, Any] = self.scenario.parameters(name)
+        overrides = self.parameters(name)
         if name == "recorder":
             overrides |= {"bag": str(self.bag), "when_exists": self.when_exists}
             record = Path(self._folder.name, "scenario.json")

@@ -140,6 +140,13 @@ class Stack(ABC):
     def start(self, goal: Goal | None) -> None:
         """Send the goal, if given, and start simulated time."""
 
+    def parameters(self, name: str) -> dict[str, Any]:
+        """Return the parameters of a node of the scenario."""
+        values: dict[str, Any] = self.scenario.parameters(name)
+        if name == "planner" and self.scenario.lockstep:
+            values["plan_in_background"] = False  # Known before the plant says so.
+        return values
+
     def spin(self, look: Callable[[], bool]) -> None:
         """Run until the goal is decided, or until ``look``, called five times a second, is true.
 
@@ -354,7 +361,7 @@ class InProcessStack(Stack):
         self.executor.shutdown()
 
     def _make(self, name: str, context: rclpy.Context | None) -> FlightNode:
-        overrides = self.scenario.parameters(name)
+        overrides = self.parameters(name)
         if name == "recorder":
             overrides |= {"bag": str(self.bag), "when_exists": self.when_exists}
         try:

@@ -123,6 +123,29 @@ def test_control_in_lanes_is_that_of_the_controller() -> None:
 
 
 @needs_compiler
+def test_automatic_gains_in_lanes_are_those_of_the_controller() -> None:
+    """Of all flights, or of some: the others have gains of their own."""
+    chosen: dict[str, Any] = {
+        "law": "transposed_jacobian",
+        "ticks": 150,
+        "count": 5,
+        "max_force": 10.0,
+    }
+    flights = controlled("planar_manipulator", SHAPE, **chosen, gains=Gains())
+    here, there = fly_lanes(flights), fly_one_by_one(flights)
+    assert "lanes" in here.engine
+    assert_same(here, there)
+    given = controlled("planar_manipulator", SHAPE, **chosen, gains=Gains.uniform(30.0, 60.0))
+    program = given.program
+    assert isinstance(program, ControlledGoals)
+    mixed = dataclasses.replace(program, gains=(*program.gains[:2], *[Gains()] * 3))
+    flights = dataclasses.replace(given, program=mixed)
+    here, there = fly_lanes(flights), fly_one_by_one(flights)
+    assert_same(here, there)
+    assert np.abs(there.q[2:, -1] - fly_one_by_one(given).q[2:, -1]).max() > 1e-6
+
+
+@needs_compiler
 @pytest.mark.slow
 def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller() -> None:
     """Through a singularity, and with joints that are held within a small rate."""

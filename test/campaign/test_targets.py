@@ -62,7 +62,7 @@ def applied(name: str, scenario: Scenario, value: Any) -> tuple[list[Any], dict[
 
 
 CASES: dict[str, tuple[float, str, dict[str, Any]]] = {
-    "plant.tick_rate": (12.5, "Hz", {"plant.tick_rate": 12.5}),
+    "plant.tick_rate": (12.5, "Hz", {"plant.tick_rate": 12.5, "planner.tick_rate": 12.5}),
     "planner.position_tolerance": (0.07, "m", {"planner.position_tolerance": 0.07}),
     "plant.initial_joint_positions[1]": (
         0.75,

@@ -312,7 +312,7 @@ def test_what_the_command_line_changes_reaches_the_flight(
     assert scenario.plant.time_mode == "realtime"
     assert scenario.plant.real_time_factor == 1.0
     assert scenario.plant.tick_rate == 50.0
-    assert scenario.planner.tick_rate == 20.0
+    assert scenario.planner.tick_rate == 50.0
     assert scenario.planner.method == "lie_bracket"
     assert scenario.planner.plan_in_background is True
     assert scenario.goal.position.tolist() == [0.0, 1.0, 2.0]

@@ -348,7 +348,8 @@ def test_a_pose_is_lost_only_after_odom_was_connected(controller: Rig) -> None:
     assert controller.host.states == ["waiting"]
     controller.wall += 2.0
     controller.commander.take_accepted_jump()
-    assert_one_sentence(controller.host.statuses[-1].message, "Waiting for states on 'odom'.")
+    message = "Waiting for states on 'odom', and no node publishes 'odom'."
+    assert controller.host.statuses[-1].message == message
     controller.host.publishers.add("odom")
     for tick in range(5, 8):
         controller.joints(tick)
@@ -370,10 +371,16 @@ def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
     rig.commander.activate()
     assert rig.host.statuses[-1].message == "Waiting for a robot on 'robot_description'."
     rig.use(arm)
+    rig.host.publishers |= {"joint_states"}
     assert said() == "Waiting for states on 'joint_states' and 'odom'."
     count = len(rig.host.statuses)
     assert said() == "Waiting for states on 'joint_states' and 'odom'."
     assert len(rig.host.statuses) == count, "it is said once"
+    rig.host.publishers -= {"odom", "joint_states"}
+    both = "'joint_states' and 'odom'"
+    assert said() == f"Waiting for states on {both}, and no node publishes {both}."
+    rig.host.publishers |= {"joint_states"}
+    assert said() == f"Waiting for states on {both}, and no node publishes 'odom'."
     rig.odom(1)
     assert said() == "Waiting for states on 'joint_states'."
     rig.joints(1)
@@ -387,7 +394,8 @@ def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
     for _ in range(8):
         rig.wall += 0.3
         rig.commander.take_accepted_jump()
-    assert rig.host.statuses[-1].message.startswith("Waiting for states on 'joint_states'; the la")
+    ceased = "Waiting for states on 'joint_states', which have ceased."
+    assert rig.host.statuses[-1].message == ceased
     rig.state(2)
     assert rig.host.states[-1] == "holding"
 

@@ -139,6 +139,8 @@ def test_a_robot_without_joints_is_controlled() -> None:
     controller = build_controller(robot, ControllerConfig(profile="step"))
     state = ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(0))
     controller.set_goals(0.0, state, base=pose([0.5, 0.0, -0.25], [0.0, 0.1, 0.0]))
+    unseen = controller.command(0.0, None, state.q, state.qdot).realised
+    np.testing.assert_array_equal(unseen.wrench_B, np.zeros(6))
     result = controller.command(0.0, state, state.q, state.qdot).realised
     wanted = [*(16 * np.array([0.5, 0.0, -0.25])), 0.0, 0.18 * 0.1, 0.0]
     np.testing.assert_allclose(result.wrench_B, np.array(wanted) / 1.02, rtol=1e-6, atol=1e-12)

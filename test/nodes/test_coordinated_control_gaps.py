@@ -22,6 +22,7 @@ def test_without_odom_the_base_is_estimated_and_then_the_thrusters_are_off(
     # The first state without odom is known to be one when the next joints come; those are answered
     # at once, and so are all that follow.
     loop.show(odom=False)
+    harness.settle(loop.probe)
     for _ in range(4):
         wrench, _ = loop.answer(odom=False)
         assert nanoseconds(loop.probe.last("base_wrench").header.stamp) == loop.tick * TICK_NS

@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import signal
-import subprocess
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
@@ -27,6 +25,7 @@ from mcap.stream_reader import StreamReader
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
+from support.nodes_apart import START, NodeProcess
 from support.ros_harness import Harness, Probe, nanoseconds
 from support.sentences import assert_one_sentence
 from support.warm_python import WarmPython
@@ -34,8 +33,6 @@ from support.warm_python import WarmPython
 from spacerobot_ros.nodes import NODE_TYPES
 
 ROOT = Path(__file__).parents[2]
-START = 60.0
-"""Wall s in which a process is up, or has ended, on a machine with other things to do."""
 
 TICK_NS = 50_000_000
 FAST = {"robot": "sliding_masses", "tick_rate": "20", "real_time_factor": "5.0"}
@@ -47,68 +44,16 @@ GAIT = {
 }
 
 
-class Process:
-    """One node in a process group of its own; its standard error goes to a file."""
-
-    def __init__(
-        self,
-        folder: Path,
-        domain: int,
-        node: str,
-        parameters: dict[str, str],
-        namespace: str = "",
-        arguments: Sequence[str] = (),
-        prepare: Callable[[], None] | None = None,
-    ) -> None:
-        self.name = f"{namespace}/{node}"
-        self.errors = folder / f"{namespace.strip('/')}_{node}.txt"
-        words = ["--ros-args", "-r", f"__ns:={namespace or '/'}", *arguments]
-        for key, value in parameters.items():
-            words += ["-p", f"{key}:={value}"]
-        with self.errors.open("wb") as errors:
-            self.process = subprocess.Popen(
-                # runpy warns that the package has imported the module before.
-                [
-                    *(sys.executable, "-W", "ignore::RuntimeWarning:runpy"),
-                    *("-m", NODE_TYPES[node].__module__, *words),
-                ],
-                cwd=ROOT,
-                env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
-                stdout=errors,
-                stderr=errors,
-                start_new_session=True,
-                preexec_fn=prepare,
-            )
-
-    def signal(self, number: signal.Signals) -> None:
-        self.process.send_signal(number)
-
-    def end(self) -> int:
-        """Wait for the end, and return the exit code."""
-        return self.process.wait(timeout=START)
-
-    @property
-    def said(self) -> str:
-        """Standard output and error up to now."""
-        return self.errors.read_text("utf-8")
-
-    def kill(self) -> None:
-        """End the whole group, whatever state it is in."""
-        if self.process.poll() is None:
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait(timeout=START)
-
-
-Start = Callable[..., Process]
+Start = Callable[..., NodeProcess]
 
 
 @pytest.fixture
 def start(tmp_path: Path, ros_domain: int) -> Iterator[Start]:
     """Return what starts a node in this test's domain; nothing of it outlives the test."""
-    processes: list[Process] = []
+    processes: list[NodeProcess] = []
 
-    def start(node: str, parameters: dict[str, str], **options: Any) -> Process:
-        process = Process(tmp_path, ros_domain, node, parameters, **options)
+    def start(node: str, parameters: dict[str, str], **options: Any) -> NodeProcess:
+        process = NodeProcess(tmp_path, ros_domain, node, parameters, **options)
         processes.append(process)
         return process
 
@@ -167,13 +112,13 @@ def test_a_signal_ends_a_node_with_exit_code_0(
         assert make_reader(file).get_summary() is not None
 
 
-def await_nodes(harness: Harness, probe: Probe, processes: list[Process]) -> None:
+def await_nodes(harness: Harness, probe: Probe, processes: list[NodeProcess]) -> None:
     """Wait until every process answers as a node that is active."""
     for process in processes:
         await_node(harness, probe, process)
 
 
-def await_node(harness: Harness, probe: Probe, process: Process) -> None:
+def await_node(harness: Harness, probe: Probe, process: NodeProcess) -> None:
     client = probe.create_client(GetState, f"{process.name}/get_state")
     harness.spin_until(
         lambda: process.process.poll() is not None or client.service_is_ready(),

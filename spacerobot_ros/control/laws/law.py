@@ -233,7 +233,7 @@ class ControlLaw(ABC):
         self.singular_value_threshold: float = self.options.singular_value_threshold
         self._integral = np.zeros(self.outputs.m)
         """Integral of the errors (m,), m s or rad s."""
-        self._use_function(weighs=self._has_automatic(gains))
+        self._use_function(weighs=self.has_automatic_gains(gains))
         self.set_gains(gains)
 
     def _use_function(self, *, weighs: bool) -> None:
@@ -259,8 +259,8 @@ class ControlLaw(ABC):
         for name, value in inputs.items():
             self._in[name][:] = value
 
-    def _has_automatic(self, gains: Gains) -> bool:
-        """Whether gains are automatic that depend on the masses."""
+    def has_automatic_gains(self, gains: Gains) -> bool:
+        """Return whether some of the outputs have automatic gains that depend on the masses."""
         force = self.gain_units != ACCELERATION_GAINS
         return force and not all(each.all() for each in gains.diagonals(self.outputs.selection))
 
@@ -355,7 +355,7 @@ class ControlLaw(ABC):
             raise ParameterError(
                 f"The law '{self.name}' has no integral term: its gains ki must be 0."
             )
-        if self._has_automatic(gains) and not self._weighs:
+        if self.has_automatic_gains(gains) and not self._weighs:
             before = self._in
             self._use_function(weighs=True)
             for name, value in before.items():

@@ -32,7 +32,8 @@ class TransposedJacobianLaw(ControlLaw):
     The product ``J_z J_q^-1`` maps the base twist and the joint rates to the output rates: the
     masses cancel, and the law needs the robot's geometry alone. It inverts no matrix that can be
     singular: near a singularity of ``J_z`` the command is as bounded as the errors are. It has no
-    acceleration feedforward.
+    acceleration feedforward. Automatic gains are matrices that do follow the masses, with
+    feedforward (:meth:`.ControlLaw.automatic_effort`).
 
     With fewer outputs than degrees of freedom eq. (29) does not act on the other motion: arms go on
     swinging. ``joint_damping`` subtracts ``joint_damping * qdot`` from the joint efforts.

@@ -1,0 +1,155 @@
+"""Flights of executables with nothing but a robot: reached, without a warning, recorded whole."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.interface_package import SPACEROBOT_MSGS, with_interfaces
+from support.nodes_apart import NodesApart
+from support.planner_flight import Place
+from support.slow import some_fast
+from support.warm_python import WarmPython
+
+ROOT = Path(__file__).parents[2]
+COMMAND = ("-m", "spacerobot_ros.cli.main")
+
+FREE_FLYER = """<robot name="cube">
+  <link name="hull"><inertial><mass value="12"/>
+    <inertia ixx="0.2" iyy="0.25" izz="0.3" ixy="0" ixz="0" iyz="0"/></inertial></link>
+</robot>
+"""
+"""A spacecraft without joints."""
+
+PLANNED: dict[str, Place] = {
+    "sliding_masses": ([0.05, 0.0, 0.0], [0.0, 0.0, 0.0]),
+    "three_joint_arm": ([0.0, 0.0, 0.0], [0.02, 0.01, 0.05]),
+    "planar_chain": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.3]),
+    "surveyor": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.1]),
+    "seven_joint_arm": ([0.0, 0.0, 0.0], [0.05, 0.0, 0.05]),
+}
+CONTROLLED: dict[str, Place] = {
+    "planar_manipulator": ([0.2, 0.1, 0.0], [0.0, 0.0, 0.2]),
+    "servicer": ([0.2, 0.0, 0.0], [0.0, 0.0, 0.0]),
+    "three_joint_arm": ([0.1, 0.1, 0.0], [0.0, 0.0, 0.2]),
+    "cube": ([0.2, -0.1, 0.1], [0.1, 0.0, 0.2]),
+}
+FLIGHTS = [
+    *(("planner", robot) for robot in PLANNED),
+    *(("coordinated_control", robot) for robot in CONTROLLED),
+]
+QUICK = [("planner", "sliding_masses"), ("coordinated_control", "planar_manipulator")]
+
+
+def robot_given(name: str, folder: Path) -> str:
+    """Return what the plant's parameter names: a robot of the package, or a file."""
+    if name != "cube":
+        return name
+    file = folder / "cube.urdf"
+    file.write_text(FREE_FLYER)
+    return str(file)
+
+
+def check_record(apart: NodesApart, python: WarmPython) -> None:
+    """Report, draw and replay the only bag in the folder; verification says that it cannot."""
+    (bag,) = apart.folder.glob("*.mcap")
+    environment = {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(apart.domain),
+        "PYTHONPATH": str(ROOT),
+        "MPLBACKEND": "agg",
+    }
+
+    def spacerobot(*words: str, code: int = 0) -> str:
+        done = python.run([*COMMAND, *words], apart.folder, environment, timeout=300.0)
+        assert done.returncode == code, (words, done.stdout, done.stderr)
+        return done.stdout + done.stderr
+
+    # Nothing records which command a plant held in which tick of the wall clock.
+    assert "only flights in lockstep can be verified" in spacerobot("verify", bag.name, code=2)
+    spacerobot("report", bag.name)
+    assert bag.with_suffix(".html").stat().st_size > 10_000
+    spacerobot("figures", bag.name, "--format", "svg", "--out", "figures")
+    assert list((apart.folder / "figures").glob("*.svg"))
+    heard = apart.probe.count("odom")
+    spacerobot("replay", bag.name, "--rate", "20")
+    apart.wait(lambda: apart.probe.count("odom") > heard + 10, "the bag's states have come again")
+
+
+@pytest.mark.parametrize(("node", "robot"), some_fast(FLIGHTS, *QUICK))
+def test_a_goal_on_the_topic_is_reached(
+    apart: NodesApart, warm_python: WarmPython, node: str, robot: str
+) -> None:
+    apart.start("plant", robot=robot_given(robot, apart.folder))
+    apart.start(node)
+    apart.start("recorder")
+    place = (PLANNED if node == "planner" else CONTROLLED)[robot]
+    apart.fly(node, place, readers=2)
+    apart.end()
+    assert apart.complaints == []
+    check_record(apart, warm_python)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("node", "robot"), FLIGHTS)
+def test_a_goal_of_an_action_is_reached(
+    apart: NodesApart, warm_python: WarmPython, node: str, robot: str
+) -> None:
+    apart.environment = with_interfaces(SPACEROBOT_MSGS)
+    apart.start("plant", robot=robot_given(robot, apart.folder))
+    apart.start(node)
+    apart.start("recorder")
+    client = apart.folder / "client.py"
+    client.write_text(CLIENT)
+    position, rotvec = (PLANNED if node == "planner" else CONTROLLED)[robot]
+    done = subprocess.run(
+        [sys.executable, client.name, f"{node}/fly_to", *map(str, [*position, *rotvec])],
+        cwd=apart.folder,
+        env={**os.environ, **apart.environment, "ROS_DOMAIN_ID": str(apart.domain)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, (done.stderr, apart.said)
+    feedback, outcome = done.stdout.split()
+    assert outcome == "reached", (done.stdout, apart.said)
+    assert int(feedback) > 0
+    apart.end()
+    assert apart.complaints == []
+    check_record(apart, warm_python)
+    (bag,) = apart.folder.glob("*.mcap")
+    assert f"/{node}/fly_to/_action/feedback".encode() in bag.read_bytes()
+
+
+CLIENT = """
+import sys
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.action import ActionClient
+from scipy.spatial.transform import Rotation
+from spacerobot_msgs.action import FlyTo
+
+rclpy.init()
+node = rclpy.create_node("client")
+client = ActionClient(node, FlyTo, sys.argv[1])
+client.wait_for_server()
+x, y, z, *rotvec = map(float, sys.argv[2:])
+pose = PoseStamped()
+pose.header.frame_id = "world"
+pose.pose.position.x, pose.pose.position.y, pose.pose.position.z = x, y, z
+o = pose.pose.orientation
+o.x, o.y, o.z, o.w = Rotation.from_rotvec(rotvec).as_quat().tolist()
+heard = []
+sent = client.send_goal_async(FlyTo.Goal(base_pose=[pose]), feedback_callback=heard.append)
+rclpy.spin_until_future_complete(node, sent)
+result = sent.result().get_result_async()
+rclpy.spin_until_future_complete(node, result)
+print(result.result().result.message, file=sys.stderr)
+print(len(heard), result.result().result.outcome)
+"""
+"""A program of another that sends a goal by the action, and prints what becomes of it."""

@@ -1,0 +1,284 @@
+"""Executables of the package, each a process of its own as `ros2 run` starts it, and what they say.
+
+They have nothing but the parameters that a test names, a folder to work in, and a ROS domain.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Odometry
+from support.planner_flight import Place, goal_at, values_of
+from support.ros_harness import Harness
+
+ROOT = Path(__file__).resolve().parents[2]
+START = 120.0
+"""Wall s in which a process is up, or has ended, on a machine with other things to do."""
+
+FLIGHT = 180.0
+"""Wall s in which a goal is decided."""
+
+STATUS_OF = {
+    "plant": "plant/status",
+    "planner": "planner/status",
+    "coordinated_control": "controller/status",
+}
+DECIDED = ("reached", "failed", "refused", "aborted")
+_COMPLAINT = re.compile(r"^\[(WARN|ERROR|FATAL)\]|Traceback|Warning: |Error: ")
+
+
+class NodeProcess:
+    """One executable in a process group of its own; what it prints goes to a file.
+
+    Parameters
+    ----------
+    folder
+        Its working folder, and that of the file.
+    domain
+        Its ROS domain.
+    node
+        Its name, of the executable and of the node.
+    parameters
+        What it is given, as words of the command line.
+    namespace, arguments, prepare
+        Of the node; further ROS arguments; what the process does before it begins.
+    environment
+        What differs from the environment of the test.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        domain: int,
+        node: str,
+        parameters: dict[str, str],
+        namespace: str = "",
+        arguments: Sequence[str] = (),
+        prepare: Callable[[], None] | None = None,
+        environment: dict[str, str] | None = None,
+    ) -> None:
+        self.name = f"{namespace}/{node}"
+        lives = len(list(folder.glob(f"{namespace.strip('/')}_{node}*.txt")))
+        self.errors = folder / f"{namespace.strip('/')}_{node}{lives or ''}.txt"
+        words = [f"{key}:={value}" for key, value in parameters.items()]
+        given = [*arguments, *(each for word in words for each in ("-p", word))]
+        if namespace:
+            given += ["-r", f"__ns:={namespace}"]
+        differing = {**os.environ, **(environment or {})}
+        path = f"{ROOT}{os.pathsep}{differing.get('PYTHONPATH', '')}"
+        # The executable takes the first Python on PATH where none is installed beside it.
+        programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        with self.errors.open("wb") as errors:
+            self.process = subprocess.Popen(
+                [str(ROOT / "scripts" / node), *(["--ros-args", *given] if given else [])],
+                cwd=folder,
+                env={
+                    **differing,
+                    "PATH": programs,
+                    "PYTHONPATH": path,
+                    "ROS_DOMAIN_ID": str(domain),
+                    "ROS_LOG_DIR": str(folder / "log"),
+                },
+                stdout=errors,
+                stderr=errors,
+                start_new_session=True,
+                preexec_fn=prepare,
+            )
+
+    def signal(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+    def end(self) -> int:
+        """Wait for the end, and return the exit code."""
+        return self.process.wait(timeout=START)
+
+    @property
+    def said(self) -> str:
+        """Standard output and error up to now."""
+        return self.errors.read_text("utf-8")
+
+    def kill(self) -> None:
+        """End the whole group, whatever state it is in."""
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait(timeout=START)
+
+
+class NodesApart:
+    """Nodes that a test starts one by one, and a probe that hears their statuses.
+
+    Parameters
+    ----------
+    harness
+        Where the probe is.
+    folder, domain
+        Of all nodes.
+    """
+
+    def __init__(self, harness: Harness, folder: Path, domain: int) -> None:
+        self.harness, self.folder, self.domain = harness, folder, domain
+        topics = {"events": DiagnosticStatus, "/diagnostics": DiagnosticArray, "odom": Odometry}
+        latched = tuple(STATUS_OF.values())
+        statuses = dict.fromkeys(latched, DiagnosticStatus)
+        self.probe = harness.probe({**topics, **statuses}, latched=latched)
+        self.goals = self.probe.create_publisher(PoseStamped, "goal_pose", 10)
+        self.environment: dict[str, str] = {}
+        """What differs for nodes from the environment of the test."""
+        self.running: dict[str, NodeProcess] = {}
+        self.all: list[NodeProcess] = []
+        """Every process that was started, dead ones too."""
+
+    # -- processes ----------------------------------------------------------------------------
+
+    def start(self, node: str, **parameters: Any) -> NodeProcess:
+        """Start an executable; double underscores in names of parameters stand for dots."""
+        words = {key.replace("__", "."): str(value) for key, value in parameters.items()}
+        process = NodeProcess(self.folder, self.domain, node, words, environment=self.environment)
+        self.running[node] = process
+        self.all.append(process)
+        return process
+
+    def kill(self, node: str) -> None:
+        """End a process by SIGKILL."""
+        self.running.pop(node).kill()
+
+    def end(self) -> None:
+        """Interrupt all nodes; each ends with 0, and leaves no process."""
+        for process in self.running.values():
+            process.signal(signal.SIGINT)
+        codes = {name: process.end() for name, process in self.running.items()}
+        assert set(codes.values()) <= {0}, (codes, self.said)
+        self.running.clear()
+        assert self.left() == []
+
+    def left(self) -> list[str]:
+        """Return the command lines of processes of these nodes that still run."""
+        mark = f"ROS_LOG_DIR={self.folder / 'log'}\0"
+        found = []
+        for process in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                dead = (process / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
+                if not dead and mark in (process / "environ").read_text():
+                    found.append((process / "cmdline").read_text().replace("\0", " "))
+        return found
+
+    def close(self) -> None:
+        """End whatever still runs."""
+        for process in self.all:
+            process.kill()
+
+    # -- what they say ------------------------------------------------------------------------
+
+    @property
+    def said(self) -> str:
+        """All logs, for the message of a test that fails."""
+        return "\n".join(f"--- {each.errors.stem}\n{each.said}" for each in self.all)
+
+    @property
+    def complaints(self) -> list[str]:
+        """Warnings and errors in all logs."""
+        lines = (f"{p.name} {line}" for p in self.all for line in p.said.splitlines())
+        return [line for line in lines if _COMPLAINT.search(line.partition(" ")[2])]
+
+    def wait(self, predicate: Callable[[], Any], what: str, timeout: float = FLIGHT) -> None:
+        """Wait for something that nodes say; a process that ends meanwhile fails the test."""
+
+        def look() -> bool:
+            for process in self.running.values():
+                assert process.process.poll() is None, f"{process.name} has ended\n{self.said}"
+            return bool(predicate())
+
+        try:
+            self.harness.spin_until(look, what, timeout)
+        except AssertionError as error:
+            raise AssertionError(f"{error}\n{self.statuses()}\n{self.said}") from None
+
+    def status(self, node: str) -> dict[str, str]:
+        """Return the values of a node's last status, with its message; empty: there is none."""
+        kept = self.probe.messages[STATUS_OF[node]]
+        return {**values_of(kept[-1]), "message": kept[-1].message} if kept else {}
+
+    def statuses(self) -> str:
+        return "\n".join(f"{node}: {self.status(node)}" for node in STATUS_OF)
+
+    def wait_state(self, node: str, *states: str, timeout: float = FLIGHT) -> dict[str, str]:
+        """Wait until the last status of a node has one of some states, and return it."""
+        self.wait(lambda: self.status(node).get("state") in states, f"{node} is {states}", timeout)
+        return self.status(node)
+
+    def diagnosed(self, name: str) -> dict[str, str]:
+        """Return the values of the last diagnosis of a name, with its message."""
+        for array in reversed(self.probe.messages["/diagnostics"]):
+            for status in array.status:
+                if status.name == name:
+                    return {**values_of(status), "message": status.message}
+        return {}
+
+    # -- goals --------------------------------------------------------------------------------
+
+    def send(self, place: Place | PoseStamped, readers: int) -> str:
+        """Publish a goal once it has so many readers; return its id."""
+        self.wait(
+            lambda: self.goals.get_subscription_count() >= readers, f"{readers} readers", START
+        )
+        goal = place if isinstance(place, PoseStamped) else goal_at(place)
+        sec, nanosec = divmod(time.time_ns(), 1_000_000_000)
+        goal.header.stamp.sec, goal.header.stamp.nanosec = sec, nanosec
+        self.goals.publish(goal)
+        return f"{sec}.{nanosec:09d}"
+
+    def told(self, node: str, goal_id: str) -> list[tuple[str, str]]:
+        """Return states and messages of the statuses about a goal."""
+        statuses = self.probe.messages[STATUS_OF[node]]
+        about = ((values_of(status), status.message) for status in statuses)
+        return [
+            (values["state"], text) for values, text in about if values.get("goal_id") == goal_id
+        ]
+
+    def decision(self, node: str, goal_id: str) -> tuple[str, str]:
+        """Wait until a goal is decided, and return state and message."""
+        found: list[tuple[str, str]] = []
+
+        def decided() -> bool:
+            found[:] = [each for each in self.told(node, goal_id) if each[0] in DECIDED]
+            return bool(found)
+
+        self.wait(decided, f"{node} decides about goal {goal_id}")
+        return found[0]
+
+    def fly(self, node: str, place: Place | PoseStamped, readers: int = 1) -> None:
+        """Send a goal, and have it reached."""
+        state, message = self.decision(node, self.send(place, readers))
+        assert state == "reached", f"{message}\n{self.said}"
+
+    # -- life ---------------------------------------------------------------------------------
+
+    def life(self, node: str) -> str:
+        """Return the lifecycle state of a node, as soon as it answers."""
+        client = self.probe.create_client(GetState, f"{node}/get_state")
+        self.wait(client.service_is_ready, f"{node} is up", START)
+        answer = self.harness.call(client, GetState.Request())
+        self.probe.destroy_client(client)
+        return str(answer.current_state.label)
+
+    def change(self, node: str, transition: int) -> bool:
+        """Ask a node for a change of its lifecycle state."""
+        client = self.probe.create_client(ChangeState, f"{node}/change_state")
+        self.wait(client.service_is_ready, f"{node} is up", START)
+        request = ChangeState.Request()
+        request.transition.id = transition
+        answer = self.harness.call(client, request)
+        self.probe.destroy_client(client)
+        return bool(answer.success)
