@@ -13,7 +13,6 @@ from spacerobot_ros.version import __version__
 
 _COMMAND_NAMES_BY_MODULE = {
     "bags": ("export", "figures", "replay", "report", "salvage", "verify"),
-    "bench": ("bench",),
     "campaign": ("campaign",),
     "flights": ("goal", "run", "scenarios", "up"),
     "plan": ("plan",),

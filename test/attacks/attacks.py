@@ -424,10 +424,4 @@ ATTACKS = (
         "'rate' is nan; it must be a finite number",
         f"replay {BAG} --rate nan",
     ),
-    of_option(
-        "benchmarks",
-        "a folder that is no checkout",
-        "There is no checkout in /etc",
-        "bench ticks --against /etc",
-    ),
 )
