@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from operator import is_not
 from typing import Any
@@ -28,7 +29,8 @@ from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal
 from spacerobot_ros.times import SECOND
 
 JOINT_REFERENCE, BASE_REFERENCE = "joint_reference", "base_reference"
@@ -228,6 +230,27 @@ class ControllerCommander(Commander):
             self._answer_state(overdue, send=overdue is _WHOLE)
         super().take_joints(stamp_ns, joints)
 
+    def rehearse(self) -> None:
+        """Fly a goal and a loss of the pose for nobody, so that no function is compiled in flight.
+
+        A controller that compiles keeps the plant waiting longer than its ``command_timeout``.
+        """
+        robot = self.robot
+        if robot is None:
+            return
+        controller = build_controller(robot, self.config, self._own_law)
+        executive = ControlExecutive(controller, self.config, lambda status: None)
+        q, rates = np.clip(np.zeros(robot.n), robot.lower, robot.upper), np.zeros(robot.n)
+        upright = np.array([0.0, 0.0, 0.0, 1.0])
+        state = ControlState.at_rest(np.zeros(3), upright, q)
+        for tick, measured in enumerate((state, state, None, None)):
+            if tick == 1:
+                with suppress(PlanningError):  # The law may not control the base.
+                    goal = Goal(state.r_WB, upright)
+                    executive.submit(BASE_GOAL_KEY, IdentifiedGoal(goal, resumes=False))
+            now = tick * self.config.control_period
+            executive.evaluate(now, executive.command(now, measured, q, rates))
+
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         self.executive = ControlExecutive(
             build_controller(robot, self.config, self._own_law),
@@ -252,6 +275,7 @@ class ControllerCommander(Commander):
         if self.executive is not None:
             self._change_masses(robot)
             self.executive.configure(self.config)
+            self.rehearse()
             self._held_velocities = HeldVelocityReference(self.config.control_period)
 
     @property

@@ -138,13 +138,6 @@ class CoordinatedController:
         if self.wheels is not None:
             self.wheels.reset()
 
-    def prepare_for_losses(self) -> None:
-        """Build the functions for missing measurements, which would delay a command then."""
-        n = self.law.robot.n
-        DeadReckoning(self.law.robot, self._control_period)
-        self._braking_command(np.zeros(n), np.zeros(n))
-        self._brake = None
-
     def take_over_goals(self, other: CoordinatedController) -> None:
         """Pursue the goals of another controller from now on."""
         self.profile, self._began = other.profile, other._began

@@ -104,8 +104,7 @@ class CoordinatedControlNode(CommanderNode):
         """Control this robot from now on."""
         commander = self.commander
         commander.use_robot(robot, self.decoder_of(robot))
-        if commander.executive is not None:
-            commander.executive.controller.prepare_for_losses()
+        commander.rehearse()
         self._joint_message = joint_template(robot.joint_names)
         if robot.n:
             self._joint_message.feed("effort", commander.effort)

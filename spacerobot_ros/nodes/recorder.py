@@ -394,9 +394,10 @@ class RecorderNode(FlightNode):
     def _publish_losses(self, recording: Recording) -> None:
         if not recording.lost:
             return
-        message = f"{recording.lost.total()} messages were lost on their way to the recorder."
-        self.get_logger().warning(message, throttle_duration_sec=_LOSS_LOG_PERIOD)
         counts = dict(sorted(recording.lost.items()))
+        listed = ", ".join(f"{count} on '{topic}'" for topic, count in counts.items())
+        message = f"Messages were lost on their way to the recorder: {listed}."
+        self.get_logger().warning(message, throttle_duration_sec=_LOSS_LOG_PERIOD)
         self._publish_diagnostics("lost messages", DiagnosticStatus.WARN, message, counts)
 
     def _publish_state(self) -> None:

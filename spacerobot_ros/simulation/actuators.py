@@ -315,6 +315,16 @@ class PlantWithFaults(WrappedPlant):
             self._begin_loads()
         self._apply_active_disturbances()
 
+    def succeed(self, before: PlantWithFaults) -> None:
+        """Go on with the time, faults and disturbances of the plant of the robot so far."""
+        self.tick = before.tick
+        self.timeline.copy_from(before.timeline)
+        self._disturbances.copy_from(before._disturbances)
+        if self._disturbances.entries and self.loads is None:
+            self._begin_loads()
+        self.apply_active_faults()
+        self._apply_active_disturbances()
+
     def apply_active_faults(self) -> None:
         """Apply the faults that are active at the present time."""
         active = self.timeline.at(self.time + _FAULT_TIME_ROUNDING * self._control_period)

@@ -409,6 +409,10 @@ class Timeline(Generic[Entry]):
         else:
             self.read(text.splitlines(), now)
 
+    def copy_from(self, other: Timeline[Entry]) -> None:
+        """Take the entries of another timeline in place of these."""
+        self.entries, self.next_change = list(other.entries), -math.inf
+
     def clear(self) -> None:
         """Remove all entries, including future entries."""
         self.entries.clear()

@@ -156,7 +156,13 @@ class PlantMonitor:
         self.observe(commands, plant, config)
         self.rearms = self.resets = 0
         """Number of rearms and resets, counted by the owner."""
-        self.status = PlantStatus(PlantState.INACTIVE, "The plant is inactive.")
+        # Commanders learn these before they see a robot or a state.
+        self.status = replace(
+            PlantStatus(PlantState.INACTIVE, "The plant is inactive."),
+            actuation=config.actuation,
+            tick_rate_hz=config.tick_rate,
+            time_mode=config.time_mode,
+        )
         """Status of the last update."""
         self.failure = "", ""
         """Reason and message of the error that stopped the plant, set by the owner."""

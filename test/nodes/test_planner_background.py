@@ -10,12 +10,13 @@ from typing import Any
 import pytest
 from std_srvs.srv import Trigger
 from support.planner_flight import NEAR, Flight
-from support.ros_harness import Harness
+from support.ros_harness import Harness, nanoseconds
 
 from spacerobot_ros.planning import METHODS, GaitSchedule
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 REAL_TIME = {"time_mode": "realtime"}
+THOROUGH = {"optimal.cache": 0, "optimal.answers": 9999, "optimal.starts": 9999}
 FAR = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 
 
@@ -66,11 +67,15 @@ def test_states_are_answered_at_rest_until_the_plan_is_there(flight: Flight, gat
     flight.wait("reached")
     assert flight.error_to(NEAR)[0] < 1e-3
     assert any(speeds(flight))
-    # One command for each state, each with its stamp, as ever.
+    # One command for a state, with its stamp; where states pile up, for the last of them.
     flight.plant.trigger_deactivate()
     flight.harness.settle(flight.probe)
     stamps = [m.header.stamp for m in flight.probe.messages["joint_commands"]]
-    assert stamps == [m.header.stamp for m in flight.probe.messages["joint_states"]]
+    states = [nanoseconds(m.header.stamp) for m in flight.probe.messages["joint_states"]]
+    answered = [nanoseconds(stamp) for stamp in stamps]
+    assert answered == sorted(set(answered))
+    assert set(answered) <= set(states)
+    assert len(answered) > 0.5 * len(states)
     assert flight.probe.count("gait_schedule") >= 1
 
 
@@ -93,10 +98,10 @@ def test_an_abort_drops_what_is_being_planned(flight: Flight, gate: Gate) -> Non
 def test_a_node_that_ends_has_its_search_given_up(harness: Harness) -> None:
     flight = Flight(
         harness,
-        {"method": "optimal", "optimal.cache": 0, "optimal.answers": 9999, "optimal.starts": 9999},
-        REAL_TIME,
+        {"robot": "seven_joint_arm", "method": "optimal", **THOROUGH},
+        {"robot": "seven_joint_arm", **REAL_TIME},
     )
-    flight.send(([0.0, 0.0, 0.0], [0.05, -0.03, 0.02]))
+    flight.send(([0.0, 0.0, 0.0], [0.5, -0.3, 0.2]))
     flight.start()
     before = threading.active_count()
     flight.harness.spin_until(lambda: threading.active_count() > before, "the search")

@@ -149,6 +149,10 @@ class PlantNode(FlightNode):
         decided = config.decided()
         # Joints that move, and thrusters, are there for efforts alone.
         self._undecided = config.actuation == "auto" and decided.actuation == "velocity"
+        self._under_efforts: PlantWithFaults | None = None
+        """The plant as efforts move it from its initial state, as long as it may be needed."""
+        if self._undecided:
+            self._under_efforts = build_plant(robot, config.decided("effort"))
         last = self._last_state(robot)
         self._tick = 0 if last is None else round(last.time_ns / self._period_ns)
         self._use_plant(
@@ -238,7 +242,9 @@ class PlantNode(FlightNode):
         self._undecided, config = False, self.config.decided(actuation)
         if actuation == "effort":
             commands, robot = self._commands, self.plant.robot
+            before = self.plant
             self._use_plant(self._plant_now(robot, config), config)
+            self.plant.succeed(before)
             self._commands.succeed(commands)
             if self._lockstep is not None:
                 self._lockstep = Lockstep(self._commands)
@@ -249,6 +255,7 @@ class PlantNode(FlightNode):
             if self._clearance is not None:
                 self._clearance.observe(self.plant)
             self._count_commanders()
+        self._under_efforts = None
         self._monitor.observe(self._commands, self.plant, config)
         self.get_logger().info(f"Commands carry {_CARRIED[actuation]}: the plant takes these.")
         self._publish_changed_status()
@@ -256,8 +263,10 @@ class PlantNode(FlightNode):
     def _plant_now(self, robot: SpaceRobot, config: PlantConfig) -> PlantWithFaults:
         """Return a plant of another actuation in the present state, in which the joints rest."""
         plant, capturing = self.plant, self.plant.capturing
-        if capturing is None and not np.any(plant.momentum[:6]):
-            return build_plant(robot, config)  # It rests where it began.
+        prepared = self._under_efforts
+        if capturing is None and not np.any(plant.momentum[:6]) and not self.config.resume_bag:
+            assert prepared is not None
+            return prepared  # It rests where it began.
         from spacerobot_ros.bag.salvage import LastState  # Few plants drift before they move.
 
         target = None

@@ -56,6 +56,9 @@ _MOMENTUM_ROUNDING = 1e-9
 _LOG_PERIOD = 5.0
 """Wall time between two log lines of one kind, s."""
 
+_RESTING_SHARE = 0.01
+"""Share of its effort limit that a joint which rests on its stop may push."""
+
 _MILLISECONDS = 1e3
 
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -119,15 +122,20 @@ class PlantReport:
         )
 
     def limited(self) -> None:
-        """Log that joints were held back in the last step."""
-        plant = self._plant
-        texts = []
+        """Log that joints were held back in the last step, unless they merely rest on a stop."""
+        plant, texts = self._plant, []
+        resting = np.zeros(plant.robot.n, dtype=np.bool_)
+        if plant.takes_wrench:
+            limit = plant.robot.effort_limit
+            weak = np.where(np.isfinite(limit), _RESTING_SHARE * limit, 0.0)
+            resting = np.abs(plant.effort) <= weak
         for what, counts in plant.limit_counts.items():
-            names = [
-                name for name, count in zip(plant.robot.joint_names, counts, strict=True) if count
-            ]
+            held_back = (counts > 0) & ~(resting if what == "stroke" else False)
+            names = [plant.robot.joint_names[i] for i in np.flatnonzero(held_back)]
             if names:
                 texts.append(f"{what} of {', '.join(names)}")
+        if not texts:
+            return
         self._node.get_logger().warning(
             f"Limits of the URDF held joints back so far: {'; '.join(texts)}.",
             throttle_duration_sec=_LOG_PERIOD,

@@ -1038,7 +1038,7 @@ class Executive:
         message = f"A plan is made: {reason}."
         self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
         if job.reason.is_for_new_goal or not self._tracker.is_active:
-            self._add_status(PlannerState.PLANNING, message, job.identified, active)
+            self._add_status(PlannerState.PLANNING, f"Planning: {reason}.", job.identified, active)
         task = PlanningTask(
             request, braking=braking, rates_after_braking=rates, take_over=take_over
         )
