@@ -189,16 +189,20 @@ hand-goals: $(STAMP)/test ## plan HAND_GOALS random goals of end-effectors for e
 campaigns: $(STAMP)/test ## kill workers and campaigns, fly rows again through ROS: the slow tests of campaigns and flights
 	$(BIN)/python3 -m pytest -m slow test/campaign test/flight
 
+.PHONY: bench
+bench: $(STAMP)/bench ## measure what users wait for, in processor time; AGAINST=PATH: in turns with another checkout; ONLY=WORD: some
+	$(BIN)/python3 -m pytest benchmarks -q --benchmark-columns=median,iqr,rounds --benchmark-sort=fullname \
+	    $(if $(AGAINST),--against $(AGAINST)) $(if $(filter-out many,$(ONLY)),-k "$(ONLY)")
+
 .PHONY: real-time
-real-time: $(STAMP)/demo ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
-	$(BIN)/spacerobot bench real-time 600 --rate 100
-	$(BIN)/spacerobot bench real-time 60 --rate 200 --rate 500
+real-time: $(STAMP)/bench ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
+	$(BIN)/python3 benchmarks/real_time.py deadlines 600 100
+	$(BIN)/python3 benchmarks/real_time.py deadlines 60 200 500
 
 SOAK ?= 1800
 .PHONY: soak
-soak: $(STAMP)/demo ## fly half an hour (SOAK=SECONDS) in separate processes: memory, descriptors, threads; out/soak.png
-	@mkdir -p out
-	$(BIN)/spacerobot bench soak $(SOAK) --json out/soak.json
+soak: $(STAMP)/bench ## fly half an hour (SOAK=SECONDS) in separate processes: memory, descriptors, threads; out/soak.png
+	$(BIN)/python3 benchmarks/real_time.py soak $(SOAK) out
 
 # Short flights, so that the bags of all scenarios stay small. A goal not met in time is no failure.
 REFERENCE := --set plant.marker_period=5 --set plant.diagnostics_period=5
@@ -280,11 +284,12 @@ $(STAMP)/venv:
 $(STAMP)/demo: EXTRAS := jazzy,viewer,collision
 $(STAMP)/test: EXTRAS := jazzy,test
 $(STAMP)/mutants: EXTRAS := jazzy,test,mutants
+$(STAMP)/bench: EXTRAS := jazzy,campaign,bench
 $(STAMP)/docs: EXTRAS := jazzy,docs
 
 # A changed declaration or a new stamp: the package with its dependencies. Changed sources: the
 # package alone. What is left in build/lib would be installed again, deleted files too.
-$(STAMP)/demo $(STAMP)/test $(STAMP)/mutants $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
+$(STAMP)/demo $(STAMP)/test $(STAMP)/mutants $(STAMP)/bench $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
 	@rm -rf build/lib
 	@echo "Installing spacerobot_ros[$(EXTRAS)] into $(VENV)$(if $(ALL), (once; a minute or two)) ..."
 	@$(PIP) install --no-build-isolation \

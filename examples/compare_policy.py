@@ -9,10 +9,10 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+from policies.network import Policy
 
 import spacerobot_ros
 import spacerobot_ros.environments
-from spacerobot_ros.environments.policy import Policy
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.scenario import load_scenario
 

@@ -10,11 +10,11 @@ import gymnasium
 import numpy as np
 import rclpy
 from nav_msgs.msg import Odometry
+from policies.network import Policy
 from rclpy.experimental import EventsExecutor
 from sensor_msgs.msg import JointState
 
 import spacerobot_ros.environments  # noqa: F401 - registers the environments
-from spacerobot_ros.environments.policy import Policy
 from spacerobot_ros.environments.tasks import RobotStates, Task, action_scale, command_of
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes import PlantNode

@@ -10,10 +10,9 @@ from typing import Any
 import gymnasium
 import matplotlib.pyplot as plt
 import numpy as np
+from policies.network import Policy
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
-
-from spacerobot_ros.environments.policy import Policy
 
 LANES, LENGTH, WINDOW, SEED = 1024, 64, 1000, 1
 

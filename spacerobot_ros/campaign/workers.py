@@ -165,8 +165,6 @@ class LocalWorkers:
     """Processes on this machine, each behind an anonymous pipe: nobody else can reach them.
 
     Each has one task at a time, so a death has one cause; the busy worker stands for its task.
-    Together they may use half of the memory of the machine; a worker that uses more than its share
-    is killed.
 
     Parameters
     ----------
@@ -177,8 +175,6 @@ class LocalWorkers:
     tasks_per_worker = 1
 
     def __init__(self, count: int) -> None:
-        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        self._memory = max(512 * 2**20, total // (2 * count))
         self._workers = [_LocalWorker() for _ in range(count)]
 
     def count(self) -> int:
@@ -200,9 +196,6 @@ class LocalWorkers:
     def ended(self, tasks: list[_LocalWorker]) -> list[_LocalWorker]:
         """Return the tasks that have ended; after a while also an empty list."""
         ready = wait([worker.connection for worker in tasks], timeout=_POLL_PERIOD)
-        for worker in tasks:
-            if _resident_bytes(worker.process.pid) > self._memory:
-                worker.process.kill()
         return [worker for worker in tasks if worker.connection in ready]
 
     def result(self, task: _LocalWorker) -> list[Row | Fallback]:
@@ -237,13 +230,6 @@ def _run_worker(connection: Connection) -> None:
             except Exception as error:  # The parent process raises it again.
                 answer = error
             connection.send(answer)
-
-
-def _resident_bytes(process: int | None) -> int:
-    with suppress(OSError, ValueError, IndexError):
-        pages = Path(f"/proc/{process}/statm").read_text("ascii").split()[1]
-        return int(pages) * os.sysconf("SC_PAGE_SIZE")
-    return 0
 
 
 class DaskWorkers:

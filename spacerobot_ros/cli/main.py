@@ -13,10 +13,9 @@ from spacerobot_ros.version import __version__
 
 _COMMAND_NAMES_BY_MODULE = {
     "bags": ("export", "figures", "replay", "report", "salvage", "verify"),
-    "bench": ("bench",),
     "campaign": ("campaign",),
     "flights": ("goal", "run", "scenarios", "up"),
-    "plan": ("library", "plan"),
+    "plan": ("plan",),
     "robots": ("analyze", "new", "robots"),
 }
 """Names of the commands in each module of this folder: ``NAME_command`` is the attribute."""

@@ -1,4 +1,4 @@
-"""Commands that plan without ROS: plan, library."""
+"""The command that plans without ROS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from spacerobot_ros.cli.options import (
     end_effector_options,
     goal_options,
     json_option,
-    out_option,
     picture_option,
     settings_option,
     within_option,
@@ -283,51 +282,3 @@ def _record_row(record: MethodRecord) -> str:
     low, middle, high = np.quantile(record.durations, [0.0, 0.5, 1.0])
     planned, longest = np.quantile(record.plan_times, [0.5, 1.0])
     return f"{counts}{low:>10.4g}{middle:>10.4g}{high:>10.4g}{planned:>11.3g}{longest:>9.3g}"
-
-
-@click.command("library")
-@click.argument("scenario", metavar="SCENARIO|ROBOT")
-@settings_option
-@click.option(
-    "--count",
-    default=80,
-    show_default=True,
-    type=click.IntRange(min=1),
-    help="Number of random goals to plan.",
-)
-@within_option((0.3, 60.0), "Largest")
-@out_option("File to write, for the parameter planner.optimal.library [in the cache].")
-def library_command(
-    scenario: str,
-    settings: tuple[str, ...],
-    count: int,
-    within: tuple[float, float],
-    out: Path | None,
-) -> None:
-    """Make a library of manoeuvres, by which plans are found faster.
-
-    Plans of the same robot, start, limits and options take the two manoeuvres that are nearest to
-    their goal as initial guesses. Exit code 1: no goal is reachable; 2: bad input.
-    """
-    from spacerobot_ros.planning import PlanRequest
-    from spacerobot_ros.planning.methods.optimal.method import OptimalGait
-    from spacerobot_ros.simulation.trials import robot_state_of
-
-    problem = problem_of_scenario(scenario, settings=settings)
-    method = problem.method("optimal")
-    assert isinstance(method, OptimalGait)
-    goals = _random_goals(problem, count, within)
-    with click.progressbar(goals, label=problem.name, file=sys.stderr) as bar:
-        state, tolerance = robot_state_of(problem.plant()), problem.config.tolerance
-        library = method.build_library(PlanRequest(state, goal, tolerance) for goal in bar)
-    if library is None:
-        fail("None of the goals could be reached.")
-    if out is None:
-        where = method.store_library(library)
-    else:
-        # Only this user may write the library, because planners refuse one that others may write.
-        write_output(out, library.to_bytes(), mode=0o600)
-        where = out
-    if where is None:
-        fail("The library could not be kept; --out chooses another place.")
-    click.echo(f"library     {where} ({len(library.turns)} of {count} goals)")

@@ -280,7 +280,8 @@ class Commander(ABC):
 
     def _follow_rate(self) -> None:
         """Command at the rate of the plant, as soon as it is known."""
-        rate, present = self.plant.rate or self.stamps.rate, self.config.tick_rate
+        present = self.config.tick_rate
+        rate = self.plant.rate or (self.stamps.steady_rate if present else self.stamps.rate)
         if not rate or abs(rate - present) <= _EQUAL_RATES * present:
             return
         self.config = replace(self.config, tick_rate=rate)

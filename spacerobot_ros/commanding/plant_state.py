@@ -48,6 +48,9 @@ _MIN_CHECKS = 2
 _EQUAL_STEPS, _MEASURED_STEPS = 2, 8
 """Number of steps that tell the rate of the states: if they are equal, and if they are not."""
 
+_STEADY = 1.2
+"""Largest ratio of two steps of a steady rate: states that a busy node skips make longer ones."""
+
 _STEP_ROUNDING_NS = 1_000
 """Largest difference between equal steps, from stamps that were computed as floating point, ns."""
 
@@ -116,6 +119,13 @@ class StampFilter:
         usual = median(steps)
         measured = SECOND / fmean(step for step in steps if step <= _STEP_SLACK * usual)
         return float(round(measured)) or measured
+
+    @property
+    def steady_rate(self) -> float:
+        """Rate of the states if many steps in a row agree, Hz; 0: they do not."""
+        steps = list(self._steps)
+        steady = len(steps) == _MEASURED_STEPS and max(steps) <= _STEADY * min(steps)
+        return self.rate if steady else 0.0
 
     def accepts_joints(self, stamp_ns: int, joints: Any) -> bool:
         """Return whether joints are of the present time; set other joints aside."""

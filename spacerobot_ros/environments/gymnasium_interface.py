@@ -1,7 +1,4 @@
-"""The environments as Gymnasium knows them: one robot in a plant, or many in SIMD lanes.
-
-A wrapper of vector environments takes the autoreset modes that those of Gymnasium refuse.
-"""
+"""The environments as Gymnasium knows them: one robot in a plant, or many in SIMD lanes."""
 
 from __future__ import annotations
 
@@ -22,9 +19,8 @@ from gymnasium.error import Error, ResetNeeded  # noqa: E402
 from gymnasium.spaces import Box  # noqa: E402
 from gymnasium.utils import EzPickle  # noqa: E402
 from gymnasium.utils.seeding import np_random  # noqa: E402
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper  # noqa: E402
+from gymnasium.vector import AutoresetMode, VectorEnv  # noqa: E402
 from gymnasium.vector.utils import batch_space  # noqa: E402
-from gymnasium.wrappers.utils import RunningMeanStd  # noqa: E402
 
 
 def _spaces(episodes: Episodes) -> tuple[Any, Any]:
@@ -243,63 +239,3 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
 
     def _info(self, mask: Any) -> dict[str, Any]:
         return {"error": np.where(mask, self.episodes.errors, 0.0), "_error": mask}
-
-
-class NormalizeObservation(VectorWrapper):
-    """Observations less their running mean, over their running standard deviation.
-
-    That of Gymnasium, in every autoreset mode: its own takes ``NextStep`` alone, with the same
-    numbers. Each observation is counted once: the last ones of episodes that begin anew in the same
-    step (``final_obs``, which are normalised too) are, and those of robots that a reset leaves out
-    are not. ``update_running_mean = False`` keeps the statistics as they are.
-
-    Parameters
-    ----------
-    env
-        The vector environment.
-    epsilon
-        Positive number that is added to the variance.
-    """
-
-    def __init__(self, env: VectorEnv, epsilon: float = 1e-8) -> None:
-        super().__init__(env)
-        shape: Any = env.single_observation_space.shape
-        self.single_observation_space = Box(-np.inf, np.inf, shape, dtype=np.float32)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.obs_rms = RunningMeanStd(shape=shape)
-        self.epsilon = epsilon
-        self.update_running_mean = True
-
-    def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment; observations that are new are counted."""
-        # Read before it is taken out of the options.
-        mask = (options or {}).get("reset_mask", slice(None))
-        observations, infos = self.env.reset(seed=seed, options=options)
-        self._count(observations[mask])
-        return self._normalized(observations), infos
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step the environment; its observations are counted."""
-        observations, *rest, infos = self.env.step(actions)
-        last = infos.get("final_obs")
-        if last is None:
-            self._count(observations)
-        else:
-            ended = np.flatnonzero(infos["_final_obs"])
-            self._count(np.concatenate([np.stack(last[ended].tolist()), observations]))
-            normalized = last.copy()
-            for row in ended.tolist():
-                normalized[row] = self._normalized(last[row])
-            infos["final_obs"] = normalized
-        rewards, terminations, truncations = rest
-        return self._normalized(observations), rewards, terminations, truncations, infos
-
-    def _count(self, observations: Any) -> None:
-        if self.update_running_mean:
-            self.obs_rms.update(observations)
-
-    def _normalized(self, observations: Any) -> Any:
-        deviation = np.sqrt(self.obs_rms.var + self.epsilon)
-        return ((observations - self.obs_rms.mean) / deviation).astype(np.float32)

@@ -78,6 +78,9 @@ _PARAMETER_RECORD_BY_TOPIC = {
 
 A node that publishes them is configured: its parameters keep their values."""
 
+_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
+"""What rmw_dds_common calls the node of a publisher that is discovered before its node."""
+
 _QUEUE_DEPTH = 2000
 """Queue depth of subscriptions; above 5000 the events executor stops responding."""
 
@@ -112,6 +115,8 @@ class RecorderNode(FlightNode):
         self._stamps = _StampReader()
         self._parameter_requests: dict[str, RemoteParameters | None] = {}
         """Names of the parameter records that are in the bag or requested from nodes."""
+        self._topics_without_owner: set[str] = set()
+        """Topics whose publisher is known before its node, whose parameters are to be requested."""
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
@@ -133,6 +138,7 @@ class RecorderNode(FlightNode):
         self._chosen_topics = {self.resolve_topic_name(topic) for topic in config.topics.split()}
         self._shared_topics = {self._clock_topic, *map(self.resolve_topic_name, _SHARED_TOPICS)}
         self._parameter_requests = {}
+        self._topics_without_owner = set()
         frames = tuple(map(self.resolve_topic_name, (TRANSFORMS, STATIC_TRANSFORMS)))
         self._transforms: _RecordedTransforms | None = None
         if config.tf_period and self._is_chosen(frames[0], TRANSFORM_TYPE):
@@ -263,6 +269,9 @@ class RecorderNode(FlightNode):
             known = topic in self._recorded or topic in self._unreadable_topics
             if not known and self._is_chosen(topic, types[0]):
                 self._record(recording, topic, types[0])
+        for topic in tuple(self._topics_without_owner):
+            for owner in self.get_publishers_info_by_topic(topic)[:1]:
+                self._request_parameters(topic, owner)
         for name, question in self._parameter_requests.items():
             if question is not None and question.look():
                 self._parameter_requests[name] = None
@@ -309,7 +318,7 @@ class RecorderNode(FlightNode):
         ours = topic.startswith(f"{namespace}/") and not topic.endswith(TOPICS_NOT_RECORDED)
         return ours and type_name != _CLOCK_TYPE
 
-    def _request_parameters(self, topic: str, publishers: Sequence[Any]) -> None:
+    def _request_parameters(self, topic: str, owner: Any) -> None:
         """Request the parameters of a topic's publisher for the bag, unless the bag has them."""
         for name, title in _PARAMETER_RECORD_BY_TOPIC.items():
             if not topic.endswith(f"/{name}"):
@@ -318,7 +327,10 @@ class RecorderNode(FlightNode):
             own = self.get_namespace().rstrip("/")
             if topic == f"{own}/{name}":
                 record = f"parameters/{title}"
-            owner = publishers[0]
+            if owner.node_name == _UNKNOWN_NODE:
+                self._topics_without_owner.add(topic)
+                continue
+            self._topics_without_owner.discard(topic)
             full = f"{owner.node_namespace.rstrip('/')}/{owner.node_name}"
             watched = {node.get_fully_qualified_name() for node in self._taps.nodes}
             if record not in self._parameter_requests and full not in watched:
@@ -349,7 +361,7 @@ class RecorderNode(FlightNode):
             self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
             return
         self._recorded.add(topic)
-        self._request_parameters(topic, publishers)
+        self._request_parameters(topic, publishers[0])
         listener = None
         if self._transforms is not None:
             listener = self._transforms.listener(topic, channel)
@@ -361,7 +373,8 @@ class RecorderNode(FlightNode):
             recording.latched[channel] = None
         if self._taps.tap(topic, take, len(offered)):
             return
-        events = loss_events(recording, topic)
+        # Latched topics keep their last message: one that is replaced in transit is not lost.
+        events = None if channel in recording.latched else loss_events(recording, topic)
         self.create_subscription(kind, topic, take, qos, event_callbacks=events, raw=True)
 
     # -- reports ------------------------------------------------------------------------------

@@ -424,16 +424,4 @@ ATTACKS = (
         "'rate' is nan; it must be a finite number",
         f"replay {BAG} --rate nan",
     ),
-    of_option(
-        "benchmarks",
-        "a folder that is no checkout",
-        "There is no checkout in /etc",
-        "bench ticks --against /etc",
-    ),
-    of_option(
-        "libraries",
-        "goals that are nowhere",
-        "Random goals lie within nan m and 60 deg of the start",
-        "library sliding_masses --within nan 60",
-    ),
 )

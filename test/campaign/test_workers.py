@@ -134,32 +134,12 @@ def test_an_error_of_a_task_is_raised_here(made: list[Any]) -> None:
         local.result(local.submit("a"))
 
 
-@pytest.mark.parametrize(("count", "share"), [(1, 4 * 2**30), (4, 2**30), (64, 512 * 2**20)])
-def test_a_worker_that_takes_more_than_its_share_of_half_the_memory_is_killed(
-    count: int, share: int, made: list[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of 8 GiB; the least share is half a GiB."""
-    sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2 * 2**20}
-    monkeypatch.setattr(os, "sysconf", sizes.__getitem__)
-    local: Any = LocalWorkers(count)
-    monkeypatch.setattr(workers, "wait", lambda pipes, timeout: pipes if timeout == 0.2 else None)
-    for size, killed in ((share, []), (share + 1, ["kill"])):
-        monkeypatch.setattr(workers, "_resident_bytes", lambda pid, size=size: size)
-        assert local.ended(made[:1]) == made[:1]
-        assert made[0].process.calls == killed
-
-
 def test_tasks_whose_pipes_are_ready_have_ended(
     made: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     local: Any = LocalWorkers(3)
     monkeypatch.setattr(workers, "wait", lambda pipes, timeout: pipes[1:])
     assert local.ended(made) == made[1:]
-
-
-def test_the_memory_of_a_process() -> None:
-    assert 2**20 < workers._resident_bytes(os.getpid()) < 2**36
-    assert workers._resident_bytes(None) == 0
 
 
 def test_a_worker_starts_with_one_thread_and_without_ctrl_c(

@@ -1,9 +1,8 @@
-"""Findings of `analyze`, plans, libraries and flights as lines, from results made by hand."""
+"""Findings of `analyze`, plans and flights as lines, from results made by hand."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -221,45 +220,6 @@ def test_the_warning_about_efforts(monkeypatch: pytest.MonkeyPatch) -> None:
         "The goal is not reached within the planner's tolerance: 0.5 rad and 0 m from the goal. "
         "It stopped.\n"
     )
-
-
-@pytest.mark.parametrize(
-    ("out", "stored", "code", "said"),
-    [
-        (True, None, 0, "library     OUT (3 of 5 goals)\n"),
-        (False, Path("in the cache"), 0, "library     in the cache (3 of 5 goals)\n"),
-        (False, None, 1, ""),
-    ],
-)
-def test_a_library_is_written_or_kept(
-    out: bool,
-    stored: Path | None,
-    code: int,
-    said: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    from spacerobot_ros.planning.methods.optimal.method import OptimalGait
-
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    library = SimpleNamespace(turns=[1, 2, 3], to_bytes=lambda: b"library")
-
-    def build(self: Any, requests: Any) -> Any:
-        assert len(list(requests)) == 5
-        return library
-
-    monkeypatch.setattr(OptimalGait, "build_library", build)
-    monkeypatch.setattr(OptimalGait, "store_library", lambda self, given: stored)
-    file = tmp_path / "own.lib"
-    words = ["library", "sliding_masses", "--count", "5", *(["--out", str(file)] if out else [])]
-    result = CliRunner().invoke(main, words)
-    assert result.exit_code == code
-    assert result.stdout == said.replace("OUT", str(file))
-    if out:
-        assert file.read_bytes() == b"library"
-        assert file.stat().st_mode & 0o777 == 0o600
-    if code:
-        assert "The library could not be kept; --out chooses another place." in result.stderr
 
 
 # -- flights --------------------------------------------------------------------------------------

@@ -1,8 +1,7 @@
-"""Options of `bench`, `figures`, `export`, `verify` and `campaign` reach the functions behind."""
+"""Options of `figures`, `export`, `verify` and `campaign` reach the functions behind."""
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Iterator
@@ -17,12 +16,6 @@ from support.command_line import CliRunner, Result
 
 import spacerobot_ros.bag
 import spacerobot_ros.bag.tables as tables
-import spacerobot_ros.benchmarks.checkouts as checkouts
-import spacerobot_ros.benchmarks.engines as engines
-import spacerobot_ros.benchmarks.planning as planning
-import spacerobot_ros.benchmarks.real_time as real_time
-import spacerobot_ros.benchmarks.soak as soak
-import spacerobot_ros.benchmarks.ticks as ticks
 import spacerobot_ros.flight.verification as verification
 import spacerobot_ros.report
 import spacerobot_ros.session.viewing as viewing
@@ -37,100 +30,6 @@ from spacerobot_ros.report.figures import PictureFormat
 
 def call(*words: object) -> Result:
     return CliRunner().invoke(main, [str(word) for word in words])
-
-
-@pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
-    """Return the calls of benchmarks; each prints its name and gives its arguments as figures."""
-    asked: list[tuple[Any, ...]] = []
-
-    def stand_in(module: Any, name: str) -> None:
-        def measure(*words: Any, **options: Any) -> dict[str, Any]:
-            kept = tuple(word for word in words if not callable(word))
-            asked.append((name, *kept, *options.values()))
-            (show,) = (word for word in words if word is click.echo)
-            show(name)
-            return {"flat": len(asked) < 2, "asked": name}
-
-        monkeypatch.setattr(module, name, measure)
-
-    for module, *names in (
-        (ticks, "ticks_benchmark"),
-        (real_time, "real_time_benchmark", "viewer_benchmark"),
-        (soak, "soak_benchmark"),
-        (planning, "planning_benchmark", "first_plan_benchmark"),
-        (engines, "lanes_benchmark"),
-    ):
-        for name in names:
-            stand_in(module, name)
-    return asked
-
-
-@pytest.mark.parametrize(
-    ("words", "call_"),
-    [
-        ("", ("ticks_benchmark", 20_000)),
-        ("100", ("ticks_benchmark", 100)),
-        ("--ticks 150", ("ticks_benchmark", 150)),
-        ("--ticks=150", ("ticks_benchmark", 150)),
-        ("real-time", ("real_time_benchmark", 60.0, (100.0,))),
-        ("real-time 5 --rate 1 --rate 1e4", ("real_time_benchmark", 5.0, (1.0, 1e4))),
-        ("soak", ("soak_benchmark", 1800.0, None)),
-        ("soak 10", ("soak_benchmark", 10.0, None)),
-        ("viewer", ("viewer_benchmark", 60.0, True)),
-        ("viewer 5 --no-priorities", ("viewer_benchmark", 5.0, False)),
-        ("planning", ("planning_benchmark", 20, None, None, None)),
-        (
-            "planning 1 --long-search 1 --library 1 --against x",
-            ("planning_benchmark", 1, Path("x"), 1, 1),
-        ),
-        ("first-plans", ("first_plan_benchmark", None)),
-        ("first-plans --against x", ("first_plan_benchmark", Path("x"))),
-        ("campaign", ("lanes_benchmark",)),
-    ],
-)
-def test_benchmarks_are_given_their_numbers(
-    asked: list[Any], tmp_path: Path, words: str, call_: tuple[Any, ...]
-) -> None:
-    assert call("bench", *words.split()).exit_code == 0
-    assert asked == [call_]
-    file = tmp_path / "new" / "figures.json"
-    if words and not words.startswith("--"):
-        done = call("bench", *words.split(), "--json", file)
-        assert json.loads(file.read_text("utf-8")) == {"flat": False, "asked": call_[0]}
-        soaks = words.startswith("soak")
-        assert done.exit_code == (1 if soaks else 0), "memory that grows fails"
-        assert file.read_text("utf-8").count("\n") == (1 if soaks else 4)
-        assert asked[1] == ((*call_[:-1], file.with_suffix(".png")) if soaks else call_)
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        *("ticks 99", "real-time 4.9", "real-time --rate 0.9", "real-time --rate 10001"),
-        *("soak 9.9", "viewer 4.9", "planning 0", "planning --long-search 0"),
-        *("planning --library 0", "ticks --rounds 0"),
-    ],
-)
-def test_benchmarks_of_nothing_are_refused(asked: list[Any], words: str) -> None:
-    assert call("bench", *words.split()).exit_code == 2
-    assert asked == []
-
-
-def test_checkouts_are_measured_in_turns(asked: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    compared: list[tuple[Any, ...]] = []
-
-    def compare(other: Path, measure: Any, show: Any, rounds: int) -> dict[str, Any]:
-        there = SimpleNamespace(measure=lambda *w, **o: (*w, o), run=lambda words: words)
-        compared.append((other, measure(there), rounds))
-        return {}
-
-    monkeypatch.setattr(checkouts, "compare", compare)
-    assert call("bench", "ticks", 200, "--against", "x").exit_code == 0
-    assert call("bench", "real-time", 7, "--against", "y", "--rounds", 1).exit_code == 0
-    words = ["-m", "spacerobot_ros", "bench", "real-time", "7.0", "--rate=100.0", "--json"]
-    assert compared == [(Path("x"), ("tick_times", {"ticks": 200}), 5), (Path("y"), words, 1)]
-    assert asked == []
 
 
 @pytest.mark.parametrize(

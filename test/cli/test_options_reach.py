@@ -20,8 +20,6 @@ import spacerobot_ros.report
 import spacerobot_ros.session.run as session
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.planning.core.method import PlanRequest
-from spacerobot_ros.planning.methods.optimal.method import OptimalGait
 from spacerobot_ros.scenario import load_scenario
 
 RPY = (20.0, -35.0, 50.0)
@@ -168,30 +166,6 @@ def test_a_path_of_an_end_effector_is_sent(monkeypatch: pytest.MonkeyPatch, tmp_
     assert call("goal", *words).exit_code == 0
     assert sent[0].links_with_paths == {"tip"}
     assert sent[0].end_effectors[0].values == (0.4, 0.1, 0.8)
-
-
-# -- libraries of manoeuvres --------------------------------------------------------------------
-
-
-def test_a_library_is_of_as_many_goals_within_the_bounds_by_a_method_with_the_settings(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[tuple[OptimalGait, list[PlanRequest]]] = []
-    monkeypatch.setattr(
-        OptimalGait, "build_library", lambda self, requests: asked.append((self, list(requests)))
-    )
-    words = ("library", "sliding_masses", "--count", 40, "--within", 0.02, 7.0)
-    result = call(*words, "--set", "planner.optimal.answers=3")
-    assert result.exit_code == 1  # There is no library.
-    ((method, requests),) = asked
-    assert method.options.answers == 3
-    assert len(requests) == 40
-    start = requests[0].state
-    distances = [np.linalg.norm(each.goal.position - start.position) for each in requests]
-    at = Rotation.from_quat(start.quaternion).inv()
-    turns = [(at * Rotation.from_quat(each.goal.quaternion)).magnitude() for each in requests]
-    assert 0.015 < max(distances) <= 0.02
-    assert np.radians(5.0) < max(turns) <= np.radians(7.0)
 
 
 # -- stacks -------------------------------------------------------------------------------------

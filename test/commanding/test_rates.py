@@ -116,6 +116,17 @@ def test_a_rate_that_differs_from_the_parameter_is_followed_and_said_once(kind: 
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_states_that_are_skipped_do_not_change_the_rate(kind: str) -> None:
+    """As under load, where only the last of several states is answered."""
+    rig = Rig(kind)
+    rig.states(5, 20.0)
+    for skipped in (2, 2, 3, 2, 2, 1, 2, 2, 1, 2):
+        rig.states(1, 20.0 / skipped)
+        assert rig.commander.config.tick_rate == pytest.approx(20.0)
+    assert not rig.warnings
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_the_first_state_of_a_plant_in_lockstep_is_answered(kind: str) -> None:
     rig = Rig(kind)
     rig.plant_says(tick_rate_hz=25.0, time_mode="lockstep")

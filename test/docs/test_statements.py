@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from spacerobot_ros.model import SpaceRobot, vector_machine
-from spacerobot_ros.resources import resource_names, robot_file
-
 ROOT = Path(__file__).resolve().parents[2]
 
 HELD_BY_TESTS = [
@@ -74,12 +71,6 @@ HELD_BY_TESTS = [
 ]
 """Page, statement, and the test that holds it."""
 
-HELD_BY_COMMANDS = [
-    ("docs/records.md", "takes 19 to 40 % of the processor time of a tick", "bench ticks"),
-    ("docs/architecture.md", "1.51 to 1.58 times as much in the same run", "bench"),
-]
-"""Page, statement, and the command of ``spacerobot`` that measures it."""
-
 
 def text_of(page: str) -> str:
     return " ".join((ROOT / page).read_text("utf-8").split())
@@ -90,35 +81,3 @@ def test_a_statement_is_there_and_has_its_test(page: str, statement: str, test: 
     assert statement in text_of(page)
     file, _, name = test.partition("::")
     assert re.search(rf"^def {name}\(", (ROOT / "test" / file).read_text("utf-8"), re.MULTILINE)
-
-
-@pytest.mark.parametrize(("page", "statement", "command"), HELD_BY_COMMANDS)
-def test_a_figure_is_there_with_the_command_that_measures_it(
-    page: str, statement: str, command: str
-) -> None:
-    assert statement in text_of(page)
-    assert f"spacerobot {command}" in text_of(page)
-
-
-@pytest.mark.slow
-def test_composite_bodies_take_a_part_of_the_operations() -> None:
-    shares = []
-    for name in ("dual_arm", "sliding_masses"):
-        robot = SpaceRobot.from_file(robot_file(name))
-        composite, paper = (
-            robot.function(each, compile=False).n_instructions()
-            for each in ("shape_equations", "forward_dynamics")
-        )
-        shares.append(f"{100 * composite / paper:.0f} % (`{name}`)")
-    assert f"it takes {' to '.join(shares)} of the operations" in text_of("docs/theory/model.md")
-
-
-def test_the_scenarios_with_reference_bags_are_thirteen() -> None:
-    assert len(resource_names("bags", ".mcap")) == 13
-
-
-def test_lanes_are_as_many_as_the_page_says() -> None:
-    lanes = {"avx512f": 8, "avx2": 4, "sse2": 2}
-    assert {flag: unit.lanes for flag, unit in vector_machine.VECTOR_UNITS.items()} == lanes
-    statement = "There are eight lanes with AVX-512, four with AVX2, two otherwise."
-    assert statement in text_of("docs/theory/lanes.md")

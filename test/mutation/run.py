@@ -51,7 +51,7 @@ _LEFT_OUT = shutil.ignore_patterns(
 _FIRST = 12
 """So many tests are tried before the rest is imported: they notice most of what is noticed."""
 
-_REPEATED = ("test/nodes/", "test/session/", "test/cli/", "test/benchmarks/", "test/examples/")
+_REPEATED = ("test/nodes/", "test/session/", "test/cli/", "test/examples/")
 """Tests whose failure is tried again: on a loaded machine one may fail by itself."""
 
 

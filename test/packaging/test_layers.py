@@ -19,7 +19,6 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     PACKAGE: (
         ("__main__", "__init__"),  # The package's own module offers parts of all layers.
         ("cli",),
-        ("benchmarks",),
         ("environments",),  # above campaigns, whose draws they start from
         ("campaign",),  # above the reports, whose style it has, and the stack, which it flies
         ("report",),
@@ -77,7 +76,7 @@ ROS = {
     "trajectory_msgs",
     "visualization_msgs",
 }
-KNOW_ROS = ("nodes", "session", "cli", "benchmarks")
+KNOW_ROS = ("nodes", "session", "cli")
 
 
 @cache

@@ -144,7 +144,6 @@ class Keyed:
         self._limits = MotionLimits(-np.ones(3), np.ones(3), np.ones(3) / 2, np.ones(3) / 3)
         self._efforts: Any = SimpleNamespace(limit=np.array([1.0, 2.0, 3.0]))
         self.clearance: Any = SimpleNamespace(facts=np.array([0.01, 1.0]))
-        self._library: Any = SimpleNamespace(digest="0a1b2c")
         self.options, self.robot = OptimalOptions(), "robot"
 
 
@@ -188,8 +187,6 @@ def test_whatever_a_plan_depends_on_changes_its_key(monkeypatch: pytest.MonkeyPa
         {"_efforts": SimpleNamespace(limit=np.array([1.0, 2.0, 4.0]))},
         {"clearance": None},
         {"clearance": SimpleNamespace(facts=np.array([0.02, 1.0]))},
-        {"_library": None},
-        {"_library": SimpleNamespace(digest="0a1b2d")},
         {"options": replace(OptimalOptions(), starts=3)},
         {"robot": "another"},
     ]

@@ -1,4 +1,4 @@
-"""Guesses for robots that drift, manoeuvres of a library, and rates of twists, part by part."""
+"""Guesses for robots that drift and rates of twists, part by part."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from support.planner_loop import robot_of
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFollower, TwistFrame
-from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses, SolutionLibrary
+from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -114,56 +114,6 @@ def test_every_third_kind_of_guess_coasts_where_the_robot_drifts(guesses: Initia
     coasting = [count > 1 for count in still]
     assert not any(c for k, c in enumerate(coasting) if k % 3 != 1)
     assert sum(coasting) >= 2
-
-
-@pytest.mark.parametrize(
-    ("turn", "final", "order"),
-    [
-        # By the turn: 0.4 rad about z is 0.1 rad from the first manoeuvre and 0.15 from the last.
-        ([0.0, 0.0, 0.4], [0.1, 0.2], [0, 3]),
-        # By the last shape: 0.2 of a half range of 0.5 is more than 0.6 of one of 2.
-        ([0.0, 0.0, 0.5], [0.7, 0.2], [0, 3]),
-        ([0.0, 0.0, 0.5], [0.1, -0.4], [1, 0]),
-        ([0.0, 0.0, -0.2], [0.6, 0.1], [2, 0]),
-        # A free last shape does not count.
-        ([0.0, 0.0, -0.2], None, [2, 1]),
-    ],
-)
-def test_the_nearest_manoeuvres_are_those_of_the_nearest_turns_and_shapes(
-    turn: list[float], final: list[float] | None, order: list[int]
-) -> None:
-    turns = Rotation.from_rotvec([[0, 0, 0.5], [0, 0.45, 0], [0, 0, -0.2], [0, 0, 0.55]])
-    s = np.linspace(0.0, 1.0, 5)[:, np.newaxis]
-    shapes = np.array(
-        [
-            [0.1, -0.1] + (s + k * s * (1 - s)) * (np.array(end) - [0.1, -0.1])
-            for k, end in enumerate([[0.1, 0.2], [0.5, -0.4], [0.6, 0.1], [0.1, 0.2]])
-        ]
-    )
-    library = SolutionLibrary("key", turns.as_quat(), shapes)
-    wide = MotionLimits(np.array([-2.0, -0.5]), np.array([2.0, 0.5]), np.ones(2), np.ones(2))
-    start, last = np.array([0.2, -0.05]), None if final is None else np.array(final)
-    likely = np.zeros(2)
-    boundary = BoundaryConditions(start, Rotation.from_rotvec(turn).as_quat(), likely, last)
-    found = list(library.nearest(boundary, wide))
-    late = s**3 * (10 - 15 * s + 6 * s**2)
-    expected = [
-        own + (1 - late) * (start - own[0]) + late * ((own[-1] if last is None else last) - own[-1])
-        for own in shapes
-    ]
-    assert len(found) == 2
-    for each, k in zip(found, order, strict=True):
-        np.testing.assert_allclose(each, np.clip(expected[k], wide.lower, wide.upper), atol=1e-12)
-
-
-def test_a_library_holds_shapes_at_equal_intervals_of_time() -> None:
-    class Schedule:
-        ticks = 80
-        positions = np.column_stack([np.arange(81.0) ** 2, -np.arange(81.0)])
-
-    found = SolutionLibrary.from_schedules("key", [Schedule()], np.array([[0, 0, 0, 1.0]]))  # type: ignore[list-item]
-    assert found.shapes.shape == (1, 41, 2)
-    np.testing.assert_allclose(found.shapes[0], Schedule.positions[::2])
 
 
 FOLLOWER = ResolvedRateOptions(max_acceleration=(0.6, 0.8, 1.1))

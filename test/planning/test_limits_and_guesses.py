@@ -16,7 +16,6 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.methods.optimal.initial_guesses import (
     _LOOPS,
     InitialGuesses,
-    SolutionLibrary,
 )
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -295,31 +294,6 @@ def test_loops_of_about_unit_size_end_where_they_begin(number: int, joints: int)
         np.testing.assert_allclose(path[[0, -1]], 0.0, atol=1e-12)
         sizes.append(np.abs(path).max())
     assert 0.3 < np.median(sizes) < 3.0
-
-
-def test_a_library_of_something_else_is_refused() -> None:
-    turns, shapes = np.tile(IDENTITY, (2, 1)), np.arange(12.0).reshape(2, 2, 3)
-    library = SolutionLibrary("key", turns, shapes)
-    same = SolutionLibrary.from_bytes(library.to_bytes())
-    assert (same.key, same.digest) == ("key", library.digest)
-    np.testing.assert_array_equal(same.shapes, shapes)
-    for other in (
-        SolutionLibrary("key", turns[:, :3], shapes),
-        SolutionLibrary("key", turns[:1], shapes),
-        SolutionLibrary("key", turns[:0], shapes[:0]),
-        SolutionLibrary("key", turns, shapes[:, :1]),
-        SolutionLibrary("key", turns, shapes[0]),
-        SolutionLibrary("key", turns, shapes.astype(np.float32)),
-        SolutionLibrary("key", turns.astype(int), shapes),
-    ):
-        with pytest.raises(ValueError, match="it holds no library of manoeuvres"):
-            SolutionLibrary.from_bytes(other.to_bytes())
-    for broken in (
-        SolutionLibrary("key", turns * np.nan, shapes),
-        SolutionLibrary("key", turns, shapes + np.inf),
-    ):
-        with pytest.raises(ValueError, match="it is not finite"):
-            SolutionLibrary.from_bytes(broken.to_bytes())
 
 
 def test_a_guess_through_shapes_passes_them_at_equal_intervals(guesses: InitialGuesses) -> None:

@@ -14,8 +14,8 @@ from planning.test_optimal import ARM_START, QUICK
 from planning.test_reach import some_shape, urdf_of
 from scipy.spatial.transform import Rotation
 from support.oracles.pinocchio_oracle import PinocchioOracle
+from support.random_requests import CASES, requests
 
-from spacerobot_ros.benchmarks.measurements import CASES, requests
 from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance, plan

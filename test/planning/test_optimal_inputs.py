@@ -23,7 +23,7 @@ from spacerobot_ros.planning import (
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.path_deviation import PathCheck
 from spacerobot_ros.planning.methods.optimal import OptimalGait
-from spacerobot_ros.planning.methods.optimal.initial_guesses import SolutionLibrary
+from spacerobot_ros.planning.methods.optimal.initial_guesses import move_to_ends
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -51,7 +51,6 @@ def asked(
 
     monkeypatch.setattr(ManoeuvreSearch, "search", search)
     method = OptimalGait(ARM, TICK, 0.01, OptimalOptions(cache=0, **options))
-    monkeypatch.setattr(method, "_library", "the library")
     state = RobotState(np.zeros(3), Rotation.from_rotvec([0.3, 0.1, -0.2]).as_quat(), START)
     goal = Goal.from_rotvec([0.0, 0.0, 0.0], [0.3, 0.15, -0.2])
     goal = Goal(goal.position, goal.quaternion, None if shape is None else np.array(shape))
@@ -62,18 +61,16 @@ def asked(
     return boundary, limits, named
 
 
-def test_corrections_may_use_the_margins_and_have_no_library(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_corrections_may_use_the_margins_and_are_gentle(monkeypatch: pytest.MonkeyPatch) -> None:
     margins = (0.1, 0.2, 0.3)
     _, limits, named = asked(monkeypatch, correction=False, joint_margin=margins)
     np.testing.assert_allclose(limits.lower, ARM.lower + margins)
     np.testing.assert_allclose(limits.upper, ARM.upper - margins)
-    assert (named["library"], named["gentle"]) == ("the library", False)
+    assert named["gentle"] is False
     _, limits, named = asked(monkeypatch, correction=True, joint_margin=margins)
     np.testing.assert_array_equal(limits.lower, ARM.lower)
     np.testing.assert_array_equal(limits.upper, ARM.upper)
-    assert (named["library"], named["gentle"]) == (None, True)
+    assert named["gentle"] is True
 
 
 @pytest.mark.parametrize("shape", [None, [0.4, -0.9, 1.0]])
@@ -107,30 +104,18 @@ def test_shapes_within_margins_are_admitted_and_those_beyond_limits_are_not() ->
     np.testing.assert_allclose(wide.upper, [1.9, 1.0, 4.0])
 
 
-def test_the_nearest_manoeuvres_of_a_library_are_near_in_turn_and_both_shapes() -> None:
-    def turn(angle: float) -> Array:
-        return Rotation.from_rotvec([0.0, angle, 0.0]).as_quat()
-
-    way = np.linspace(0.0, 1.0, 5)[:, np.newaxis]
-
-    def path(begin: float, end: float) -> Array:
-        return begin + way * (end - begin) * np.array([1.0, -0.5, 0.3])
-
-    # The first has the wrong turn, the second begins elsewhere, the third ends elsewhere.
-    detour = path(0.1, 0.6) + 0.1 * np.sin(np.pi * way)
-    paths = [path(0.0, 0.5), path(0.9, 0.5), path(0.0, -0.9), detour]
-    library = SolutionLibrary("k", np.array([turn(1.4), *[turn(0.3)] * 3]), np.array(paths))
-    final = path(0.0, 0.5)[-1]
-    boundary = BoundaryConditions(np.zeros(3), turn(0.35), final, final)
-    found = list(library.nearest(boundary, LIMITS))
-    assert len(found) == 2
-    for shapes in found:
-        np.testing.assert_allclose(shapes[0], 0.0, atol=1e-12)
-        np.testing.assert_allclose(shapes[-1], final, atol=1e-12)
-    s = way
+def test_a_guess_is_moved_to_the_ends_and_within_the_limits() -> None:
+    s = np.linspace(0.0, 1.0, 5)[:, np.newaxis]
+    own = 0.1 + s * np.array([0.5, -0.25, 0.15]) + 0.1 * np.sin(np.pi * s)
+    final = np.array([0.5, -0.25, 0.15])
     late = s**3 * (10 - 15 * s + 6 * s**2)
-    moved = paths[3] + (1 - late) * -paths[3][0] + late * (final - paths[3][-1])
-    np.testing.assert_allclose(found[0], moved)
+    for last in (final, None):
+        boundary = BoundaryConditions(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), final, last)
+        expected = own + (1 - late) * -own[0] + late * (0.0 if last is None else last - own[-1])
+        np.testing.assert_allclose(move_to_ends(own, boundary, LIMITS), expected, atol=1e-12)
+    narrow = MotionLimits(np.full(3, -0.1), np.full(3, 0.2), *[np.ones(3)] * 2)
+    moved = move_to_ends(own, boundary, narrow)
+    np.testing.assert_allclose(moved, np.clip(expected, -0.1, 0.2), atol=1e-12)
 
 
 # -- plans in motion --------------------------------------------------------------------------

@@ -308,30 +308,27 @@ def progress(**changes: Any) -> _SearchState:
     return _SearchState(BOUNDARY, LIMITS, IDENTITY, options, NEVER, None, gentle=False)
 
 
-def test_solutions_agree_by_number_and_two_are_enough_with_a_library() -> None:
+def test_solutions_agree_by_number_and_two_are_enough_with_a_guess() -> None:
     same = [path(5.0)] * 5
     assert progress(agreeing=5).solutions_agree(same)
     assert not progress(agreeing=5).solutions_agree(same[1:])
     assert not progress(agreeing=0).solutions_agree(same)
     assert not progress(agreeing=1).solutions_agree([])
-    with_library = progress(agreeing=5)
-    with_library.library = SimpleNamespace()  # type: ignore[assignment]
-    assert with_library.solutions_agree(same[:2])
-    assert not with_library.solutions_agree(same[:1])
+    with_guess = progress(agreeing=5)
+    with_guess.guess = np.zeros((4, 2))
+    assert with_guess.solutions_agree(same[:2])
+    assert not with_guess.solutions_agree(same[:1])
     one = progress(agreeing=1)
-    one.library = with_library.library
+    one.guess = with_guess.guess
     assert one.solutions_agree(same[:1])
 
 
-def test_the_first_guesses_are_those_of_a_library(
-    model: ManoeuvreModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_given_guess_is_the_first(model: ManoeuvreModel) -> None:
     search = Search(model, n20=[5.0, 5.5, 5.8])
-    library: Any = SimpleNamespace(nearest=lambda *_: iter([np.zeros((4, 2))] * 2))
     options = replace(OPTIONS, starts=3, answers=9)
-    search.search(BOUNDARY, LIMITS, IDENTITY, 20, options, library=library)
+    search.search(BOUNDARY, LIMITS, IDENTITY, 20, options, guess=np.zeros((4, 2)))
     guessed = [call.guess.duration for call in search.scripted[20].calls]
-    np.testing.assert_allclose(guessed, [6.0, 6.0, 10.0])
+    np.testing.assert_allclose(guessed, [6.0, 10.0, 10.0])
 
 
 def test_the_cost_is_the_time_or_the_effort_in_a_given_time() -> None:

@@ -185,7 +185,6 @@ def test_a_mission_is_flown_from_the_page(
         watched.hear()
         np.testing.assert_allclose(watched.joints, [0.1, 0, 0], atol=5e-3)
 
-        # How often it is drawn on a quiet machine is measured by `spacerobot bench viewer`.
         assert page.frames_per_s(3.0, time.monotonic) > 1.0
         assert window.complaints == []
         assert page.requests_outside() == []

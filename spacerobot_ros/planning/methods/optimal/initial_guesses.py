@@ -1,32 +1,22 @@
-"""Initial guesses of the search for a manoeuvre: loops upon the direct way, and a library.
+"""Initial guesses of the search for a manoeuvre: loops upon the direct way.
 
 A path that only goes from one shape to the other is a saddle: to first order no small change of it
 turns the base elsewhere. So guesses are the direct way with loops upon it, whose size is such that
 their areas, times the curvature, are about the wanted turn. The loops are those of the papers, a
 cycle of three frequencies (paper 1, section 5) and a square (paper 3, section III), and random
-trigonometric ones. A library of manoeuvres to many goals of one robot gives guesses for goals that
-are near to theirs.
+trigonometric ones.
 """
 
 from __future__ import annotations
 
-import hashlib
-import io
 import itertools
 import math
-import zipfile
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.files import Cache, UntrustedFileError, read_private
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     attitude_error,
@@ -38,7 +28,6 @@ from spacerobot_ros.model.rotations import (
     rotvecs_from_quaternions,
 )
 from spacerobot_ros.model.wheels import ReactionWheels
-from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -431,162 +420,10 @@ _LOOPS: tuple[Loop, ...] = (
 )
 
 
-_NEAREST_MANOEUVRES = 2
-"""Number of a library's manoeuvres that a search begins with."""
-
-_SHAPES_PER_MANOEUVRE = 41
-"""Number of shapes that a library stores of a manoeuvre."""
-
-
-@dataclass(frozen=True)
-class SolutionLibrary:
-    """Manoeuvres of one robot.
-
-    Attributes
-    ----------
-    key
-        A hash of the robot and its limits (:func:`library_key`).
-    turns
-        (K, 4) quaternions of the last attitudes in the first ones.
-    shapes
-        (K, M, n) shapes at equal intervals from the beginning to the end.
-    """
-
-    key: str
-    turns: Array
-    shapes: Array
-
-    @classmethod
-    def from_schedules(
-        cls, key: str, schedules: Sequence[GaitSchedule], turns: Array
-    ) -> SolutionLibrary:
-        """Return the library of some schedules and their turns (K, 4)."""
-        instants = np.linspace(0, 1, _SHAPES_PER_MANOEUVRE)
-        shapes = [
-            _interpolate(instants, np.linspace(0, 1, schedule.ticks + 1), schedule.positions)
-            for schedule in schedules
-        ]
-        return cls(key, turns, np.array(shapes))
-
-    @property
-    def digest(self) -> str:
-        """A hash of the library's content."""
-        return hashlib.sha256(self.to_bytes()).hexdigest()
-
-    def nearest(self, boundary: BoundaryConditions, limits: MotionLimits) -> Iterator[Array]:
-        """Yield the shapes (M, n) of manoeuvres with the nearest ends, moved to these ends."""
-        half = limits.joint_ranges(boundary.start)[1]
-        half = np.where(half > 0, half, 1.0)
-        # The angle between two turns, and the distances of the shapes at both ends.
-        apart = 2 * np.arccos(np.clip(np.abs(self.turns @ boundary.goal_rotation), 0.0, 1.0))
-        begins = np.linalg.norm((self.shapes[:, 0] - boundary.start) / half, axis=1)
-        distance = apart + begins
-        if boundary.final is not None:
-            ends = (self.shapes[:, -1] - boundary.final) / half
-            distance = distance + np.linalg.norm(ends, axis=1)
-        for index in np.argsort(distance, kind="stable")[:_NEAREST_MANOEUVRES]:
-            shapes = self.shapes[index]
-            s = np.linspace(0.0, 1.0, len(shapes))[:, np.newaxis]
-            late = s**3 * (10 - 15 * s + 6 * s**2)
-            last = shapes[-1] if boundary.final is None else boundary.final
-            changed = (
-                shapes + (1 - late) * (boundary.start - shapes[0]) + late * (last - shapes[-1])
-            )
-            yield np.clip(changed, limits.lower, limits.upper)
-
-    def to_bytes(self) -> bytes:
-        """Return the library as the bytes of a numpy archive."""
-        return pack_arrays(key=self.key, turns=self.turns, shapes=self.shapes)
-
-    @classmethod
-    def from_bytes(cls, content: bytes) -> SolutionLibrary:
-        """Return the library from the bytes of its archive.
-
-        Raises
-        ------
-        ValueError
-            That holds something else.
-        """
-        key, turns, shapes = unpack_arrays(content, "library", "key", "turns", "shapes")
-        fits = turns.shape[1:] == (4,) and shapes.ndim == 3 and len(shapes) == len(turns) > 0
-        if not fits or shapes.shape[1] < 2 or not turns.dtype == shapes.dtype == np.float64:
-            raise ValueError("it holds no library of manoeuvres")
-        if not (np.all(np.isfinite(turns)) and np.all(np.isfinite(shapes))):
-            raise ValueError("it is not finite")
-        return cls(str(key), turns, shapes)
-
-
-def library_key(robot: SpaceRobot, limits: MotionLimits, axes: Array, *, position: bool) -> str:
-    """Return a hash of everything that the manoeuvres of a library depend on."""
-    digest = hashlib.sha256(robot.equations_key.encode())
-    for numbers in (*vars(limits).values(), axes):
-        digest.update(np.ascontiguousarray(numbers, dtype=float).tobytes())
-    digest.update(repr((robot.joint_names, position)).encode())
-    return digest.hexdigest()
-
-
-def library_file(key: str) -> tuple[Cache, str]:
-    """Return the cache of libraries, and the file name of a library."""
-    return Cache(cache_directory() / "libraries"), archive_name(key)
-
-
-def load_library(path: str, key: str) -> SolutionLibrary | None:
-    """Return the library at a path; for an empty path, the cached library or None.
-
-    Raises
-    ------
-    ParameterError
-        There is none at the path, it is of another robot, or others may have written it.
-    """
-    if not path:
-        cache, name = library_file(key)
-        kept = cache.load(name, key) if (cache.folder / name).exists() else None
-        if kept is None:
-            return None
-        try:
-            found = SolutionLibrary.from_bytes(kept[1])
-        except ValueError as error:
-            cache.discard(name, str(error))
-            return None
-        return found if found.key == key else None
-    try:
-        found = SolutionLibrary.from_bytes(read_private(Path(path).expanduser()))
-    except (OSError, ValueError, UntrustedFileError) as error:
-        raise ParameterError(f"The library '{path}' cannot be used: {error}") from None
-    if found.key != key:
-        raise ParameterError(
-            f"The library '{path}' is of another robot, or of other limits; spacerobot library "
-            "makes one of this."
-        )
-    return found
-
-
-# -- archives of arrays ---------------------------------------------------------------------------
-
-
-def archive_name(key: str) -> str:
-    """Return the file name of an archive from the hash of its key."""
-    return f"{key[:32]}.npz"
-
-
-def pack_arrays(**arrays: Any) -> bytes:
-    """Return arrays and texts as the bytes of a numpy archive."""
-    file = io.BytesIO()
-    np.savez(file, **arrays)
-    return file.getvalue()
-
-
-def unpack_arrays(content: bytes, kind: str, *names: str) -> list[Array]:
-    """Return the named arrays of an archive.
-
-    Raises
-    ------
-    ValueError
-        It holds no such arrays; the message names the ``kind`` of thing that they would be.
-    """
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            return [arrays[name] for name in names]
-    except (OSError, EOFError, KeyError, MemoryError, ValueError, zipfile.BadZipFile):
-        # The message of numpy recommends to trust the file.
-        raise ValueError(f"it holds no {kind}") from None
+def move_to_ends(shapes: Array, boundary: BoundaryConditions, limits: MotionLimits) -> Array:
+    """Return the shapes (M, n) of a manoeuvre, moved to other ends and within the limits."""
+    s = np.linspace(0.0, 1.0, len(shapes))[:, np.newaxis]
+    late = s**3 * (10 - 15 * s + 6 * s**2)
+    last = shapes[-1] if boundary.final is None else boundary.final
+    moved = shapes + (1 - late) * (boundary.start - shapes[0]) + late * (last - shapes[-1])
+    return np.clip(moved, limits.lower, limits.upper)

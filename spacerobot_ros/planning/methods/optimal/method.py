@@ -8,14 +8,14 @@ at guesses with loops (:mod:`.initial_guesses`), made into held commands that en
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import ClassVar
 
 import casadi as ca
@@ -27,11 +27,8 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
-    attitude_error,
     matrices_from_quaternions,
     matrix_from_quaternion,
-    quaternion_inverse,
-    quaternion_multiply,
 )
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import values_of
@@ -52,15 +49,6 @@ from spacerobot_ros.planning.methods.optimal.end_effectors import (
 )
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
-from spacerobot_ros.planning.methods.optimal.initial_guesses import (
-    SolutionLibrary,
-    archive_name,
-    library_file,
-    library_key,
-    load_library,
-    pack_arrays,
-    unpack_arrays,
-)
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.motion_bounds import (
@@ -90,9 +78,6 @@ _MAX_STARTS_IN_MOTION = 12
 
 _ZERO_ERROR = 1e-10
 """Largest error that counts as zero: the robot is at the goal; rad, m and joint coordinates."""
-
-_MAX_CACHED_END_ERROR = 1e-7
-"""Largest error at the ends of a cached manoeuvre, rad, m and joint coordinates."""
 
 _ACTIVE_LIMIT_SHARE = 0.95
 """Share of a limit beyond which a manoeuvre counts as limited by it."""
@@ -128,9 +113,6 @@ _STARTS_PER_COASTING_END = 8
 _MAX_DURATION_RATIO = 2.5
 """Longest time of a manoeuvre that ends at a pass, as multiple of that at zero momentum."""
 
-_MAX_DURATION_FACTOR, _LONGEST_ADDITIONAL_TICKS = 1.25, 20
-"""Longest duration of held commands: a factor of optimal.longest, and additional ticks."""
-
 _STARTS_BEFORE_FASTEST = 2
 """Guesses without a manoeuvre in the asked time after which the fastest one is looked for."""
 
@@ -139,7 +121,7 @@ _MAX_FASTEST_RATIO = 1.25
 on: there may be a faster one, but none so much faster."""
 
 _LIMIT_ROUNDING = 1e-8
-"""Largest excess of a cached manoeuvre over a limit, relative or in joint coordinates."""
+"""Largest relative excess over a limit that counts as rounding."""
 
 
 @dataclass(frozen=True)
@@ -241,10 +223,6 @@ class OptimalGait(GaitMethod):
         self._base_goals = _GoalKind(self._specification, self._model)
         self._end_effector_goals: dict[tuple[object, ...], _GoalKind] = {}
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
-        self._library_key = library_key(
-            robot, self._limits, self._specification.axes, position=self._specification.position
-        )
-        self._library = load_library(chosen.library, self._library_key)
 
     def _kind_of(self, goal: Goal) -> _GoalKind:
         """Return the kind of a goal; that of a goal of end-effectors is made when it is needed.
@@ -262,27 +240,6 @@ class OptimalGait(GaitMethod):
             model = replace(self._model, axes=of.axes, end_effectors=of.rows_at_end)
             self._end_effector_goals[key] = _GoalKind(of, model)
         return self._end_effector_goals[key]
-
-    def build_library(self, requests: Iterable[PlanRequest]) -> SolutionLibrary | None:
-        """Return the manoeuvres of all requests that can be reached; None if none can.
-
-        They are planned without a library.
-        """
-        self._library = None
-        schedules, turns = [], []
-        for request in requests:
-            with suppress(PlanningError):
-                schedules.append(self.plan(request))
-                begins = quaternion_inverse(request.state.quaternion)
-                turns.append(quaternion_multiply(begins, request.goal.quaternion))
-        if not schedules:
-            return None
-        return SolutionLibrary.from_schedules(self._library_key, schedules, np.array(turns))
-
-    def store_library(self, library: SolutionLibrary) -> Path | None:
-        """Store a library in the cache, where plans find it; return its path, None on failure."""
-        cache, name = library_file(self._library_key)
-        return cache.store(name, self._library_key, library.to_bytes())
 
     @classmethod
     def require_suitable(cls, robot: SpaceRobot) -> None:
@@ -491,8 +448,12 @@ class OptimalGait(GaitMethod):
         key = None
         if self._cache is not None and not correction and duration is None:
             key = self._request_key(request)
-            if kept := self._load_cached_plan(self._cache, key, request, boundary, limits):
-                return kept
+            if kept := self._cache.load(f"{key[:32]}.npz", key):
+                plan = _CachedPlan.from_bytes(kept[1])
+                notes: Notes = {**plan.notes, "from_cache": 1.0}
+                return self._build_schedule(
+                    state, goal, plan.positions, notes, boundary.velocity, end
+                )
         chosen = replace(self.options, duration=0.0, answers=1) if correction else self.options
         if duration is not None:
             chosen = replace(chosen, duration=duration)
@@ -524,7 +485,7 @@ class OptimalGait(GaitMethod):
             and self._is_within_efforts(found.manoeuvre, boundary.velocity, boundary)
         ):
             kept_plan = _CachedPlan(schedule.positions, found.notes)
-            self._cache.store(archive_name(key), key, kept_plan.to_bytes())
+            self._cache.store(f"{key[:32]}.npz", key, kept_plan.to_bytes())
         return schedule
 
     @cached_property
@@ -619,15 +580,13 @@ class OptimalGait(GaitMethod):
         chosen: OptimalOptions,
         cancellation: Cancellation,
         max_failed_starts: int = sys.maxsize,
-        guess: SolutionLibrary | None = None,
+        guess: Array | None = None,
     ) -> _PlanResult:
         """Return a manoeuvre that begins at once; see :meth:`.ManoeuvreSearch.search`.
 
-        A ``guess`` comes before all others.
+        The shapes (M, n) of a ``guess`` come before all other guesses.
         """
         state, correction = request.state, request.correction
-        # Libraries have manoeuvres to attitudes of the base.
-        library = None if correction or request.goal.end_effectors else self._library
         found = self._within_efforts(
             self._kind_of(request.goal),
             lambda searches: searches.from_rest.search(
@@ -637,7 +596,7 @@ class OptimalGait(GaitMethod):
                 self._count_intervals(correction),
                 chosen,
                 cancellation,
-                library=guess or library,
+                guess=guess,
                 # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
                 gentle=correction and not boundary.is_timed,
                 max_failed_starts=max_failed_starts,
@@ -760,13 +719,12 @@ class OptimalGait(GaitMethod):
         at_rest = replace(aimed, angular_momentum=np.zeros(3))
         few = replace(chosen, starts=min(chosen.starts, _STARTS_PER_COASTING_END))
         free = self._begin_now(there, at_rest, limits, few, cancellation)
-        guess = SolutionLibrary("", at_rest.goal_rotation[np.newaxis], free.positions[np.newaxis])
         takes = len(free.positions) - 1
         begin = max(0, end - takes)
         later, aimed = self._later(request, boundary, coast, begin)
         brief = replace(chosen, longest=min(chosen.longest, _MAX_DURATION_RATIO * takes * h))
         found = self._begin_now(
-            later, aimed, limits, brief, cancellation, _STARTS_AFTER_COASTING, guess
+            later, aimed, limits, brief, cancellation, _STARTS_AFTER_COASTING, free.positions
         )
         self._constraints.check(coast.shapes[:begin], coast.attitudes[:begin], h)
         return replace(
@@ -972,96 +930,7 @@ class OptimalGait(GaitMethod):
             numbers["effort"] = self._efforts.limit
         if self.clearance is not None:
             numbers["clearance"] = self.clearance.facts
-        if self._library is not None:
-            digest = bytes.fromhex(self._library.digest)
-            numbers["library"] = np.frombuffer(digest, np.uint8).astype(float)
         return plan_key(self.robot, numbers, values_of(self.options))
-
-    def _load_cached_plan(
-        self,
-        cache: Cache,
-        key: str,
-        request: PlanRequest,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-    ) -> GaitSchedule | None:
-        """Return the cached plan of a key, if it still reaches its goal within the limits."""
-        kept = cache.load(archive_name(key), key)
-        if kept is None:
-            return None
-        try:
-            plan = _CachedPlan.from_bytes(kept[1])
-            self._require_valid_manoeuvre(plan.positions, request, boundary, limits)
-        except (ValueError, UnusableCandidateError) as reason:
-            cache.discard(archive_name(key), str(reason))
-            return None
-        notes: Notes = {**plan.notes, "from_cache": 1.0}
-        ends = boundary.velocity, boundary.final_velocity
-        return self._build_schedule(request.state, request.goal, plan.positions, notes, *ends)
-
-    def _require_valid_manoeuvre(
-        self,
-        positions: Array,
-        request: PlanRequest,
-        boundary: BoundaryConditions,
-        limits: MotionLimits,
-    ) -> None:
-        """Refuse shapes (N + 1, n) at the ticks that a search for this request would not return.
-
-        Raises
-        ------
-        CandidateError
-            They are of another robot, miss an end, or exceed a limit or a path constraint.
-        """
-        period, state, robot = self.control_period, request.state, self.robot
-        if positions.ndim != 2 or positions.shape[1] != robot.n or len(positions) < 2:
-            raise UnusableCandidateError(
-                f"it is of shape {positions.shape}, not of {robot.n} joints"
-            )
-        if not np.all(np.isfinite(positions)):
-            raise UnusableCandidateError("it is not finite")
-        wanted, duration = self.options.duration, (len(positions) - 1) * period
-        if wanted > 0 and abs(duration - wanted) > period:
-            raise UnusableCandidateError(f"it takes {duration:g} s, not {wanted:g} s")
-        if (
-            duration
-            > _MAX_DURATION_FACTOR * self.options.longest + _LONGEST_ADDITIONAL_TICKS * period
-        ):
-            raise UnusableCandidateError(f"it takes {duration:g} s")
-        first, last = positions[0], positions[-1]
-        if np.abs(first - boundary.start).max() > _MAX_CACHED_END_ERROR:
-            raise UnusableCandidateError("it begins in another shape")
-        if (
-            boundary.final is not None
-            and np.nanmax(np.abs(last - boundary.final), initial=0.0) > _MAX_CACHED_END_ERROR
-        ):
-            raise UnusableCandidateError("it ends in another shape")
-        if boundary.center is not None:
-            beside = robot.center_of_mass(last) - boundary.center
-            if np.linalg.norm(beside) > _MAX_CACHED_END_ERROR:
-                raise UnusableCandidateError("it ends in another position")
-        attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
-        ends = boundary.velocity, boundary.final_velocity
-        factor, overrun = limits.excess(positions, period, *ends)
-        if self._efforts is not None:
-            L_B = _momenta_in_base(state, attitudes)
-            factor = max(factor, self._efforts.excess(positions, ends[0], L_B, ends[1]))
-        if factor > 1 + _LIMIT_ROUNDING or overrun > _LIMIT_ROUNDING:
-            raise UnusableCandidateError("it exceeds a limit of the joints")
-        kind = self._kind_of(request.goal)
-        aim = quaternion_multiply(state.quaternion, boundary.goal_rotation)
-        aim = aim if request.goal.end_effectors else request.goal.quaternion
-        error = attitude_error(attitudes[-1], aim)
-        if np.linalg.norm(kind.specification.axes @ error) > _MAX_CACHED_END_ERROR:
-            raise UnusableCandidateError("it ends in another attitude")
-        if (rows_at_end := kind.model.end_effectors) is not None:
-            turn = quaternion_multiply(quaternion_inverse(state.quaternion), attitudes[-1])
-            rows = rows_at_end.evaluate(turn[np.newaxis], last[np.newaxis], boundary.end_effectors)
-            if np.abs(rows[0]).max() > _MAX_CACHED_END_ERROR:
-                raise UnusableCandidateError("it ends with end-effectors elsewhere")
-        self._constraints.check(positions, attitudes, period)
-        if too_near := self._too_near(positions, self._base_poses(state, positions, attitudes)):
-            raise UnusableCandidateError(too_near)
 
 
 def _asked_time(chosen: OptimalOptions) -> tuple[str, float]:
@@ -1087,29 +956,15 @@ class _CachedPlan:
 
     def to_bytes(self) -> bytes:
         """Return the plan as a numpy archive."""
-        return pack_arrays(positions=self.positions, notes=json.dumps(self.notes))
+        file = io.BytesIO()
+        np.savez(file, positions=self.positions, notes=json.dumps(self.notes))
+        return file.getvalue()
 
     @classmethod
     def from_bytes(cls, content: bytes) -> _CachedPlan:
-        """Return the plan of a numpy archive.
-
-        Raises
-        ------
-        ValueError
-            That holds something else.
-        """
-        positions, text = unpack_arrays(content, "plan", "positions", "notes")
-        notes = json.loads(str(text))
-        if positions.dtype != np.float64 or not isinstance(notes, dict):
-            raise ValueError("it holds something else than a plan")
-        if not all(_is_numeric_note(value) for value in notes.values()):
-            raise ValueError("its notes are not numbers")
-        return cls(positions, notes)
-
-
-def _is_numeric_note(value: object) -> bool:
-    values = value if isinstance(value, list) else [value]
-    return all(isinstance(each, float) and math.isfinite(each) for each in values)
+        """Return the plan of a numpy archive."""
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return cls(arrays["positions"], json.loads(str(arrays["notes"])))
 
 
 def plan_key(robot: SpaceRobot, numbers: Mapping[str, Array], options: Mapping[str, object]) -> str:
@@ -1118,7 +973,7 @@ def plan_key(robot: SpaceRobot, numbers: Mapping[str, Array], options: Mapping[s
     if "effort" in numbers:
         digest.update(robot.function("joint_efforts", compile=False).serialize().encode())
     facts = {
-        "format": 2,
+        "format": 3,
         "versions": [__version__, ca.__version__, np.__version__],
         "joints": robot.joint_names,
         "options": options,

@@ -150,9 +150,6 @@ class OptimalOptions(MotionOptions):
     longest: float = parameter(
         3600.0, "longest manoeuvre that is still planned", unit="s", minimum=1.0, maximum=1e9
     )
-    library: str = parameter(
-        "", "file of spacerobot library with manoeuvres to begin with; '': that of the cache"
-    )
     cache: int = parameter(1, "1: manoeuvres are kept on disk", minimum=0, maximum=1)
 
 

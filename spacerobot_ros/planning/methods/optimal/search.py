@@ -38,7 +38,7 @@ from spacerobot_ros.planning.methods.optimal.held_commands import (
     HeldCommands,
     ManoeuvreModel,
 )
-from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses, SolutionLibrary
+from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses, move_to_ends
 from spacerobot_ros.planning.methods.optimal.joint_efforts import EffortLimitedShooting
 from spacerobot_ros.planning.methods.optimal.kept_distances import (
     ROUNDS,
@@ -133,8 +133,8 @@ _AGREEING_COST_TOLERANCE = 3e-3
 """Solutions whose costs are this near, relative, agree: the coarse grid and the tolerance of the
 solver leave as much between them."""
 
-_AGREEING_SOLUTIONS_WITH_LIBRARY = 2
-"""Number of agreeing solutions that end a search with first guesses from a library."""
+_AGREEING_SOLUTIONS_WITH_GUESS = 2
+"""Number of agreeing solutions that end a search whose first guess is given."""
 
 _MAX_ITERATIONS_OF_STOPS = 120
 """Steps of the solver from a guess in which wheels stop the base: most take twenty."""
@@ -238,7 +238,7 @@ class _SearchState:
 
     Attributes
     ----------
-    boundary, limits, quaternion, options, cancellation, library
+    boundary, limits, quaternion, options, cancellation, guess
         As of :meth:`ManoeuvreSearch.search`.
     starts, rejection
         Guesses that were tried, and the reason against the last candidate.
@@ -255,7 +255,7 @@ class _SearchState:
     quaternion: Array
     options: OptimalOptions
     cancellation: Cancellation
-    library: SolutionLibrary | None
+    guess: Array | None
     gentle: bool
     max_failed_starts: int = sys.maxsize
     starts: int = 0
@@ -309,9 +309,8 @@ class _SearchState:
         """Whether the best solution was found often enough."""
         costs = np.array([self.cost(each) for each in solutions])
         agreeing = self.options.agreeing
-        if self.library is not None:
-            # A library's guesses come from solutions that agreed for nearby goals.
-            agreeing = min(agreeing, _AGREEING_SOLUTIONS_WITH_LIBRARY)
+        if self.guess is not None:
+            agreeing = min(agreeing, _AGREEING_SOLUTIONS_WITH_GUESS)
         same = int(np.sum(costs <= costs.min(initial=math.inf) * (1 + _AGREEING_COST_TOLERANCE)))
         return 0 < agreeing <= same
 
@@ -354,16 +353,16 @@ class ManoeuvreSearch:
         intervals: int,
         options: OptimalOptions,
         cancellation: Cancellation = NEVER,
-        library: SolutionLibrary | None = None,
+        guess: Array | None = None,
         *,
         gentle: bool = False,
         max_failed_starts: int = sys.maxsize,
     ) -> Manoeuvre:
         """Return the fastest manoeuvre found from attitude ``quaternion`` (4,) of R_WB.
 
-        The nearest manoeuvres of a library are the first guesses. A ``gentle`` manoeuvre takes the
-        path of least effort, whose turn of the base depends least on errors of masses. After
-        ``max_failed_starts`` guesses without any solution the search ends.
+        The shapes (M, n) of a ``guess``, moved to the ends, come before all other guesses. A
+        ``gentle`` manoeuvre takes the path of least effort, whose turn of the base depends least on
+        errors of masses. After ``max_failed_starts`` guesses without any solution the search ends.
 
         Raises
         ------
@@ -381,7 +380,7 @@ class ManoeuvreSearch:
             )
         kept = self._begin(boundary)
         progress = _SearchState(
-            boundary, limits, quaternion, options, cancellation, library, gentle, max_failed_starts
+            boundary, limits, quaternion, options, cancellation, guess, gentle, max_failed_starts
         )
         found = self._search_on_grids(progress, intervals)
         if found and kept is not None:
@@ -795,11 +794,9 @@ class ManoeuvreSearch:
         of_boundary = guesses.generate(boundary, limits, boundary.likely_final_shape)
         if len(self._wheels) and len(self._axes):
             of_boundary = guesses.generate_with_wheels(self._wheels, boundary, limits, self._robot)
-        if progress.library is not None:
-            near = progress.library.nearest(boundary, limits)
-            of_boundary = itertools.chain(
-                (guesses.from_shapes(x, limits) for x in near), of_boundary
-            )
+        if progress.guess is not None:
+            moved = move_to_ends(progress.guess, boundary, limits)
+            of_boundary = itertools.chain([guesses.from_shapes(moved, limits)], of_boundary)
         solutions: list[Trajectory] = []
         enough = progress.options.answers
         for number, guess in enumerate(itertools.islice(of_boundary, starts), 1):

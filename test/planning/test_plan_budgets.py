@@ -1,4 +1,4 @@
-"""Which cached manoeuvres are refused, at the boundaries, and the budgets of plans in motion."""
+"""Budgets of plans in motion and of corrections, and limits that count as active."""
 
 from __future__ import annotations
 
@@ -14,143 +14,19 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.methods.optimal.method import OptimalGait
-from spacerobot_ros.planning.methods.optimal.problem import (
-    BoundaryConditions,
-    MotionLimits,
-    OptimalOptions,
-    UnusableCandidateError,
-)
+from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions
 
 Array = npt.NDArray[np.float64]
 
 PERIOD = 0.1
-IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 START, FINAL = np.array([0.3, -0.2]), np.array([0.5, 0.4])
-TURN = Rotation.from_rotvec([0.1, -0.3, 0.2])
 STATE: Any = SimpleNamespace(
     quaternion=Rotation.from_rotvec([0.3, 0.2, -0.4]).as_quat(), angular_momentum=np.zeros(3)
 )
-LIMITS = MotionLimits(np.full(2, -9.0), np.full(2, 9.0), np.full(2, 1e6), np.full(2, 1e6))
 
 
 def shapes(ticks: int) -> Array:
     return np.linspace(START, FINAL, ticks + 1)
-
-
-def method(**options: Any) -> Any:
-    """Return a stand-in for the method, whose base turns as the goal asks for."""
-    made: Any = SimpleNamespace(
-        control_period=PERIOD,
-        robot=SimpleNamespace(n=2, center_of_mass=lambda q: np.array([q[0], q[1], 0.0])),
-        options=replace(OptimalOptions(longest=4.0), **options),
-        off=np.zeros(3),
-        rows=None,
-        near="",
-        excess=0.0,
-    )
-    made._efforts = SimpleNamespace(excess=lambda *_, **__: made.excess)
-
-    def attitudes(positions: Array, quaternion: Array, _: Array) -> Array:
-        end = Rotation.from_quat(quaternion) * TURN * Rotation.from_rotvec(made.off)
-        return np.vstack([np.tile(quaternion, (len(positions) - 1, 1)), end.as_quat()])
-
-    made._prediction = SimpleNamespace(attitudes=attitudes)
-    kind = SimpleNamespace(
-        specification=SimpleNamespace(axes=np.eye(3)),
-        model=SimpleNamespace(end_effectors=None),
-    )
-    made._kind_of = lambda goal: kind
-    made._constraints = SimpleNamespace(check=lambda *_: None)
-    made._too_near = lambda *_: made.near
-    made._base_poses = lambda *_: None
-    made.kind = kind
-    return made
-
-
-def refusal(made: Any, positions: Array, **changes: Any) -> str:
-    """Return why a manoeuvre is refused; empty: it is not."""
-    boundary = replace(BoundaryConditions(START, TURN.as_quat(), FINAL, FINAL), **changes)
-    goal = SimpleNamespace(
-        end_effectors=(), quaternion=(Rotation.from_quat(STATE.quaternion) * TURN).as_quat()
-    )
-    request: Any = SimpleNamespace(state=STATE, goal=goal)
-    try:
-        OptimalGait._require_valid_manoeuvre(made, positions, request, boundary, LIMITS)
-    except UnusableCandidateError as error:
-        return str(error)
-    return ""
-
-
-def test_a_manoeuvre_for_the_request_is_taken() -> None:
-    assert not refusal(method(), shapes(30))
-    assert not refusal(method(duration=3.04), shapes(30))
-    assert not refusal(method(duration=3.04), shapes(31))
-    assert refusal(method(duration=3.04), shapes(32)) == "it takes 3.2 s, not 3.04 s"
-    assert refusal(method(duration=3.04), shapes(29)) == "it takes 2.9 s, not 3.04 s"
-
-
-def test_a_manoeuvre_may_be_a_quarter_and_twenty_ticks_longer_than_the_longest() -> None:
-    assert not refusal(method(), shapes(70))
-    assert refusal(method(), shapes(71)) == "it takes 7.1 s"
-
-
-@pytest.mark.parametrize(
-    ("positions", "sentence"),
-    [
-        (shapes(30)[:, :1], "it is of shape (31, 1), not of 2 joints"),
-        (shapes(30)[:1], "it is of shape (1, 2), not of 2 joints"),
-        (shapes(30)[0], "it is of shape (2,), not of 2 joints"),
-        (shapes(30) * np.nan, "it is not finite"),
-    ],
-)
-def test_what_is_no_manoeuvre_of_the_robot_is_refused(positions: Array, sentence: str) -> None:
-    assert refusal(method(), positions) == sentence
-
-
-def test_the_ends_are_met_within_a_ten_millionth() -> None:
-    near, beside = np.array([0.0, 0.9e-7]), np.array([0.0, -1.1e-7])
-    assert not refusal(method(), shapes(30), start=START + near, final=FINAL + near)
-    assert refusal(method(), shapes(30), start=START + beside) == "it begins in another shape"
-    assert refusal(method(), shapes(30), final=FINAL + beside) == "it ends in another shape"
-    assert not refusal(method(), shapes(30), final=None)
-    center = np.array([0.5, 0.4, 0.0])
-    assert not refusal(method(), shapes(30), final=None, center=center + 0.5e-7)
-    said = refusal(method(), shapes(30), final=None, center=center + 0.9e-7)
-    assert said == "it ends in another position"
-    made = method()
-    made.off = np.array([0.0, 0.9e-7, 0.0])
-    assert not refusal(made, shapes(30))
-    made.off = np.array([0.0, 1.1e-7, 0.0])
-    assert refusal(made, shapes(30)) == "it ends in another attitude"
-    made.kind.specification.axes = np.array([[1.0, 0.0, 0.0]])
-    assert not refusal(made, shapes(30)), "along the axes that are reached"
-
-
-def test_limits_efforts_and_distances_are_kept() -> None:
-    for excess, refused in ((1 + 0.9e-8, False), (1 + 1.1e-8, True)):
-        made = method()
-        made.excess = excess
-        said = "it exceeds a limit of the joints" if refused else ""
-        assert refusal(made, shapes(30)) == said
-    made = method()
-    made.near = "links 'a' and 'b' are near"
-    assert refusal(made, shapes(30)) == "links 'a' and 'b' are near"
-
-    def evaluate(turn: Array, q: Array, _: Any) -> tuple[Array, int, int]:
-        assert (Rotation.from_quat(turn[0]).inv() * TURN).magnitude() < 1e-9, "at the end"
-        np.testing.assert_array_equal(q, [FINAL])
-        return np.array([[0.0, made.miss]]), 0, 0
-
-    rows = SimpleNamespace(evaluate=evaluate)
-    made = method()
-    made.kind.model.end_effectors = rows
-    made.miss = 0.9e-7
-    assert not refusal(made, shapes(30))
-    made.miss = -1.1e-7
-    assert refusal(made, shapes(30)) == "it ends with end-effectors elsewhere"
-
-
-# -- budgets ------------------------------------------------------------------------------------
 
 
 def planned(velocity: list[float], previous: object = None, **options: Any) -> Any:
