@@ -67,5 +67,5 @@ def test_twenty_second_goals_in_motion_are_flown(apart: NodesApart, robot: str) 
     if robot == "seven_joint_arm":
         assert max(plan_times(apart)) > COMMAND_TIMEOUT
     apart.end()
-    # The planner may say of a slow plan that it was late; the plant has never been without commands.
+    # The planner may say that a plan was late; the plant has never been without commands.
     assert [line for line in apart.complaints if line.startswith("/plant")] == []
