@@ -90,9 +90,10 @@ def _farthest_sample(motion: Signal, a: int, b: int) -> tuple[float, int, int, i
     if b - a < 2:
         return 0.0, a, b, a
     time, values = motion.time[a : b + 1], motion.values[a : b + 1]
-    share: Array = ((time - time[0]) / max(time[-1] - time[0], 1e-12))[:, np.newaxis]
+    span = float(time[-1] - time[0])  # Below zero where a plant was started again.
+    share: Array = ((time - time[0]) / (span if abs(span) > 1e-12 else np.inf))[:, np.newaxis]
     off = np.abs(values - values[0] - share * (values[-1] - values[0])).max(axis=1, initial=0.0)
-    k = int(np.argmax(off))
+    k = 1 + int(np.argmax(off[1:-1]))
     return -float(off[k]), a, b, a + k
 
 

@@ -374,6 +374,18 @@ def test_a_line_is_simplified_by_its_worst_samples() -> None:
     assert (two.tolist(), off) == ([0, 1], 0.0)
 
 
+def test_a_line_is_simplified_whose_time_begins_again() -> None:
+    """A plant was killed and started again."""
+    time = np.tile(0.05 * np.arange(300.0), 2)
+    values = 50.0 * np.random.default_rng(4).random((600, 1))
+    kept, off = simplified(Signal(time, values), 200)
+    assert len(kept) == 200
+    assert (np.diff(kept) > 0).all()
+    assert 1.0 < off < np.inf
+    kept, off = simplified(Signal(time, np.zeros((600, 1))), 200)
+    assert (len(kept), off) == (65, 0.0)
+
+
 def test_a_sample_counts_by_its_distance_from_the_line_in_time() -> None:
     time = np.array([0.0, 1.0, 10.0])
     motion = Signal(time, np.array([[0.0, 0.0], [2.0, -3.0], [10.0, 0.0]]))
