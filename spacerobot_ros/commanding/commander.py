@@ -245,8 +245,9 @@ class Commander(ABC):
         """Wall times of the activation, the last answer, the last state and the last look, s."""
         self.refusal = ""
         """Why the last joint states were refused, as a clause; empty: they were not."""
-        self._reported_missing = ""
-        """What the last status said is waited for, as a clause; empty: nothing."""
+        self._reported_missing = self._reported_waiting = ""
+        """What the last status said is waited for, as a clause, and the goal that waits; empty:
+        nothing."""
         self._last_status: Status | None = None
         """The last status that did not say so."""
         self._ignored_reported, self._next_report = 0, 0.0
@@ -300,7 +301,7 @@ class Commander(ABC):
         """Give up the goals and the robot; later goals wait for another robot."""
         if self.executive is not None:
             self._give_up_goals(PlantStopped(why))
-            self._stop_executive()
+            self._stop_executive(why)
         self.robot = self.executive = self._decoder = self._described = None
 
     def activate(self) -> None:
@@ -321,13 +322,13 @@ class Commander(ABC):
 
     def deactivate(self) -> None:
         """Give up the goals and stop commanding; the file of goals stays."""
-        if self.activity is not CommanderActivity.INACTIVE and self.executive is not None:
-            self._stop_executive()
-        self.activity, self._waiting_goals = CommanderActivity.INACTIVE, {}
-        later = ""
+        why = "Aborted: this node was deactivated."
         if self.config.resume_file:
-            later = " A goal that came by topic is resumed when it is activated again."
-        self._fly_to.end_dropped_goals((), f"Aborted: this node was deactivated.{later}")
+            why += " A goal that came by topic is resumed when it is activated again."
+        if self.activity is not CommanderActivity.INACTIVE and self.executive is not None:
+            self._stop_executive(why)
+        self.activity, self._waiting_goals = CommanderActivity.INACTIVE, {}
+        self._fly_to.end_dropped_goals((), why)
 
     # -- goals --------------------------------------------------------------------------------
 
@@ -602,6 +603,8 @@ class Commander(ABC):
             unheard = [topic for topic in absent if waited and not self.host.has_publisher(topic)]
             nobody = f", and no node publishes {_quoted(unheard)}" if unheard else ""
             return f"states on {_quoted(absent)}{refused}{nobody}"
+        if self.plant.inactive:
+            return "the plant, which is inactive: activate it"
         silence = self._clock() - self._heard
         longest = max(_LONGEST_SILENCE, _SILENT_PERIODS * self.config.control_period)
         if silence > longest and not (self.plant.paused or self.plant.in_lockstep):
@@ -616,13 +619,14 @@ class Commander(ABC):
             self._heard += now - self._checked  # This process itself stood still.
         self._checked = now
         missing = self.missing
-        if not self.active or missing == self._reported_missing:
+        goal_id = self._pursued_goal_id if missing else ""
+        known = missing == self._reported_missing and goal_id == self._reported_waiting
+        if known or not self.active:
             return
         if missing and self._reported_missing and now - self._activated < _LONGEST_SILENCE:
             return  # The rest is on its way.
-        self._reported_missing = missing
+        self._reported_missing, self._reported_waiting = missing, goal_id
         if missing:
-            goal_id = self._pursued_goal_id
             goes_on = " The goal is pursued when they come." if goal_id else ""
             message = f"Waiting for {missing}.{goes_on}"
             self._publish_status(self._make_status("waiting", message, goal_id))
@@ -790,8 +794,8 @@ class Commander(ABC):
         """Message on a plant that takes other commands than these; empty: it takes them."""
 
     @abstractmethod
-    def _stop_executive(self) -> None:
-        """Stop the executive, which gives up its goals."""
+    def _stop_executive(self, why: str) -> None:
+        """Stop the executive, which gives up its goals, with a message for their statuses."""
 
     @abstractmethod
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:

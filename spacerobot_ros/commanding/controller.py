@@ -291,9 +291,12 @@ class ControllerCommander(Commander):
     def _without_goal(self) -> tuple[str, str]:
         return "holding", "Waiting for a goal; the robot holds its pose."
 
-    def _stop_executive(self) -> None:
+    def _stop_executive(self, why: str) -> None:
         assert self.executive is not None
+        unfinished = self.executive.unfinished_goals
         self.executive.reset()
+        for goal_id in sorted(unfinished.intersection(self._ids_by_key.values())):
+            self._report_aborted(goal_id, why)
 
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         if self.executive is None:

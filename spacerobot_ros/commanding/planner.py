@@ -231,7 +231,7 @@ class PlannerCommander(Commander):
             pursued |= {each.goal_id for each in outputs if isinstance(each, PlannerStatus)}
         return pursued
 
-    def _stop_executive(self) -> None:
+    def _stop_executive(self, why: str) -> None:
         assert self.executive is not None
         if self.trajectories is None:
             commands = self.statistics.commands_published

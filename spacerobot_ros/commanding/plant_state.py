@@ -427,6 +427,11 @@ class PlantListener:
         return ""
 
     @property
+    def inactive(self) -> bool:
+        """Whether the plant says that it is inactive."""
+        return self._status is not None and self._status.state is PlantState.INACTIVE
+
+    @property
     def rate(self) -> float:
         """Ticks a second of the plant, Hz; 0: it is not known."""
         return 0.0 if self._status is None else self._status.tick_rate_hz

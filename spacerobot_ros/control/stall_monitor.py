@@ -133,7 +133,10 @@ class StallMonitor:
         if stop and limited:
             return stop
         if law.singular_error_share > _SINGULAR_SHARE:
-            return "the arm is stretched out or folded (singular)"
+            return (
+                "the arm is stretched out or folded (singular); end-effectors without a goal of "
+                "their own stay where they are"
+            )
         if limited:
             for part, name in (
                 (result.excess.wrench_B[:3], "the force of the thrusters is at its limit"),

@@ -159,6 +159,8 @@ class CoordinatedControlNode(CommanderNode):
         # One lost message is no matter for the log.
         if status.state.level and (lasts or status.state is not ControllerState.ESTIMATING):
             self.get_logger().warning(status.message, throttle_duration_sec=5.0)
+        elif status.state is ControllerState.REACHED and not lasts:
+            self.get_logger().info(status.message)
 
     def publish_start(self, start: ScheduleStart) -> None:
         """Ignore schedules, which a controller does not have."""

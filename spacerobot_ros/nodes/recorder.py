@@ -217,6 +217,8 @@ class RecorderNode(FlightNode):
             question.close()
         if self.recording is not None:
             self.recording.close()
+            path, count = self.recording.writer.path, self.recording.messages
+            self.get_logger().info(f"{count} messages are recorded in {path}.")
 
     # -- for the composer of the nodes --------------------------------------------------------
 

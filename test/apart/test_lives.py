@@ -126,7 +126,8 @@ def test_silent_publishers_do_not_hold_a_node_that_is_activated_again(
     assert apart.change(name, Transition.TRANSITION_DEACTIVATE)
     assert apart.life(name) == "inactive"
     if name == "plant":
-        apart.wait_state(commander, "waiting", timeout=20.0)
+        waiting = apart.wait_state(commander, "waiting", timeout=20.0)
+        assert "the plant, which is inactive" in waiting["message"]
     assert apart.change(name, Transition.TRANSITION_ACTIVATE)
     apart.wait_state(commander, *AT_REST[commander], timeout=20.0)
     apart.fly(commander, FAR[commander])

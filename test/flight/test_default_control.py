@@ -128,7 +128,7 @@ def test_a_hand_out_of_reach_is_stalled_with_its_cause(tmp_path: Path, robot: st
     time, _ = stalls(flight)
     assert time < 60.0
     last = [each for _, each in statuses(flight) if each.state is ControllerState.STALLED][-1]
-    assert last.message.endswith(": the arm is stretched out or folded (singular).")
+    assert "the arm is stretched out or folded (singular)" in last.message
 
 
 def test_a_base_that_leaves_its_hand_behind_is_stalled(tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_a_base_that_leaves_its_hand_behind_is_stalled(tmp_path: Path) -> None:
     flight = flown(tmp_path, "planar_manipulator", 20.0, base=away, turn=np.zeros(3), time_limit=90)
     time, status = stalls(flight)
     assert time < 75.0
-    assert status.message.endswith(": the arm is stretched out or folded (singular).")
+    assert "the arm is stretched out or folded (singular)" in status.message
 
 
 def test_a_robot_that_chatters_ends_with_its_cause(tmp_path: Path) -> None:

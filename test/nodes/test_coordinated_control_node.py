@@ -272,6 +272,7 @@ def test_goals_are_forgotten_by_a_deactivation(harness: Harness) -> None:
     loop.aim(base=pose([1.0, 0.0, 0.0]))
     assert loop.answer()[0][0] == pytest.approx(KP)
     loop.node.trigger_deactivate()
+    loop.wait_for("aborted")
     count = loop.probe.count("base_wrench")
     loop.place = np.array([0.5, 0.0, 0.0])
     loop.show()

@@ -325,7 +325,8 @@ class PlantNode(FlightNode):
         pace = "in lockstep"
         if self._real_time is not None:
             pace = f"in real time times {config.real_time_factor:g}"
-        carried = _CARRIED["auto" if self._undecided else config.decided().actuation]
+        actuation = "effort" if self.plant.takes_wrench else "velocity"
+        carried = _CARRIED["auto" if self._undecided else actuation]
         return (
             f"Simulates {described_robot(self.plant.robot)} at {config.tick_rate:g} Hz {pace}; "
             f"commands carry {carried}."

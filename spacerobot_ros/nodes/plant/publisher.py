@@ -180,6 +180,8 @@ class PlantReport:
     def _command_status(self, *, refused: bool) -> DiagnosticStatus:
         commands = self._commands
         level, message = _WARN if refused else _OK, "commands arrive"
+        if not commands.in_force:
+            message = "no command is in force"
         if commands.fault:
             level = _ERROR
             message = f"Nothing moves until '~/rearm' is called: {commands.fault}."
