@@ -13,7 +13,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from sensor_msgs.msg import JointState
 
-from spacerobot_ros.bag import RecordingState
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import PlanningError, RecordingError
 from spacerobot_ros.events import EventKind
@@ -372,76 +371,6 @@ def test_a_recorder_takes_its_own_stack(
         get_namespace=lambda: "/left/",
     )  # fmt: skip
     assert RecorderNode._is_chosen(node, topic, type_name) is recorded
-
-
-@pytest.mark.parametrize(
-    ("topic", "namespace", "record"),
-    [
-        ("/plant/odom", "/", "parameters/plant/plant"),
-        ("/odom", "/", "parameters/plant"),
-        ("/left/planner/status", "/left", "parameters/planner"),
-        ("/left/controller/status", "/", "parameters/left/coordinated_control"),
-        ("/podom", "/", None),
-        ("/momentum", "/", None),
-    ],
-)
-def test_the_publisher_of_a_topic_is_asked_for_its_parameters_once(
-    monkeypatch: pytest.MonkeyPatch, topic: str, namespace: str, record: str | None
-) -> None:
-    monkeypatch.setattr(recorder, "RemoteParameters", lambda node, name: f"asked {name}")
-    owner = SimpleNamespace(node_namespace="/of/", node_name="owner")
-    watched = SimpleNamespace(get_fully_qualified_name=lambda: "/of/other")
-    node: Any = SimpleNamespace(
-        get_namespace=lambda: namespace, _parameter_requests={"there": None},
-        _taps=SimpleNamespace(nodes=[watched]),
-    )  # fmt: skip
-    RecorderNode._request_parameters(node, topic, [owner, None])
-    wanted = {} if record is None else {record: "asked /of/owner"}
-    assert node._parameter_requests == {"there": None, **wanted}
-    if record is not None:
-        node._parameter_requests[record] = None
-        RecorderNode._request_parameters(node, topic, [owner])
-        assert node._parameter_requests[record] is None
-        del node._parameter_requests[record]
-        watched.get_fully_qualified_name = lambda: "/of/owner"
-        RecorderNode._request_parameters(node, topic, [owner])
-        assert record not in node._parameter_requests
-
-
-def test_a_closed_recording_subscribes_nothing_and_answers_are_described() -> None:
-    described: list[Any] = []
-    recording = SimpleNamespace(
-        state=RecordingState.CLOSED, describe=lambda *given: described.append(given)
-    )
-    over = {"a": False, "b": True, "c": True}
-    values = {"a": None, "b": {"rate": "2"}, "c": None}
-    questions: dict[str, Any] = {
-        name: SimpleNamespace(look=lambda name=name: over[name], values=values[name])
-        for name in over
-    }
-    recorded: list[Any] = []
-    node: Any = SimpleNamespace(
-        recording=recording,
-        _taps=SimpleNamespace(release_incomplete=lambda count: ["/x", "/clock"]),
-        count_publishers=None,
-        _recorded={"/x", "/y"},
-        _unreadable_topics={"/z"},
-        _follow_clock=lambda recording: recorded.append("clock"),
-        get_topic_names_and_types=lambda: [
-            ("/x", ["X", "other"]), ("/y", ["Y"]), ("/z", ["Z"]), ("/w", ["W"]), ("/v", ["V"]),
-        ],
-        _is_chosen=lambda topic, kind: topic != "/v",
-        _record=lambda recording, topic, kind: recorded.append((topic, kind)),
-        _parameter_requests={**questions, "d": None},
-    )  # fmt: skip
-    RecorderNode.scan(node)
-    assert not recorded
-    recording.state = RecordingState.WAITING
-    RecorderNode.scan(node)
-    assert recorded == ["clock", ("/x", "X"), ("/w", "W")]
-    assert described == [("b", {"rate": "2"})]
-    left = {name for name, each in node._parameter_requests.items() if each is not None}
-    assert left == {"a"}
 
 
 # -- watchdog -----------------------------------------------------------------------------------

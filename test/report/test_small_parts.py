@@ -392,7 +392,7 @@ def test_a_sample_counts_by_its_distance_from_the_line_in_time() -> None:
     assert _farthest_sample(motion, 0, 2) == (-3.0, 0, 2, 1)
     assert _farthest_sample(motion, 0, 1) == (0.0, 0, 1, 0)
     still = Signal(np.zeros(3), motion.values)
-    assert _farthest_sample(still, 0, 2) == (-10.0, 0, 2, 2)
+    assert _farthest_sample(still, 0, 2) == (-3.0, 0, 2, 1)
 
 
 @pytest.mark.parametrize(
