@@ -93,6 +93,10 @@ class Terminals:
                     start_new_session=True,
                 )
             return
+        self.output(command)
+
+    def output(self, command: str) -> str:
+        """Return what a command prints that ends well by itself."""
         done = subprocess.run(
             ["bash", "-e", "-c", command],
             cwd=self.folder,
@@ -103,6 +107,7 @@ class Terminals:
             check=False,
         )
         assert done.returncode == 0, (command, done.stdout, done.stderr, self.said)
+        return done.stdout
 
     def wait(self, predicate: Callable[[], Any], what: str) -> None:
         """Wait for something that a probe hears."""
@@ -125,8 +130,10 @@ class Terminals:
 
     def interrupt(self) -> dict[str, int]:
         """Press Ctrl-C in every terminal, and return the exit codes by command."""
-        for process in self.staying.values():
-            os.killpg(process.pid, signal.SIGINT)
+        for command, process in self.staying.items():
+            # Without a terminal launch passes the signal on: nodes would have two.
+            alone = command.startswith("ros2 launch")
+            (os.kill if alone else os.killpg)(process.pid, signal.SIGINT)
         codes = {name: process.wait(LONGEST) for name, process in self.staying.items()}
         self.staying.clear()
         return codes
@@ -244,6 +251,7 @@ def test_parameters_are_set_between_two_lives(
     probe.watch("joint_states", JointState)
     terminals.wait(lambda: probe.count("joint_states") > 0, "states")
     assert len(probe.last("joint_states").name) == 3
+    terminals.wait(lambda: "/plant" in terminals.output("ros2 node list"), "discovery by ros2")
     terminals.do("ros2 param dump /plant")
     for line in commands("docs/operation.md", "ros2 lifecycle set", "ros2 param set"):
         terminals.do(line)
