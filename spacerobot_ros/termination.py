@@ -42,7 +42,7 @@ _LONGEST_NOTICE_TIME = 5.0
 _TIME_AFTER_PARENT_END = 1.7
 """Wall time within which a process must end after its parent has ended, s."""
 
-_SAME_SIGNAL_TIME = 0.5
+_SAME_SIGNAL_TIME = 1.0
 """Wall time between signals that count as one, s: launcher and terminal both send a signal."""
 
 _KILL_WAIT = 0.3

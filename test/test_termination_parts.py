@@ -116,9 +116,9 @@ INT, TERM = int(signal.SIGINT), int(signal.SIGTERM)
         # The main thread has 1.2 s to end.
         ([(1.0, [TERM]), (1.125, None)], [None, 1200, 75], False),
         ([(1.0, [TERM]), (1.25, None)], [None, 1200], True),
-        # Signals within half a second are one; then another ends it at once, also in one reading.
+        # Signals within a second are one; then another ends it at once, also in one reading.
         ([(1.0, [INT, TERM]), (0.5, [INT])], [None, 1200, 700], False),
-        ([(1.0, [INT]), (0.25, [TERM]), (0.375, [TERM])], [None, 1200, 950], True),
+        ([(1.0, [INT]), (0.25, [TERM]), (0.875, [TERM])], [None, 1200, 950], True),
         # The end of the parent gives 1.7 s; the signal of the kernel says the same again.
         ([(1.0, "pipe"), (1.5, None)], [None, 1700, 200], False),
         ([(1.0, "pipe"), (1.75, None)], [None, 1700], True),
