@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
+from itertools import permutations
 from typing import Any
 
 import pytest
@@ -50,6 +51,20 @@ def begin(apart: NodesApart, commander: str) -> None:
     apart.start("plant", robot=ROBOTS[commander])
     apart.start(commander)
     apart.start("recorder")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("commander", ROBOTS)
+def test_nodes_start_in_any_order_without_a_warning(apart: NodesApart, commander: str) -> None:
+    for order in permutations(("plant", commander, "recorder")):
+        for node in order:
+            given = {"robot": ROBOTS[commander]} if node == "plant" else {}
+            apart.start(node, **given)
+        apart.wait_state(commander, *AT_REST[commander])
+        apart.wait_state("plant", "running")
+        apart.wait_states(40)
+        apart.end()
+        assert apart.complaints == [], (order, apart.said)
 
 
 @pytest.mark.parametrize(("commander", "killed", "phase"), some_fast(KILLS, *QUICK_KILLS))

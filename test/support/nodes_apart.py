@@ -225,6 +225,11 @@ class NodesApart:
         self.wait(lambda: self.status(node).get("state") in states, f"{node} is {states}", timeout)
         return self.status(node)
 
+    def wait_states(self, count: int) -> None:
+        """Wait for so many states of the plant from now on."""
+        seen = self.probe.count("odom")
+        self.wait(lambda: self.probe.count("odom") >= seen + count, f"{count} states")
+
     def diagnosed(self, name: str) -> dict[str, str]:
         """Return the values of the last diagnosis of a name, with its message."""
         for array in reversed(self.probe.messages["/diagnostics"]):
