@@ -51,6 +51,9 @@ _EQUAL_STEPS, _MEASURED_STEPS = 2, 8
 _STEADY = 1.2
 """Largest ratio of two steps of a steady rate: states that a busy node skips make longer ones."""
 
+_LATEST_POSE = 0.5
+"""Time behind the states up to which a pose without joints is late, s."""
+
 _STEP_ROUNDING_NS = 1_000
 """Largest difference between equal steps, from stamps that were computed as floating point, ns."""
 
@@ -232,6 +235,8 @@ class StampFilter:
             if given.message is None or given.stamp_ns == self.now_ns:
                 continue
             ahead = (given.stamp_ns - self.now_ns) / SECOND
+            if name == "odom" and -_LATEST_POSE < ahead < 0:
+                continue  # It is late, as while this process stood still, and of no other time.
             self.ignored += 1
             self.last_ignored = (
                 f"A message on '{name}' is ignored: its stamp is {abs(ahead):.4g} s "
