@@ -42,6 +42,9 @@ _STEP_SLACK = 1.5
 _PACE_SLACK = 2.0
 """Largest ratio of the time of lost states to the time expected from the plant's pace."""
 
+_MEETING_TIME = 1.0
+"""Wall time from the first state in which poses may come before or long after their joints, s."""
+
 _MIN_CHECKS = 2
 """Number of checks without a state of the old time before a time jump is accepted."""
 
@@ -50,9 +53,6 @@ _EQUAL_STEPS, _MEASURED_STEPS = 2, 8
 
 _STEADY = 1.2
 """Largest ratio of two steps of a steady rate: states that a busy node skips make longer ones."""
-
-_LATEST_POSE = 0.5
-"""Time behind the states up to which a pose without joints is late, s."""
 
 _STEP_ROUNDING_NS = 1_000
 """Largest difference between equal steps, from stamps that were computed as floating point, ns."""
@@ -229,14 +229,17 @@ class StampFilter:
             self._pending_jump = _PendingJump(self._clock(), joints)
 
     def _ignore_jump(self) -> None:
-        """Count the set-aside messages as ignored: the old time goes on."""
+        """Count the set-aside messages as ignored: the old time goes on.
+
+        While nodes meet, they receive one topic earlier than the other: such poses do not count.
+        """
         joints = _NO_MESSAGE if self._pending_jump is None else self._pending_jump.joints
-        for name, given in (("joint_states", joints), ("odom", self._jump_odom)):
+        meeting = self._clock() - self._origin_wall < _MEETING_TIME
+        odom = _NO_MESSAGE if meeting else self._jump_odom
+        for name, given in (("joint_states", joints), ("odom", odom)):
             if given.message is None or given.stamp_ns == self.now_ns:
                 continue
             ahead = (given.stamp_ns - self.now_ns) / SECOND
-            if name == "odom" and -_LATEST_POSE < ahead < 0:
-                continue  # It is late, as while this process stood still, and of no other time.
             self.ignored += 1
             self.last_ignored = (
                 f"A message on '{name}' is ignored: its stamp is {abs(ahead):.4g} s "

@@ -274,6 +274,7 @@ def test_a_jump_is_not_believed_at_the_first_look_after_a_standstill() -> None:
 
 def test_ignored_messages_are_named_with_their_distance_in_time() -> None:
     exact = Exact()
+    exact.wall += 1.0  # The nodes have met.
     for part, ahead, words in (
         ("joint_states", 8.125, "8.125 s ahead of"),
         ("joint_states", -0.5, "0.5 s behind"),
@@ -288,3 +289,23 @@ def test_ignored_messages_are_named_with_their_distance_in_time() -> None:
         assert exact.times.last_ignored == (
             f"A message on '{part}' is ignored: its stamp is {words} the time of the states."
         )
+
+
+@pytest.mark.parametrize(("wall", "counted"), [(0.9375, 0), (1.0, 1)])
+@pytest.mark.parametrize("ahead", [-0.375, 0.25])
+def test_poses_of_other_times_do_not_count_while_nodes_meet(
+    ahead: float, wall: float, counted: int
+) -> None:
+    clock = [50.0]
+    times = StampFilter(clock=lambda: clock[0])
+    stamp = 8 * SECOND
+    assert times.accepts_joints(stamp, "joints")
+    stamp += SECOND // 16
+    clock[0] += 1 / 16
+    assert times.accepts_joints(stamp, "joints")
+    clock[0] = 50.0 + wall
+    # As far ahead of the states as the pace of the plant does not explain.
+    pose = stamp + round((ahead if ahead < 0 else 2 * wall + ahead) * SECOND)
+    assert not times.accepts_odom(pose, "odom")
+    assert times.accepts_joints(stamp, "joints")
+    assert times.ignored == counted
