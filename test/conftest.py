@@ -23,6 +23,7 @@ from support.warm_python import WarmPython
 
 if TYPE_CHECKING:
     import rclpy
+    from support.ros_harness import Harness
 
 _WORKER = "PYTEST_XDIST_WORKER" in os.environ
 """Workers inherit what their controller has set."""
@@ -160,6 +161,16 @@ def ros_context(ros_domain: int) -> Iterator[rclpy.Context]:
     rclpy.init(args=[], context=context, domain_id=ros_domain)
     yield context
     rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture
+def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
+    """Return an empty executor in a ROS domain of this test's own."""
+    from support.ros_harness import Harness
+
+    harness = Harness(ros_context)
+    yield harness
+    harness.close()
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
@@ -148,13 +147,6 @@ def terminals(harness: Harness, tmp_path: Path, ros_domain: int) -> Iterator[Ter
     opened = Terminals(harness, tmp_path, ros_domain)
     yield opened
     opened.close()
-
-
-@pytest.fixture
-def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
-    harness = Harness(ros_context)
-    yield harness
-    harness.close()
 
 
 @pytest.fixture

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import rclpy
 from support.planner_flight import TURNED, Flight
 from support.ros_harness import Harness
 from support.walks import PACKAGE, Walk, chain
@@ -16,13 +14,6 @@ from spacerobot_ros.resources import robot_file
 GOAL_TO_COMMAND = "From a goal pose to a command"
 SCENARIO_TO_BAG = "From a scenario to a bag"
 URDF_TO_FUNCTION = "From a URDF to a compiled function"
-
-
-@pytest.fixture
-def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
-    harness = Harness(ros_context)
-    yield harness
-    harness.close()
 
 
 def test_from_a_goal_pose_to_a_command(harness: Harness) -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from rclpy.parameter import Parameter as RosParameter
 from support.control_loop import Loop, pose
 from support.planner_flight import HERE, NEAR, Flight
@@ -18,13 +16,6 @@ from spacerobot_ros.nodes.common.node import FlightNode
 from spacerobot_ros.parameters import Parameter, declared
 
 NUMBERS = (0.0, 1e-300, 1e300, -1.0, math.nan, math.inf, -math.inf)
-
-
-@pytest.fixture
-def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
-    harness = Harness(ros_context)
-    yield harness
-    harness.close()
 
 
 def attempts(parameter: Parameter) -> list[Any]:

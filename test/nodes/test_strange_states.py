@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import array
 import copy
-from collections.abc import Iterator
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry, Path
@@ -29,13 +27,6 @@ from spacerobot_ros.times import LATEST_NS, first_time_ns, set_stamp, stamp_byte
 
 LAST = 2**31 - 1
 SECOND = 1_000_000_000
-
-
-@pytest.fixture
-def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
-    harness = Harness(ros_context)
-    yield harness
-    harness.close()
 
 
 def joints(names: list[str], stamp: tuple[int, int] = (1, 0), value: float = 0.5) -> JointState:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
@@ -27,13 +25,6 @@ NOW = 12_000_000_345
 GOAL = Goal.checked([1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0])
 TOPICS = {"goal_pose": PoseStamped, "end_effector/goal_pose": PoseStamped}
 STATUS = {"planner": "planner/status", "coordinated_control": "controller/status"}
-
-
-@pytest.fixture
-def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
-    harness = Harness(ros_context)
-    yield harness
-    harness.close()
 
 
 class Mission:

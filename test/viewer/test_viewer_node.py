@@ -5,13 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 import viser
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
@@ -40,13 +38,6 @@ URDF = load_robot(robot_file("sliding_masses")).urdf
 GOAL = Goal.checked([1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
 HERE = Measured(0.0, np.eye(7)[6], *np.zeros((3, 3)))
 ARM = load_robot(robot_file("three_joint_arm"))
-
-
-@pytest.fixture
-def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
-    harness = Harness(ros_context)
-    yield harness
-    harness.close()
 
 
 class Stack:

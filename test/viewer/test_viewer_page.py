@@ -37,13 +37,6 @@ POSITION, ANGLES = "Goal (m)", "Roll, pitch, yaw (deg)"
 
 
 @pytest.fixture
-def harness(ros_context: object) -> Iterator[Harness]:
-    harness = Harness(ros_context)
-    yield harness
-    harness.close()
-
-
-@pytest.fixture
 def nodes(tmp_path: Path, ros_domain: int) -> Iterator[Processes]:
     with processes(tmp_path, ros_domain) as started:
         yield started
