@@ -603,10 +603,10 @@ class Commander(ABC):
             unheard = [topic for topic in absent if waited and not self.host.has_publisher(topic)]
             nobody = f", and no node publishes {_quoted(unheard)}" if unheard else ""
             return f"states on {_quoted(absent)}{refused}{nobody}"
-        if self.plant.inactive:
-            return "the plant, which is inactive: activate it"
         silence = self._clock() - self._heard
         longest = max(_LONGEST_SILENCE, _SILENT_PERIODS * self.config.control_period)
+        if silence > longest and self.plant.inactive:
+            return "the plant, which is inactive: activate it"
         if silence > longest and not (self.plant.paused or self.plant.in_lockstep):
             ceased = "" if refused else ", which have ceased"
             return f"states on 'joint_states'{refused}{ceased}"
