@@ -85,6 +85,11 @@ class StallMonitor:
             return
         if not self._largest:
             self._begin(time, controller, config)
+        elif not self._at_rest and controller.reference_at_rest(time):
+            # Errors of a reference at rest are compared only with each other: those before
+            # say how fast it moved.
+            self._largest = []
+            self._begin(time, controller, config)
         self._next_sample = time + self._window / _SAMPLES
         errors = controller.errors()
         self._largest[0] = max(self._largest[0], _largest_share(errors, config))

@@ -47,10 +47,12 @@ def flown(
     base: np.ndarray[Any, Any] = BASE,
     turn: np.ndarray[Any, Any] = TURN,
     hand: np.ndarray[Any, Any] | None = None,
+    shape: list[float] | None = None,
     **settings: Any,
 ) -> Flight:
     """Fly the base to a pose, and the hand to where it is carried, away by ``hand``."""
-    file, shape = folder / "flight.yaml", SHAPES[robot]
+    file = folder / "flight.yaml"
+    shape = SHAPES[robot] if shape is None else shape
     if robot == "cube":
         (folder / "cube.urdf").write_text(CUBE, "utf-8")
         robot = str(folder / "cube.urdf")
@@ -107,6 +109,14 @@ def test_goals_are_reached_by_default(tmp_path: Path, robot: str, rate: float) -
     assert all(each.state.level == 0 for _, each in statuses(flight))
     for given in flight.commands.values():
         assert turns_of_sign(given.values) <= 4, "it does not chatter"
+
+
+def test_a_way_that_ends_early_is_no_stall(tmp_path: Path) -> None:
+    """The reference rests after 6 s; the errors that it leaves behind fall to nothing."""
+    base, turn = np.array([0.1, 0.05, 0.0]), np.array([0.0, 0.0, 0.1])
+    flight = flown(tmp_path, "planar_chain", 100.0, base=base, turn=turn, shape=[])
+    assert flight.outcome is Outcome.REACHED, flight.message
+    assert not [each for _, each in statuses(flight) if each.state is ControllerState.STALLED]
 
 
 # -- robots that come no nearer ---------------------------------------------------------------
