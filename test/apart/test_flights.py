@@ -41,6 +41,14 @@ FLIGHTS = [
     *(("planner", robot) for robot in PLANNED),
     *(("coordinated_control", robot) for robot in CONTROLLED),
 ]
+FURTHER: dict[str, Place] = dict.fromkeys(
+    ("free_flyer", "dual_arm", "seven_joint_arm", "planar_chain", "tender"),
+    ([0.1, 0.05, 0.0], [0.0, 0.0, 0.1]),
+)
+"""Robots that are flown by coordinated control to a goal on the topic alone."""
+
+CONTROLLED |= FURTHER
+TOPIC_FLIGHTS = [*FLIGHTS, *(("coordinated_control", robot) for robot in FURTHER)]
 QUICK = [("planner", "sliding_masses"), ("coordinated_control", "planar_manipulator")]
 
 
@@ -79,7 +87,7 @@ def check_record(apart: NodesApart, python: WarmPython) -> None:
     apart.wait(lambda: apart.probe.count("odom") > heard + 10, "the bag's states have come again")
 
 
-@pytest.mark.parametrize(("node", "robot"), some_fast(FLIGHTS, *QUICK))
+@pytest.mark.parametrize(("node", "robot"), some_fast(TOPIC_FLIGHTS, *QUICK))
 def test_a_goal_on_the_topic_is_reached(
     apart: NodesApart, warm_python: WarmPython, node: str, robot: str
 ) -> None:
