@@ -92,6 +92,10 @@ class WheelAllocation:
     """
 
     def __init__(self, axes: Array, torque: Array) -> None:
+        # Few robots have wheels, and it loads slowly: in flight, commands would stop meanwhile.
+        from scipy.optimize import lsq_linear
+
+        self._solve = lsq_linear
         self._scaled, self._torque = axes * torque, torque
         self._inverse = np.linalg.pinv(self._scaled)
         largest = max(float(torque.max(initial=0.0)), _MIN_BOUND_WIDTH)
@@ -105,14 +109,12 @@ class WheelAllocation:
         tau = self._torque * (self._inverse @ torque)
         if np.all((lower <= tau) & (tau <= upper)):
             return np.asarray(tau)
-        from scipy.optimize import lsq_linear  # Slow to import, and rarely needed.
-
         wanted = np.concatenate([torque / self._size, np.zeros(len(lower))])
         bounds = (
             (lower - _MIN_BOUND_WIDTH) / self._torque,
             (upper + _MIN_BOUND_WIDTH) / self._torque,
         )
-        shares = lsq_linear(self._extended, wanted, bounds, method="bvls", tol=1e-14).x
+        shares = self._solve(self._extended, wanted, bounds, method="bvls", tol=1e-14).x
         return np.clip(self._torque * shares, lower, upper)
 
     def within(self, limits: Array) -> float:

@@ -152,7 +152,10 @@ class PlantNode(FlightNode):
         self._under_efforts: PlantWithFaults | None = None
         """The plant as efforts move it from its initial state, as long as it may be needed."""
         if self._undecided:
-            self._under_efforts = build_plant(robot, config.decided("effort"))
+            under_efforts = config.decided("effort")
+            self._under_efforts = build_plant(robot, under_efforts)
+            # Derive the law of its brakes now: between two ticks, the plant would be late.
+            CommandValidator(self._under_efforts, under_efforts)
         last = self._last_state(robot)
         self._tick = 0 if last is None else round(last.time_ns / self._period_ns)
         self._use_plant(
