@@ -71,7 +71,6 @@ setup(
         NAME: [
             "py.typed",
             "batch/*.hpp",
-            "collision/*.c",
             "model/*.c",
             "report/*.css",
             "report/*.js",

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.crossing import RADII, URDF
 
 from spacerobot_ros.collision import BasePoses, CollisionGeometry, ObstaclePair, PathCheck
-from spacerobot_ros.collision.rows import DistanceRows, world_pose_parameters
+from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.model import SpaceRobot, parse_robot
@@ -100,36 +100,11 @@ def test_the_nearest_approach_is_between_the_ticks(geometry: CollisionGeometry, 
     assert pair not in [each.pair for each in none]
 
 
-def test_rows_follow_the_turn_of_the_base(geometry: CollisionGeometry) -> None:
-    robot = SpaceRobot(geometry.robot)
-    center_of_mass = robot.function("center_of_mass", compile=False)
-    rows = DistanceRows.from_obstacles(geometry, pair_of(geometry, "left"), center_of_mass)
-    shapes, base = moving(7)
-    start = Rotation.from_quat(base.quaternion[0])
-    r_WC = base.position[0] + start.apply(robot.center_of_mass(shapes[0]))
-    w = world_pose_parameters(start.inv().as_matrix(), -start.inv().apply(r_WC))
-    rng = np.random.default_rng(3)
-    for q, x in zip(shapes, rng.normal(size=(7, 4)), strict=True):
-        R_WB = start * Rotation.from_quat(x)
-        r_WB = r_WC - R_WB.apply(robot.center_of_mass(q))
-        at = BasePoses(r_WB[np.newaxis], R_WB.as_quat()[np.newaxis])
-        expected = left_ball_to_rock(q[np.newaxis], at)[0]
-        y = np.concatenate([q, x])
-        assert float(rows.values(y, w)) == pytest.approx(expected, abs=1e-6)
-        steps = 1e-6 * np.eye(6)
-        slope = [
-            (float(rows.values(y + e, w)) - float(rows.values(y - e, w))) / 2e-6 for e in steps
-        ]
-        assert rows.jacobian(y, w).full()[0] == pytest.approx(slope, abs=1e-6)
-        bend = [(rows.jacobian(y + e, w) - rows.jacobian(y - e, w)).full()[0] / 2e-6 for e in steps]
-        assert rows.hessian(y, w, 2.0).full() == pytest.approx(2 * np.array(bend), abs=1e-5)
-
-
 def test_planes_follow_the_turn_of_the_base(geometry: CollisionGeometry) -> None:
     robot = SpaceRobot(geometry.robot)
     center_of_mass = robot.function("center_of_mass", compile=False)
     pair = pair_of(geometry, "left")
-    row = DistanceRows.of_planes(geometry, pair, center_of_mass)
+    row = PlaneDistance.of(geometry, pair, center_of_mass)
     shapes, base = moving(7)
     start = Rotation.from_quat(base.quaternion[0])
     r_WC = base.position[0] + start.apply(robot.center_of_mass(shapes[0]))

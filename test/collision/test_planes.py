@@ -8,7 +8,7 @@ from support.slow import some_fast
 
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.collision.distances import EnclosureDistances
-from spacerobot_ros.collision.rows import DistanceRows
+from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import robot_file
@@ -26,9 +26,9 @@ def shapes(geometry: CollisionGeometry, count: int) -> Array:
     return np.random.default_rng(11).uniform(low, high, (count, len(low)))
 
 
-def rows_of(geometry: CollisionGeometry, pair: int) -> DistanceRows:
+def rows_of(geometry: CollisionGeometry, pair: int) -> PlaneDistance:
     center_of_mass = SpaceRobot(geometry.robot).function("center_of_mass", compile=False)
-    return DistanceRows.of_planes(geometry, pair, center_of_mass)
+    return PlaneDistance.of(geometry, pair, center_of_mass)
 
 
 def some_pairs(geometry: CollisionGeometry) -> list[int]:

@@ -157,19 +157,25 @@ class EffortLimitedShooting(MultipleShooting):
         stop: StopRule,
         duration: DurationBounds,
         near: Neighbourhood | None = None,
+        *,
+        refining: bool = False,
     ) -> Trajectory | None:
         """Solve as :class:`MultipleShooting` does, with joint efforts within limits."""
         # A guess whose efforts just reach their limits was made for these limits.
         peak = self._efforts.peak(guess, boundary)
         if not _AT_LIMITS_FROM <= peak <= 1 + _AT_LIMITS_BEYOND:
-            solution = super().solve(boundary, limits, guess, stop, duration, near)
+            solution = super().solve(
+                boundary, limits, guess, stop, duration, near, refining=refining
+            )
             if solution is None or self._efforts.peak(solution, boundary) <= 1:
                 return solution
             guess = solution if duration.fixed else self._efforts.slowed(solution, boundary)
         if self._limited is None:
             stages = self._stages((self._efforts.inequality(drifting=self._with_drift),))
             self._limited = MultipleShooting(stages, self.intervals, self._tolerance)
-        solution = self._limited.solve(boundary, limits, guess, stop, duration, near)
+        solution = self._limited.solve(
+            boundary, limits, guess, stop, duration, near, refining=refining
+        )
         self.iterations, self.converged = self._limited.iterations, self._limited.converged
         self.lack = self._limited.lack
         return solution

@@ -2,18 +2,11 @@
 without has brought near.
 
 Rows for all pairs would be dear, and few of them matter. So a problem is solved without any first.
-Where held commands bring links too near, by the exact check, the problem with rows for these pairs
-is solved from there, and so on until none is too near. Rows are of two kinds
-(:mod:`spacerobot_ros.collision.rows`).
-
-Smooth rows are near to the distances but are no bounds of them: a pair that is still too near is
-given as much more room as it lacked. They lead far round in one solution, but are dear where many
-pairs are near, and fail from some paths.
-
-Distances from planes (:class:`KeptByPlanes`, :class:`PathClearing`) hold near the path that they
-are made for alone. So a clear path is looked for in small changes, in more time and with little
-effort; links may be nearer than they ought to be at first, at a cost. A clear path is then made
-faster in the same way, by changes that keep it clear.
+Where held commands bring links too near, by the exact check, the pairs get rows: their distances
+from planes between them (:mod:`spacerobot_ros.collision.planes`), which hold near the path that
+they are made for alone. So a clear path is looked for in small changes, in more time and with
+little effort; links may be nearer than they ought to be at first, at a cost. A clear path is then
+made faster in the same way, by changes that keep it clear.
 
 J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
 checking", International Journal of Robotics Research 33, 2014, whose steps are quadratic programs;
@@ -25,19 +18,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from spacerobot_ros.collision import Approach, BasePoses
 from spacerobot_ros.collision.geometry import Poses
-from spacerobot_ros.collision.rows import (
-    PLANE_SIZE,
-    CompiledRows,
-    DistanceRows,
-    world_pose_parameters,
-)
+from spacerobot_ros.collision.planes import PLANE_SIZE, PlaneDistance
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
@@ -51,20 +38,10 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     UnusableCandidateError,
 )
 
-ROUNDS = 6
-"""Solutions from one guess, each with more pairs or more room, before it is given up."""
-
 _INITIAL_MARGIN = 2e-3
 """Room beyond the clearance that a pair is given: held commands change the path, m."""
 
 _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
-
-_MAX_ACTIVE_DISTANCE = 0.05
-"""Distance beyond the clearance at which the rows of a pair are no longer compared with it, m."""
-
-_END_MARGIN = 1e-4
-"""Smallest margin at the ends, where the shape is given, m."""
-
 
 _MIN_INSTANTS = 80
 """Instants of a manoeuvre at which links are kept apart on a grid at least: between the knots of a
@@ -87,7 +64,7 @@ _PROGRESS_SHARE = 0.9
 """Largest ratio of the lack of distance to the one two paths before at which it is going on."""
 
 _MIN_GAIN = 0.01
-"""Relative gain of time below which a clear path is not made faster any more."""
+"""Relative gain of time below which a clear path is not made faster any more, at the full reach."""
 
 _REACH_DIVISOR, _REACH_FACTOR, _MIN_REACH_SHARE = 3.0, 2.0, 0.02
 """Divisor of the reach where a faster path is not clear, its factor where it is, and the share of
@@ -97,9 +74,6 @@ the largest reach at which paths are not made faster any more."""
 def instants_of(intervals: int) -> int:
     """Return at how many instants of each interval pairs are kept apart."""
     return max(2, math.ceil(_MIN_INSTANTS / intervals))
-
-
-K = TypeVar("K", bound="KeptDistances")
 
 
 class DistanceLibrary:
@@ -116,27 +90,15 @@ class DistanceLibrary:
     def __init__(self, clearance: Clearance, robot: SpaceRobot, prediction: BasePrediction) -> None:
         self.clearance = clearance
         self._robot, self._prediction = robot, prediction
-        self._rows: dict[tuple[int, bool], DistanceRows] = {}
+        self._rows: dict[int, PlaneDistance] = {}
 
-    def of(self, pairs: Sequence[int], *, planes: bool = False) -> list[DistanceRows]:
-        """Return the smooth rows of pairs, or their distances from planes."""
-        for pair in pairs:
-            if (pair, planes) not in self._rows:
-                self._rows[pair, planes] = self._derive(pair, planes=planes)
-        return [self._rows[pair, planes] for pair in pairs]
-
-    @cached_property
-    def _compiled(self) -> CompiledRows | None:
-        return CompiledRows.of(self.clearance.geometry)
-
-    def _derive(self, pair: int, *, planes: bool) -> DistanceRows:
-        geometry = self.clearance.geometry
-        if not planes and not geometry.with_obstacles[pair]:
-            compiled = self._compiled
-            return compiled.rows(pair) if compiled else DistanceRows.of(geometry, [pair])
+    def of(self, pairs: Sequence[int]) -> list[PlaneDistance]:
+        """Return the distances of pairs from planes."""
         center_of_mass = self._robot.function("center_of_mass", compile=False)
-        derive = DistanceRows.of_planes if planes else DistanceRows.from_obstacles
-        return derive(geometry, pair, center_of_mass)
+        for pair in pairs:
+            if pair not in self._rows:
+                self._rows[pair] = PlaneDistance.of(self.clearance.geometry, pair, center_of_mass)
+        return [self._rows[pair] for pair in pairs]
 
     def begin(self, boundary: BoundaryConditions, *, turn_is_known: bool) -> KeptDistances:
         """Return the pairs that are kept apart between two ends: none yet.
@@ -158,7 +120,7 @@ class DistanceLibrary:
                 end, turn = boundary.final[np.newaxis], boundary.goal_rotation[np.newaxis]
                 base = self.base_poses(boundary, end, turn)
             self.clearance.require_shape(boundary.final, required, base)
-        return KeptDistances(self, boundary, required, turn_is_known=turn_is_known)
+        return KeptDistances(self, boundary, required)
 
     def base_poses(
         self, boundary: BoundaryConditions, shapes: Array, turns: Array
@@ -172,29 +134,23 @@ class DistanceLibrary:
         attitudes = quaternion_multiply(boundary.state.quaternion, turns)
         return self._prediction.poses(boundary.state, shapes, attitudes)
 
-    def world(self, boundary: BoundaryConditions) -> Array:
-        """Return the numbers (12,) of the pose of the world (:func:`.world_pose_parameters`)."""
-        state = boundary.state
-        assert state is not None
-        R_0W = matrix_from_quaternion(state.quaternion).T
-        r_WC = state.position + R_0W.T @ self._robot.center_of_mass(state.q)
-        return world_pose_parameters(R_0W, -R_0W @ r_WC)
-
     def planes(self, boundary: BoundaryConditions, pair: int, poses: Poses) -> tuple[Array, Array]:
         """Return the distances (K,) of a pair, m, and its planes (K, 7) as rows take them."""
         geometry = self.clearance.geometry
         distances, planes = geometry.planes(pair, poses)
         if geometry.with_obstacles[pair]:
             # From W to the centre of mass with the attitude of the base at the start.
-            world = self.world(boundary)
-            R_0W, r_0W = world[:9].reshape(3, 3).T, world[9:]
-            planes[:, :3] = planes[:, :3] @ R_0W.T
-            planes[:, 3] += planes[:, :3] @ r_0W
+            state = boundary.state
+            assert state is not None
+            R_W0 = matrix_from_quaternion(state.quaternion)
+            r_WC = state.position + R_W0 @ self._robot.center_of_mass(state.q)
+            planes[:, 3] -= planes[:, :3] @ r_WC
+            planes[:, :3] = planes[:, :3] @ R_W0
         return distances, planes
 
 
 class KeptDistances:
-    """The pairs that are kept apart in one search.
+    """The pairs that are kept apart in one search, each by planes along a path.
 
     Parameters
     ----------
@@ -204,24 +160,13 @@ class KeptDistances:
         Both ends.
     required
         (P,) the distances that all pairs are to keep, m.
-    turn_is_known
-        As for :meth:`DistanceLibrary.begin`.
     """
 
     def __init__(
-        self,
-        library: DistanceLibrary,
-        boundary: BoundaryConditions,
-        required: Array,
-        *,
-        turn_is_known: bool,
+        self, library: DistanceLibrary, boundary: BoundaryConditions, required: Array
     ) -> None:
         self._library, self._boundary, self._required = library, boundary, required
-        self._turn_is_known = turn_is_known
         self._room: dict[int, float] = {}
-
-    has_planes = False
-    """Whether rows are distances from planes."""
 
     @property
     def pairs(self) -> tuple[int, ...]:
@@ -240,84 +185,9 @@ class KeptDistances:
         """Return a clause about a path that comes too near; no control period: of no times."""
         return self._library.clearance.clause(approach, control_period)
 
-    def include(self, other: KeptDistances) -> None:
-        """Keep the pairs of another search apart, too, with their margins."""
-        for pair, room in other._room.items():
-            self._room[pair] = max(room, self._room.get(pair, 0.0))
-
-    def copy(self: K) -> K:
-        """Return a copy, to which pairs can be added."""
-        other = type(self)(
-            self._library, self._boundary, self._required, turn_is_known=self._turn_is_known
-        )
-        other._room = dict(self._room)
-        return other
-
-    def add(self, near: Sequence[Approach]) -> None:
-        """Add pairs that have come too near; pairs that are kept already get a larger margin."""
-        for each in near:
-            if each.pair in self._room:
-                lacking = max(self._required[each.pair] - each.distance, 0.0)
-                self._room[each.pair] += lacking + _INITIAL_MARGIN
-            else:
-                self._room[each.pair] = min(self._row_error(each), 0.0) + _INITIAL_MARGIN
-
-    def _row_error(self, approach: Approach) -> float:
-        """Return the row of a pair less its distance, m; zero for an obstacle."""
-        (rows,) = self._library.of([approach.pair])
-        if rows.is_of_obstacle:
-            return 0.0
-        value = float(rows.values(approach.shape[:, np.newaxis]).full().min())
-        return value - approach.distance
-
-    def reduce_margins(self, positions: Array, turns: Array) -> bool:
-        """Set margins to the errors of the rows where pairs are nearest along held
-        commands, (N + 1, n) and (N + 1, 4); return whether any margin decreases.
-        """
-        library, base = self._library, self._library.base_poses(self._boundary, positions, turns)
-        spent = False
-        for each in library.clearance.approaches(
-            positions, self._required + _MAX_ACTIVE_DISTANCE, base
-        ):
-            if each.pair not in self._room:
-                continue
-            if library.clearance.geometry.with_obstacles[each.pair]:
-                continue
-            room = self._row_error(each) + _INITIAL_MARGIN
-            if room < self._room[each.pair] - _INITIAL_MARGIN:
-                self._room[each.pair], spent = room, True
-        return spent
-
-    def by_planes(self) -> KeptByPlanes:
-        """Return no pairs yet that planes keep apart between the same ends."""
-        return KeptByPlanes(
-            self._library, self._boundary, self._required, turn_is_known=self._turn_is_known
-        )
-
-    def within(self, limits: MotionLimits, path: Trajectory | None = None) -> MotionLimits:
-        """Return limits with the distances that the rows keep, wherever a path is."""
-        ends, turns = [self._boundary.start], [_NO_TURN]
-        if self._boundary.final is not None:
-            ends.append(self._boundary.final)
-            turns.append(self._boundary.goal_rotation)
-        known = len(ends) if self._turn_is_known else 1
-        shapes, turned = np.array(ends).T, np.hstack([ends, turns])[:known].T
-        least, world = [], np.zeros(0)
-        for pair, rows in zip(self.pairs, self._library.of(self.pairs), strict=True):
-            if rows.is_of_obstacle:
-                world = self._library.world(self._boundary)
-                values = rows.values(turned, np.tile(world[:, np.newaxis], turned.shape[1]))
-            else:
-                values = rows.values(shapes)
-            at_ends = float(values.full().min()) - _END_MARGIN
-            least.append(min(self._required[pair] + self._room[pair], at_ends))
-        return replace(limits, distances=np.array([[*least, *world]]))
-
-
-class KeptByPlanes(KeptDistances):
-    """Pairs that planes keep apart."""
-
-    has_planes = True
+    def anew(self) -> KeptDistances:
+        """Return no pairs yet between the same ends."""
+        return KeptDistances(self._library, self._boundary, self._required)
 
     def add(self, near: Sequence[Approach]) -> None:
         """Add pairs that have come too near."""
@@ -351,7 +221,7 @@ class KeptByPlanes(KeptDistances):
         )
 
     def within(
-        self, limits: MotionLimits, path: Trajectory | None = None, *, pushing: bool = False
+        self, limits: MotionLimits, path: Trajectory, *, pushing: bool = False
     ) -> MotionLimits:
         """Return limits with planes between all pairs at all instants of N intervals of a path.
 
@@ -359,7 +229,8 @@ class KeptByPlanes(KeptDistances):
         that they have, where there is less room: so a clear path keeps to its own planes.
         ``pushing``: pairs are to have their room, but for the ends, whose shapes are given.
         """
-        assert path is not None
+        if not self.pairs:
+            return limits
         shapes, turns = self.along(path)
         poses = self._library.clearance.geometry.poses(
             shapes, self._library.base_poses(self._boundary, shapes, turns)
@@ -414,7 +285,7 @@ class PathClearing(Generic[H]):
         the path itself is.
     """
 
-    kept: KeptByPlanes
+    kept: KeptDistances
     limits: MotionLimits
     solve: Callable[[Trajectory, float | None, Neighbourhood], tuple[Trajectory, float]]
     control_period: float
@@ -467,7 +338,7 @@ class PathClearing(Generic[H]):
             gain = 1 - faster.duration / path.duration
             if gain > 0:
                 path, held = faster, found
-            if gain < _MIN_GAIN and reach == 1.0:
+            if gain < _MIN_GAIN * reach:
                 break
             reach = min(_REACH_FACTOR * reach, 1.0)
         return path, held

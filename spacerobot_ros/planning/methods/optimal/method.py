@@ -711,7 +711,7 @@ class OptimalGait(GaitMethod):
         ------
         PlanningError
             None was found.
-        CandidateError
+        UnusableCandidateError
             Coasting violates a path constraint.
         """
         h = self.control_period

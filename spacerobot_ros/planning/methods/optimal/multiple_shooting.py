@@ -42,11 +42,16 @@ _IPOPT_OPTIONS = {
     "ipopt.constr_viol_tol": 1e-6,
     # Iterative refinement of steps is off.
     "ipopt.fast_step_computation": "yes",
+    # A diverging solve ends here: beyond it the factors fill in, and a step takes a second.
+    "ipopt.max_hessian_perturbation": 1e6,
 }
 
 
 _WARM_OPTIONS = {"ipopt.mu_init": 3e-3, "ipopt.bound_push": 1e-3, "ipopt.bound_frac": 1e-3}
 """With distances: the guess is a solution without some of them, which is not to be left far."""
+
+_REFINING_OPTIONS = {"ipopt.mu_init": 1e-3}
+"""The guess is a solution on a coarser grid."""
 
 _WARM_STRETCH = 1.5
 """With distances: factor of the time of the guess. At full speed velocities and accelerations are
@@ -193,6 +198,10 @@ class MultipleShooting:
     def _continuing_solver(self) -> ca.Function:
         return self._build_solver(_CONTINUED_OPTIONS)
 
+    @cached_property
+    def _refining_solver(self) -> ca.Function:
+        return self._build_solver(_REFINING_OPTIONS)
+
     def solve(
         self,
         boundary: BoundaryConditions,
@@ -201,6 +210,8 @@ class MultipleShooting:
         stop: StopRule,
         duration: DurationBounds,
         near: Neighbourhood | None = None,
+        *,
+        refining: bool = False,
     ) -> Trajectory | None:
         """Return the fastest trajectory near ``guess``; None if none.
 
@@ -221,6 +232,8 @@ class MultipleShooting:
             Its bounds.
         near
             Where the solution is to be near the guess; None: anywhere.
+        refining
+            Whether the guess is a solution on a coarser grid.
         """
         N, layout = self.intervals, self._program.layout
         vertices = np.array([np.tile(x, (N + 1, 1)) for x in (limits.lower, limits.upper)])
@@ -248,9 +261,10 @@ class MultipleShooting:
         if layout.has_lack:
             most[-1] = lack
         self._monitor.begin(stop)
-        solver = self._solver
+        solver = self._refining_solver if refining and not self._has_distances else self._solver
         begin: Mapping[str, Array | ca.DM]
-        if self._last is not None and guess is self._last.trajectory:
+        begins_at_last = self._last is not None and guess is self._last.trajectory
+        if self._last is not None and begins_at_last:
             solver, begin = self._continuing_solver, self._last.variables
         else:
             slower = self._has_distances and not duration.fixed and not boundary.is_timed
@@ -270,7 +284,7 @@ class MultipleShooting:
         stats = solver.stats()
         self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
         x = result["x"].full().ravel()
-        if not self.converged and solver is not self._solver:
+        if not self.converged and begins_at_last:
             return self.solve(boundary, limits, guess, stop, duration, near)
         if not self.converged:
             # Where the goal drifts away, no time makes up for what each interval violates.
@@ -326,9 +340,7 @@ def _pack_parameters(
             ),
             *(typical, weights if limits.distances.size else weights[:2]),
             boundary.angular_momentum if drifting else np.zeros(0),
-            np.broadcast_to(
-                limits.distances, (len(guess.shapes) - 1, limits.distances.shape[-1])
-            ).ravel(),
+            limits.distances.ravel(),
         ]
     )
 

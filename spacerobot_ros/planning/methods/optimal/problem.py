@@ -248,8 +248,8 @@ class BoundaryConditions:
 @dataclass(frozen=True)
 class MotionLimits:
     """Bounds (n,) of the joints: ``lower`` and ``upper`` in m or rad, ``velocity`` a second,
-    ``acceleration`` a second squared; ``distances`` (N, M), or (1, M) for all, are the parameters
-    of the rows that keep pairs of links apart in N intervals (:meth:`.KeptDistances.within`).
+    ``acceleration`` a second squared; ``distances`` (N, M) are the planes that keep pairs of
+    links apart in N intervals (:meth:`.KeptDistances.within`).
     """
 
     lower: Array
@@ -503,7 +503,7 @@ class PathConstraints:
 
         Raises
         ------
-        CandidateError
+        UnusableCandidateError
             It violates a constraint.
         """
         for box in self.keep_out_boxes:

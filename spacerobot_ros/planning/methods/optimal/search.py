@@ -23,8 +23,7 @@ from functools import partial
 
 import numpy as np
 
-from spacerobot_ros.collision import Approach
-from spacerobot_ros.collision.rows import DistanceRows
+from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.errors import NotFoundError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -41,8 +40,6 @@ from spacerobot_ros.planning.methods.optimal.held_commands import (
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses, move_to_ends
 from spacerobot_ros.planning.methods.optimal.joint_efforts import EffortLimitedShooting
 from spacerobot_ros.planning.methods.optimal.kept_distances import (
-    ROUNDS,
-    KeptByPlanes,
     KeptDistances,
     PathClearing,
     instants_of,
@@ -98,29 +95,12 @@ _MAX_REFINED_COST_RATIO = 1.1
 """Largest ratio of the cost of a coarse solution to the best one at which it is refined, too: the
 coarse grid underestimates some costs by more than others."""
 
-_MAX_SEPARATION_ITERATIONS = 80
-"""Steps of the solver by which a manoeuvre that keeps clear on a coarse grid is refined at most."""
-
-_MAX_CLEARING_ITERATIONS = 200
-"""Steps of the solver from a manoeuvre in collision to one that keeps clear at most: those that
-come to an end take fewer."""
-
-_MAX_ITERATIONS_BY_PLANES = 80
+_MAX_CLEARING_ITERATIONS = 80
 """Steps of the solver between paths that planes are made for at most."""
 
-_GOOD_CLEAR_RATIO = 1.05
-"""Ratio of the duration of a manoeuvre that keeps clear to that of the one in collision up to which
-no faster one is looked for."""
-
-_MAX_CLEAR_STARTS, _MAX_LAST_STARTS, _CLEAR_ANSWERS = 16, 6, 2
-"""Further guesses near which manoeuvres that keep clear are looked for at most; those with smooth
-rows after them; and the number of solutions that ends either search."""
-
-_MAX_SHORTENING_ROUNDS = 3
-"""Solutions by which a manoeuvre is made to keep no more distance than is asked for."""
-
-_DEEP_CONTACT = -0.02
-"""Distance of links below which their way round is looked for on a coarse grid, m."""
+_MAX_CLEAR_STARTS, _CLEAR_ANSWERS = 16, 2
+"""Further guesses near which manoeuvres that keep clear are looked for at most, and the number of
+solutions that ends the search."""
 
 _CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR = 2.0, 1.2
 """Ratios of the time of a path that is to become clear to that of a path in collision, and to that
@@ -171,6 +151,9 @@ _AGREEING_SOLUTIONS_IN_MOTION = 3
 _MAX_RATE_EXCESS, _RATE_RESERVE = 1.1, 1.002
 """Largest excess of the base rate of held commands over its bound at which they are made slower, as
 the bound is imposed at the steps of a solution alone, and the factor of that excess."""
+
+_CLEARING_TIME_FACTOR_IN_MOTION = 1.4
+"""As ``_CLEARING_TIME_FACTOR``, in motion, where joints run on farther in long intervals."""
 
 _MIN_TICKS_IN_MOTION = 4
 """Control periods that a manoeuvre in motion takes at least."""
@@ -280,15 +263,12 @@ class _SearchState:
         """Whether the manoeuvre is to be fast."""
         return self.options.duration == 0 and not self.gentle
 
-    def by_planes(self) -> _SearchState:
-        """Return the same with no pairs yet that planes keep apart."""
+    def clearing(self) -> _SearchState:
+        """Return the same with no pairs yet that are kept apart, and fewer steps of the solver."""
         assert self.kept is not None
-        return replace(self.with_iterations(_MAX_ITERATIONS_BY_PLANES), kept=self.kept.by_planes())
-
-    def with_iterations(self, most: int) -> _SearchState:
-        """Return the same with at most so many steps of the solver from a guess."""
-        iterations = min(self.options.iterations, most)
-        return replace(self, options=replace(self.options, iterations=iterations))
+        iterations = min(self.options.iterations, _MAX_CLEARING_ITERATIONS)
+        options = replace(self.options, iterations=iterations)
+        return replace(self, options=options, kept=self.kept.anew())
 
     def cut_short(self, *, found: bool) -> bool:
         """Whether the wall time is used up."""
@@ -341,9 +321,7 @@ class ManoeuvreSearch:
         self._wheels = ReactionWheels.of(model.robot.description)
         self._holder = CommandHolder(model)
         self._stages: dict[tuple[bool, bool, bool], Stages] = {}
-        self._solvers: dict[
-            tuple[int, bool, float, tuple[int, ...], bool, bool], MultipleShooting
-        ] = {}
+        self._solvers: dict[tuple[int, bool, float, tuple[int, ...], bool], MultipleShooting] = {}
 
     def search(
         self,
@@ -445,28 +423,13 @@ class ManoeuvreSearch:
         known, clear = [each.solution for each in found], []
         for path in self._other_paths(progress, intervals, known):
             with self._attempt(progress):
-                clear.append(self._clear_coarsely(progress.by_planes(), path, intervals))
+                clear.append(self._clear_coarsely(progress.clearing(), path, intervals))
             if len(clear) == _CLEAR_ANSWERS:
                 break
         for state, path in sorted(clear, key=lambda each: each[1].duration):
             with self._attempt(progress):
                 return [self._clear_finely(state, path, intervals)]
-        if progress.cut_short(found=False):
-            return []
-        # The last resort: guesses anew, with smooth rows for the pairs that have come near.
-        progress.limits = kept.within(progress.limits)
-        options = progress.options
-        progress.options = replace(
-            options,
-            starts=min(options.starts, _MAX_LAST_STARTS),
-            answers=min(options.answers, _CLEAR_ANSWERS),
-            iterations=min(options.iterations, _MAX_CLEARING_ITERATIONS),
-        )
-        again = self._search_on_grids(progress, intervals)
-        for each in sorted(again, key=lambda one: one.duration):
-            if freed := self._make_clear(progress, each, intervals):
-                break
-        return freed
+        return []
 
     def _other_paths(
         self, progress: _SearchState, intervals: int, known: Sequence[Trajectory]
@@ -523,140 +486,16 @@ class ManoeuvreSearch:
     def _make_clear(
         self, progress: _SearchState, manoeuvre: Manoeuvre, intervals: int
     ) -> list[Manoeuvre]:
-        """Return manoeuvres near to one that keep clear; that one itself, if it does."""
+        """Return a manoeuvre near to one that keeps clear; that one itself, if it does; or none."""
         kept = progress.kept
         assert kept is not None
         if not kept.approaches(manoeuvre.positions, manoeuvre.quaternions):
             return [manoeuvre]
-        found: list[Manoeuvre] = []
-        # Pairs of one manoeuvre are not those of another.
-        smooth = kept.copy()
         with self._attempt(progress):
-            state = replace(progress, kept=smooth)
-            found.append(self._clear_smoothly(state, manoeuvre, intervals))
-        if not found:
-            kept.include(smooth)
-        aim = _GOOD_CLEAR_RATIO * manoeuvre.duration
-        if found and (found[0].duration <= aim or not progress.hastens):
-            return found
-        with self._attempt(progress):
-            state = progress.by_planes()
+            state = progress.clearing()
             coarse = self._clear_coarsely(state, manoeuvre.solution, intervals)
-            found.append(self._clear_finely(*coarse, intervals))
-        return found
-
-    def _clear_smoothly(
-        self, progress: _SearchState, manoeuvre: Manoeuvre, intervals: int
-    ) -> Manoeuvre:
-        """Return a manoeuvre near to one that comes too near, by smooth rows.
-
-        Raises
-        ------
-        CandidateError
-            None was found.
-        """
-        kept = progress.kept
-        assert kept is not None
-        near = kept.approaches(manoeuvre.positions, manoeuvre.quaternions)
-        progress = progress.with_iterations(_MAX_CLEARING_ITERATIONS)
-        coarser = intervals // _COARSE_GRID_RATIO
-        # On a coarse grid the attitude of a robot that drifts is too far off.
-        on_full_grid = progress.boundary.drifts or coarser < _MIN_COARSE_INTERVALS
-        brief = progress.with_iterations(_MAX_SEPARATION_ITERATIONS)
-        if near[0].distance > _DEEP_CONTACT or on_full_grid:
-            clear = self._clear_on_grid(progress, manoeuvre, intervals, TOLERANCE)
-            return self._shorten_with_less_clearance(brief, clear, intervals)
-        # The way round is far: it is found on a coarse grid first.
-        clear = self._clear_on_grid(progress, manoeuvre, coarser, _COARSE_TOLERANCE)
-        try:
-            refined = self._clear_on_grid(brief, clear, intervals, TOLERANCE)
-        except UnusableCandidateError:
-            return clear
-        refined = self._shorten_with_less_clearance(brief, refined, intervals)
-        return min(refined, clear, key=lambda one: one.duration)
-
-    def _clear_on_grid(
-        self, progress: _SearchState, manoeuvre: Manoeuvre, intervals: int, tolerance: float
-    ) -> Manoeuvre:
-        """Return a manoeuvre near to another one that keeps clear, solved for on a grid.
-
-        Raises
-        ------
-        CandidateError
-            None was found.
-        """
-        kept = progress.kept
-        assert kept is not None
-        solution, near = (
-            manoeuvre.solution,
-            kept.approaches(manoeuvre.positions, manoeuvre.quaternions),
-        )
-        for _ in range(ROUNDS):
-            kept.add(near)
-            solution = self._solve_with_separation(progress, solution, intervals, tolerance)
-            made = self._make_held_commands(progress, solution)
-            near = kept.approaches(made.positions, made.quaternions)
-            if not near:
-                return replace(made, separated_pairs=len(kept.pairs))
-        raise UnusableCandidateError(kept.message(near[0], self._period))
-
-    def _shorten_with_less_clearance(
-        self, progress: _SearchState, manoeuvre: Manoeuvre, intervals: int
-    ) -> Manoeuvre:
-        """Return a faster manoeuvre near to one that keeps clear by more than it needs to, as rows
-        are not exact; that one, where none is found.
-        """
-        assert progress.kept is not None
-        kept, best = progress.kept.copy(), manoeuvre
-        near: list[Approach] = []
-        for _ in range(_MAX_SHORTENING_ROUNDS):
-            held = manoeuvre.held
-            if near:
-                kept.add(near)
-            elif not kept.reduce_margins(held.positions, held.quaternions):
-                break
-            closer = replace(progress, kept=kept)
-            try:
-                solution = self._solve_with_separation(closer, manoeuvre.solution, intervals)
-                if solution.duration > best.duration - self._period:
-                    break
-                manoeuvre = self._make_held_commands(closer, solution)
-            except UnusableCandidateError:
-                break
-            near = kept.approaches(manoeuvre.positions, manoeuvre.quaternions)
-            if not near and manoeuvre.duration < best.duration:
-                best = replace(manoeuvre, separated_pairs=len(kept.pairs))
-        return best
-
-    def _solve_with_separation(
-        self,
-        progress: _SearchState,
-        trajectory: Trajectory,
-        intervals: int,
-        tolerance: float = TOLERANCE,
-    ) -> Trajectory:
-        """Return a solution near to a trajectory that keeps pairs of links apart.
-
-        Raises
-        ------
-        CandidateError
-            No such solution was found.
-        """
-        kept = progress.kept
-        assert kept is not None
-        within = replace(progress, limits=kept.within(progress.limits))
-        solver = self._get_solver(within, intervals, tolerance)
-        guess = trajectory
-        if len(trajectory.shapes) != intervals + 1:
-            guess = _build_guesses(self._robot, solver, progress.boundary).resample(trajectory)
-        # On the same grid, a solver continues at its own last solution.
-        solution = self._solve_from_guess(within, solver, guess, progress.stop_rule(found=False))
-        progress.cancellation.raise_if_requested()
-        result = _NO_PATH_FOUND if solution is None else f"{solution.duration:.6g} s"
-        progress.report(f"{len(kept.pairs)} pair(s) apart", result, solver.iterations)
-        if solution is None:
-            raise UnusableCandidateError(_NO_PATH_FOUND)
-        return solution
+            return [self._clear_finely(*coarse, intervals)]
+        return []
 
     def _clear_coarsely(
         self, progress: _SearchState, path: Trajectory, intervals: int
@@ -723,7 +562,7 @@ class ManoeuvreSearch:
     ) -> PathClearing[Manoeuvre]:
         """Return the clearing of paths on a grid, as held commands or as they are."""
         kept, limits = progress.kept, progress.limits
-        assert isinstance(kept, KeptByPlanes)
+        assert kept is not None
         solve = partial(self._solve_apart, progress, intervals, tolerance)
         return PathClearing(kept, limits, solve, self._period, hold)
 
@@ -745,7 +584,7 @@ class ManoeuvreSearch:
             No such solution was found.
         """
         kept, boundary, limits = progress.kept, progress.boundary, progress.limits
-        assert isinstance(kept, KeptByPlanes)
+        assert kept is not None
         if progress.options.duration > 0:
             limits = _narrowed(limits)
         solver = self._get_solver(progress, intervals, tolerance)
@@ -782,7 +621,6 @@ class ManoeuvreSearch:
             tolerance,
             pairs,
             drifting=progress.boundary.drifts,
-            planes=progress.kept is not None and progress.kept.has_planes,
         )
 
     def _search_from_guesses(
@@ -856,7 +694,7 @@ class ManoeuvreSearch:
                 if grid is not full:
                     guess = _build_guesses(self._robot, full, progress.boundary).resample(solution)
                     stop = progress.stop_rule(found=bool(found))
-                    refined = self._solve_from_guess(progress, full, guess, stop)
+                    refined = self._solve_from_guess(progress, full, guess, stop, refining=True)
                     progress.cancellation.raise_if_requested()
                 manoeuvre = self._make_held_commands(progress, refined)
                 found.append(manoeuvre)
@@ -875,19 +713,13 @@ class ManoeuvreSearch:
         pairs: tuple[int, ...] = (),
         *,
         drifting: bool = False,
-        planes: bool = False,
     ) -> MultipleShooting:
         """Return the solver with a number of intervals, with or without a position, which keeps
-        pairs of links apart; ``drifting``, for an angular momentum that is not zero; ``planes``, by
-        distances from planes.
+        pairs of links apart; ``drifting``, for an angular momentum that is not zero.
         """
-        key = intervals, position, tolerance, pairs, drifting, planes
+        key = intervals, position, tolerance, pairs, drifting
         if key not in self._solvers:
-            rows = (
-                partial(self._distances.of, pairs, planes=planes)
-                if pairs and self._distances
-                else None
-            )
+            rows = partial(self._distances.of, pairs) if pairs and self._distances else None
             of = partial(self._get_stages, position, rows, instants_of(intervals), drifting)
             self._solvers[key] = (
                 MultipleShooting(of(), intervals, tolerance)
@@ -901,7 +733,7 @@ class ManoeuvreSearch:
     def _get_stages(
         self,
         position: bool,
-        rows: Callable[[], list[DistanceRows]] | None,
+        rows: Callable[[], list[PlaneDistance]] | None,
         instants: int,
         drifting: bool,
         inequalities: Sequence[PathInequality] = (),
@@ -927,6 +759,8 @@ class ManoeuvreSearch:
         solver: MultipleShooting,
         guess: Trajectory,
         stop: StopRule,
+        *,
+        refining: bool = False,
     ) -> Trajectory | None:
         """Return the solution from a guess, None if there is none."""
         boundary, limits, options = progress.boundary, progress.limits, progress.options
@@ -939,7 +773,7 @@ class ManoeuvreSearch:
             T = max(_GENTLE_DURATION_FACTOR * guess.duration, shortest)
         else:
             duration = DurationBounds(shortest, options.longest)
-            solution = solver.solve(boundary, limits, guess, stop, duration)
+            solution = solver.solve(boundary, limits, guess, stop, duration, refining=refining)
             if solution is None or solver.converged or self._constraints.base_rate_limit > 0:
                 return solution
             # A solution without convergence is not yet as fast as possible.
@@ -972,7 +806,7 @@ class ManoeuvreSearch:
 
         Raises
         ------
-        CandidateError
+        UnusableCandidateError
             There is no solution, or none that commands reach within the constraints.
         """
         if trajectory is None:
@@ -1006,9 +840,8 @@ class ManoeuvreSearch:
         """
         boundary, limits, kept = progress.boundary, progress.limits, progress.kept
         narrowed, near = _narrowed(limits), None
-        if kept is not None:
+        if kept is not None and kept.pairs:
             narrowed = kept.within(narrowed, trajectory)
-        if kept is not None and kept.has_planes:
             near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
         solver = self._get_solver(progress, len(trajectory.shapes) - 1)
         ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
@@ -1142,29 +975,57 @@ class MotionSearch:
 
         Raises
         ------
-        CandidateError
+        UnusableCandidateError
             There are none that reach the goal within the limits.
         """
-        position = boundary.center is not None
-        drifting = boundary.drifts
-        solver = self._solver(intervals, position, TOLERANCE, (), drifting=drifting)
-        held = self._make_held_commands(solver, boundary, limits, candidate, motion, options, stop)
-        if kept is None:
+        position, drifting = boundary.center is not None, boundary.drifts
+        free = self._solver(intervals, position, TOLERANCE, (), drifting=drifting)
+        guesses = _build_guesses(self._robot, free, boundary)
+        path, duration = guesses.resample(candidate), options.duration
+        if duration == 0:
+            path = self._find_fastest(free, boundary, limits, path, stop, options) or path
+            duration = path.duration
+        held = self._hold(free, boundary, limits, path, duration, motion, options, stop)
+        if kept is None or not kept.approaches(held.positions, held.quaternions):
             return held
-        kept = kept.copy()
-        for _ in range(ROUNDS):
-            near = kept.approaches(held.positions, held.quaternions)
-            if not near:
-                return held
-            kept.add(near)
-            solver = self._solver(intervals, position, TOLERANCE, kept.pairs, drifting=drifting)
-            within = kept.within(limits)
-            held = self._make_held_commands(
-                solver, boundary, within, candidate, motion, options, stop
+        kept = kept.anew()
+        brief = replace(stop, iterations=min(stop.iterations, _MAX_CLEARING_ITERATIONS))
+
+        def solver() -> MultipleShooting:
+            return self._solver(intervals, position, TOLERANCE, kept.pairs, drifting=drifting)
+
+        def solve(
+            guess: Trajectory, duration: float | None, near: Neighbourhood
+        ) -> tuple[Trajectory, float]:
+            bounds = self._duration_bounds(options)
+            if duration is not None:
+                bounds = DurationBounds(duration, duration)
+            narrowed = self._narrow_limits(limits, _ACCELERATION_SHARES_IN_MOTION[-1])
+            within = kept.within(narrowed, guess, pushing=near.largest_lack > 0)
+            apart = solver()
+            solution = apart.solve(boundary, within, guess, brief, bounds, near)
+            stop.cancellation.raise_if_requested()
+            if solution is None:
+                raise UnusableCandidateError(_NO_PATH_FOUND)
+            return solution, apart.lack
+
+        def hold(path: Trajectory) -> HeldCommands:
+            apart, within = solver(), kept.within(limits, path)
+            near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
+            return self._hold(
+                apart, boundary, within, path, path.duration, motion, options, brief, near
             )
-        if near := kept.approaches(held.positions, held.quaternions):
-            raise UnusableCandidateError(kept.message(near[0], self._period))
-        return held
+
+        clearing = PathClearing(kept, limits, solve, self._period, hold)
+        if options.duration > 0:
+            path, clear = clearing.clear(path, duration)
+        else:
+            slower = path.stretched(_CLEARING_TIME_FACTOR_IN_MOTION)
+            lacking = boundary.velocity - slower.velocities[0]
+            slower = guesses.with_initial_velocity(slower, lacking, limits)
+            path, clear = clearing.shorten(*clearing.clear(slower, slower.duration))
+        assert clear is not None
+        return clear
 
     def _planned_speed_limit(self, limits: MotionLimits) -> Array:
         """Return the largest planned velocities (n,)."""
@@ -1192,8 +1053,7 @@ class MotionSearch:
         options: OptimalOptions,
     ) -> Trajectory | None:
         """Return the fastest trajectory near a guess, None if there is none."""
-        shortest = min(_MIN_TICKS_IN_MOTION * self._period, options.longest)
-        duration = DurationBounds(shortest, options.longest)
+        duration = self._duration_bounds(options)
         for room in _ACCELERATION_SHARES_IN_MOTION:
             narrowed = self._narrow_limits(limits, room)
             solution = solver.solve(boundary, narrowed, guess, stop, duration)
@@ -1201,34 +1061,34 @@ class MotionSearch:
                 return solution
         return None
 
+    def _duration_bounds(self, options: OptimalOptions) -> DurationBounds:
+        shortest = min(_MIN_TICKS_IN_MOTION * self._period, options.longest)
+        return DurationBounds(shortest, options.longest)
+
     def _narrow_limits(self, limits: MotionLimits, room: float) -> MotionLimits:
         velocity = self._planned_speed_limit(limits)
         return replace(limits, velocity=velocity, acceleration=room * limits.acceleration)
 
-    def _make_held_commands(
+    def _hold(
         self,
         solver: MultipleShooting,
         boundary: BoundaryConditions,
         limits: MotionLimits,
-        candidate: Trajectory,
+        path: Trajectory,
+        duration: float,
         motion: InitialMotion,
         options: OptimalOptions,
         stop: StopRule,
+        near: Neighbourhood | None = None,
     ) -> HeldCommands:
-        """Return a candidate as held commands.
+        """Return a path as held commands, in a duration (s) or a few more control periods.
 
         Raises
         ------
-        CandidateError
+        UnusableCandidateError
             There are none that reach the goal within the limits.
         """
-        guesses = _build_guesses(self._robot, solver, boundary)
-        guess, duration = guesses.resample(candidate), options.duration
-        most = 1 if duration > 0 else len(_ADDITIONAL_TICKS)
-        if duration == 0:
-            finer = self._find_fastest(solver, boundary, limits, guess, stop, options)
-            guess = guess if finer is None else finer
-            duration = guess.duration
+        most = 1 if options.duration > 0 else len(_ADDITIONAL_TICKS)
         ticks = max(1, math.ceil(duration / self._period - 1e-6))
         aim = boundary
         for more, room in itertools.product(
@@ -1238,9 +1098,10 @@ class MotionSearch:
             solution = solver.solve(
                 aim,
                 self._narrow_limits(limits, room),
-                replace(guess, step=T / solver.intervals),
+                replace(path, step=T / solver.intervals),
                 stop,
                 DurationBounds(T, T),
+                near,
             )
             if stop.cancellation.requested:
                 break

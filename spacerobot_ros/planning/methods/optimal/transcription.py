@@ -38,7 +38,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.collision.rows import PLANE_SIZE, DistanceRows
+from spacerobot_ros.collision.planes import PLANE_SIZE, PlaneDistance
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cached_function, source_hash
 from spacerobot_ros.model.description import Array
@@ -145,9 +145,8 @@ class Stages:
     rotation_of_step
         The rotation vector (3,) of a step (:func:`turn_function`).
     distances
-        Distances of pairs of links, and of links and obstacles, in an interval, less the smallest
-        ones that are allowed or from planes, plus a lack that is a variable of the program: as its
-        rows and ``>= 0``; None: none.
+        Distances of pairs of links, and of links and obstacles, from planes in an interval, plus a
+        lack that is a variable of the program: as its rows and ``>= 0``; None: none.
     """
 
     joints: int
@@ -211,7 +210,7 @@ class Stages:
         turn = turn_function(robot, drifting=drifting)
         return cls(n, begins, interval, ends, path, turn)
 
-    def with_distances(self, rows: Sequence[DistanceRows], instants: int) -> Stages:
+    def with_distances(self, rows: Sequence[PlaneDistance], instants: int) -> Stages:
         """Return the problem in which pairs of links keep distances, too, at a number of instants
         in each interval.
         """
@@ -322,22 +321,18 @@ def _interval_block(
     )
 
 
-def _distance_block(n: int, pairs: Sequence[DistanceRows], instants: int) -> ConstraintBlock:
+def _distance_block(n: int, pairs: Sequence[PlaneDistance], instants: int) -> ConstraintBlock:
     """Return the distances at equally spaced instants of an interval, by the chain rule.
 
     The last instant is the end of the interval. The turn of the base there is about the weighted
-    mean of those at the knots; rows take it at any norm. Rows are all of one kind: smooth ones less
-    the smallest distances, or distances from planes, which each instant has of its own.
+    mean of those at the knots; rows take it at any norm. Each instant has planes of its own.
     """
     # In MX, whose functions call those of the pairs: made anew for every choice of pairs.
     h, s, v, v_next = ca.MX.sym("h"), *(ca.MX.sym(name, n) for name in ("s", "v", "v+"))
     X, X_next, lack = ca.MX.sym("X", 4), ca.MX.sym("X+", 4), ca.MX.sym("lack")
     z = ca.vertcat(h, X, s, v, X_next, v_next, lack)
     turning = any(rows.is_of_obstacle for rows in pairs)
-    by_planes = any(rows.is_plane for rows in pairs)
-    least = ca.MX.sym("least", 0 if by_planes else len(pairs))
-    world = ca.MX.sym("world", 12 if turning and not by_planes else 0)
-    planes = ca.MX.sym("planes", PLANE_SIZE, len(pairs) * instants if by_planes else 0)
+    planes = ca.MX.sym("planes", PLANE_SIZE, len(pairs) * instants)
     multipliers = ca.MX.sym("lambda", len(pairs) * instants)
     values, jacobian, hessian = [], [], ca.MX(z.numel(), z.numel())
     size = n + 4 if turning else n
@@ -350,15 +345,12 @@ def _distance_block(n: int, pairs: Sequence[DistanceRows], instants: int) -> Con
         turned = ca.vertcat(point, (1 - tau) * X + tau * X_next)
         slopes, curvature = [], ca.MX(size, size)
         for row, (rows, multiplier) in enumerate(zip(pairs, ca.vertsplit(by_row), strict=True)):
-            at = [turned if rows.is_of_obstacle else point]
-            if by_planes:
-                at.append(planes[:, (number - 1) * len(pairs) + row])
-            elif rows.is_of_obstacle:
-                at.append(world)
+            plane = planes[:, (number - 1) * len(pairs) + row]
+            at = turned if rows.is_of_obstacle else point, plane
             J, H = rows.jacobian(*at), rows.hessian(*at, multiplier)
             if turning and not rows.is_of_obstacle:
                 J, H = ca.horzcat(J, ca.MX(1, 4)), ca.diagcat(H, ca.MX(4, 4))
-            values.append(rows.values(*at) + (lack if by_planes else lack - least[row]))
+            values.append(rows.values(*at) + lack)
             slopes.append(J)
             curvature += H
         J = ca.vertcat(*slopes)
@@ -372,7 +364,7 @@ def _distance_block(n: int, pairs: Sequence[DistanceRows], instants: int) -> Con
         by_point = ca.triu(_point_derivative_columns(half.T, along, weights, tau, n))
         by_point += ca.vertcat(bend, ca.MX(by_point.size1() - 1, by_point.size2()))
         hessian += ca.diagcat(by_point, ca.MX(1, 1))
-    z_p, J = [z, ca.vertcat(least, world, ca.vec(planes))], ca.vertcat(*jacobian)
+    z_p, J = [z, ca.vec(planes)], ca.vertcat(*jacobian)
     return ConstraintBlock(
         ca.Function("distances", z_p, [ca.vertcat(*values)]),
         ca.Function("distances_jac", z_p, [ca.vertcat(*values), J]),

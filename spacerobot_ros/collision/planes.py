@@ -1,0 +1,128 @@
+"""Distances of pairs from planes between them, as smooth functions of the shape, for a solver.
+
+Between two convex solids at given poses there is a plane that touches the first one where it is
+nearest to the second, and moves with it. The distance of the nearest point of the second one from
+that plane is that of the solids at these poses, or less the depth of their contact, and near them
+to first order. It is exact and cheap, and is made anew along every path that a solver has found.
+
+Distances of two links depend on the shape q alone. Those of a link and an obstacle depend on the
+turn X of the base since the start, too: the centre of mass C of the system rests or drifts steadily
+at zero force, and a point of the link at ``r_BP(q)`` in the base is, seen from C in the attitude of
+the base at the start, at ``X (r_BP(q) - r_BC(q))``, where the obstacle is at rest.
+
+J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
+checking", International Journal of Robotics Research 33, 2014.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from spacerobot_ros.collision.geometry import CollisionGeometry, Solid
+from spacerobot_ros.model import symbolic_rotations
+from spacerobot_ros.model.description import JointKind, RobotDescription
+from spacerobot_ros.model.kinematics import joint_positions
+
+PLANE_SIZE = 7
+"""Numbers of a plane and a point."""
+
+
+@dataclass(frozen=True)
+class PlaneDistance:
+    """The distance of a pair from a plane between its solids, with derivatives.
+
+    The numbers ``w`` (7,) of a plane are a unit normal (3,) and the distance from the origin, m, in
+    the frame of the first link, and the point (3,), m, in that of the second one. For an obstacle
+    the plane is in the frame of the centre of mass with the attitude of the base at the start, and
+    the point in that of the link.
+
+    Attributes
+    ----------
+    values
+        ``(q, w) -> d``, m.
+    jacobian
+        ``(q, w) -> dd/dq`` (1, n).
+    hessian
+        ``(q, w, lambda) -> `` the Hessian (n, n) of ``lambda d``.
+    is_of_obstacle
+        Whether one of the pair is an obstacle: the functions then take ``y = [q; X]`` (n + 4) in
+        place of q, with a quaternion X of any norm.
+    """
+
+    values: ca.Function
+    jacobian: ca.Function
+    hessian: ca.Function
+    is_of_obstacle: bool = False
+
+    @classmethod
+    def of(
+        cls, geometry: CollisionGeometry, pair: int, center_of_mass: ca.Function
+    ) -> PlaneDistance:
+        """Derive the distance of a pair, by its number; ``center_of_mass`` is ``q -> r_BC``."""
+        robot, of_obstacle = geometry.robot, bool(geometry.with_obstacles[pair])
+        n = len(robot.joint_names)
+        y, plane = ca.SX.sym("y", n + 4 if of_obstacle else n), ca.SX.sym("plane", PLANE_SIZE)
+        multiplier, q = ca.SX.sym("lambda"), y[:n]
+        normal, offset, point = plane[:3], plane[3], plane[4:]
+        first, second = (geometry.solids[i] for i in geometry.pairs[pair])
+        if of_obstacle:
+            chain, X = _chain_of(robot, first.body), y[n:]
+            R_BL, r_BL = _pose_of_link(robot, first, chain, joint_positions(robot, q))
+            R_X = symbolic_rotations.matrix_from_quaternion(X / ca.norm_2(X))
+            x = R_X @ (r_BL + R_BL @ point - center_of_mass(q))
+        else:
+            (R_A, r_A), (R_P, r_P) = _relative_poses(robot, first, second, q)
+            x = R_A.T @ (r_P + R_P @ point - r_A)
+        d = ca.dot(normal, x) - offset
+        hessian = ca.hessian(multiplier * d, y)[0]
+        return cls(
+            ca.Function("distances", [y, plane], [ca.cse(d)]),
+            ca.Function("distances_jac", [y, plane], [ca.cse(ca.jacobian(d, y))]),
+            ca.Function("distances_hess", [y, plane, multiplier], [ca.cse(hessian)]),
+            of_obstacle,
+        )
+
+
+def _relative_poses(
+    robot: RobotDescription, first: Solid, second: Solid, q: ca.SX
+) -> list[tuple[ca.SX, ca.SX]]:
+    """Return the poses of the links of two solids in the last body that carries both."""
+    theta = joint_positions(robot, q)
+    chains = [_chain_of(robot, each.body) for each in (first, second)]
+    common = len([1 for a, b in zip(*chains, strict=False) if a == b])
+    return [
+        _pose_of_link(robot, solid, chain[common:], theta)
+        for solid, chain in zip((first, second), chains, strict=True)
+    ]
+
+
+def _pose_of_link(
+    robot: RobotDescription, solid: Solid, chain: Sequence[int], theta: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """Return the pose of a solid's link in the body that carries the first of a chain."""
+    R, r = ca.SX.eye(3), ca.SX(3, 1)
+    for index in chain:
+        body = robot.bodies[index]
+        joint = body.joint
+        if joint is None:
+            continue
+        r = r + R @ ca.sparsify(ca.DM(body.origin.r))
+        R = R @ ca.sparsify(ca.DM(body.origin.R))
+        if joint.kind is JointKind.PRISMATIC:
+            r = r + R @ ca.sparsify(ca.DM(joint.axis)) * theta[index - 1]
+        else:
+            R = R @ symbolic_rotations.matrix_about_axis(joint.axis, theta[index - 1])
+    _, pose = robot.frames[solid.link]
+    return R @ ca.sparsify(ca.DM(pose.R)), r + R @ ca.DM(pose.r)
+
+
+def _chain_of(robot: RobotDescription, body: int) -> list[int]:
+    """Return the bodies from the base out to one."""
+    chain = []
+    while body >= 0:
+        chain.append(body)
+        body = robot.bodies[body].parent
+    return chain[::-1]
