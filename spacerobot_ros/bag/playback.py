@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 
 from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.reader import Bag
@@ -246,8 +247,7 @@ class Playback:
             number: topic.name for topic in self.topics for number in bag.channel_ids(topic.name)
         }
         self._timeline = Timeline(rate, self._start_ns)
-        self._remaining_messages = self._messages(self._start_ns)
-        self._next_message = next(self._remaining_messages, None)
+        self._begin()
         if self._next_message is None:
             raise RecordingError(
                 f"The bag {bag.path} has no message to replay from {start:g} s on"
@@ -323,21 +323,11 @@ class Playback:
         """
         at = min(max(bag_ns, self._start_ns), self._last_ns)
         recent = max(at - _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS, self._start_ns)
-        last = {message.topic: message for message in self._latched_messages_before(at)}
         begins = at == self._start_ns and not self._timeline.running
-        for message in self._messages_between(
-            set(self._topic_by_channel), recent, at if begins else at - 1
-        ):
-            last[message.topic] = message
-        self._remaining_messages.close()
-        self._remaining_messages = self._messages_between(
-            set(self._topic_by_channel), at, self._end_ns
-        )
+        shown = self._last_messages(at, recent, at if begins else at - 1)
         self._timeline.seek(at, clock_ns)
-        self._next_message = next(self._remaining_messages, None)
-        # Sorted by publication; none is later than the next message of the replay.
-        ordered = sorted(last.values(), key=lambda message: message.log_time_ns)
-        return [replace(message, log_time_ns=at) for message in ordered]
+        self._set_coming(self._messages(set(self._topic_by_channel), at, self._end_ns))
+        return shown
 
     @property
     def start_ns(self) -> int:
@@ -351,43 +341,51 @@ class Playback:
 
     def close(self) -> None:
         """Close the bag; the replay has no more messages."""
-        self._remaining_messages.close()
-        self._next_message = None
+        self._set_coming(iter(()))
+
+    def _set_coming(self, messages: Iterator[ReplayMessage]) -> None:
+        self._coming = messages
+        self._next_message = next(messages, None)
+
+    def _begin(self) -> None:
+        """Let all messages from the start on come, after those that were latched before it."""
+        found = self._messages(set(self._topic_by_channel), self._start_ns, self._end_ns)
+        first = list(islice(found, 1))
+        start = self._start_ns
+        earlier = self._last_messages(start, start, start - 1) if first else []
+        self._set_coming(chain(earlier, first, found))
 
     def _take_next_message(self) -> ReplayMessage:
         message = self._next_message
         assert message is not None
-        self._next_message = next(self._remaining_messages, None)
+        self._next_message = next(self._coming, None)
         if self._next_message is None and self._loop:
             # A repeated replay begins at the log time of the last message.
             last = max(message.log_time_ns, self._start_ns)
             self._timeline.seek(self._start_ns, self._timeline.clock_time(last))
-            self._remaining_messages = self._messages(self._start_ns)
-            self._next_message = next(self._remaining_messages, None)
+            self._begin()
         return message
 
-    def _messages(self, start_ns: int) -> Generator[ReplayMessage, None, None]:
-        earlier = {message.topic: message for message in self._latched_messages_before(start_ns)}
-        in_time = self._messages_between(set(self._topic_by_channel), start_ns, self._end_ns)
-        first = next(in_time, None)
-        if first is None:
-            return
-        yield from (replace(m, log_time_ns=start_ns) for m in earlier.values())
-        yield first
-        yield from in_time
+    def _last_messages(self, time_ns: int, since_ns: int, until_ns: int) -> list[ReplayMessage]:
+        """Return the last message of each topic, by age, as due at a time.
 
-    def _latched_messages_before(self, time_ns: int) -> Iterator[ReplayMessage]:
-        """Yield the messages of latched topics before a time; the last of each counts."""
+        They are those of latched topics before that time, and of others in a span.
+        """
         latched = {n for t in self.topics if t.latched for n in self._bag.channel_ids(t.name)}
-        if latched and time_ns > self._bag.start_time_ns:
-            yield from self._messages_between(latched, 0, time_ns - 1)
+        last: dict[str, ReplayMessage] = {}
+        spans = (latched, 0, time_ns - 1), (set(self._topic_by_channel), since_ns, until_ns)
+        for channels, begin, end in spans:
+            last.update((each.topic, each) for each in self._messages(channels, begin, end))
+        ordered = sorted(last.values(), key=lambda message: message.log_time_ns)
+        return [replace(message, log_time_ns=time_ns) for message in ordered]
 
-    def _messages_between(
+    def _messages(
         self, channel_ids: set[int], start_ns: int, end_ns: int
-    ) -> Generator[ReplayMessage, None, None]:
-        found = self._bag.raw_messages(channel_ids, start_ns, end_ns)
-        for channel_id, log_time_ns, _, data in found:
-            yield ReplayMessage(self._topic_by_channel[channel_id], log_time_ns, data)
+    ) -> Iterator[ReplayMessage]:
+        if start_ns <= end_ns:
+            found = self._bag.raw_messages(channel_ids, start_ns, end_ns)
+            for channel_id, log_time_ns, _, data in found:
+                yield ReplayMessage(self._topic_by_channel[channel_id], log_time_ns, data)
 
 
 def _replay_topic(bag: Bag, name: str) -> ReplayTopic:
