@@ -92,53 +92,6 @@ class ReplayMessage:
     data: bytes
 
 
-class Timeline:
-    """The time of a bag as a function of a monotonic clock.
-
-    Parameters
-    ----------
-    rate
-        Seconds of the bag in a second of the clock, positive.
-    bag_ns
-        Where in the bag to begin, in nanoseconds; it stands there until ``run``.
-    """
-
-    def __init__(self, rate: float, bag_ns: int) -> None:
-        self._rate = rate
-        self._bag_ns = bag_ns
-        self._clock_ns = 0
-        self._running = False
-
-    @property
-    def running(self) -> bool:
-        """Whether the time of the bag advances."""
-        return self._running
-
-    def start(self, clock_ns: int) -> None:
-        """Let time advance; ``clock_ns`` is the present time of the clock."""
-        if not self._running:
-            self._clock_ns, self._running = clock_ns, True
-
-    def stop(self, clock_ns: int) -> None:
-        """Stop time."""
-        self._bag_ns = self.bag_time(clock_ns)
-        self._running = False
-
-    def seek(self, bag_ns: int, clock_ns: int) -> None:
-        """Jump to ``bag_ns`` in the bag when the clock is at ``clock_ns``."""
-        self._bag_ns, self._clock_ns = bag_ns, clock_ns
-
-    def bag_time(self, clock_ns: int) -> int:
-        """Return the time in the bag, in nanoseconds."""
-        if not self._running:
-            return self._bag_ns
-        return self._bag_ns + math.floor((clock_ns - self._clock_ns) * self._rate)
-
-    def clock_time(self, bag_ns: int) -> int:
-        """Return the clock's time at which ``bag_ns`` is reached if nothing stops before."""
-        return self._clock_ns + math.ceil((bag_ns - self._bag_ns) / self._rate)
-
-
 class SubscriberWait:
     """Decides when a replay may begin: when all known readers are matched and no more come.
 
@@ -246,7 +199,10 @@ class Playback:
         self._topic_by_channel = {
             number: topic.name for topic in self.topics for number in bag.channel_ids(topic.name)
         }
-        self._timeline = Timeline(rate, self._start_ns)
+        self._rate = rate
+        self._bag_ns = self._start_ns
+        self._clock_ns: int | None = None
+        """Time of the clock when that of the bag was `_bag_ns`; None: time stands still there."""
         self._begin()
         if self._next_message is None:
             raise RecordingError(
@@ -260,14 +216,9 @@ class Playback:
         """Whether all messages have been replayed."""
         return self._next_message is None
 
-    @property
-    def running(self) -> bool:
-        """Whether the time of the bag advances."""
-        return self._timeline.running
-
     def bag_time(self, clock_ns: int) -> int:
         """Return the time in the bag, in nanoseconds, when the clock is at ``clock_ns``."""
-        now = self._timeline.bag_time(clock_ns)
+        now = self._time(clock_ns)
         if self._next_message is None:
             return now
         # Pending messages are published late, not skipped.
@@ -275,11 +226,12 @@ class Playback:
 
     def run(self, clock_ns: int) -> None:
         """Let time advance; ``clock_ns`` is the present time of the clock."""
-        self._timeline.start(clock_ns)
+        if self._clock_ns is None:
+            self._clock_ns = clock_ns
 
     def pause(self, clock_ns: int) -> None:
         """Stop time."""
-        self._timeline.stop(clock_ns)
+        self._bag_ns, self._clock_ns = self._time(clock_ns), None
 
     def take_due(self, clock_ns: int, max_count: int) -> list[ReplayMessage]:
         """Return the messages that are due, at most ``max_count``.
@@ -290,23 +242,24 @@ class Playback:
             The bag turns out damaged.
         """
         taken: list[ReplayMessage] = []
-        while self._next_message is not None and self._timeline.running and len(taken) < max_count:
-            if self._next_message.log_time_ns > self._timeline.bag_time(clock_ns):
+        while self._next_message is not None and self._clock_ns is not None:
+            due = self._next_message.log_time_ns <= self._time(clock_ns)
+            if not due or len(taken) >= max_count:
                 break
             taken.append(self._take_next_message())
         return taken
 
     def next_due_time(self) -> int | None:
         """Return the clock time of the next message, ns; None at the end or during a pause."""
-        if self._next_message is None or not self._timeline.running:
+        if self._next_message is None or self._clock_ns is None:
             return None
-        return self._timeline.clock_time(self._next_message.log_time_ns)
+        return self._clock_ns + self._clock_span(self._next_message.log_time_ns)
 
     def step(self, clock_ns: int) -> ReplayMessage | None:
         """Return the next message at once, due or not; None at the end of the replay."""
         if self._next_message is None:
             return None
-        self._timeline.seek(max(self._next_message.log_time_ns, self._start_ns), clock_ns)
+        self._set_time(max(self._next_message.log_time_ns, self._start_ns), clock_ns)
         return self._take_next_message()
 
     def seek(self, bag_ns: int, clock_ns: int) -> list[ReplayMessage]:
@@ -323,9 +276,9 @@ class Playback:
         """
         at = min(max(bag_ns, self._start_ns), self._last_ns)
         recent = max(at - _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS, self._start_ns)
-        begins = at == self._start_ns and not self._timeline.running
+        begins = at == self._start_ns and self._clock_ns is None
         shown = self._last_messages(at, recent, at if begins else at - 1)
-        self._timeline.seek(at, clock_ns)
+        self._set_time(at, clock_ns)
         self._set_coming(self._messages(set(self._topic_by_channel), at, self._end_ns))
         return shown
 
@@ -342,6 +295,19 @@ class Playback:
     def close(self) -> None:
         """Close the bag; the replay has no more messages."""
         self._set_coming(iter(()))
+
+    def _time(self, clock_ns: int) -> int:
+        if self._clock_ns is None:
+            return self._bag_ns
+        return self._bag_ns + math.floor((clock_ns - self._clock_ns) * self._rate)
+
+    def _clock_span(self, bag_ns: int) -> int:
+        """Return how long the clock takes from the last change of time to a time in the bag."""
+        return math.ceil((bag_ns - self._bag_ns) / self._rate)
+
+    def _set_time(self, bag_ns: int, clock_ns: int) -> None:
+        self._bag_ns = bag_ns
+        self._clock_ns = None if self._clock_ns is None else clock_ns
 
     def _set_coming(self, messages: Iterator[ReplayMessage]) -> None:
         self._coming = messages
@@ -361,8 +327,8 @@ class Playback:
         self._next_message = next(self._coming, None)
         if self._next_message is None and self._loop:
             # A repeated replay begins at the log time of the last message.
-            last = max(message.log_time_ns, self._start_ns)
-            self._timeline.seek(self._start_ns, self._timeline.clock_time(last))
+            span = self._clock_span(max(message.log_time_ns, self._start_ns))
+            self._set_time(self._start_ns, (self._clock_ns or 0) + span)
             self._begin()
         return message
 
