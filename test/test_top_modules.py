@@ -6,7 +6,6 @@ import importlib
 import logging
 import math
 import os
-import signal
 import stat
 import subprocess
 import sys
@@ -20,7 +19,7 @@ import numpy as np
 import pytest
 import yaml
 
-from spacerobot_ros import errors, files, measures, parameters, resources, termination, times
+from spacerobot_ros import errors, files, measures, resources, times
 from spacerobot_ros.errors import (
     GoalError,
     NotFoundError,
@@ -796,105 +795,6 @@ def test_parameters_of_a_scenario_have_their_types(tmp_path: Path) -> None:
     assert silent.config("recorder").tf_period == 0.0
     assert not fast.lockstep
     assert isinstance(fast.planner, PlannerConfig)
-
-
-# -- termination ----------------------------------------------------------------------------------
-
-
-class Child:
-    """A process that ends by one of its signals."""
-
-    def __init__(self, ends_by: int | None) -> None:
-        self.ends_by, self.sent = ends_by, list[tuple[int, float]]()
-        self.pid, self.code = 4711, None if ends_by is None else 7
-        self.ended = False
-        self.stdin = SimpleNamespace(close=lambda: self.sent.append((0, -1.0)))
-        self.stdout = None
-
-    def send_signal(self, number: int) -> None:
-        self.number = number
-
-    def wait(self, patience: float | None = None) -> int:
-        if patience is None:
-            return 9
-        self.sent.append((self.number, patience))
-        if self.number != self.ends_by:
-            raise subprocess.TimeoutExpired("it", patience)
-        self.ended = True
-        return 7
-
-    def poll(self) -> int | None:
-        return self.code if self.ended else None
-
-
-@pytest.mark.parametrize(
-    ("ends_by", "sent", "killed"),
-    [
-        (signal.SIGINT, [(signal.SIGINT, 1.5)], False),
-        (signal.SIGTERM, [(signal.SIGINT, 1.5), (signal.SIGTERM, 0.5)], False),
-        (None, [(signal.SIGINT, 1.5), (signal.SIGTERM, 0.5)], True),
-    ],
-)
-def test_a_child_is_ended_by_one_signal_after_the_other(
-    ends_by: int | None,
-    sent: list[tuple[int, float]],
-    killed: bool,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    killings: list[Any] = []
-    monkeypatch.setattr(os, "killpg", lambda *given: killings.append(given))
-    child: Any = Child(ends_by)
-    assert termination.end_child(child, {signal.SIGINT: 1.5, signal.SIGTERM: 0.5}) == 9
-    assert child.sent == [*sent, (0, -1.0)]
-    assert killings == ([(4711, signal.SIGKILL)] if killed else [])
-
-
-def test_children_hold_a_pipe_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[Any] = []
-    monkeypatch.setattr(termination, "_lifeline_read_end", lambda: 5)
-    monkeypatch.setattr(subprocess, "Popen", lambda *given, **more: started.append((given, more)))
-    monkeypatch.setattr(subprocess, "run", lambda *given, **more: started.append((given, more)))
-    lifeline = f"5:{os.getpid()}"
-    assert termination.child_options({"A": "b"}) == {
-        "env": {"A": "b", "SPACEROBOT_LIFELINE": lifeline},
-        "pass_fds": (5,),
-    }
-    assert termination.child_options()["env"] == {**os.environ, "SPACEROBOT_LIFELINE": lifeline}
-    own = termination.child_options({})
-    termination.start_child(["-m", "x"], {}, stdout=3)
-    termination.run_child(["-c", "y"], {}, timeout=4)
-    assert started == [
-        (([sys.executable, "-m", "x"],), {"start_new_session": True, **own, "stdout": 3}),
-        (
-            ([sys.executable, "-c", "y"],),
-            {"capture_output": True, "text": True, "check": False, **own, "timeout": 4},
-        ),
-    ]
-
-
-def test_a_lifeline_is_that_of_the_parent(monkeypatch: pytest.MonkeyPatch) -> None:
-    changed: list[Any] = []
-    monkeypatch.setattr(os, "set_inheritable", lambda *given: changed.append(given))
-    monkeypatch.delenv("SPACEROBOT_LIFELINE", raising=False)
-    assert termination._parent_lifeline() == (None, 0)
-    monkeypatch.setenv("SPACEROBOT_LIFELINE", "12:345")
-    assert termination._parent_lifeline() == (12, 345)
-    assert changed == [(12, False)]
-    assert "SPACEROBOT_LIFELINE" not in os.environ
-
-
-def test_what_is_said_of_a_signal() -> None:
-    words = {
-        signal.SIGINT: "Interrupted.",
-        signal.SIGTERM: "Terminated.",
-        signal.SIGHUP: "Hung up.",
-    }
-    for number, text in words.items():
-        ending = termination.Terminated(number)
-        assert (str(ending), ending.number, ending.exit_code) == (text, number, 128 + number)
-    assert str(termination.Terminated(signal.SIGUSR1)) == "Terminated."
-    assert termination.termination() is None
-    assert parameters.Value is not None
 
 
 @pytest.mark.parametrize(
