@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import re
 import subprocess
 import sys
@@ -54,12 +53,6 @@ _MAX_LINKS = 200
 
 _XACRO_CPU_TIME = 10
 """Limit of processor time for the expansion of a xacro file, s; six times as much wall time."""
-
-_XACRO_VARIABLES = (
-    *("PATH", "PYTHONPATH", "LANG"),
-    *("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH", "ROS_DISTRO"),
-)
-"""Environment variables that xacro files may read."""
 
 
 def load_robot(path: str | Path) -> RobotDescription:
@@ -142,21 +135,17 @@ def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescri
 
 
 def _expand_xacro(path: Path) -> str:
-    """Return the URDF text of a xacro file, which a confined process expands.
-
-    Robot files are exchanged between strangers: see :mod:`spacerobot_ros.model.xacro_files`.
-    """
+    """Return the URDF text of a xacro file; see :mod:`spacerobot_ros.model.xacro_files`."""
     by_hand = f"`xacro {path.name} > {path.name.split('.')[0]}.urdf`"
     if find_spec("xacro") is None:
         raise RobotDescriptionError(
             f"{path} is a xacro file, and the package xacro is not installed: `pip install xacro`, "
             f"or expand it where it is: {by_hand}."
         )
-    environment = {name: os.environ[name] for name in _XACRO_VARIABLES if name in os.environ}
+    words = [xacro_files.__file__, str(path), f"{_XACRO_CPU_TIME}"]
     try:
         done = subprocess.run(
-            [sys.executable, xacro_files.__file__, str(path), f"{_XACRO_CPU_TIME}"],
-            env={**environment, "PYTHONIOENCODING": "utf-8"},
+            [sys.executable, "-X", "utf8", *words],
             capture_output=True,
             encoding="utf-8",
             errors="replace",
@@ -171,8 +160,8 @@ def _expand_xacro(path: Path) -> str:
         reasons = [line for line in done.stderr.splitlines() if line.startswith("REASON ")]
         reason = reasons[-1][7:] if reasons else "it needs too much time or memory"
     raise RobotDescriptionError(
-        f"The xacro file {path} cannot be expanded: {reason.rstrip('.')}. If you trust it, expand "
-        f"it yourself: {by_hand}."
+        f"The xacro file {path} cannot be expanded: {reason.rstrip('.')}. Correct it, or expand it "
+        f"by hand: {by_hand}."
     )
 
 

@@ -309,7 +309,7 @@ ATTACKS = (
     ),
     of_scenario(
         "an alias of itself",
-        "it refers to itself",
+        "it has more than 100000 values, with those that its aliases repeat",
         "a: &a [*a]\nscenario:\n  ros__parameters: {goal_position: [0, 0, 0]}\n",
     ),
     of_scenario(

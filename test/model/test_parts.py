@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model import integration, meshes, rotations, xacro_files
+from spacerobot_ros.model import integration, meshes, rotations
 from spacerobot_ros.model.description import Pose
 from spacerobot_ros.model.integration import count_steps, repeat_step
 from spacerobot_ros.model.kinematics import LinkPlacement
@@ -290,13 +290,3 @@ def test_a_collada_file_has_its_own_unit(name: str, data: bytes, unit: float | N
         return
     with pytest.raises(meshes._DamagedError, match=r"^its unit is no length$"):
         meshes._unit_in_metres(Path(name), data)
-
-
-def test_the_root_of_a_package_is_the_nearest_folder_with_its_description(tmp_path: Path) -> None:
-    deep = tmp_path / "outer" / "inner" / "urdf"
-    deep.mkdir(parents=True)
-    file = deep / "robot.xacro"
-    assert xacro_files.package_root(file) == deep.resolve()
-    for folder in (tmp_path / "outer", tmp_path / "outer" / "inner"):
-        (folder / "package.xml").touch()
-        assert xacro_files.package_root(file) == folder.resolve()
