@@ -14,6 +14,7 @@ import logging
 import os
 import secrets
 import stat
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -267,7 +268,7 @@ class Cache:
 
 
 def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: str) -> None:
-    """Log a warning that is given once; afterwards it is logged for debugging.
+    """Log a warning that is given once an installation; afterwards it is logged for debugging.
 
     Parameters
     ----------
@@ -276,10 +277,12 @@ def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: st
         warning is given each time.
     """
     cache = Cache(folder)
-    known = cache.load(name, name) is not None
+    # Installations that share a cache have a file each.
+    entry = f"{name}-{hashlib.sha256(sys.prefix.encode()).hexdigest()[:32]}"
+    known = cache.load(entry, entry) is not None
     logger.log(logging.DEBUG if known else logging.WARNING, message)
     if not known:
-        cache.store(name, name, b"")
+        cache.store(entry, entry, b"")
 
 
 def _trailer(content: bytes, key: str) -> bytes:
