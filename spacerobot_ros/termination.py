@@ -37,7 +37,7 @@ _LONGEST_UNWINDING_TIME = 1.2
 _SAME_SIGNAL_TIME = 1.0
 """Wall time between signals that count as one, s: launcher and terminal both send a signal."""
 
-_TIME_AFTER_PARENT_END = 1.7
+_TIME_AFTER_PARENT_END = 1.5
 """Wall time after the end of the parent at which the kernel kills this process, s."""
 
 _PARENT_VARIABLE = "SPACEROBOT_PARENT"
@@ -116,7 +116,7 @@ class _Guard:
             number = signal.SIGTERM
             _set_timer(_TIME_AFTER_PARENT_END, signal.SIG_DFL)
         if self.ending is not None:
-            if time.monotonic() - self._since > _SAME_SIGNAL_TIME:
+            if not parent_ended and time.monotonic() - self._since > _SAME_SIGNAL_TIME:
                 self._end_process()
             return
         self.ending, self._since = Terminated(number), time.monotonic()

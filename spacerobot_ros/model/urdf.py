@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 import subprocess
 import sys
 from collections import Counter
@@ -571,7 +570,7 @@ def _require_mass(robot: RobotDescription) -> None:
 
 # -- form of the text -------------------------------------------------------------------------
 
-_OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": "a COLLADA file"}
+_OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model"}
 """Descriptions of other file formats by their root elements."""
 
 _ELEMENTS_READ = {
@@ -660,7 +659,11 @@ def _checked_root(text: str) -> Element:
             f"The robot description is not valid URDF: it is no XML ({error})."
         ) from error
     if root.tag != "robot":
-        raise RobotDescriptionError(_other_root_message(root.tag))
+        raise RobotDescriptionError(
+            "The robot description is not valid URDF but "
+            f"{_OTHER_FORMATS.get(root.tag, 'something else')}: its root element is <{root.tag}>, "
+            "and that of a URDF is <robot>. Export or convert it to URDF."
+        )
     for element in [root, *root.findall("link"), *root.findall("joint")]:
         unused = {child.tag for child in element} - set(_ELEMENTS_READ[element.tag])
         _remove_children(element, unused)
@@ -706,19 +709,6 @@ class _MalformedError(RobotDescriptionError):
 
     def __init__(self, flaw: str, remedy: str) -> None:
         super().__init__(f"The robot description is not valid URDF: {flaw}; write {remedy}.")
-
-
-def _other_root_message(tag: str) -> str:
-    namespace = re.fullmatch(r"\{(.*)\}robot", tag)
-    if namespace is not None:
-        return (
-            "The robot description is not valid URDF: its elements are in the namespace "
-            f"'{namespace[1]}'; remove xmlns=\"...\" from <robot>."
-        )
-    return (
-        f"The robot description is not valid URDF but {_OTHER_FORMATS.get(tag, 'something else')}: "
-        f"its root element is <{tag}>, and that of a URDF is <robot>. Export or convert it to URDF."
-    )
 
 
 def _require_type(joint: Element, where: str) -> None:

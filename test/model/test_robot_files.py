@@ -141,7 +141,6 @@ BROKEN = {
     "SDF": ("<sdf version='1.9'><model name='a'/></sdf>", r"but an SDF model: .* <sdf>.* convert"),
     "MuJoCo": ("<mujoco><worldbody/></mujoco>", r"but a MuJoCo model: .* <mujoco>.* convert"),
     "a web page": ("<html><body/></html>", r"but something else: .* <html>"),
-    "a namespace": (changed("<robot ", '<robot xmlns="http://x" '), r"remove xmlns="),
     "no name": (changed(' name="probe"', ""), r"the <robot> has no name; write <robot name="),
     "no link": ('<robot name="a"/>', r"exactly one root link .* found: none\. Give it a <link>"),
     # Masses and inertias.
