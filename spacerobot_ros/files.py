@@ -25,7 +25,7 @@ _LOG = logging.getLogger(__name__)
 
 _OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
-_CACHE_MAGIC = b"spacerobot_ros cache 3"
+_CACHE_MAGIC = b"spacerobot_ros cache 2"
 """Beginning of the last line of a cache file, with the number of the file format."""
 
 _MCAP_MAGIC = b"\x89MCAP"
@@ -208,7 +208,7 @@ def _require_own(path: Path) -> None:
 class Cache:
     """A folder of files that can be computed again. Its methods log warnings instead of raising.
 
-    The last line of a file holds the SHA-256 of its key and content, against disks that get full.
+    The last line of a file holds its key, length and SHA-256, against disks that get full.
     The folder must belong to this user, and no other user may write into it, because its files are
     executed and flown.
 
@@ -286,8 +286,8 @@ def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: st
 
 
 def _trailer(content: bytes, key: str) -> bytes:
-    digest = hashlib.sha256(key.encode() + b"\n" + content).hexdigest()
-    return b"\n%s %s\n" % (_CACHE_MAGIC, digest.encode())
+    digest = hashlib.sha256(content).hexdigest()
+    return b"\n%s %s %d %s\n" % (_CACHE_MAGIC, key.encode(), len(content), digest.encode())
 
 
 def _content_of_entry(whole: bytes, key: str) -> bytes:

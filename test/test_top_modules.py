@@ -263,7 +263,7 @@ def test_a_cache_gives_what_was_stored_under_a_key(
     assert path == tmp_path / "a" / "b" / "x"
     assert stat.S_IMODE((tmp_path / "a" / "b").stat().st_mode) == 0o700
     assert cache.load("x", "key") == (path, b"content")
-    assert path.read_bytes().splitlines()[-1].startswith(b"spacerobot_ros cache 3 ")
+    assert path.read_bytes().splitlines()[-1].startswith(b"spacerobot_ros cache 2 key 7 ")
     with caplog.at_level(logging.WARNING):
         assert cache.load("x", "other") is None
     assert not path.exists()
