@@ -187,8 +187,6 @@ def read_private(path: Path) -> bytes:
     UntrustedFileError
         It belongs to another user, or others may write it.
     """
-    if path.exists() and not path.is_file():
-        raise UntrustedFileError(f"'{path}' is not a regular file; remove it.")
     _require_own(path)
     return path.read_bytes()
 
