@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros import files
 from spacerobot_ros.campaign.statistics import influences
 from spacerobot_ros.collision.geometry import Solid, _solid_in_world
 from spacerobot_ros.collision.rounded_box import RoundedBox
@@ -67,13 +66,6 @@ def test_dispersions_that_do_not_vary_are_passed_over_and_the_next_ones_are_not(
         ("moving", "twice", pytest.approx(1.0)),
         ("turned", "twice", pytest.approx(-1.0)),
     ]
-
-
-def test_yaml_may_have_a_million_characters(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "_MAX_YAML_CHARACTERS", 8)
-    assert files.load_yaml("a: 12345") == {"a": 12345}
-    with pytest.raises(ValueError, match="it has more than 8 characters"):
-        files.load_yaml("a: 123456")
 
 
 @pytest.mark.parametrize(

@@ -70,11 +70,10 @@ def test_what_is_damaged_is_derived_again(
     assert derivation.count == 2
 
 
-def test_what_others_may_have_written_is_not_read(folder: Path) -> None:
+def test_a_folder_that_others_may_write_is_not_read(folder: Path) -> None:
     derivation = Derivation()
     derivation.kept()
-    (kept,) = folder.iterdir()
-    kept.chmod(0o666)
+    folder.chmod(0o777)
     derivation.kept()
     assert derivation.count == 2
 

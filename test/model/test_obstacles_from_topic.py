@@ -7,10 +7,8 @@ import pytest
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.urdf import load_robot, parse_robot, parse_world
 from spacerobot_ros.model.world import (
-    MAX_OBSTACLES_TEXT,
     links_with_shapes,
     obstacles_from_topic,
-    with_obstacles_around,
     with_world,
 )
 from spacerobot_ros.resources import robot_file
@@ -30,18 +28,11 @@ def test_a_text_is_obstacles_and_an_empty_one_is_none() -> None:
     assert links_with_shapes(world) == ["ball", "post"]
     for empty in ("", " \n"):
         assert obstacles_from_topic(empty) is None
-    padded = BALL + " " * (MAX_OBSTACLES_TEXT - len(BALL))
-    assert len(padded) == 1_000_000
-    assert obstacles_from_topic(padded) is not None
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            BALL + " " * (MAX_OBSTACLES_TEXT - len(BALL) + 1),
-            "^The obstacles are a text of 1000001 characters, which may have at most 1000000: give",
-        ),
         (
             BALL.replace('"a" type="fixed"', '"a" type="continuous"'),
             "joint 'a' is (floating|continuous): give it",
@@ -63,12 +54,12 @@ def test_other_texts_are_refused(text: str, message: str) -> None:
 def test_a_robot_is_among_the_obstacles_that_came_last() -> None:
     robot = load_robot(robot_file("planar_chain"))
     before = with_world(robot, parse_world(BALL.replace("ball", "stone")))
-    other = with_obstacles_around(before, parse_world(BALL))
+    other = with_world(before, parse_world(BALL))
     assert other.world is not None
     carried = parse_robot(other.urdf).world
     assert carried is not None
     assert links_with_shapes(carried) == ["ball", "post"]
-    free = with_obstacles_around(other, None)
+    free = with_world(other, None)
     assert free.world is None
     assert parse_robot(free.urdf).world is None
     assert "<world" not in free.urdf

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -12,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model import integration, meshes, rotations, xacro_files
+from spacerobot_ros.model import integration, meshes, rotations
 from spacerobot_ros.model.description import Pose
 from spacerobot_ros.model.integration import count_steps, repeat_step
 from spacerobot_ros.model.kinematics import LinkPlacement
@@ -211,58 +210,6 @@ def test_matrices_about_axes_and_products_of_many() -> None:
 
 # -- meshes --------------------------------------------------------------------------------------
 
-CORNERS = b"v 0 0 0\nv 1 0 0 1.0\nv 1 1 0\n\nv 0 1 0\n# no corner\nv 0.5 0.5 1\n"
-
-
-@pytest.mark.parametrize(
-    ("faces", "triangles"),
-    [
-        (b"f 1 2 3", [(0, 1, 2)]),
-        (b"f 1 2 3 4", [(0, 1, 2), (0, 2, 3)]),
-        (b"f 2/1/1 3//2 4/3 1 5", [(1, 2, 3), (1, 3, 0), (1, 0, 4)]),
-        (b"f -1 -5 -4", [(4, 0, 1)]),
-        (b"f 1 2 \\\n3", [(0, 1, 2)]),
-        (b"f 1 2 \\\r\n5 4", [(0, 1, 4), (0, 4, 3)]),
-        (b"f 1 2", []),
-        (b"vn 0 0 1\ns off", []),
-    ],
-)
-def test_faces_are_fans_of_triangles(faces: bytes, triangles: list[tuple[int, ...]]) -> None:
-    mesh = meshes._read_obj(CORNERS + faces)
-    assert [tuple(face) for face in mesh.faces.tolist()] == triangles
-    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]]
-    assert mesh.faces.shape == (len(triangles), 3)
-
-
-@pytest.mark.parametrize(
-    ("line", "reason"),
-    [
-        (b"v 1 2", "a vertex has not three coordinates"),
-        (b"v 1 2 x", "a coordinate is no number"),
-        (b"f 1 b 3", "a corner of a face is no number"),
-        (b"f 0 1 2", "a face has the index of a missing vertex"),
-    ],
-)
-def test_damaged_lines_of_obj_are_refused(line: bytes, reason: str) -> None:
-    with pytest.raises(meshes._DamagedError) as refusal:
-        meshes._read_obj(CORNERS + line)
-    assert str(refusal.value) == reason
-
-
-def test_indices_of_corners_count_from_either_end() -> None:
-    most = meshes._MAX_MESH_BYTES
-    for word, index in (
-        (b"1", 0),
-        (b"7/2/3", 6),
-        (b"-1", 8),
-        (b"-9//1", 0),
-        (b"%d" % most, most - 1),
-    ):
-        assert meshes._parse_corner_index(word, 9) == index
-    for word in (b"0", b"%d" % (most + 1), b"-%d" % (most + 1)):
-        with pytest.raises(meshes._DamagedError):
-            meshes._parse_corner_index(word, 9)
-
 
 def test_equal_corners_are_one_whatever_the_sign_of_their_zeros() -> None:
     corners = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0], [-0.0, 0, 1], [0, 1, -0.0], [2, 2, 2]])
@@ -271,32 +218,3 @@ def test_equal_corners_are_one_whatever_the_sign_of_their_zeros() -> None:
     np.testing.assert_array_equal(mesh.vertices[mesh.faces].reshape(-1, 3), corners)
     none = meshes.mesh_from_corners(np.zeros((0, 3)))
     assert (none.vertices.shape, none.faces.shape) == ((0, 3), (0, 3))
-
-
-@pytest.mark.parametrize(
-    ("name", "data", "unit"),
-    [
-        ("a.stl", b'<unit meter="0.5"/>', 1.0),
-        ("a.DAE", b"<unit name=\"cm\" meter = '0.01'/>", 0.01),
-        ("a.dae", b"<asset/>", 1.0),
-        ("a.dae", b'<unit meter="0"/>', None),
-        ("a.dae", b'<unit meter="-1"/>', None),
-        ("a.dae", b'<unit meter="1e99"/>', None),
-    ],
-)
-def test_a_collada_file_has_its_own_unit(name: str, data: bytes, unit: float | None) -> None:
-    if unit is not None:
-        assert meshes._unit_in_metres(Path(name), data) == unit
-        return
-    with pytest.raises(meshes._DamagedError, match=r"^its unit is no length$"):
-        meshes._unit_in_metres(Path(name), data)
-
-
-def test_the_root_of_a_package_is_the_nearest_folder_with_its_description(tmp_path: Path) -> None:
-    deep = tmp_path / "outer" / "inner" / "urdf"
-    deep.mkdir(parents=True)
-    file = deep / "robot.xacro"
-    assert xacro_files.package_root(file) == deep.resolve()
-    for folder in (tmp_path / "outer", tmp_path / "outer" / "inner"):
-        (folder / "package.xml").touch()
-        assert xacro_files.package_root(file) == folder.resolve()

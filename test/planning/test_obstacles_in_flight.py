@@ -15,7 +15,7 @@ from support.planner_phases import executing, planning, resting, stub_of, twisti
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.urdf import load_robot, parse_world
-from spacerobot_ros.model.world import with_obstacles_around
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -157,7 +157,7 @@ def test_a_path_of_the_base_is_read_between_its_poses() -> None:
 
 def test_the_clearance_of_another_robot_is_among_the_same_obstacles() -> None:
     robot = load_robot(robot_file("planar_chain"))
-    described = with_obstacles_around(robot, parse_world(BALL))
+    described = with_world(robot, parse_world(BALL))
     other = Clearance(described, 0.03).of(robot)
     assert (other._robot.world, other.distance) == (described.world, 0.03)
 
@@ -166,7 +166,7 @@ def test_the_clearance_of_another_robot_is_among_the_same_obstacles() -> None:
 def test_a_worker_plans_among_the_obstacles_that_it_is_given(*, obstacles: bool) -> None:
     loop = resting()
     robot, config = loop.plant.robot, PlannerConfig(clearance=0.0)
-    described = with_obstacles_around(robot.description, parse_world(BALL)) if obstacles else None
+    described = with_world(robot.description, parse_world(BALL)) if obstacles else None
     worker = PlanningWorker(robot, config, loop.method, described=described)
     if described is None:
         assert worker.clearance is None

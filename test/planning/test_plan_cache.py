@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -54,12 +55,9 @@ def cache(
 
     monkeypatch.setattr(ManoeuvreSearch, "search", searching)
     cache = Cache(tmp_path / "plans")
-    cache.store(made[1].name, key_of(made[1]), content_of(made[1]))
+    cache.folder.mkdir()
+    shutil.copy(made[1], cache.folder)
     return cache
-
-
-def key_of(path: Path) -> str:
-    return path.read_bytes().splitlines()[-1].split()[3].decode()
 
 
 def content_of(path: Path) -> bytes:
