@@ -71,7 +71,6 @@ setup(
         NAME: [
             "py.typed",
             "batch/*.hpp",
-            "model/*.c",
             "report/*.css",
             "report/*.js",
             "viewer/*.js",

@@ -20,7 +20,6 @@ import numpy.typing as npt
 from spacerobot_ros.model.compilation import (
     compilation_settings,
     compiled,
-    compiled_before,
     dense_function,
 )
 from spacerobot_ros.model.composite_rigid_body import (
@@ -103,27 +102,12 @@ class ModelFunctions:
             return self._symbolic[name]
         return self.composed(name, lambda: self._symbolic[name])
 
-    def composed(
-        self, name: str, build: Callable[[], ca.Function], *, lasting: bool = False
-    ) -> ca.Function:
-        """Return a function composed of those of the model, compiled once per name.
-
-        ``lasting`` is that of :func:`.compiled`.
-        """
+    def composed(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
+        """Return a function composed of those of the model, compiled once per name."""
         key = (name, *compilation_settings())
         if key not in self._compiled:
-            self._compiled[key] = compiled(build(), lasting=lasting)
+            self._compiled[key] = compiled(build())
         return self._compiled[key]
-
-    def is_compiled(self, name: str) -> bool:
-        """Whether a function of the model is there compiled, in this process or in the cache."""
-        key = (name, *compilation_settings())
-        if key not in self._compiled:
-            kept = compiled_before(self.function(name, compile=False))
-            if kept is None:
-                return False
-            self._compiled[key] = kept
-        return True
 
     @property
     def total_mass(self) -> float:

@@ -64,7 +64,7 @@ class SpaceRobot:
         self.effort_limit = description.limits("effort")
         self._model, self._p = self._chosen_model(build)
         self._buffers: dict[str, BufferedFunction] = {}
-        self._compiles_on_demand = False
+        self._compiles = True
         self._require_positive_inertia()
 
     @classmethod
@@ -268,21 +268,15 @@ class SpaceRobot:
 
     def buffered(self, name: str) -> BufferedFunction:
         """Return a function with input and output buffers of its own, for one caller."""
-        model = self._model
-        if self._compiles_on_demand and not model.is_compiled(name):
-            interpreted = model.function(name, compile=False)
-            return BufferedFunction(interpreted, self._p, lambda: model.function(name))
-        return BufferedFunction(model.function(name), self._p)
+        return BufferedFunction(self._model.function(name, compile=self._compiles), self._p)
 
     @cached_property
-    def compiled_on_demand(self) -> SpaceRobot:
-        """The same robot for callers with few calls: a function runs in CasADi's virtual machine,
-        with the same numbers, bit for bit, until it was called so often that compiling pays.
+    def interpreted(self) -> SpaceRobot:
+        """The same robot for callers with few calls, for whom compiling does not pay: functions of
+        the model run in CasADi's virtual machine, with the same numbers, bit for bit.
         """
-        if self._compiles_on_demand:
-            return self
         robot = copy.copy(self)
-        robot._buffers, robot._compiles_on_demand = {}, True
+        robot._buffers, robot._compiles = {}, False
         return robot
 
     def velocity_step(self, substeps: int) -> BufferedFunction:
@@ -300,7 +294,7 @@ class SpaceRobot:
         evaluated in every tick.
         """
         model = self._model
-        function = model.composed(name, lambda: build(Composition(model, ca.MX)), lasting=True)
+        function = model.composed(name, lambda: build(Composition(model, ca.MX)))
         return BufferedFunction(function, self._p)
 
     def expressions(self) -> Composition:

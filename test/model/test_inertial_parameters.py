@@ -109,7 +109,7 @@ def test_momentum_is_that_of_pinocchio() -> None:
 def test_one_compilation_serves_every_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[str] = []
 
-    def counted(function: ca.Function, *, lasting: bool = False) -> ca.Function:
+    def counted(function: ca.Function) -> ca.Function:
         built.append(function.name())
         return function
 
