@@ -79,7 +79,7 @@ class ModelFunctions:
         self._kin = tree_kinematics(robot, mass_properties)
         self._inertia = composites(self._kin)
         self._symbolic: dict[str, ca.Function] = {}
-        self._compiled: dict[tuple[str, ...], ca.Function] = {}
+        self._compiled: dict[tuple[Hashable, ...], ca.Function] = {}
         self.derived: dict[Hashable, Any] = {}
         """Cache of objects that other modules derive from the model, by key."""
 
@@ -102,12 +102,12 @@ class ModelFunctions:
             return self._symbolic[name]
         return self.composed(name, lambda: self._symbolic[name])
 
-    def composed(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
-        """Return a function composed of those of the model, compiled once per name."""
-        key = (name, *compilation_settings())
-        if key not in self._compiled:
-            self._compiled[key] = compiled(build())
-        return self._compiled[key]
+    def composed(self, key: Hashable, build: Callable[[], ca.Function]) -> ca.Function:
+        """Return a function composed of those of the model, compiled once per key."""
+        place = (key, *compilation_settings())
+        if place not in self._compiled:
+            self._compiled[place] = compiled(build())
+        return self._compiled[place]
 
     @property
     def total_mass(self) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.model.compilation import BufferedFunction, compilation_settings, compiled
+from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions, SymbolicModels
@@ -301,16 +301,13 @@ class SpaceRobot:
         """Return the model's functions as SX expressions for larger functions; see :meth:`view`."""
         return Composition(self._model, ca.SX)
 
-    def view(self, function: ca.Function, key: Hashable | None = None) -> BufferedFunction:
+    def view(self, function: ca.Function, key: Hashable) -> BufferedFunction:
         """Compile a function of :meth:`expressions`, and return it with its own buffers.
 
-        The argument ``p``, if it has one, is set to this robot's mass properties. With a ``key``,
-        which no other function has, it is compiled as :meth:`cached_object` says.
+        The argument ``p``, if it has one, is set to this robot's mass properties. Functions with
+        one ``key`` are the same: it is compiled once, as :meth:`cached_object` says.
         """
-        if key is None:
-            return BufferedFunction(compiled(function), self._p)
-        code = self.cached_object((key, *compilation_settings()), lambda: compiled(function))
-        return BufferedFunction(code, self._p)
+        return BufferedFunction(self._model.composed(key, lambda: function), self._p)
 
     def cached_object(self, key: Hashable, make: Callable[[], _Made]) -> _Made:
         """Return an object that is made of :meth:`expressions`, once per key for all robots that

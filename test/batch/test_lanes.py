@@ -211,9 +211,10 @@ def test_the_widest_registers_that_there_are_are_chosen(monkeypatch: pytest.Monk
         ("fpu sse2 avx avx2", "AVX2"),
         ("fpu sse2", "SSE2"),
         ("asimd", "two at a time"),
+        (None, "two at a time"),
     ):
         native.vector_unit.cache_clear()
-        text = f"model name : avx512f\nflags\t\t: {flags}\n"
+        text = f"model name : avx512f\nflags\t\t: {flags}\n" if flags else "no processor\n"
         monkeypatch.setattr(Path, "read_text", lambda *_, text=text, **__: text)
         assert native.vector_unit().name == name
     monkeypatch.undo()
@@ -238,6 +239,23 @@ def test_narrower_registers_give_the_same_flights(
         here = fly_lanes(flights)
         assert f"{chosen.lanes} lanes" in here.engine
         assert_equal_flights(here, fly_one_by_one(flights))
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_without_vector_functions_of_the_c_library_lanes_fly_as_well(
+    robots: dict[str, SpaceRobot], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    flights = velocity_flights(robots["servicer"], 9, each=True, deadband=0.0)
+    with_functions = fly_lanes(flights)
+    compiler = tmp_path / "c++"
+    script = f'#!/bin/sh\ncase "$*" in *-lmvec*) exit 1;; esac\nexec {cxx_compiler()} "$@"\n'
+    compiler.write_text(script, encoding="utf-8")
+    compiler.chmod(0o700)
+    monkeypatch.setenv("CXX", str(compiler))
+    here = fly_lanes(flights)
+    assert here.engine == with_functions.engine
+    assert_equal_flights(here, with_functions)
 
 
 @needs_compiler
