@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -196,8 +197,8 @@ def load_library(
         names["cpp"] = "C++ compiler (c++, g++, clang++ or $CXX)"
         raise NoLibraryError(f"no {names[language]} was found")
     words = [compiler, *_FLAGS, *flags]
-    platform = f"{sysconfig.get_platform()} {_c_library_version()}"
-    key = _hash_text("\n".join([platform, *words, *libraries, source]))
+    machine = [sysconfig.get_platform(), *platform.libc_ver()]
+    key = _hash_text("\n".join([*machine, *words, *libraries, source]))
     file_name = f"{name}-{key[:32]}.so"
     cache = Cache(cache_directory())
     if kept := cache.load(file_name, key):
@@ -236,22 +237,22 @@ def _run_compiler(command: Sequence[str], folder: Path) -> None:
     OSError
         It cannot be started.
     """
-    output = folder / "output"
-    # The compiler's temporary files are deleted with the folder, also where it is killed.
+    # The compiler's temporary files are deleted with the folder, also if it is killed.
     environment = {**os.environ, "TMPDIR": str(folder)}
-    with ExitStack() as entered, output.open("wb") as said:
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "env": environment}
+    with ExitStack() as entered:
         for context in tuple(compilation_contexts):
             entered.enter_context(context())
-        code = entered.enter_context(
-            tool(command, stdout=said, stderr=subprocess.STDOUT, env=environment)
-        ).wait()
-    compiler = command[0]
+        process = entered.enter_context(tool(command, **options))
+        assert process.stdout is not None
+        with process.stdout as said:
+            lines = said.read().decode(errors="replace").strip().splitlines()
+        code = process.wait()
     if code < 0:
-        raise NoLibraryError(f"{compiler} was ended by {signal.Signals(-code).name}")
+        raise NoLibraryError(f"{command[0]} was ended by {signal.Signals(-code).name}")
     if code:
-        lines = output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         reason = f"no reason given; is the disk of {folder.parent} full?"
-        raise NoLibraryError(f"{compiler} failed ({code}): {lines[0][:300] if lines else reason}")
+        raise NoLibraryError(f"{command[0]} failed ({code}): {lines[0][:300] if lines else reason}")
 
 
 @lru_cache(maxsize=1)
@@ -261,14 +262,6 @@ def _announce_compilation() -> None:
         "Compiling the equations of this robot: once, some seconds.",
         extra={ANNOUNCEMENT_ATTRIBUTE: True},
     )
-
-
-@lru_cache(maxsize=1)
-def _c_library_version() -> str:
-    """Return name and version of the C library, which objects refer to."""
-    with suppress(AttributeError, ValueError, OSError):
-        return os.confstr("CS_GNU_LIBC_VERSION") or ""
-    return ""
 
 
 @lru_cache

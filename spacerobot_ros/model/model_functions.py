@@ -15,7 +15,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from spacerobot_ros.model.compilation import (
     compilation_settings,
@@ -86,7 +85,7 @@ class ModelFunctions:
     @classmethod
     def of(cls, robot: RobotDescription) -> ModelFunctions:
         """Return the model with a robot's constants; equal robots of a process share it."""
-        return _model_of_key(_RobotKey(hashlib.sha256(pickle.dumps(robot)).hexdigest(), robot))
+        return _model_of_key(_RobotKey.of(robot, robot))
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
         """Return a function of the model by name (the keys of ``_builders``).
@@ -358,10 +357,14 @@ _MAX_SYMBOLIC_MODELS = 8
 
 @dataclass(frozen=True)
 class _RobotKey:
-    """A robot identified by a hash of its whole description."""
+    """A robot identified by a hash of facts about it."""
 
     key: str
     robot: RobotDescription = field(compare=False)
+
+    @classmethod
+    def of(cls, robot: RobotDescription, facts: object) -> _RobotKey:
+        return cls(hashlib.sha256(pickle.dumps(facts)).hexdigest(), robot)
 
 
 @lru_cache(maxsize=_MAX_SYMBOLIC_MODELS)
@@ -402,20 +405,18 @@ class Composition:
 class SymbolicModels:
     """Models with mass properties as an argument, for all robots of the same structure."""
 
-    def __init__(self, robot: RobotDescription, free: npt.NDArray[np.bool_]) -> None:
-        self._robot, self._free = robot, free
+    def __init__(self, robot: RobotDescription) -> None:
+        self._robot = robot
+        self._free = possibly_nonzero_entries(InertialParameters.of(robot))
         self._models: dict[bool, ModelFunctions] = {}
 
     @classmethod
     def of(cls, robot: RobotDescription) -> SymbolicModels:
         """Return the models for all robots that differ from this robot in mass properties alone."""
+        bodies = [(body.name, body.joint, body.parent, body.origin) for body in robot.bodies]
         free = possibly_nonzero_entries(InertialParameters.of(robot))
-        key = _structure_key(robot, free)
-        found = _symbolic_models.pop(key, None) or cls(robot, free)
-        _symbolic_models[key] = found
-        if len(_symbolic_models) > _MAX_SYMBOLIC_MODELS:
-            del _symbolic_models[next(iter(_symbolic_models))]
-        return found
+        facts = (robot.name, bodies, robot.frames, [link.name for link in robot.links], free)
+        return _models_of_key(_RobotKey.of(robot, facts))
 
     def model(self, parameters: InertialParameters) -> tuple[ModelFunctions, Array]:
         """Return the model for inertial parameters (..., B), and its argument ``p`` (..., k).
@@ -431,11 +432,6 @@ class SymbolicModels:
         return self._models[usual], np.ascontiguousarray(vector[..., free])
 
 
-_symbolic_models: dict[str, SymbolicModels] = {}
-
-
-def _structure_key(robot: RobotDescription, free: npt.NDArray[np.bool_]) -> str:
-    """Return a hash of a description without its mass properties."""
-    bodies = [(body.name, body.joint, body.parent, body.origin) for body in robot.bodies]
-    facts = (robot.name, bodies, robot.frames, [link.name for link in robot.links], free)
-    return hashlib.sha256(pickle.dumps(facts)).hexdigest()
+@lru_cache(maxsize=_MAX_SYMBOLIC_MODELS)
+def _models_of_key(equal: _RobotKey) -> SymbolicModels:
+    return SymbolicModels(equal.robot)

@@ -113,7 +113,7 @@ def test_one_compilation_serves_every_draw(monkeypatch: pytest.MonkeyPatch) -> N
         built.append(function.name())
         return function
 
-    monkeypatch.setattr(model_functions, "_symbolic_models", {})
+    model_functions._models_of_key.cache_clear()
     monkeypatch.setattr(model_functions, "compiled", counted)
     robot = SpaceRobot(load_robot(share_directory() / "urdf" / "sliding_masses.urdf"))
     heavy = robot.inertial.scaled(1.5)
