@@ -74,17 +74,12 @@ def give_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "truncated": lambda whole: whole[:5000],
-    "cut in its last line": lambda whole: whole[:-10],
-    "zeroed": lambda whole: bytes(len(whole)),
     "empty": lambda _: b"",
     "one bit": lambda whole: whole[:3000] + bytes([whole[3000] ^ 1]) + whole[3001:],
-    "longer": lambda whole: whole + b"x",
     "without its last line": lambda whole: whole[: whole.rfind(b"\nspacerobot_ros cache")],
-    "text": lambda _: b"#!/bin/sh\n",
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_object_is_made_anew(
     damage: str, cache: Path, caplog: pytest.LogCaptureFixture
@@ -118,6 +113,7 @@ def test_an_object_under_the_name_of_another_is_not_loaded(
     content = other.read_bytes()
     assert is_compiled()
     (own,) = set(cache.iterdir()) - {other}
+    own.unlink()  # It may still be mapped.
     own.write_bytes(content)
     assert is_compiled()
     assert "is deleted" in caplog.text
@@ -138,7 +134,6 @@ def test_flags_are_part_of_the_name() -> None:
 @pytest.mark.parametrize(
     ("script", "reason"),
     [
-        ("exit 0", "No such file"),
         ('while [ "$1" != -o ]; do shift; done; echo hello > "$2"', "cannot be loaded"),
         ("echo no room >&2; exit 3", r"failed \(3\): no room"),
         ("exit 4", r"failed \(4\): no reason given; is the disk of .* full"),
