@@ -133,29 +133,17 @@ def compiled(function: ca.Function) -> ca.Function:
     """Return the function as compiled C, or unchanged if it is not or cannot be compiled."""
     if not _is_compilation_enabled():
         return function
-    generator = ca.CodeGenerator(function.name(), {"with_header": False})
+    name = function.name()
+    generator = ca.CodeGenerator(name, {"with_header": False})
     generator.add(function)
-    found = compiled_functions(str(generator.dump()), [function.name()])
-    return function if found is None else found[0]
-
-
-def compiled_functions(source: str, names: Sequence[str]) -> list[ca.Function] | None:
-    """Return functions of a C source by their names, which have CasADi's interface.
-
-    None: compiling is off, or impossible, with a warning.
-    """
-    if not _is_compilation_enabled():
-        return None
     try:
-        return load_library(
-            names[0], source, lambda path: [ca.external(name, path) for name in names]
-        )
+        return load_library(name, str(generator.dump()), lambda path: ca.external(name, path))
     except NoLibraryError as reason:
         warn_once(
             "Functions run in CasADi's virtual machine, slower and with the same formulas "
             f"(SPACEROBOT_COMPILE=0 asks for it): {reason}."
         )
-        return None
+        return function
 
 
 def load_library(

@@ -32,7 +32,7 @@ TOLERANCE = 1e-5
 
 _IPOPT_OPTIONS = {
     "print_time": False,
-    # Compiled functions cannot be differentiated, so the solver must not ask for it.
+    # All derivatives are given: the solver is not to derive more.
     "no_nlp_grad": True,
     "calc_lam_p": False,
     "ipopt.print_level": 0,
