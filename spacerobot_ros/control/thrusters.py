@@ -314,9 +314,6 @@ class ThrusterAllocation:
     :class:`spacerobot_ros.control.ActuatorLimits`. For a wrench outside the cone of the thrusters
     the nearest wrench in the cone is allocated, with torques weighted by the mean lever.
 
-    SIMD lanes have the active-set solver once more in C++ (``batch/thrusters.hpp``), because its
-    steps differ from lane to lane; test/batch holds both to the same random cases.
-
     Parameters
     ----------
     wrenches
@@ -349,13 +346,6 @@ class ThrusterAllocation:
         self._usable = usable
         self._columns = self._matrix[:, usable]
         self._extended = np.vstack([self._columns, COST_WEIGHT * self._cost[usable]])
-
-    @property
-    def problem(self) -> tuple[Array, Array]:
-        """The least-squares problem of a wrench: the matrix (7, m) of the levels, with the cost in
-        the last row, and the weights (6,) of the wrench on the right-hand side.
-        """
-        return self._extended, self._weights
 
     def allocate(self, wanted: Array, most: Array) -> Allocation:
         """Return levels (m,), each within ``most`` (m,), for a wrench ``wanted`` (6,), or for the
@@ -516,7 +506,7 @@ PULSE_OUTPUTS = ("on_time", "added", "next_remaining", "next_open", "begun")
 
 
 def pulse_function(count: int) -> ca.Function:
-    """Return the pulses of a control period as a function of numbers or, in lanes, of symbols.
+    """Return the pulses of a control period as a function.
 
     A closed thruster opens if its level is a whole shortest pulse; an open one stays open as long
     as it has a level. It takes :data:`PULSE_INPUTS` and gives :data:`PULSE_OUTPUTS`, (count,) each:
