@@ -513,6 +513,29 @@ def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Fli
     return replace(flight, series=_LazyMapping({**makers, "propellant": used}))
 
 
+def since(flight: Flight, start: float) -> Flight:
+    """Return a flight with times since ``start``, s."""
+    series = flight.series
+
+    def moved(name: str) -> Signal:
+        return Signal(series[name].time - start, series[name].values)
+
+    def earlier(goals: tuple[SentGoal, ...]) -> tuple[SentGoal, ...]:
+        return tuple(replace(sent, time=sent.time - start) for sent in goals)
+
+    return replace(
+        flight,
+        series=_LazyMapping({name: partial(moved, name) for name in series}),
+        statuses=tuple((ns - round(start * SECOND), status) for ns, status in flight.statuses),
+        events=tuple(
+            each if each.time_s is None else replace(each, time_s=each.time_s - start)
+            for each in flight.events
+        ),
+        goals=earlier(flight.goals),
+        end_effector_goals=earlier(flight.end_effector_goals),
+    )
+
+
 def impulse(thrust: Signal, weights: Array) -> Signal:
     """Return the sum over time (N, 1) of thrusts (N, m), N, each times its weight (m,)."""
     ticks = np.diff(thrust.time, prepend=thrust.time[:1])
