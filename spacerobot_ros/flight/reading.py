@@ -19,7 +19,6 @@ import numpy as np
 
 from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
-from spacerobot_ros.control.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.errors import (
     GoalError,
     PlanningError,
@@ -32,6 +31,7 @@ from spacerobot_ros.flight.flight import Commands, Flight, SentGoal, Signal, goa
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.model.world import obstacles_from_topic, with_world
 from spacerobot_ros.parameters import declared, known_values
