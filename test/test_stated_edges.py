@@ -11,7 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.campaign.statistics import influences
-from spacerobot_ros.collision.geometry import Solid, _solid_in_world
+from spacerobot_ros.collision.distances import Solid
+from spacerobot_ros.collision.geometry import _solid_in_world
 from spacerobot_ros.collision.rounded_box import RoundedBox
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.measures import METRICS
@@ -132,7 +133,7 @@ def test_the_goal_of_an_end_effector_has_axes_where_an_angle_counts(
 ) -> None:
     goal = SimpleNamespace(position=np.array([0.3, 0.2, 0.1]), quaternion=np.array([0, 0, 0, 1.0]))
     report: Any = SimpleNamespace(
-        goal=None,
+        base_goal=None,
         tool_targets=[SimpleNamespace(goal=goal)],
         link_goals={},
         controls=lambda part: controls if part == "end_effector" else [],

@@ -31,7 +31,7 @@ def select_engine(campaign: Campaign, engine_name: str) -> Engine:
     """
     if engine_name != "auto":
         engine = ENGINE_FACTORIES[engine_name]()
-        reason = engine.refusal(campaign, asked=True)
+        reason = engine.refusal(campaign)
         if reason:
             raise SpaceRobotError(f"The engine '{engine_name}' cannot fly this campaign: {reason}")
         return engine

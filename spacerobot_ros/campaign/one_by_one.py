@@ -64,7 +64,7 @@ class FlightsEngine(_OneByOneEngine):
 
     name = "flights"
 
-    def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
+    def refusal(self, campaign: Campaign) -> str:
         """Return the reason why this engine cannot fly a campaign, as a clause."""
         try:
             require_flyable(campaign.scenario)
@@ -161,7 +161,7 @@ class RosEngine(_OneByOneEngine):
 
     name = "ros"
 
-    def refusal(self, campaign: Campaign, *, asked: bool = False) -> str:
+    def refusal(self, campaign: Campaign) -> str:
         """Return the reason why this engine cannot fly a campaign, as a clause."""
         return "it kills nodes on the way" if campaign.scenario.kills else ""
 

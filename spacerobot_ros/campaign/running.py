@@ -20,7 +20,7 @@ from spacerobot_ros.campaign.config import Campaign, parse_campaign, scenario_of
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
-from spacerobot_ros.campaign.rows import LANES, Row
+from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.workers import (
     THIS_PROCESS,
     Cluster,
@@ -238,12 +238,10 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
     known = stored_flight(dataset, number)
     if known is None:
         return Rerun(row, None, "", "", bag)
-    outcome, engine, metrics = known
+    outcome, _, metrics = known
     deviation, at = largest_deviation(metrics, row.metrics)
     note = ""
-    if campaign.scenario.plant.thrusters and engine == LANES:
-        note = "It was flown in lanes: thrusters that are on or off multiply rounding."
-    elif campaign.scenario.plant.thrusters and flight.inertial is not None:
+    if campaign.scenario.plant.thrusters and flight.inertial is not None:
         note = (
             "Its masses are drawn: the plants of campaign and stack differ in rounding, which "
             "thrusters that are on or off multiply."

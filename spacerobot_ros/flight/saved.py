@@ -22,7 +22,6 @@ from spacerobot_ros.bag.tables import (
     with_euler_angles,
 )
 from spacerobot_ros.control.status import ControllerStatus
-from spacerobot_ros.control.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.messages.builders import (
     goal_message,
     path_message,
@@ -32,6 +31,7 @@ from spacerobot_ros.messages.builders import (
 from spacerobot_ros.messages.layout import encode, stamped_copies
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
+from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.model.visuals import meshes_for_bag
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND

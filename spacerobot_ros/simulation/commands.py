@@ -501,35 +501,27 @@ class _JointBrakes:
     """
 
     def __init__(self, plant: Plant, control_period: float) -> None:
-        # Plants with servos need no law.
-        from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
-        from spacerobot_ros.control.laws.law import Gains
-
         robot: SpaceRobot = plant.robot
-        rate = min(_BRAKING_RATE, _MAX_RATE_PER_TICK / control_period)
+        self._rate = min(_BRAKING_RATE, _MAX_RATE_PER_TICK / control_period)
         self._braked: slice | npt.NDArray[np.int64] = slice(None)
         self._efforts = np.zeros(robot.n)
         if robot.description.wheel_names:
             wheels = ReactionWheels.of(robot.description)
             robot, self._braked = robot.derived(wheels.gyrostat), wheels.other
-        outputs = ComputedTorqueLaw.default_outputs(robot, "")
-        # The reference is always the present shape, so only the damping acts.
-        self._law = ComputedTorqueLaw(robot, outputs, Gains.uniform(1.0, rate)) if robot.n else None
+        self._inertia, self._bias = robot.buffered("inertia_matrix"), robot.buffered("bias")
         self._plant = plant
 
     def efforts(self) -> Array:
-        """Return the efforts (n,) of the next tick, N or N m, before limits."""
-        from spacerobot_ros.control.state import ControlState, JointReference, Reference
+        """Return the efforts (n,) of the next tick, N or N m, before limits.
 
-        plant = self._plant
-        if self._law is None:
-            return self._efforts
-        q, qdot = plant.q[self._braked], plant.qdot[self._braked]
-        state = ControlState(
-            plant.pose[:3], plant.pose[3:], plant.twist[:3], plant.twist[3:], q, qdot
-        )
-        tau = self._law.command(state, Reference(joints=JointReference.at_rest(q))).tau
-        self._efforts[self._braked] = tau
+        The rows of the joints in ``H+ z0ddot + C+ = Q`` (paper 4, eq. 19), with those of the base
+        inserted.
+        """
+        q, qdot = self._plant.q[self._braked], self._plant.qdot[self._braked]
+        (H,), (C,) = self._inertia(q), self._bias(q, np.zeros(3), self._plant.twist[3:], qdot)
+        qddot = -self._rate * qdot
+        omega_dot = -np.linalg.solve(H[3:6, 3:6], H[3:6, 6:] @ qddot + C[3:6])
+        self._efforts[self._braked] = H[6:, 6:] @ qddot + H[6:, 3:6] @ omega_dot + C[6:]
         return self._efforts
 
 

@@ -85,10 +85,9 @@ SIZES = {
     **{"alive": 1, "measured": N, "joint_bias": N, "joint_noise": 1, "limits": 2 * N},
     **{"peak_rate": N, "peak_effort": N, "peak_wrench": 2, "impulse": 2, "lowest": N, "highest": N},
     **{"decision": 1, "decided": 1, "decided_state": 2 * N + 13, "ended": 1},
-    **{"end_state": 2 * N + 20, "drift": 2, "propellant": 1, "unallocated": 1, "wanted": 6},
-    **{"pending_impulse": 6, "p": 40, "h": 1, "command": N + 6, "momenta": 6, "r_cm": 3},
-    **{"limited": 2 * N + 1, "pose": 7, "twist": 6, "momentum": 7, "exact": 1, "remaining": 2},
-    **{"levels": 2, "shortest": 2},
+    **{"end_state": 2 * N + 20, "drift": 2, "p": 40, "h": 1, "command": N + 6},
+    **{"momenta": 6, "r_cm": 3},
+    **{"limited": 2 * N + 1, "pose": 7, "twist": 6, "momentum": 7, "exact": 1},
 }
 
 
@@ -299,7 +298,6 @@ def test_results_come_from_the_rows_of_their_names(sliders: SpaceRobot) -> None:
         np.testing.assert_array_equal(result.limited_ticks["stroke"][row], limits[N:])
     np.testing.assert_array_equal(result.measured_q, result.q)
     np.testing.assert_array_equal(result.measured_pose, result.pose)
-    assert np.isnan(result.propellant).all()
     assert not result.peak_rate[[1, 5]].any()
 
 
@@ -439,36 +437,6 @@ def test_controlled_lanes_begin_decide_and_end_each_for_itself(
         ("goal 6", 20.0),
     ]
     assert result.fallback_ticks.tolist() == [1, 0, 1, 1, 0, 0, 0]
-
-
-def test_an_impulse_beyond_the_thrust_is_allocated_by_the_modulator(sliders: SpaceRobot) -> None:
-    asked = []
-
-    def allocate(impulse: Array, most: Array) -> Any:
-        asked.append((impulse.copy(), most.copy()))
-        return SimpleNamespace(levels=np.array([0.25, 0.5]))
-
-    table = SimpleNamespace(min_on_time=np.array([0.01, 0.02]))
-    allocation = SimpleNamespace(allocate=allocate)
-
-    def wait() -> None:
-        memory, at = block._memory, block._rows
-        block._modulator = SimpleNamespace(allocation=allocation, table=table)
-        block._pending[2] = Pending.FIRE
-        memory[2, at["unallocated"], 0] = 1.0
-        memory[2, at["wanted"], 0] = np.arange(1.0, 7.0)
-        memory[2, at["pending_impulse"], 0] = np.arange(6.0) / 8
-        memory[2, at["remaining"], 0] = [0.005, 0.03]
-        memory[2, at["propellant"], 0] = 0.75
-
-    flights = flights_of(sliders, "effort", held())
-    block, result = block_of(flights, library=Library([wait])), BatchResult.empty(flights)
-    block.fly(result, {})
-    ((impulse, most),) = asked
-    np.testing.assert_allclose(impulse, [0.04, 0.205, 0.37, 0.535, 0.7, 0.865])
-    np.testing.assert_allclose(most, [0.045, 0.03])
-    assert block._memory[2, block._rows["levels"], 0].tolist() == [0.25, 0.5]
-    assert result.propellant[[4, 6]].tolist() == [0.0, 0.75]
 
 
 def noise_of(

@@ -29,7 +29,6 @@ from spacerobot_ros.control.laws.law import GainPair, Gains
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.state import ControlState
-from spacerobot_ros.control.thrusters import ThrusterTable, thruster_table
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.compilation import cxx_compiler
@@ -188,41 +187,6 @@ def test_the_servicer_is_controlled_in_lanes() -> None:
     here, there = fly_lanes(flights), fly_one_by_one(flights)
     assert_same(here, there)
     assert np.abs(here.q[:, -1] - shape).max() > 0.001
-
-
-def thrusters(robot: SpaceRobot, force: float) -> ThrusterTable:
-    """Return two thrusters at each of the eight corners of a cube on the base."""
-    entries: list[dict[str, Any]] = []
-    for corner in itertools.product((-0.4, 0.4), repeat=3):
-        for axis in (0, 1):
-            direction = [0.0, 0.0, 0.0]
-            direction[axis] = -corner[axis]
-            named = {"name": f"thruster_{len(entries)}", "position": list(corner)}
-            entries.append({**named, "direction": direction, "force": force, "isp": 220.0})
-    return thruster_table([{**each, "min_on_time": 0.01} for each in entries], robot.description)
-
-
-@needs_compiler
-@pytest.mark.slow
-@pytest.mark.parametrize("force", [40.0, 8.0])
-def test_thrusters_in_lanes_are_fired_as_by_the_modulator(force: float) -> None:
-    """Until rounding decides about a pulse; the weak ones are at their limit at once."""
-    flights = controlled(
-        *("planar_manipulator", SHAPE),
-        ticks=25,
-        noise=0.0,
-        profile="step",
-        gains=Gains.uniform(1000.0, 60.0),
-        max_force=10.0,
-    )
-    flights = dataclasses.replace(flights, thrusters=thrusters(flights.robot, force))
-    here, there = fly_lanes(flights), fly_one_by_one(flights)
-    assert "lanes" in here.engine
-    for name in (*NUMBERS, "propellant"):
-        one, two = getattr(here, name), getattr(there, name)
-        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9, err_msg=name)
-    assert there.propellant.min() > 0
-    assert bool(here.fallback_ticks.any()) == (force < 10.0)
 
 
 @needs_compiler

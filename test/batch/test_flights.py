@@ -72,8 +72,6 @@ def controlled(period: float = 0.05, gains: tuple[object, ...] = ()) -> Controll
         (STILL, {"report_ticks": (-1, 5)},
          "The instants (-1, 5) are not ascending ticks of a flight of 10."),
         (STILL, {"sensors": range(3)}, "There are sensors of 3 flights, not 2."),
-        (STILL, {"thrusters": SimpleNamespace(names=("a",))},
-         "Only the wrench of a controller can come from thrusters."),
         (FollowedSchedule(np.zeros((5, 3))), {"actuation": "effort"},
          "A schedule needs velocity actuation."),
         (FollowedSchedule(np.zeros((5, 2))), {}, "The joints are (5, 2), not (ticks, 3)."),
@@ -123,7 +121,7 @@ def test_joints_that_move_at_the_start_need_efforts(sliders: SpaceRobot) -> None
 
 def test_flights_have_their_last_tick_and_the_steps_of_their_plant(sliders: SpaceRobot) -> None:
     plain = flights(sliders, STILL)
-    assert (plain.report_ticks, plain.thruster_count, len(plain)) == ((10,), 0, 2)
+    assert (plain.report_ticks, len(plain)) == ((10,), 2)
     assert flights(sliders, STILL, report_ticks=(0, 4, 10)).report_ticks == (0, 4, 10)
     assert flights(sliders, STILL, integration_step=0.02).substeps == 3
     assert flights(sliders, STILL, integration_step=0.05).substeps == 1
@@ -214,7 +212,6 @@ def test_results_begin_empty(sliders: SpaceRobot) -> None:
     }
     assert (result.decision.tolist(), result.decision_tick.tolist()) == ([0, 0], [-1, -1])
     assert (result.end_tick.tolist(), result.fallback_ticks.tolist()) == ([10, 10], [0, 0])
-    assert np.isnan(result.propellant).all()
     for limits in (result.lowest, result.highest):
         assert limits.tolist() == made.initial_states.q.tolist()
         limits[0] = 9.0
@@ -242,11 +239,6 @@ def test_errors_are_distances_and_angles_to_a_pose(sliders: SpaceRobot) -> None:
     assert angle.shape == distance.shape == (2, 3)
 
 
-def test_flights_name_their_thrusters_and_times(sliders: SpaceRobot) -> None:
-    table: Any = SimpleNamespace(names=("a", "b"))
-    made = flights(sliders, controlled(0.0500000001), actuation="effort", thrusters=table)
-    assert made.thruster_count == 2
-    assert BatchResult.empty(made).propellant.tolist() == [0.0, 0.0]
-    # Of each actuation the plant's own step, unless one is given.
+def test_steps_are_those_of_the_actuation_unless_they_are_given(sliders: SpaceRobot) -> None:
     assert flights(sliders, STILL).substeps == 5
     assert flights(sliders, STILL, actuation="effort").substeps == 50

@@ -91,56 +91,35 @@ def test_a_goal_of_end_effectors_is_not_flown_in_lanes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "asked", "reason"),
+    ("given", "reason"),
     [
-        ({}, False, ""),
-        (disperse("coordinated_control.gains.base_position.kp"), False, ""),
-        (disperse("plant.sensors.joint_noise"), False, ""),
+        ({}, ""),
+        (disperse("coordinated_control.gains.base_position.kp"), ""),
+        (disperse("plant.sensors.joint_noise"), ""),
         (
             disperse("coordinated_control.time_limit"),
-            False,
             f"'coordinated_control.time_limit' {SHARED}",
         ),
         *(
-            (disperse(name), False, f"'{name}' {SHARED}")
+            (disperse(name), f"'{name}' {SHARED}")
             for name in ("plant.tick_rate", "plant.integration_step")
         ),
         (
+            {"set": {"plant.thrusters": "urdf"}},
+            "its thrusters are on or off, which engine 'flights' flies",
+        ),
+        (
             {"set": {"plant.beyond_limits": "refuse"}},
-            False,
             "the plant refuses commands beyond limits",
         ),
         (
             {"set": {"coordinated_control.tasks": "detumble"}},
-            False,
             "its controller has tasks before goals, which engine 'flights' does",
         ),
     ],
 )
-def test_which_controlled_campaigns_are_flown_in_lanes(
-    given: dict[str, Any], asked: bool, reason: str
-) -> None:
-    assert _ControlledLanes().refusal(controlled(**given), asked=asked) == reason
-
-
-@pytest.mark.parametrize(
-    ("excluded", "asked", "reason"),
-    [
-        (
-            (),
-            False,
-            "its thrusters are on or off, which amplifies rounding: ask for lanes by name",
-        ),
-        (("up",), True, "some of its thrusters are excluded"),
-        ((), True, "the plant refuses commands beyond limits"),
-    ],
-)
-def test_thrusters_are_flown_in_lanes_where_lanes_are_asked_for(
-    excluded: tuple[str, ...], asked: bool, reason: str
-) -> None:
-    plant = SimpleNamespace(thrusters="urdf", thrusters_excluded=excluded, beyond_limits="refuse")
-    made: Any = SimpleNamespace(scenario=SimpleNamespace(plant=plant))
-    assert _ControlledLanes().refusal(made, asked=asked) == reason
+def test_which_controlled_campaigns_are_flown_in_lanes(given: dict[str, Any], reason: str) -> None:
+    assert _ControlledLanes().refusal(controlled(**given)) == reason
 
 
 @pytest.mark.parametrize(
@@ -164,13 +143,13 @@ def test_laws_of_lanes_are_one_function_and_control_the_goals(
     monkeypatch.setattr(lanes, "build_controller", lambda *_: SimpleNamespace(law=law))
     robot = SimpleNamespace(description=SimpleNamespace(wheel_names=()))
     monkeypatch.setattr(lanes, "nominal_robots", lambda _: SimpleNamespace(controller=robot))
-    assert _ControlledLanes().refusal(CONTROLLED, asked=False) == reason
+    assert _ControlledLanes().refusal(CONTROLLED) == reason
 
     def refuse(*_: Any) -> Any:
         raise SpaceRobotError("No such law.")
 
     monkeypatch.setattr(lanes, "build_controller", refuse)
-    assert _ControlledLanes().refusal(CONTROLLED, asked=False) == "No such law."
+    assert _ControlledLanes().refusal(CONTROLLED) == "No such law."
 
 
 def test_lanes_choose_between_a_planner_and_a_controller(
@@ -180,13 +159,9 @@ def test_lanes_choose_between_a_planner_and_a_controller(
     monkeypatch.setattr(engine._flights, "refusal", lambda made: "")
     monkeypatch.setattr(engine._scheduled, "refusal", lambda made: f"scheduled {made.name}")
 
-    def refusal(made: Campaign, asked: bool) -> str:
-        return f"controlled {made.name} {asked}"
-
-    monkeypatch.setattr(engine._controlled, "refusal", refusal)
+    monkeypatch.setattr(engine._controlled, "refusal", lambda made: f"controlled {made.name}")
     assert engine.refusal(PLANNED) == "scheduled short"
-    assert engine.refusal(CONTROLLED) == "controlled controlled False"
-    assert engine.refusal(CONTROLLED, asked=True) == "controlled controlled True"
+    assert engine.refusal(CONTROLLED) == "controlled controlled"
     both = replace(CONTROLLED.scenario, commanders=("planner", "coordinated_control"))
     assert engine.refusal(replace(CONTROLLED, scenario=both)) == (
         "lanes have velocities of a planner, or efforts of coordinated control"
@@ -200,14 +175,13 @@ def test_lanes_choose_between_a_planner_and_a_controller(
 def test_an_engine_is_chosen_by_name_or_the_first_that_can(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked: list[tuple[str, bool]] = []
+    asked: list[str] = []
 
     def engine(name: str, reason: str) -> Callable[[], Any]:
-        def refusal(made: Any, asked: bool = False) -> str:
-            asked_of.append((name, asked))
+        def refusal(made: Any) -> str:
+            asked.append(name)
             return reason
 
-        asked_of = asked
         return lambda: SimpleNamespace(name=name, refusal=refusal)
 
     def choose(**reasons: str) -> None:
@@ -216,9 +190,9 @@ def test_an_engine_is_chosen_by_name_or_the_first_that_can(
 
     choose(one="not one", two="", three="")
     assert select_engine(PLANNED, "auto").name == "two"
-    assert asked == [("one", False), ("two", False)]
+    assert asked == ["one", "two"]
     assert select_engine(PLANNED, "three").name == "three"
-    assert asked[2:] == [("three", True)]
+    assert asked[2:] == ["three"]
     with pytest.raises(SpaceRobotError) as refused:
         select_engine(PLANNED, "one")
     assert str(refused.value) == "The engine 'one' cannot fly this campaign: not one"
@@ -522,14 +496,11 @@ def decided(decision: Decision, tick: int, **given: Any) -> Any:
         lowest=second(-0.5, -1.0),
         highest=second(0.5, 1.0),
         momentum_drift=second(6.0, 7.0),
-        propellant=np.array([8.0, 9.0]),
         failures=given.get("failures", {0: "no"}),
     )
     robot = SimpleNamespace(n=n, description=SimpleNamespace(end_effector=lambda frame: ""))
     starts = SimpleNamespace(qdot=second(-0.75, 0.25))
-    flights: Any = SimpleNamespace(
-        robot=robot, initial_states=starts, thrusters=given.get("thrusters")
-    )
+    flights: Any = SimpleNamespace(robot=robot, initial_states=starts)
     batch = [_PreparedDraw(Draw(number, 1, {}), flight) for number in range(2)]
     made = replace(CONTROLLED, max_flight_time=0.0)  # A controller ends by itself after it.
     _, found = _ControlledLanes().measures(made, result, batch, flights, 0.25)
@@ -554,7 +525,6 @@ def test_the_measures_of_control_are_those_of_the_end_of_the_flight() -> None:
     np.testing.assert_array_equal(found.momentum_drift, [6.0, 7.0])
     assert math.isnan(found.propellant)
     assert (found.corrections, found.plan_time) == (0, 0.0)
-    assert decided(Decision.REACHED, 20, thrusters="some").propellant == 9.0
 
 
 def test_how_control_ends() -> None:

@@ -588,7 +588,6 @@ def test_a_rerun_without_dispersions() -> None:
 @pytest.mark.parametrize(
     ("engine", "outcome", "thrusters", "inertial", "note"),
     [
-        ("lanes", "reached", "urdf", None, "It was flown in lanes: thrusters that are on or off"),
         ("flights", "reached", "urdf", None, ""),
         ("flights", "reached", "urdf", "drawn", "Its masses are drawn: the plants of campaign and"),
         ("flights", "reached", "", "drawn", ""),

@@ -193,8 +193,8 @@ def test_the_distance_of_a_plan_from_its_goal() -> None:
 
 
 def test_the_warning_about_efforts(monkeypatch: pytest.MonkeyPatch) -> None:
+    from spacerobot_ros.flight import trials
     from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
-    from spacerobot_ros.simulation import trials
 
     class Evaluation:
         def __init__(self) -> None:

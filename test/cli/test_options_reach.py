@@ -19,6 +19,7 @@ import spacerobot_ros.nodes.common.process as process
 import spacerobot_ros.report
 import spacerobot_ros.session.run as session
 from spacerobot_ros.cli.main import main
+from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.scenario import load_scenario
 
@@ -74,7 +75,7 @@ def test_the_attitude_of_a_scenario_is_given_in_degrees(
 
     monkeypatch.setattr(type(scenario), "with_goal", noted)
     call(command, "arm_attitude", "--goal-rpy-deg", *RPY)
-    attitude = Rotation.from_quat(found[0].problem().goal.quaternion)
+    attitude = Rotation.from_quat(PlanningProblem.of(found[0]).goal.quaternion)
     assert (attitude.inv() * attitude_of_rpy()).magnitude() < 1e-12
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog, lsq_linear
 from support.oracles import Array
 
-from spacerobot_ros.control.thrusters import ThrusterAllocation, thrusters_of_urdf
+from spacerobot_ros.model.thrusters import ThrusterAllocation, thrusters_of_urdf
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import share_directory
 

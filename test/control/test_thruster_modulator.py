@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.oracles import Array
 
-from spacerobot_ros.control.thrusters import ThrusterModulator, ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.model.thrusters import ThrusterModulator, ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import share_directory
 

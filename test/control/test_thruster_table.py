@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from spacerobot_ros.control.thrusters import ThrusterTable, load_thrusters, thrusters_of_urdf
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
+from spacerobot_ros.model.thrusters import ThrusterTable, load_thrusters, thrusters_of_urdf
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 
 SERVICER = Path(__file__).parents[2] / "urdf" / "servicer.urdf"

@@ -13,8 +13,8 @@ import yaml
 from hypothesis import strategies as st
 from support.fuzzing import NUMBERS, TEXTS, VALUES, attempt, damaged, fuzz
 
-from spacerobot_ros.control.thrusters import load_thrusters
 from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.thrusters import load_thrusters
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import resource_names, robot_file, share_directory
 from spacerobot_ros.scenario import NODES, Scenario, load_scenario, parse_setting

@@ -10,8 +10,8 @@ import numpy as np
 from hypothesis import strategies as st
 from support.fuzzing import attempt, damaged, fuzz
 
-from spacerobot_ros.control.thrusters import thrusters_of_urdf
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.thrusters import thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.resources import resource_names, robot_file
 

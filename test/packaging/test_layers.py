@@ -32,9 +32,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("measures",),  # of flights, lanes and the page
         ("bag",),
         ("messages",),  # above the commands of the simulation, which they carry
-        ("simulation",),
         ("control",),  # above planning, whose goals it takes
-        ("planning",),
+        ("planning", "simulation"),  # flight software and plant, both on the model
         ("collision",),
         ("model",),
         ("events", "parameters", "resources", "termination"),
@@ -210,7 +209,6 @@ MUTABLE = {
     "spacerobot_ros.planning.execution.executive.Teleoperation",
     "spacerobot_ros.planning.methods.optimal.search._SearchState",
     "spacerobot_ros.report.solids.Solids",
-    "spacerobot_ros.simulation.trials.MethodRecord",
     "spacerobot_ros.flight.verification._Resimulation",
 }
 """Dataclasses that change: records in the making. All others are values."""

@@ -97,7 +97,7 @@ def test_joints_are_known_by_their_names_and_not_by_their_places(
             velocity = [10.0 * numbers[name] for name in names]
             say("/joint_states", joint_states(time, names, position, velocity), time)
     flight = read_report(path)
-    assert flight.joint_names == ["a", "b", "c"]
+    assert flight.joint_names == ("a", "b", "c")
     times = [0.0, 0.5, 1.5, 2.5, 3.0, 4.0]
     assert flight.shape.time.tolist() == times
     expected = np.array([1.0, 2.0, 3.0]) + np.array(times)[:, np.newaxis]

@@ -276,7 +276,7 @@ def test_a_key_stands_above_its_axes() -> None:
 
 def test_goals_limits_and_peaks_of_a_group() -> None:
     """Two limits of one value are one line; limits out of sight are left out."""
-    flight: Any = SimpleNamespace(executing=[SimpleNamespace(time=0.5)], end=3.0)
+    flight: Any = SimpleNamespace(executing=[(0.5, None)], end=3.0)
     signal = signal_of([0.0, 1.0, 0.5], [1.0, 0.0, 0.25])
     group = TraceGroup(signal, ["a", "b"], "label", "m", ["#0000ff", "#ff0000"])
     axes = axes_of()
@@ -301,7 +301,7 @@ def test_goals_limits_and_peaks_of_a_group() -> None:
 
 def test_duty_cycles_have_rows() -> None:
     """A value holds from the sample before; dense ones are the largest in each slice."""
-    flight: Any = SimpleNamespace(events=(), cycles=None, end=10.0)
+    flight: Any = SimpleNamespace(timed_events=(), cycles=None, end=10.0)
     for count, dense in ((1920, False), (1921, True)):
         values = np.zeros((count, 2))
         values[100, 0] = 1.0
@@ -615,11 +615,11 @@ def test_tables_of_many_events_are_folded_and_cut(count: int, folded: bool, more
 
 def test_events_of_charts_are_the_first_five_hundred() -> None:
     events = [event(k / 4) for k in range(502)][::-1]
-    found = page._chart_events(SimpleNamespace(events=events))  # type: ignore[arg-type]
+    found = page._chart_events(SimpleNamespace(timed_events=events))  # type: ignore[arg-type]
     assert len(found) == 500
     assert (found[0]["time"], found[-1]["time"]) == (0.0, 499 / 4)
     twice = [event(1.0), event(1.0), event(1.0, EventKind.LATCHED)]
-    found = page._chart_events(SimpleNamespace(events=twice))  # type: ignore[arg-type]
+    found = page._chart_events(SimpleNamespace(timed_events=twice))  # type: ignore[arg-type]
     assert [each["text"] for each in found] == ["correction", "correction (+1)", "latched"]
     assert found[1]["sentence"] == "At 1 s. At 1 s."
     assert [each["strong"] for each in found] == [False, False, True]
@@ -679,7 +679,7 @@ def numbers(text: str, kind: str) -> list[float]:
 
 
 def test_charts_of_groups() -> None:
-    flight: Any = SimpleNamespace(end=1.0, events=[])
+    flight: Any = SimpleNamespace(end=1.0, timed_events=[])
     signal = signal_of([0.0, 1e-3, 100.0], [1.0, 2.0, 0.0])
     group = TraceGroup(signal, ["a", "b"], "label", "m", ["#0", "#1"], goals=[(0.0, 1.0, 1, 50.0)])
     limits = [(0, -19.0), (1, -21.0), (0, 119.0), (1, 121.0)]
@@ -750,8 +750,8 @@ def test_paths_in_space_have_few_points() -> None:
     points = np.column_stack([np.arange(8003.0)] * 3)
     still = np.zeros((5, 7))
     position = Signal(np.arange(8003.0), points)
-    changed = replace(flight, position=position)
-    vars(changed)["tool"] = Signal(np.arange(5.0), still)
+    changed = replace(flight)
+    vars(changed).update(position=position, tool=Signal(np.arange(5.0), still))
     (command,) = scene._path_commands(changed)
     assert command["path"] == "/flight/path of the base"
     values = command["object"]["geometries"][0]["data"]["attributes"]["position"]["array"]
@@ -761,8 +761,8 @@ def test_paths_in_space_have_few_points() -> None:
         "/flight/path of the base",
         "/flight/path of the end-effector",
     ]
-    one = replace(flight, position=signal_of([1.0], [2.0], [3.0]))
-    vars(one)["tool"] = Signal.empty(7)
+    one = replace(flight)
+    vars(one).update(position=signal_of([1.0], [2.0], [3.0]), tool=Signal.empty(7))
     assert scene._path_commands(one) == []
 
 

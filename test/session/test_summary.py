@@ -14,8 +14,8 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose
 
 from spacerobot_ros.bag import BagWriter, iterate_raw
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
-from spacerobot_ros.control.thrusters import find_thrusters
 from spacerobot_ros.measures import Outcome
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import (

@@ -9,13 +9,11 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.flight import second_opinion, verification
-from spacerobot_ros.flight.second_opinion import EngineComparison, EngineFlight
+from spacerobot_ros.flight.second_opinion import EngineComparison
 from spacerobot_ros.flight.verification import Difference, _PublishedTopic, _Resimulation
-from spacerobot_ros.simulation.mujoco_engine import EFFORT_STEP, VELOCITY_STEP
 from spacerobot_ros.topics import TOPICS
 
 PERIOD_NS = 50_000_000
@@ -268,76 +266,6 @@ def test_a_flight_has_a_state_in_every_tick_or_nearly(
 # -- the second engine ---------------------------------------------------------------------------
 
 
-class Engine:
-    """Stand-in for MuJoCo: moves by what it is told."""
-
-    name = "engine 1"
-
-    def __init__(self) -> None:
-        self.pose, self.q, self.asked = np.array([0.0] * 6 + [1.0]), np.zeros(2), list[Any]()
-        self.loads, self.momenta = list[Any](), list[Any]()
-
-    def step_under_velocities(self, qdot: Any, momenta: Any, period: float) -> Any:
-        self.asked.append(("velocities", period))
-        self.q = self.q + period * qdot
-        self.momenta.append(momenta.tolist())
-        return momenta + period
-
-    def step_under_efforts(self, effort: Any, wrench: Any, period: float) -> None:
-        self.asked.append(("efforts", period))
-
-    def load(self, vector: Any) -> None:
-        self.loads.append(vector)
-
-
-def engine_flight(*, effort: bool) -> Any:
-    plant = SimpleNamespace(
-        time=0.25,
-        loads=None,
-        active=(),
-        qdot=np.array([0.1, -0.3]),
-        limit_counts={"stroke": np.array([2, 0, 1])},
-        robot=SimpleNamespace(joint_names=("a", "b", "c")),
-    )
-    made: Any = object.__new__(EngineFlight)
-    made._plant, made._period, made._engine = plant, 0.1, Engine()
-    made._effort_plant = SimpleNamespace(effort=None, wrench=None) if effort else None
-    made._momenta, made._stopped = np.zeros(6), np.array([2, 0, 1])
-    made._faults, made._first, made._until = (), 5, ""
-    made._poses, made._shapes = [made._engine.pose], [made._engine.q]
-    return made
-
-
-def test_an_engine_is_compared_at_the_ticks_that_both_have() -> None:
-    made = engine_flight(effort=False)
-    for _ in range(3):
-        made.fly_next_tick()
-    assert made._engine.asked == [("velocities", 0.1)] * 3
-    # Momenta go on from those after the tick before.
-    np.testing.assert_allclose(made._engine.momenta, np.outer([0.0, 0.1, 0.2], np.ones(6)))
-    turned = Rotation.from_rotvec([0.0, 0.003, 0.004]).as_quat()
-    poses = np.array([[0.0] * 6 + [1.0]] * 5)
-    poses[2, :3], poses[3, 3:] = [0.001, 0.002, -0.002], turned
-    shapes = 0.1 * np.outer(np.arange(-1.0, 4.0), [0.1, -0.3])
-    shapes[4, 1] += 0.004
-    found = made.comparison(np.array([4, 5, 6, 7, 8]), poses, shapes)
-    assert found == cast(Any, EngineComparison)(
-        engine="engine 1",
-        integrator=f"Runge-Kutta 4 with steps of at most {VELOCITY_STEP:g} s",
-        ticks=3,
-        position=pytest.approx(0.003),
-        attitude=pytest.approx(0.005, rel=1e-6),
-        joints=pytest.approx(0.004),
-        time=pytest.approx(0.7),
-    )
-    # Beyond the last tick of the engine nothing is compared.
-    assert made.comparison(np.array([5, 9]), poses[:2], shapes[1:3]).ticks == 0
-    under_efforts = engine_flight(effort=True)
-    one = under_efforts.comparison(np.array([5]), poses[:1], np.zeros((1, 2)))
-    assert one.integrator.endswith(f"at most {EFFORT_STEP:g} s")
-    assert EFFORT_STEP != VELOCITY_STEP
-
-
 def test_an_engine_agrees_within_a_bound_in_each_quantity() -> None:
     at = second_opinion.AGREEMENT_TOLERANCE
     same = EngineComparison("e", "i", 1, at, at, at, 0.0)
@@ -345,37 +273,3 @@ def test_an_engine_agrees_within_a_bound_in_each_quantity() -> None:
     assert same.stop_reason == ""
     for name in ("position", "attitude", "joints"):
         assert not replace(same, **cast(Any, {name: at * 1.001})).agrees
-
-
-@pytest.mark.parametrize(
-    ("change", "until"),
-    [
-        ({}, ""),
-        ({"loads": SimpleNamespace(last="the loads")}, ""),
-        ({"limit_counts": {"stroke": np.array([2, 1, 2])}},
-         "joint 'b' is at its stop at 0.25 s, which the engine does not model"),
-        ({"active": (SimpleNamespace(kind="sensor_noise", target="b"),
-                     SimpleNamespace(kind="joint_stuck", target="c"))},
-         "joint 'c' is held at 0.25 s, which the engine does not model"),
-    ],
-)  # fmt: skip
-def test_an_engine_flies_no_further_than_it_knows_the_forces(
-    change: dict[str, Any], until: str
-) -> None:
-    made = engine_flight(effort=True)
-    vars(made._plant).update(change)
-    made.fly_next_tick()
-    assert made._until == until
-    assert made._engine.asked == ([] if until else [("efforts", 0.1)])
-    assert len(made._poses) == len(made._shapes) == (1 if until else 2)
-    assert made._engine.loads == ["the loads" if "loads" in change else None]
-    # A joint that was held at the beginning of a tick counts as well.
-    vars(made._plant).update(loads=None, active=())
-    if "limit_counts" not in change:
-        made._until = ""
-        made.fly_next_tick()
-        assert bool(made._until) is bool(until)
-    if until:
-        made._until = until
-        made.fly_next_tick()
-        assert not made._engine.asked[1:]

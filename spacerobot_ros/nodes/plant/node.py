@@ -154,7 +154,7 @@ class PlantNode(FlightNode):
         if self._undecided:
             under_efforts = config.decided("effort")
             self._under_efforts = build_plant(robot, under_efforts)
-            # Derive the law of its brakes now: between two ticks, the plant would be late.
+            # Make the equations of its brakes now: between two ticks, the plant would be late.
             CommandValidator(self._under_efforts, under_efforts)
         last = self._last_state(robot)
         self._tick = 0 if last is None else round(last.time_ns / self._period_ns)

@@ -10,11 +10,17 @@ from scipy.spatial.transform import Rotation
 from support.planner_loop import QUICK, TICK, StubMethod, goal_at, robot_of
 
 from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.flight.trials import (
+    PlanEvaluation,
+    PlanningProblem,
+    random_goals,
+    try_goals,
+    try_method,
+)
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.trials import PlanningProblem, random_goals, try_goals, try_method
 
 AWAY = goal_at(([0.05, -0.03, 0.02], [0.0, 0.0, 0.0]))
 
@@ -104,10 +110,12 @@ def test_goals_are_counted_by_what_became_of_them(monkeypatch: pytest.MonkeyPatc
         lines.append(line)
         method.overshoot = 1e-2
 
-    (record,) = try_goals(problem(), [AWAY, far, AWAY], ["stub"], show)
-    assert (record.reached, record.missed, record.refused) == (1, 1, ["It is too far."])
-    assert len(record.durations) == len(record.plan_times) == 2
-    assert record.durations == pytest.approx([2.0, 2.0])
+    results = try_goals(problem(), [AWAY, far, AWAY], ["stub"], show)
+    first, refused, last = results["stub"]
+    assert isinstance(first, PlanEvaluation)
+    assert isinstance(last, PlanEvaluation)
+    assert (first.reached, str(refused), last.reached) == (True, "It is too far.", False)
+    assert first.duration == last.duration == pytest.approx(2.0)
     assert lines[0].startswith("goal 1, stub: 2 s, ")
     assert lines[1] == "goal 2, stub: It is too far."
     assert lines[2].endswith(f" rad and {1e-2 * np.linalg.norm(AWAY.position):.2g} m off")
