@@ -288,8 +288,7 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     second_commander: str = parameter(
         "refuse",
-        "realtime: a second answer to the same state from another commander, and two commanders "
-        "that alternate",
+        "realtime: a second answer to one state while several nodes publish commands",
         choices=("refuse", "accept"),
     )
     latched_faults: str = parameter(

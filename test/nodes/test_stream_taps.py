@@ -19,7 +19,7 @@ from support.recorded_stack import LATCHED_TOPICS, STREAMS, Stack
 from support.ros_harness import DEEP, Harness, nanoseconds
 
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
-from spacerobot_ros.nodes.common.streams import RawOutput, with_information
+from spacerobot_ros.nodes.common.streams import RawOutput
 
 TAPPED = {"/clock", "/odom", "/base_pose", "/joint_states", "/momentum", "/joint_commands"}
 
@@ -181,9 +181,7 @@ def test_messages_that_nobody_can_receive_are_not_published(
     receiver.create_subscription(
         String,
         "words",
-        with_information(
-            lambda raw, about: heard.append((about["publication_sequence_number"], raw))
-        ),
+        lambda raw, about: heard.append((about["publication_sequence_number"], raw)),
         qos,
         raw=True,
     )

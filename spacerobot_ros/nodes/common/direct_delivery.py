@@ -100,8 +100,7 @@ class DirectDelivery:
                 [stream for stream in inputs if stream.topic == topic],
             )
             alone = subscribed.count(topic) == len(link.inputs)
-            numbered = any(stream.numbered for stream in link.inputs)
-            if link.outputs and alone and not numbered and not self._has_other_publishers(link):
+            if link.outputs and alone and not self._has_other_publishers(link):
                 self._links.append(link)
         self._announce(outputs, set(subscribed) - self.topics)
         for link in self._links:

@@ -181,7 +181,6 @@ class FlightNode(LifecycleNode):
         callback: RawCallback,
         *,
         qos: QoSProfile = STREAM,
-        number: Callable[[int], None] | None = None,
         event_callbacks: SubscriptionEventCallbacks | None = None,
     ) -> RawInput:
         """Subscribe to serialised messages and return their stream.
@@ -194,8 +193,6 @@ class FlightNode(LifecycleNode):
             Called with each message.
         qos, event_callbacks
             Quality of service and event callbacks of the subscription.
-        number
-            Called before with the number that its publisher has given to the message, if wanted.
         """
         # The stream guards its callback already: one call less for each message.
         subscribe = super().create_subscription
@@ -210,7 +207,6 @@ class FlightNode(LifecycleNode):
             destroy=self.destroy_subscription,
             qos=qos,
             on_error=lambda error: self._fail(f"a message on '{topic}'", error),
-            number=number,
         )
         self.raw_inputs.append(stream)
         return stream

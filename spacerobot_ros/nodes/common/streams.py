@@ -272,8 +272,6 @@ class RawInput(RawStream):
         Quality of service of the subscription.
     on_error
         Called with an exception of a callback: none leaves the executor.
-    number
-        Called before with the number that its publisher has given to the message, if wanted.
     """
 
     def __init__(
@@ -285,12 +283,9 @@ class RawInput(RawStream):
         destroy: Callable[[Subscription], object],
         qos: QoSProfile,
         on_error: Callable[[Exception], None],
-        number: Callable[[int], None] | None = None,
     ) -> None:
         super().__init__(topic, take)
         self._create, self._destroy, self._qos = create, destroy, qos
-        self.numbered = number is not None
-        """Whether the numbers are wanted, which only a subscription has."""
 
         def receive(raw: bytes) -> None:
             try:
@@ -300,14 +295,7 @@ class RawInput(RawStream):
                 on_error(error)
 
         self.receive: RawCallback = receive
-        """Callback of the subscription, without the number of the message."""
-
-        def receive_numbered(raw: bytes, information: Any) -> None:
-            assert number is not None
-            number(information.get("publication_sequence_number") or 0)  # 0: none.
-            receive(raw)
-
-        self._callback = with_information(receive_numbered) if self.numbered else receive
+        """Callback of the subscription."""
         self.subscription: Subscription | None = None
         """The subscription; None while messages are handed over without it."""
         self.subscribe()
@@ -316,7 +304,7 @@ class RawInput(RawStream):
         """Subscribe, in place of a present subscription, with the same or another QoS."""
         self.unsubscribe()
         self._qos = qos or self._qos
-        self.subscription = self._create(self._callback, self._qos)
+        self.subscription = self._create(self.receive, self._qos)
 
     def unsubscribe(self) -> None:
         """End the subscription."""

@@ -197,13 +197,8 @@ class PlantNode(FlightNode):
         """The text on the topic obstacles; None: the robot has its own."""
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         for topic in (*self._readers, *(["base_wrench"] if self._undecided else [])):
-            stream = self.take_raw(
-                message_class(TOPICS[topic].type),
-                topic,
-                partial(self._on_command, topic),
-                # In lockstep the first command of a tick counts, whichever node publishes it.
-                number=None if self._real_time is None else partial(self._on_number, topic),
-            )
+            kind = message_class(TOPICS[topic].type)
+            stream = self.take_raw(kind, topic, partial(self._on_command, topic))
             # Commands are recorded as the plant receives them.
             self.raw_streams.append(stream)
         for topic, inject in (
@@ -528,12 +523,6 @@ class PlantNode(FlightNode):
             source.commanders = self.count_publishers(source.topic)
 
     # -- commands -----------------------------------------------------------------------------
-
-    def _on_number(self, topic: str, number: int) -> None:
-        """Note the number of the next message on a topic of commands."""
-        reader = self._readers.get(topic)
-        if reader is not None:
-            reader.source.senders.note(number, self._tick * self._period_ns)
 
     def _on_command(self, topic: str, raw: bytes) -> None:
         if self._active is not _RUNNING and self._active is not _PAUSED:
