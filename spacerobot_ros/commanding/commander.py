@@ -104,9 +104,6 @@ class CommanderHost(Protocol):
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""
 
-    def log_about_goals(self, level: LogLevel, message: str) -> None:
-        """Log a line about a goal, at a limited rate where many goals arrive."""
-
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of odom, or of a reference, is connected."""
 

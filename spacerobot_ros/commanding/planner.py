@@ -41,7 +41,6 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatistics,
     PlannerStatus,
     ScheduleStart,
-    Severity,
     end_effector_values,
     goal_values,
     waypoint_counts,
@@ -392,10 +391,8 @@ class PlannerCommander(Commander):
                     self._warn_of_disturbances(self._disturbances)
                 case Event() as event:
                     host.report_event(event)
-                case Notice(Severity.ERROR, message):
-                    host.log("error", message)
                 case Notice(severity, message):
-                    host.log_about_goals(severity.value, message)
+                    host.log(severity.value, message)
                 case Transition(source, event, target):
                     host.log("debug", f"{source.value} -> {target.value}: {event.value}")
                     if self.trajectories is not None:

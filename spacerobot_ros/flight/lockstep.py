@@ -224,8 +224,6 @@ class _Host:
     def log(self, level: str, message: str) -> None:
         pass
 
-    log_about_goals = log
-
     def has_publisher(self, topic: str) -> bool:
         return topic == "odom" or (topic == JOINT_REFERENCE and self.flight.has_planner)
 

@@ -236,7 +236,7 @@ class PlannerNode(CommanderNode):
     def publish_status(self, status: Status) -> None:
         """Publish and log a status of the goal."""
         super().publish_status(status)
-        self.log_about_goals("warning" if status.state.level else "info", status.message)
+        self.log("warning" if status.state.level else "info", status.message)
 
     def publish_start(self, start: ScheduleStart) -> None:
         """Publish a schedule, its path and its goal, in a thread if planning runs in a thread."""

@@ -1,7 +1,4 @@
-"""Base class of the nodes that command a plant: it converts the messages of a commander.
-
-Of lines about goals that pour in, its log has the last one of each period.
-"""
+"""Base class of the nodes that command a plant: it converts the messages of a commander."""
 
 from __future__ import annotations
 
@@ -10,15 +7,13 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
@@ -45,7 +40,7 @@ from spacerobot_ros.nodes.common.messages import (
     goal_of,
 )
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
-from spacerobot_ros.nodes.common.streams import RawInput, with_information
+from spacerobot_ros.nodes.common.streams import RawInput
 from spacerobot_ros.nodes.common.watchdog import Role, SilenceReport
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -56,8 +51,8 @@ from spacerobot_ros.times import SECOND, first_time_ns, set_stamp
 _WAITING_STATE_CHECK_PERIOD = 0.1
 """Wall time between two checks of postponed state messages, s."""
 
-_FOREIGN_STATUS_LOG_PERIOD = 5.0
-"""Least wall time between log lines about foreign publishers of plant/status, s."""
+_STATUS_LOG_PERIOD = 5.0
+"""Least wall time between log lines about statuses of the plant that do not count, s."""
 
 _LONGEST_DIAGNOSTICS_PERIOD = 1.0
 """Longest wall time between diagnostics in runs that need not be repeatable, s."""
@@ -91,7 +86,6 @@ class CommanderNode(FlightNode):
     def prepare(self) -> None:
         """Create an inactive commander, and the servers of actions."""
         self.commander = self.make_commander()
-        self._goal_lines = LogRateLimiter()
         self._goal_actions = GoalActions(self)
 
     @abstractmethod
@@ -113,7 +107,7 @@ class CommanderNode(FlightNode):
         self._diagnostics_period_ns = (config.diagnostics_period or math.inf) * SECOND
         self._diagnosed_ns, self._diagnosed = 0, time.monotonic()
         self._known_frames = KnownFrames(self)
-        self._last_complaint, self._statuses = -math.inf, None
+        self._statuses = None
         self._subscribe_plant_status()
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
@@ -210,14 +204,6 @@ class CommanderNode(FlightNode):
             case "error":
                 logger.error(message)
 
-    def log_about_goals(self, level: LogLevel, message: str) -> None:
-        """Log a line about a goal; where many goals arrive, one line a second."""
-        self._write(self._goal_lines.offer(time.monotonic(), Line(level, message)))
-
-    def _write(self, line: Line | None) -> None:
-        if line is not None:
-            self.log(line.level, line.message)
-
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of a topic of the state, or of a reference, is connected."""
         return self._inputs[topic].has_publisher
@@ -256,7 +242,7 @@ class CommanderNode(FlightNode):
         accepted = self.commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
         if accepted is not None:
             line = goal_description(part, accepted.goal_id, message, accepted.goal)
-            self.log_about_goals("info", line)
+            self.get_logger().info(line)
 
     def read_goal(self, key: str, message: PoseStamped) -> Goal:
         """Return the goal of a message for the base or another part of the robot.
@@ -298,61 +284,45 @@ class CommanderNode(FlightNode):
         """Subscribe anew to plant/status, whose present publishers first send their last status."""
         if self._statuses is not None:
             self.destroy_subscription(self._statuses)
-        self._status_number: int | None = None
-        """Sequence number of the plant's last status; None: any number is accepted next."""
         self._doubted = False
-        """Whether a status was received that another node may have published."""
-        receive = self.guarded(self._on_plant_status, "a message on 'plant/status'")
-        # The callback is guarded already, and rclpy inspects its signature.
-        self._statuses = LifecycleNode.create_subscription(
-            self,
+        """Whether a publisher of statuses that may not have been the plant has been heard."""
+        self._statuses = self.create_subscription(
             DiagnosticStatus,
             "plant/status",
-            with_information(lambda message, information: receive(message, information)),
+            self._on_plant_status,
             _STATUS_QOS,
+            event_callbacks=SubscriptionEventCallbacks(matched=self._on_status_publisher),
         )
 
-    def _on_plant_status(self, message: DiagnosticStatus, information: Any) -> None:
-        """React to a status of the plant that publishes odom.
+    def _on_status_publisher(self, matches: Any) -> None:
+        """Doubt what was heard from a publisher of plant/status that has left others behind."""
+        left = matches.total_count_change - matches.current_count_change
+        self._doubted |= left > 0 and matches.current_count > 0
 
-        Messages do not name their publisher. A status counts while nobody else publishes any, and
-        only with the number after the last one: otherwise it is taken again from the publishers
-        that are there then. So tests, tools and plants of other stacks stop no goal.
-        """
-        number = information["publication_sequence_number"] or 0
-        last, foreign = self._status_number, self._other_status_publishers()
-        if foreign:
+    def _on_plant_status(self, message: DiagnosticStatus) -> None:
+        """React to a status of the plant, unless another node publishes statuses, too."""
+        if self._has_foreign_statuses():
             self._doubted = True
-            now = time.monotonic()
-            if now - self._last_complaint > _FOREIGN_STATUS_LOG_PERIOD:
-                self._last_complaint = now
-                self.log(
-                    "error",
-                    f"plant/status: {', '.join(foreign)} publishes it beside the plant; no status "
-                    "counts until only the plant does.",
-                )
+            self.get_logger().warning(
+                "plant/status: more nodes publish it than odom; no status counts until only the "
+                "plant does.",
+                throttle_duration_sec=_STATUS_LOG_PERIOD,
+            )
             return
-        if last is not None and number and number != last + 1:
-            self._subscribe_plant_status()
-            return
-        self._status_number = number
         record = read_status(message)
         try:
             status = PlantStatus.from_values(record.values, record.message)
         except SpaceRobotError as error:
-            self.get_logger().warning(f"plant/status: {error}", throttle_duration_sec=5.0)
+            self.get_logger().warning(
+                f"plant/status: {error}", throttle_duration_sec=_STATUS_LOG_PERIOD
+            )
             return
         self.commander.receive_plant_status(status, record.name or "plant")
 
-    def _other_status_publishers(self) -> list[str]:
-        """Return nodes that publish plant/status but not odom; empty if no node publishes odom."""
-        found = []
-        for topic in ("plant/status", "odom"):
-            endpoints = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
-            names = {f"{each.node_namespace.rstrip('/')}/{each.node_name}" for each in endpoints}
-            found.append({name for name in names if "_UNKNOWN_" not in name})
-        statuses, odoms = found
-        return sorted(statuses - odoms) if odoms else []
+    def _has_foreign_statuses(self) -> bool:
+        """Whether more nodes publish plant/status than odom, as every plant publishes both."""
+        statuses, odoms = map(self.count_publishers, ("plant/status", "odom"))
+        return bool(statuses > odoms > 0)
 
     def _on_odom(self, raw: bytes) -> None:
         self.commander.receive_odom(first_time_ns(raw), raw)
@@ -411,13 +381,12 @@ class CommanderNode(FlightNode):
     def _process_waiting_messages(self) -> None:
         """Process waiting statuses, and a postponed state once its time is accepted."""
         assert self._statuses is not None
-        self._write(self._goal_lines.due(time.monotonic()))
         commander, handle = self.commander, self._statuses.handle
         # A busy executor may lose a callback.
         with handle:
             while (taken := handle.take_message(DiagnosticStatus, False)) is not None:
-                self._on_plant_status(*taken)
-        if self._doubted and not self._other_status_publishers():
+                self._on_plant_status(taken[0])
+        if self._doubted and not self._has_foreign_statuses():
             self._subscribe_plant_status()
         if self._unheard:
             self._resubscribe_best_effort()
@@ -458,61 +427,3 @@ class CommanderNode(FlightNode):
         self._diagnosed_ns, self._diagnosed = stamps.now_ns, time.monotonic()
         set_stamp(array.header.stamp, stamps.now_ns)
         self._diagnostics.publish(array)
-
-
-# -- lines of the log -----------------------------------------------------------------------------
-
-BURST = 20
-"""Lines that pass at once after a quiet time: those of a goal with its corrections."""
-
-PERIOD = 1.0
-"""Time per line once the burst is used up, s."""
-
-
-@dataclass(frozen=True)
-class Line:
-    """Severity and text of one line."""
-
-    level: Literal["debug", "info", "warning", "error"]
-    message: str
-
-
-class LogRateLimiter:
-    """Passes a burst of log lines at once, and then one line in each period.
-
-    A line that has to wait is replaced by the next one; the line that passes at last tells how
-    many were left out. So the log ends with the last line, whatever came before.
-    """
-
-    def __init__(self) -> None:
-        self._free, self._counted_s = float(BURST), 0.0
-        self._waiting: Line | None = None
-        self._left_out = 0
-
-    def offer(self, now_s: float, line: Line) -> Line | None:
-        """Return the line to write now; None if the line waits.
-
-        Parameters
-        ----------
-        now_s
-            Wall time, s.
-        line
-            The new line.
-        """
-        if self._waiting is not None:
-            self._left_out += 1
-        self._waiting = line
-        return self.due(now_s)
-
-    def due(self, now_s: float) -> Line | None:
-        """Return the waiting line once it may be written."""
-        self._free = min(BURST, self._free + (now_s - self._counted_s) / PERIOD)
-        self._counted_s = now_s
-        line, count = self._waiting, self._left_out
-        if line is None or self._free < 1.0:
-            return None
-        self._free -= 1.0
-        self._waiting, self._left_out = None, 0
-        if not count:
-            return line
-        return replace(line, message=f"{line.message} ({count} line(s) about goals left out.)")

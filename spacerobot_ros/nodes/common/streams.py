@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -74,18 +73,6 @@ def _without_middleware(matches: Iterable[Iterable[object]]) -> Matches:
 
 
 RawCallback = Callable[[bytes], None]
-
-
-def with_information(callback: Callable[[Any, Any], None]) -> Callable[..., None]:
-    """Return a callback of a subscription that is given each message with its information."""
-
-    def take(*given: Any) -> None:
-        # The events executor of rclpy 7.1 passes message and information as one tuple.
-        callback(*(given[0] if len(given) == 1 else given))
-
-    # rclpy passes the information if the callback has two parameters.
-    take.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
-    return take
 
 
 def raw_publish(publisher: Publisher) -> RawCallback:
