@@ -650,7 +650,7 @@ class Commander(ABC):
             ahead = newer.stamp_ns - joints.stamp_ns
             if (
                 ahead > 0
-                and self.stamps.would_accept(newer.stamp_ns)
+                and self.stamps.is_present(newer.stamp_ns)
                 and self._is_of_robot(newer.message)
             ):
                 joints = newer

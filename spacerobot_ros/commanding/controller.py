@@ -380,7 +380,6 @@ class ControllerCommander(Commander):
         try:
             stamp = decoder.decode_joints(states.joints)
         except CommandError as error:
-            self.stamps.undo_last()
             self._log_fault("state", f"The state is refused: {error}")
             return
         try:

@@ -357,7 +357,6 @@ class PlannerCommander(Commander):
         try:
             measured.stamp_ns = measured.decoder.decode_joints(states.joints)
         except CommandError as error:
-            self.stamps.undo_last()
             self._log_fault("state", f"joint_states: {error}.")
             return
         if pairing is _LATE_POSE:

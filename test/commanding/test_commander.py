@@ -283,7 +283,7 @@ def test_a_jump_is_answered_with_its_pose_once_its_time_is_accepted(controller: 
         controller.wall += 0.001
     controller.state(5000)
     assert controller.host.commands == [1, 2, 3]
-    for _ in range(4):
+    for _ in range(6):
         controller.wall += 0.1
         controller.commander.take_accepted_jump()
     assert controller.host.commands == [1, 2, 3, 5000]
