@@ -1,4 +1,4 @@
-"""Methods of replay, recorder and watchdog, and of messages, with stand-ins for clocks and ROS."""
+"""Methods of replay and recorder, and of messages, with stand-ins for clocks and ROS."""
 
 from __future__ import annotations
 
@@ -9,25 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from sensor_msgs.msg import JointState
 
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import PlanningError, RecordingError
-from spacerobot_ros.events import EventKind
 from spacerobot_ros.model.rotations import compose_poses
 from spacerobot_ros.nodes import recorder, replay
-from spacerobot_ros.nodes.common import messages, ros_parameters, watchdog
+from spacerobot_ros.nodes.common import messages, ros_parameters
 from spacerobot_ros.nodes.common.messages import KnownFrames
-from spacerobot_ros.nodes.common.node import FlightNode
-from spacerobot_ros.nodes.common.watchdog import (
-    HeartbeatState,
-    Liveness,
-    Role,
-    SilenceReport,
-    Watchdog,
-)
 from spacerobot_ros.nodes.recorder import RecorderNode
 from spacerobot_ros.nodes.replay import ReplayNode
 from spacerobot_ros.planning import Goal
@@ -371,144 +361,6 @@ def test_a_recorder_takes_its_own_stack(
         get_namespace=lambda: "/left/",
     )  # fmt: skip
     assert RecorderNode._is_chosen(node, topic, type_name) is recorded
-
-
-# -- watchdog -----------------------------------------------------------------------------------
-
-
-class Beating:
-    """The liveness of a node, with what it publishes and does, on a clock by hand."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *depends_on: Role) -> None:
-        self.now = 20.0
-        self.published: list[Any] = []
-        self.timers: list[Any] = []
-        self.destroyed: list[Any] = []
-        self.silences: list[SilenceReport] = []
-        self.topics: list[str] = []
-        monkeypatch.setattr(watchdog, "time", SimpleNamespace(monotonic=lambda: self.now))
-        monkeypatch.setattr(
-            watchdog, "Watchdog", lambda timeout: Watchdog(timeout, lambda: self.now)
-        )
-        self.contexts: list[Any] = []
-        monkeypatch.setattr(watchdog, "compilation_contexts", self.contexts)
-        publisher = SimpleNamespace(publish=self.published.append)
-        node: Any = SimpleNamespace(
-            create_publisher=lambda kind, topic, qos: self.topics.append(topic) or publisher,  # type: ignore[func-returns-value]
-            create_subscription=lambda kind, topic, call, qos: self.topics.append(f"hears {topic}"),
-            create_timer=self.create,
-            destroy_timer=self.destroyed.append,
-            get_fully_qualified_name=lambda: "/own",
-        )
-        self.liveness = Liveness(node, Role.PLANT, depends_on, self.silences.append)
-
-    def create(self, period: float, call: Callable[[], None], clock: Any) -> str:
-        self.timers.append((period, clock.clock_type.name))
-        return f"timer {len(self.timers)}"
-
-    def pulses(self) -> list[str]:
-        found, self.published[:] = [each.message for each in self.published], []
-        return found
-
-    def hear(self, name: str, pulse: str = "active", role: str = "commander") -> None:
-        self.liveness._on_heartbeat(DiagnosticStatus(name=name, message=pulse, hardware_id=role))
-
-
-@pytest.mark.parametrize("timeout", [0.0, 0.75])
-@pytest.mark.parametrize("depends_on", [(), (Role.COMMANDER,)])
-def test_a_node_beats_while_it_is_active_and_says_when_it_is_busy(
-    monkeypatch: pytest.MonkeyPatch, timeout: float, depends_on: tuple[Role, ...]
-) -> None:
-    node = Beating(monkeypatch, *depends_on)
-    watches = bool(timeout and depends_on)
-    node.liveness.configure(timeout)
-    assert node.topics == ["heartbeat", *(["hears heartbeat", "/diagnostics"] if watches else [])]
-    node.liveness.beat()
-    node.liveness.end()
-    assert node.pulses() == [], "it is not active"
-    node.liveness.begin()
-    assert node.timers == [(0.2, "STEADY_TIME"), *([(0.1, "STEADY_TIME")] if watches else [])]
-    (beat,) = node.published
-    assert (beat.name, beat.hardware_id) == ("/own", "plant")
-    assert node.pulses() == ["active"]
-    assert len(node.contexts) == 1
-    with node.liveness.busy():
-        with node.liveness.busy():
-            pass
-        node.liveness.beat()
-    assert node.pulses() == ["busy"] * 4 + ["active"]
-    assert (node.liveness._watchdog is not None) is watches
-    node.liveness.end()
-    node.liveness.end()
-    assert node.pulses() == [HeartbeatState.INACTIVE.value]
-    assert len(node.destroyed) == len(node.timers)
-    assert node.contexts == []
-    assert node.liveness._watchdog is None
-    node.liveness._look()
-    assert node.pulses() == []
-
-
-def test_silent_nodes_are_in_the_diagnostics_every_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    node = Beating(monkeypatch, Role.COMMANDER)
-    node.liveness.configure(0.75)
-    node.liveness.begin()
-    node.published.clear()
-    for name, role in (
-        ("/own", "commander"),
-        ("/b", "commander"),
-        ("/c", "plant"),
-        ("/a", "commander"),
-    ):
-        node.hear(name, role=role)
-    reports: list[float] = []
-    for _ in range(30):
-        node.now += 0.125
-        node.hear("/b")
-        node.liveness._look()
-        reports += [node.now - 20.0] * len(node.published)
-        for array in node.published:
-            (status,) = array.status
-            assert (status.level, status.hardware_id) == (DiagnosticStatus.ERROR, "plant")
-            assert (status.name, status.message) == ("own: watchdog", "silent: /a")
-            assert [(pair.key, pair.value) for pair in status.values] == [("/a", "silent")]
-        node.published.clear()
-    assert reports == [0.875, 1.875, 2.875]
-    assert [(each.name, each.over) for each in node.silences] == [("/a", False)]
-    node.hear("/a")
-    ((status,),) = (array.status for array in node.published)
-    assert (status.level, status.message) == (DiagnosticStatus.OK, "all nodes send heartbeats")
-    assert [(pair.key, pair.value) for pair in status.values] == [("/a", "back")]
-    assert node.silences[-1].over
-    assert node.silences[-1].seconds == 3.75
-
-
-@pytest.mark.parametrize(("gap", "found"), [(0.25, 1), (0.3125, 0)])
-def test_a_node_that_was_suspended_gives_the_others_their_time_again(
-    gap: float, found: int
-) -> None:
-    now = [10.0]
-    dog = Watchdog(0.5, lambda: now[0])
-    dog.hear("/a", "active")
-    for seconds in (0.28125, gap):
-        now[0] += seconds
-        lost = dog.look()
-    assert len(lost) == found
-    assert SilenceReport("/a", 0.123).message == "Node '/a' is silent for 0.12 s."
-    assert SilenceReport("/a", 12.6, over=True).message == "Node '/a' is back after 13 s."
-
-
-@pytest.mark.parametrize("over", [False, True])
-def test_a_node_that_is_silent_or_back_is_an_event(over: bool) -> None:
-    done: list[Any] = []
-    log = Calls(done, "log")
-    node: Any = SimpleNamespace(get_logger=lambda: log, report_event=done.append)
-    silence = SilenceReport("/plant", 1.23456, over=over)
-    FlightNode.on_silence(node, silence)
-    line, event = done
-    assert line == ("log.info" if over else "log.error", silence.message)
-    assert event.kind is (EventKind.NODE_BACK if over else EventKind.NODE_SILENT)
-    assert (event.level, event.message) == (0 if over else 2, silence.message)
-    assert event.about == {"node": "/plant", "silent_s": "1.235"}
 
 
 # -- messages -----------------------------------------------------------------------------------
