@@ -296,8 +296,7 @@ class CommanderNode(FlightNode):
 
     def _on_status_publisher(self, matches: Any) -> None:
         """Doubt what was heard from a publisher of plant/status that has left others behind."""
-        left = matches.total_count_change - matches.current_count_change
-        self._doubted |= left > 0 and matches.current_count > 0
+        self._doubted |= matches.total_count > matches.current_count > 0
 
     def _on_plant_status(self, message: DiagnosticStatus) -> None:
         """React to a status of the plant, unless another node publishes statuses, too."""

@@ -104,7 +104,6 @@ class FlightNode(LifecycleNode):
     """Roles of the nodes whose silence this node reports."""
 
     def __init__(self, name: str, *, autostart: bool | None = None, **kwargs: Any) -> None:
-        self._timers_alive: dict[int, list[bool]] = {}
         super().__init__(name, **kwargs)
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
@@ -242,21 +241,15 @@ class FlightNode(LifecycleNode):
         self, timer_period_sec: float, callback: Callable[[], Any], *args: Any, **kwargs: Any
     ) -> Timer:
         """Create a timer with a callback whose exceptions end in :meth:`on_failure`."""
-        guarded, alive = self.guarded(callback, "a timer"), [True]
+        guarded = self.guarded(callback, "a timer")
 
         def fire() -> None:
             # The executor may still have a destroyed timer in its queue.
-            if alive[0]:
+            if timer in self.timers:
                 guarded()
 
         timer = super().create_timer(timer_period_sec, fire, *args, **kwargs)
-        self._timers_alive[id(timer)] = alive
         return timer
-
-    def destroy_timer(self, timer: Timer) -> bool:
-        """Destroy a timer: its callback runs no more."""
-        self._timers_alive.pop(id(timer), [True])[0] = False
-        return bool(super().destroy_timer(timer))
 
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
