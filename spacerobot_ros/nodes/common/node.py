@@ -327,35 +327,19 @@ class FlightNode(LifecycleNode):
         loaded again sets every one.
         """
         try:
-            changes = self._changes(parameter_list)
+            given = typed(self._parameters_declared, parameter_list)
+            changes = [each for each in given if not self._has_value(each)]
+            self._require_changeable(changes)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if not changes:
             return SetParametersResult(successful=True)
         return super().set_parameters_atomically(changes)
 
-    def _changes(self, given: list[RosParameter]) -> list[RosParameter]:
-        """Return the parameters whose values differ from the present ones, in declared types.
-
-        Raises
-        ------
-        ParameterError
-            A value is refused, or the parameter is constant now.
-        """
-        changes = [each for each in given if not self._has_value(each)]
-        self._require_changeable(changes)
-        return typed(self._parameters_declared, changes)
-
     def _has_value(self, given: RosParameter) -> bool:
         """Whether a parameter has this value already."""
-        if not self.has_parameter(given.name):
-            return False
-        try:
-            (wanted,) = typed(self._parameters_declared, [given])
-        except ParameterError:
-            return False
-        present = self.get_parameter(given.name)
-        return present.type_ == wanted.type_ and present.value == wanted.value
+        present = self.get_parameter_or(given.name)
+        return bool(present.type_ == given.type_ and present.value == given.value)
 
     @property
     def is_active(self) -> bool:
