@@ -209,9 +209,12 @@ class CommanderNode(FlightNode):
         return self._inputs[topic].has_publisher
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
-        """Return the messages that wait in the subscriptions of odom and joint_states."""
-        odoms = self._inputs["odom"].waiting()
-        joints = map(self._joined, self._inputs["joint_states"].waiting())
+        """Return the messages that wait in the subscriptions of odom and joint_states.
+
+        Where no joints wait, nor are skipped, odom comes in its own order.
+        """
+        joints = [*map(self._joined, self._inputs["joint_states"].waiting())]
+        odoms = self._inputs["odom"].waiting() if joints else []
         return (
             [Stamped(first_time_ns(raw), raw) for raw in odoms],
             [Stamped(first_time_ns(raw), raw) for raw in joints if raw is not None],
