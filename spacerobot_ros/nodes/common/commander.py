@@ -323,7 +323,8 @@ class CommanderNode(FlightNode):
 
     def _has_foreign_statuses(self) -> bool:
         """Whether more nodes publish plant/status than odom, as every plant publishes both."""
-        statuses, odoms = map(self.count_publishers, ("plant/status", "odom"))
+        topics = map(self.resolve_topic_name, ("plant/status", "odom"))
+        statuses, odoms = map(self.count_publishers, topics)
         return bool(statuses > odoms > 0)
 
     def _on_odom(self, raw: bytes) -> None:

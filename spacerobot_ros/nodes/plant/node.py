@@ -520,7 +520,8 @@ class PlantNode(FlightNode):
 
     def _count_commanders(self) -> None:
         for source in self._commands.sources:
-            source.commanders = self.count_publishers(source.topic)
+            # Names to count by are not remapped.
+            source.commanders = self.count_publishers(self.resolve_topic_name(source.topic))
 
     # -- commands -----------------------------------------------------------------------------
 
