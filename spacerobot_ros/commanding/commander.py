@@ -49,7 +49,7 @@ from spacerobot_ros.planning.execution.goal_file import (
     IdentifiedGoal,
 )
 from spacerobot_ros.planning.execution.status import ScheduleStart
-from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
 
 _REPORT_PERIOD = 1.0
@@ -77,10 +77,6 @@ class CommanderActivity(Enum):
     ACTIVE = "active"
     DECIDED = "decided"
     """The commander has stopped after a decision about its goal (``stop_when_decided``)."""
-
-
-_ACTIVE = CommanderActivity.ACTIVE
-"""Found faster than the member of the enum, for every state."""
 
 
 class CommanderHost(Protocol):
@@ -253,7 +249,7 @@ class Commander(ABC):
     @property
     def active(self) -> bool:
         """Whether states are answered and goals accepted."""
-        return self.activity is _ACTIVE
+        return self.activity is CommanderActivity.ACTIVE
 
     def use_robot(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         """Command this robot from now on, and accept the goals that wait for it.
@@ -263,7 +259,7 @@ class Commander(ABC):
         SpaceRobotError
             The configuration does not go with the robot.
         """
-        self._described, self._payload = robot, self.plant.payload
+        self._described, self._payload = robot, self.plant.status.payload
         self.config = self._adapted(self._given)
         robot = self._with_payload(robot)
         self._build_executive(robot, decoder)
@@ -276,7 +272,9 @@ class Commander(ABC):
     def _follow_rate(self) -> None:
         """Command at the rate of the plant, as soon as it is known."""
         present = self.config.tick_rate
-        rate = self.plant.rate or (self.stamps.steady_rate if present else self.stamps.rate)
+        rate = self.plant.status.tick_rate_hz or (
+            self.stamps.steady_rate if present else self.stamps.rate
+        )
         if not rate or abs(rate - present) <= _EQUAL_RATES * present:
             return
         self.config = replace(self.config, tick_rate=rate)
@@ -596,7 +594,7 @@ class Commander(ABC):
             return f"states on {_quoted(absent)}{refused}{nobody}"
         silence = self._clock() - self._heard
         longest = max(_LONGEST_SILENCE, _SILENT_PERIODS * self.config.control_period)
-        if silence > longest and self.plant.inactive:
+        if silence > longest and self.plant.status.state is PlantState.INACTIVE:
             return "the plant, which is inactive: activate it"
         if silence > longest and not (self.plant.paused or self.plant.in_lockstep):
             ceased = "" if refused else ", which have ceased"
@@ -684,8 +682,8 @@ class Commander(ABC):
         if self._actuation_refusal:
             self._log_fault("actuation", self._actuation_refusal)
         self._follow_rate()
-        if self.plant.payload != self._payload:
-            self._payload = self.plant.payload
+        if self.plant.status.payload != self._payload:
+            self._payload = self.plant.status.payload
             if self._described is not None:
                 self.robot = self._with_payload(self._described)
                 self._change_masses(self.robot)

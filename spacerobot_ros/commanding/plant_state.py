@@ -204,10 +204,6 @@ class Pairing(str, Enum):
     """Odom of a state that was handed over without odom before."""
 
 
-# Constants save the slow look-up of enum members for every state.
-_WHOLE, _WITHOUT_POSE, _LATE_POSE = Pairing.WHOLE, Pairing.WITHOUT_POSE, Pairing.LATE_POSE
-
-
 class StateSynchroniser:
     """Pairs the latest odom and joints by their stamps, and hands every state over once.
 
@@ -300,15 +296,15 @@ class StateSynchroniser:
             self._odom_fresh = self._odom_fresh and not together
             if self._joints_fresh:
                 self._joints_fresh = False
-                return _WHOLE if posed else _WITHOUT_POSE
-            return _LATE_POSE if posed else None
+                return Pairing.WHOLE if posed else Pairing.WITHOUT_POSE
+            return Pairing.LATE_POSE if posed else None
         if (
             self._joints_fresh
             and (self._without_pose or (self._odom_fresh and together))
             and all(given.stamp_ns == stamp for given in self._required.values())
         ):
             self._odom_fresh = self._joints_fresh = False
-            return _WITHOUT_POSE if self._without_pose else _WHOLE
+            return Pairing.WITHOUT_POSE if self._without_pose else Pairing.WHOLE
         return None
 
     def take_overdue(self) -> Pairing | None:
@@ -321,7 +317,7 @@ class StateSynchroniser:
             return None
         self._joints_fresh = False
         self._without_pose = self._joints_ns != self._odom_ns
-        return _WITHOUT_POSE if self._without_pose else _WHOLE
+        return Pairing.WITHOUT_POSE if self._without_pose else Pairing.WHOLE
 
 
 # -- the status of the plant ------------------------------------------------------------------
@@ -359,15 +355,14 @@ class PlantListener:
     """Follows plant/status: whether the plant obeys, and its resets; none need be published."""
 
     def __init__(self) -> None:
-        self._status: PlantStatus | None = None
-        self._name = "plant"
+        self.status = PlantStatus(PlantState.RUNNING)
+        """The latest status; before the first one, that of a plant that obeys."""
+        self._heard, self._name = False, "plant"
 
     @property
     def refusal_of_goals(self) -> str:
         """Message on why goals are refused at present; empty: goals are accepted."""
-        status = self._status
-        if status is None:
-            return ""
+        status = self.status
         if status.latched_fault:
             return f"The plant is latched: {status.latched_fault}; call '{self._name}/rearm' first."
         if status.state is PlantState.FAILED:
@@ -375,57 +370,33 @@ class PlantListener:
         return ""
 
     @property
-    def inactive(self) -> bool:
-        """Whether the plant says that it is inactive."""
-        return self._status is not None and self._status.state is PlantState.INACTIVE
-
-    @property
-    def rate(self) -> float:
-        """Ticks a second of the plant, Hz; 0: it is not known."""
-        return 0.0 if self._status is None else self._status.tick_rate_hz
-
-    @property
     def in_lockstep(self) -> bool:
         """Whether the plant waits for commands."""
-        return self._status is not None and self._status.time_mode == "lockstep"
-
-    @property
-    def actuation(self) -> str:
-        """What the plant takes: ``velocity`` or ``effort``; empty: either, or it is not known."""
-        actuation = "" if self._status is None else self._status.actuation
-        return "" if actuation == "auto" else actuation
+        return self.status.time_mode == "lockstep"
 
     @property
     def has_no_command(self) -> bool:
         """Whether no command is in force: none has come, or none is obeyed."""
-        status = self._status
-        return status is not None and (
-            status.state is PlantState.RESTING or bool(self.refusal_of_goals)
-        )
-
-    @property
-    def payload(self) -> str:
-        """The body that the robot holds, as the text of a :class:`.Payload`; empty: none."""
-        return "" if self._status is None else self._status.payload
+        return self.status.state is PlantState.RESTING or bool(self.refusal_of_goals)
 
     @property
     def paused(self) -> bool:
         """Whether the plant's time stands still."""
-        return self._status is not None and self._status.state is PlantState.PAUSED
+        return self.status.state is PlantState.PAUSED
 
     def update(self, status: PlantStatus, name: str = "plant") -> list[PlantStopped | PlantChange]:
         """Take the next status of the named plant; return the changes to react to.
 
         Statuses may be missed: the counters of a plant tell the changes in between.
         """
-        before, was_blocked = self._status, bool(self.refusal_of_goals)
-        self._status, self._name = status, name
+        before, heard, was_blocked = self.status, self._heard, bool(self.refusal_of_goals)
+        self.status, self._name, self._heard = status, name, True
         changes: list[PlantStopped | PlantChange] = []
         if self.refusal_of_goals:
-            if before is None or not was_blocked or status.latched_fault != before.latched_fault:
+            if not was_blocked or status.latched_fault != before.latched_fault:
                 changes.append(PlantStopped(status.message))
             return changes
-        if before is None:
+        if not heard:
             return changes
         if status.rearms > before.rearms and not was_blocked:
             changes.append(PlantStopped("Commands pass again after a fault was latched."))

@@ -78,9 +78,6 @@ _LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD, _LONGEST_CLEARANCE_PERIOD = 0.5, 
 _CARRIED = {"velocity": "velocities", "effort": "efforts", "auto": "velocities or efforts"}
 """What commands carry, by the parameter ``actuation``."""
 
-# Module names are faster than enum members, which are looked up for every command.
-_RUNNING, _PAUSED, _RESTING = PlantState.RUNNING, PlantState.PAUSED, PlantState.RESTING
-
 
 class PlantNode(FlightNode):
     """Integrates the momentum-conserving model and publishes the topics of a real robot.
@@ -526,7 +523,7 @@ class PlantNode(FlightNode):
     # -- commands -----------------------------------------------------------------------------
 
     def _on_command(self, topic: str, raw: bytes) -> None:
-        if self._active is not _RUNNING and self._active is not _PAUSED:
+        if not self._is_running_or_paused:
             return
         if self._undecided:
             self._decide_actuation(topic, raw)
@@ -538,7 +535,7 @@ class PlantNode(FlightNode):
             self._report.refused(reader.source, refusal)
             if refusal.latches:
                 self._publish_changed_status()
-        elif self.status.state is _RESTING:
+        elif self.status.state is PlantState.RESTING:
             self._publish_changed_status()
         if self._real_time is None:
             self._step_if_complete()
@@ -547,7 +544,7 @@ class PlantNode(FlightNode):
             self._real_time.count_command(now, reader.source.stamp_ns)
 
     def _step_if_complete(self) -> None:
-        if self._active is _RUNNING and self._commands.complete:
+        if self._active is PlantState.RUNNING and self._commands.complete:
             self._step()
 
     def _on_injection(self, inject: Callable[[str], None], message: String) -> None:
