@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from spacerobot_ros.campaign.running import Progress
     from spacerobot_ros.campaign.workers import Cluster
 
-_ENGINES = ("auto", "lanes", "flights", "ros")
+_ENGINES = ("auto", "lanes", "flights")
 
 
 class _CampaignGroup(DefaultGroup):

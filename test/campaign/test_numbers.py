@@ -509,9 +509,9 @@ def test_a_campaign_is_flown_by_the_engine_and_the_workers_that_it_is_given(
     now = iter([1.0] * 99)
     asked.clear()
     named = replace(MADE, engine="flights")
-    for options in ({}, {"engine": "ros"}, {"cluster": running.Cluster(scheduler="tcp://x")}):
+    for options in ({}, {"engine": "lanes"}, {"cluster": running.Cluster(scheduler="tcp://x")}):
         run_campaign(named, tmp_path, **options)
-    assert asked[::2] == ["flights", "ros", "flights"]
+    assert asked[::2] == ["flights", "lanes", "flights"]
     assert {workers for _, _, workers in asked[1::2]} == {None}
     asked.clear()
     run_campaign(replace(named, flights=9), tmp_path / "b", cluster=running.Cluster(0, "tcp://x"))
@@ -898,13 +898,13 @@ def test_a_campaign_without_dispersions_says_so() -> None:
 
 def test_a_row_of_an_error() -> None:
     draw = Draw(1, 2, {})
-    refused = Row.of_error(draw, SpaceRobotError("No\n robot."), "ros")
+    refused = Row.of_error(draw, SpaceRobotError("No\n robot."), "lanes")
     assert (refused.outcome, refused.reason, refused.engine) == (
         "error",
         str(SpaceRobotError("No\n robot.")),
-        "ros",
+        "lanes",
     )
-    other = Row.of_error(draw, KeyError("a\n  b"), "ros")
+    other = Row.of_error(draw, KeyError("a\n  b"), "lanes")
     assert other.reason.startswith("KeyError: ")
     assert (other.passed, other.metrics, other.fallback) == (False, {}, "")
     assert math.isnan(other.wall_time)
