@@ -45,10 +45,11 @@ from spacerobot_ros.messages.builders import (
     RobotTransforms,
     StateFrames,
 )
+from spacerobot_ros.messages.diagnostics import diagnostic_name
 from spacerobot_ros.messages.readers import read_text
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status, message_class
+from spacerobot_ros.nodes.common.messages import diagnostic_status, message_class
 from spacerobot_ros.nodes.common.node import STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters

@@ -514,29 +514,6 @@ def test_a_node_that_is_silent_or_back_is_an_event(over: bool) -> None:
 # -- messages -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("kind", "size", "scale", "number"),
-    [
-        ("box", (1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 1),
-        ("cylinder", (0.5, 3.0), (1.0, 1.0, 3.0), 3),
-        ("sphere", (0.75,), (1.5, 1.5, 1.5), 2),
-        ("mesh", (2.0, 1.0, 0.5), (2.0, 1.0, 0.5), 10),
-    ],
-)
-def test_markers_have_the_sizes_of_their_shapes(
-    kind: str, size: tuple[float, ...], scale: tuple[float, ...], number: int
-) -> None:
-    shape: Any = SimpleNamespace(
-        kind=kind, size=size, rgba=(0.125, 0.25, 0.5, 0.75), resource="file:///a.stl"
-    )
-    marker = messages.shape_marker(shape, "world", "hand", 7)
-    assert (marker.ns, marker.id, marker.type, marker.action) == ("hand", 7, number, 0)
-    assert (marker.scale.x, marker.scale.y, marker.scale.z) == scale
-    colour = marker.color
-    assert (colour.r, colour.g, colour.b, colour.a) == (0.125, 0.25, 0.5, 0.75)
-    assert (marker.header.frame_id, marker.mesh_resource) == ("world", "file:///a.stl")
-
-
 def vector(cls: Any, values: list[float]) -> Any:
     return cls(**dict(zip("xyzw", values, strict=False)))
 
