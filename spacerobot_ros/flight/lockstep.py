@@ -137,9 +137,10 @@ def require_flyable(scenario: Scenario) -> None:
     elif len(scenario.commanders) > 1 and scenario.planner.output == "commands":
         why = "planner and controller both command the joints"
     if why:
+        realtime = " --realtime" if scenario.kills and scenario.lockstep else ""
         raise ParameterError(
-            f"The scenario '{scenario.name}' cannot be flown without ROS, because {why}; "
-            "`spacerobot run` flies it."
+            f"The scenario '{scenario.name}' cannot be flown without nodes, because {why}: fly it "
+            f"with `spacerobot run --nodes{realtime}`."
         )
 
 
@@ -151,7 +152,7 @@ def fly_scenario(
     longest: float = math.inf,
     contacts: bool = True,
 ) -> Flight:
-    """Fly a scenario from its initial state to its goal, without ROS: as `spacerobot run` does.
+    """Fly a scenario from its initial state to its goal, without ROS: as ``spacerobot run`` does.
 
     Parameters
     ----------
@@ -174,8 +175,8 @@ def fly_scenario(
         The shape of the goal is of another robot.
     """
     require_flyable(scenario)
-    flight = _LockstepFlight(scenario, robots or Robots.of(scenario)).fly(progress, longest)
-    return _with_contacts(flight) if contacts else flight
+    flight = LockstepFlight(scenario, robots or Robots.of(scenario))
+    return flight.fly(progress, longest, contacts=contacts)
 
 
 def _with_contacts(flight: Flight) -> Flight:
@@ -212,7 +213,7 @@ class _DecisionState(Enum):
 class _Host:
     """The :class:`~spacerobot_ros.commanding.commander.CommanderHost` of a commander here."""
 
-    flight: _LockstepFlight
+    flight: LockstepFlight
     node: str
     send_command: Callable[[int], None]
 
@@ -237,8 +238,23 @@ class _Host:
         return [], []
 
 
-class _LockstepFlight:
-    """One flight in lockstep, tick by tick."""
+class LockstepFlight:
+    """One flight in lockstep, tick by tick.
+
+    Parameters
+    ----------
+    scenario
+        What to fly; :func:`require_flyable` accepts it.
+    robots
+        The models.
+
+    Raises
+    ------
+    ParameterError
+        A parameter or the robot is refused.
+    GoalError
+        The shape of the goal is of another robot.
+    """
 
     def __init__(self, scenario: Scenario, robots: Robots) -> None:
         config = scenario.plant
@@ -262,6 +278,7 @@ class _LockstepFlight:
         self._decided: _DecisionState | None = None
         self._moment = _DecisionState.BEFORE_COMMAND
         self._status: Status | None = None
+        self._interrupted = False
         self._planner: PlannerCommander | None = None
         self._controller: ControllerCommander | None = None
         commanders: dict[str, Commander] = {}
@@ -285,10 +302,28 @@ class _LockstepFlight:
 
     # -- the flight ---------------------------------------------------------------------------
 
-    def fly(self, progress: Progress, longest: float) -> Flight:
-        """Fly to the decision about the goal."""
-        began, interrupted = time.perf_counter(), ""
-        reported_at = began
+    def fly(
+        self,
+        progress: Progress = lambda now, end: False,
+        longest: float = math.inf,
+        *,
+        contacts: bool = True,
+    ) -> Flight:
+        """Fly to the decision about the goal; parameters are those of :func:`fly_scenario`."""
+        began = time.perf_counter()
+        interrupted = self._fly(progress, longest)
+        flight = self.until_now(time.perf_counter() - began, interrupted)
+        return _with_contacts(flight) if contacts else flight
+
+    def interrupt(self) -> None:
+        """End the flight, and the plan that is being made; called from another thread."""
+        self._interrupted = True
+        if self._planner is not None:
+            self._planner.interrupt()
+
+    def _fly(self, progress: Progress, longest: float) -> str:
+        """Fly; return why the flight was interrupted, empty if the goal was decided."""
+        reported_at = time.perf_counter()
         self._commands.revoke_before(0)
         for source in self._commands.sources:
             wrench = source.quantity == "wrench"
@@ -303,31 +338,33 @@ class _LockstepFlight:
         self._report_state()
         while True:
             self._answer_state()
+            if self._interrupted:
+                return self._interruption
             if self._decided is _DecisionState.BEFORE_COMMAND:
-                break
+                return ""
             if not self._commands.complete and not self._reported.sensors.dropout:
-                interrupted = f"No command answers the state of {self._time:g} s."
-                break
+                return f"No command answers the state of {self.time:g} s."
             ends = self._decided is not None
             if not self._step():
-                break
+                return ""
             self._report_state()
             if self._plant.injected is not self._injected_seen:
                 self._report_plant_status(PlantState.RUNNING)
             if ends:
-                break
-            if self._time >= longest:
-                interrupted = f"Interrupted after {self._time:.6g} s of simulated time."
-                break
+                return ""
+            if self.time >= longest:
+                return self._interruption
             if (
                 self._tick % _TICKS_PER_CLOCK_READ == 0
                 and time.perf_counter() - reported_at >= _PROGRESS_PERIOD
             ):
                 reported_at = time.perf_counter()
-                if progress(self._time, self._expected_end):
-                    interrupted = f"Interrupted after {self._time:.6g} s of simulated time."
-                    break
-        return self._result(time.perf_counter() - began, interrupted)
+                if progress(self.time, self._expected_end):
+                    return self._interruption
+
+    @property
+    def _interruption(self) -> str:
+        return f"Interrupted after {self.time:.6g} s of simulated time."
 
     @property
     def has_planner(self) -> bool:
@@ -339,7 +376,8 @@ class _LockstepFlight:
         return self._tick * self._period_ns
 
     @property
-    def _time(self) -> float:
+    def time(self) -> float:
+        """Simulated time, s."""
         return self._now_ns / SECOND
 
     @property
@@ -359,7 +397,7 @@ class _LockstepFlight:
         try:
             self._plant.step(*commands)
         except SpaceRobotError as error:
-            self._monitor.failure = "model", f"The plant stops at {self._time:g} s: {error}"
+            self._monitor.failure = "model", f"The plant stops at {self.time:g} s: {error}"
             self._commands.rest()
             self._report_plant_status(PlantState.FAILED)
             return False
@@ -441,7 +479,7 @@ class _LockstepFlight:
         refusal = self._commands.accept_or_refuse(source, now, values, now)
         if refusal is not None:
             self._diagnostics.note_refusal(source, refusal)
-            self.log.refusals.append((self._time, source.topic, refusal))
+            self.log.refusals.append((self.time, source.topic, refusal))
             if refusal.latches:
                 self._report_plant_status(PlantState.RUNNING)
 
@@ -459,7 +497,7 @@ class _LockstepFlight:
                 commander.receive_plant_status(status)
 
     def _events_until(self, activity: PlantState) -> list[Event]:
-        events = self._monitor.update(activity, self._time)
+        events = self._monitor.update(activity, self.time)
         return [replace(event, node="plant") for event in events]
 
     # -- goals and statuses -------------------------------------------------------------------
@@ -500,11 +538,12 @@ class _LockstepFlight:
 
     def take_event(self, node: str, event: Event) -> None:
         """Take an event of a commander; its time is now unless it has one."""
-        time = self._time if event.time_s is None else event.time_s
+        time = self.time if event.time_s is None else event.time_s
         self.log.events.append(replace(event, time_s=time, node=node))
 
-    def _result(self, wall_time: float, interrupted: str) -> Flight:
-        decision = self._follower.decision
+    def until_now(self, wall_time: float, interrupted: str = "") -> Flight:
+        """Return the flight so far; ``interrupted`` says why it ended early, if it did."""
+        decision = None if self._interrupted else self._follower.decision
         outcome = Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value)
         message = interrupted
         if decision is not None:

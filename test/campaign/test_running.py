@@ -291,16 +291,9 @@ def test_a_task_of_lanes_leaves_what_others_fly_unless_all_of_it_is_asked_for() 
     assert set(left.values()) == {"needed corrections"}
 
 
-@pytest.fixture
-def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("own_domain")
 @pytest.mark.parametrize("count", [1, pytest.param(20, marks=pytest.mark.slow)])
-def test_rows_flown_again_through_ros_are_the_same(tmp_path: Path, count: int) -> None:
-    """Masses, inertias, centres of mass, noise: through a URDF, parameters and messages."""
+def test_rows_flown_again_are_the_same(tmp_path: Path, count: int) -> None:
+    """Masses, inertias, centres of mass, noise: through a URDF and parameters."""
     made = small(flights=60 if count > 1 else 3)
     run_campaign(made, tmp_path)
     chosen = np.random.default_rng(6).permutation(made.flights)[:count]
@@ -317,10 +310,8 @@ def test_rows_flown_again_through_ros_are_the_same(tmp_path: Path, count: int) -
         assert again.report_lines[-1] == "dataset     has no such flight yet"
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("own_domain")
-def test_the_stack_ends_flights_that_are_too_long(tmp_path: Path) -> None:
-    """Its controller would try for an hour; 4 s are over before the stack looks once."""
+def test_flights_that_are_too_long_end_alike(tmp_path: Path) -> None:
+    """Its controller would try for an hour."""
     section = {
         "scenario": "coordinated_control",
         "longest": 4.0,
@@ -336,8 +327,7 @@ def test_the_stack_ends_flights_that_are_too_long(tmp_path: Path) -> None:
     assert (row["outcome"], row["duration_s"]) == ("interrupted", 4.0)
     again = rerun_flight(tmp_path, 0, tmp_path / "0.mcap")
     assert again.agrees
-    assert again.report_lines[-1].startswith("It was interrupted")
-    assert 4.0 <= again.row.metrics["duration_s"] < 1000.0
+    assert again.row.metrics["duration_s"] == 4.0
 
 
 def test_a_row_that_is_another_flight_is_noticed(tmp_path: Path) -> None:

@@ -243,7 +243,6 @@ def test_parameters_can_be_given_by_name() -> None:
 HOOKS = {
     "commanding.commander": ["_report_waiting_goal", "_forward_outputs"],
     "planning.core.method": ["_setup", "require_suitable"],
-    "session.stack": ["interrupt", "_supervise"],
 }
 """Methods of abstract classes that do nothing unless they are overridden, by module."""
 

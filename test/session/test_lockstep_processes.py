@@ -1,4 +1,4 @@
-"""Flights of a scenario in lockstep: the same messages, in one process and in many, every time."""
+"""Flights of a scenario in lockstep: the same messages without ROS and by nodes, every time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from spacerobot_ros.session.run import run_scenario
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_domain")]
 
 ENDS = ("/events", "/plant/status")
-"""Topics on which nodes say that they end: a process says so of itself, a stack in one does not."""
+"""Topics on which nodes say that they begin and end, as flights without ROS do not."""
 
 
 def messages(bag: Path) -> dict[str, list[Any]]:
@@ -41,7 +41,7 @@ def test_every_run_is_the_same(name: str, tmp_path: Path) -> None:
     scenario = load_scenario(name)
     bags = [tmp_path / f"{k}.mcap" for k in range(4)]
     for k, bag in enumerate(bags):
-        run_scenario(scenario, bag, processes=k > 0)
+        run_scenario(scenario, bag, nodes=k > 0)
     one, first, *others = map(messages, bags)
     for other in others:
         assert other == first

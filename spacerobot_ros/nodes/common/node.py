@@ -7,7 +7,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -28,7 +27,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError, describe_exception
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
@@ -297,9 +296,7 @@ class FlightNode(LifecycleNode):
         if isinstance(error, SpaceRobotError):
             message = str(error)
         else:
-            message = (
-                f"Node '{self.get_name()}' has failed at {what}: {_describe_exception(error)}."
-            )
+            message = f"Node '{self.get_name()}' has failed at {what}: {describe_exception(error)}."
         if message == self._failure:
             return  # The failure is reported already, and may recur with every message.
         self._report_failure(message, error)
@@ -308,7 +305,7 @@ class FlightNode(LifecycleNode):
                 self.trigger_deactivate()
         except Exception as second:  # A second failure must not cause a third one.
             self.get_logger().error(
-                f"Node '{self.get_name()}' cannot stop: {_describe_exception(second)}."
+                f"Node '{self.get_name()}' cannot stop: {describe_exception(second)}."
             )
         self.fault = SpaceRobotError(message)
 
@@ -318,7 +315,7 @@ class FlightNode(LifecycleNode):
         try:
             self.on_failure(message, error)
         except Exception as second:
-            self.get_logger().error(f"Node '{self.get_name()}': {_describe_exception(second)}.")
+            self.get_logger().error(f"Node '{self.get_name()}': {describe_exception(second)}.")
         self.report_event(Event(EventKind.FAILED, message, level=2))
 
     @property
@@ -513,7 +510,7 @@ class FlightNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             # rclpy drops exceptions of transitions, so they are logged here.
-            message = f"Node '{self.get_name()}' has failed: {_describe_exception(error)}."
+            message = f"Node '{self.get_name()}' has failed: {describe_exception(error)}."
             self.fault = SpaceRobotError(message)
             self.get_logger().debug(traceback.format_exc())
             self._report_failure(message, error)
@@ -608,11 +605,3 @@ def described_robot(robot: SpaceRobot | None) -> str:
         return "the robot that robot_description will bring"
     mass = robot.description.total_mass
     return f"'{robot.description.name}' ({robot.n} joint(s), {mass:.4g} kg)"
-
-
-def _describe_exception(error: BaseException) -> str:
-    """Return type, text and source line of an unexpected exception."""
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    text = " ".join(str(error).split()).rstrip(".")
-    return f"{type(error).__name__}{': ' if text else ''}{text}{place}"

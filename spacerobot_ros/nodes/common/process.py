@@ -71,16 +71,6 @@ def _use_sockets_without_shared_memory() -> None:
         )
 
 
-def use_private_discovery() -> None:
-    """Keep discovery in this process unless the user chose a range or a domain.
-
-    Two lockstep stacks that receive each other's messages would refuse each other's commands.
-    """
-    if not any(os.environ.get(name) for name in (*_DISCOVERY_CHOICES, "ROS_DOMAIN_ID")):
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"
-    use_loopback_discovery()
-
-
 def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = None) -> int:
     """Run one node in its own process until SIGINT, SIGTERM, SIGHUP, or the end of its parent.
 
