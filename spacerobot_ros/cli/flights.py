@@ -302,8 +302,9 @@ def up_command(
 ) -> None:
     """Keep the nodes of a SCENARIO or a ROBOT running in real time.
 
-    Each node is a process. A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. Send goals by topic or
-    with the command spacerobot goal. Ctrl-C, SIGTERM or SIGHUP ends the nodes.
+    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. Each node is a process.
+    Send goals by topic or with the command spacerobot goal. Ctrl-C, SIGTERM or SIGHUP ends the
+    nodes.
     """
     from spacerobot_ros.scenario import scenario_or_robot
 

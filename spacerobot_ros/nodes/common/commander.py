@@ -422,9 +422,7 @@ class CommanderNode(FlightNode):
             self._resubscribe_best_effort()
         ignored = commander.take_accepted_jump()
         if ignored or (
-            # A repeatable run depends on simulated time only.
-            self.events_have_wall_time
-            and self.config.diagnostics_period
+            self.config.diagnostics_period
             and self.is_active
             and time.monotonic() - self._diagnosed >= _LONGEST_DIAGNOSTICS_PERIOD
         ):

@@ -33,12 +33,10 @@ from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
 from spacerobot_ros.nodes.common.streams import (
-    AnnouncedPublisher,
     MatchedEndpoints,
     RawCallback,
     RawInput,
     RawOutput,
-    RawStream,
 )
 from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
@@ -108,17 +106,11 @@ class FlightNode(LifecycleNode):
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
         """Function that a finished node calls with its exit code."""
-        self.raw_streams: list[RawStream] = []
-        """Serialised streams of the node that a recorder takes, from configuration to cleanup."""
         self.raw_inputs: list[RawInput] = []
-        """Serialised messages that the node receives, likewise."""
-        self.before_cleanup: Callable[[], None] = lambda: None
-        """Function that is called before the streams of the node end."""
+        """Serialised messages that the node receives, from configuration to cleanup."""
         self._failure, self._destroyed = "", False
         self._liveness = Liveness(self, self.role, self.depends_on, self.on_silence)
         self._event_stream = self.send_raw(DiagnosticStatus, "events")
-        self.events_have_wall_time = True
-        """Whether wall time may influence published values; False in repeatable runs."""
         self._raising = False
         self._guard_transitions()
         try:
@@ -130,7 +122,6 @@ class FlightNode(LifecycleNode):
             self.add_on_set_parameters_callback(self._on_set_parameters)
             self.create_service(Trigger, "~/connections", self._on_connections)
             self.prepare()
-            self._permanent_streams = list(self.raw_streams)
             self._permanent = set(self._entities())
             if self._autostart if autostart is None else autostart:
                 self.start()
@@ -169,9 +160,7 @@ class FlightNode(LifecycleNode):
     def send_raw(self, kind: type[Any], topic: str, qos: QoSProfile = STREAM) -> RawOutput:
         """Return a new stream whose ``take`` publishes serialised messages."""
         latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        stream = RawOutput(self.create_publisher(kind, topic, qos), latched=latched)
-        self.raw_streams.append(stream)
-        return stream
+        return RawOutput(self.create_publisher(kind, topic, qos), latched=latched)
 
     def take_raw(
         self,
@@ -203,7 +192,6 @@ class FlightNode(LifecycleNode):
             return subscribe(kind, topic, receive, qos, raw=True, event_callbacks=event_callbacks)
 
         stream = RawInput(
-            self.resolve_topic_name(topic),
             callback,
             create=create,
             destroy=self.destroy_subscription,
@@ -218,7 +206,7 @@ class FlightNode(LifecycleNode):
         """Publish an event of this node; an event without a time gets the node's time."""
         if event.time_s is None:
             event = replace(event, time_s=self.simulated_time_s)
-        values = event.to_values(time.time() if self.events_have_wall_time else None)
+        values = event.to_values(time.time())
         name = self.get_fully_qualified_name()
         self._event_stream.take(StatusRecord(name, event.level, event.message, values).encoded())
 
@@ -228,11 +216,6 @@ class FlightNode(LifecycleNode):
         return None
 
     # -- callbacks ----------------------------------------------------------------------------
-
-    def create_publisher(self, msg_type: Any, topic: str, *args: Any, **kwargs: Any) -> Publisher:
-        """Return a new publisher, which announces each publication."""
-        kwargs.setdefault("publisher_class", AnnouncedPublisher)
-        return super().create_publisher(msg_type, topic, *args, **kwargs)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
@@ -552,8 +535,6 @@ class FlightNode(LifecycleNode):
     def _destroy_configured(self) -> None:
         """Destroy the entities of configure; the services of every ROS node stay."""
         self._set_parameters_read_only(fixed=False)
-        self.before_cleanup()
-        self.raw_streams[:] = self._permanent_streams
         self.raw_inputs.clear()
         destroy = {
             Timer: self.destroy_timer,

@@ -197,15 +197,13 @@ class PlantNode(FlightNode):
         """The text on the topic obstacles; None: the robot has its own."""
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         for topic in (*self._readers, *(["base_wrench"] if self._undecided else [])):
-            stream = self.take_raw(
+            self.take_raw(
                 message_class(TOPICS[topic].type),
                 topic,
                 partial(self._on_command, topic),
                 # In lockstep the first command of a tick counts, whichever node publishes it.
                 number=None if self._real_time is None else partial(self._on_number, topic),
             )
-            # Commands are recorded as the plant receives them.
-            self.raw_streams.append(stream)
         for topic, inject in (
             ("fault_injection", lambda text: self.plant.inject(text)),
             ("disturbance_injection", lambda text: self.plant.disturb(text)),
