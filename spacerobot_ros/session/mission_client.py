@@ -55,8 +55,6 @@ class MissionClient:
         Links that there will be goals for; empty name: the default end-effector.
     paths
         Those of them whose goals are paths.
-    on_end
-        Called, within the callback, when the goal is decided or no longer followed.
     name, namespace, context
         Name, namespace and rclpy context of the node.
     """
@@ -70,7 +68,6 @@ class MissionClient:
         joint_names: Callable[[], Sequence[str]] | None = None,
         end_effectors: Sequence[str] = (),
         paths: Collection[str] = (),
-        on_end: Callable[[], None] = lambda: None,
         name: str = "mission_client",
         namespace: str = "",
         context: rclpy.Context | None = None,
@@ -82,7 +79,7 @@ class MissionClient:
         """Message of the last status that another goal is not the subject of; empty before."""
         self._done = rclpy.task.Future(executor=None)
         self._frame, self._now = world_frame, now
-        self._joint_names, self._on_end = joint_names, on_end
+        self._joint_names = joint_names
         self._sent = 0
         self._follower = GoalFollower()
         self._goal_topic = self.node.create_publisher(PoseStamped, "goal_pose", STREAM)
@@ -232,8 +229,6 @@ class MissionClient:
 
     def _end(self, outcome: Outcome) -> None:
         if not self._done.done():
-            # The run ends in this callback, so that it ends at the same tick every time.
-            self._on_end()
             self._done.set_result(outcome)
 
     def _on_event(self, received: DiagnosticStatus) -> None:
