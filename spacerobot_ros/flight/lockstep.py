@@ -1,6 +1,6 @@
 """A flight in lockstep without ROS: the plant and its commanders, in the order of their nodes.
 
-The nodes of a stack in one process pass messages to each other in the order of publication. The
+Nodes in lockstep pass messages to each other in the order of publication. The
 loop makes the same calls in the same order:
 
 1. The plant reports the state of tick k.
