@@ -85,7 +85,6 @@ def record_states(
     node = harness.make(PlantNode, values, autostart=False)
     node.require_transition(node.trigger_configure)
     recorder = harness.make(RecorderNode, {"bag": str(bag), **recorded}, autostart=False)
-    recorder.watch([node])
     recorder.start()
     harness.spin_until(lambda: {"/odom", "/joint_states", "/robot_description"} <= recorder.topics)
     node.require_transition(node.trigger_activate)

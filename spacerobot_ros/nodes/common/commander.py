@@ -26,16 +26,15 @@ from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.messages.builders import StateFrames, robot_frames
+from spacerobot_ros.messages.diagnostics import encode_diagnostics, state_diagnostics
 from spacerobot_ros.messages.readers import MessageDecoder
-from spacerobot_ros.messages.statuses import read_status
+from spacerobot_ros.messages.statuses import StatusRecord, read_status
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.shared_parameters import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.fly_to import GoalActions, Surroundings
 from spacerobot_ros.nodes.common.messages import (
     KnownFrames,
-    diagnostic_name,
-    diagnostic_status,
     goal_description,
     goal_of,
 )
@@ -46,7 +45,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.status import PlantStatus
-from spacerobot_ros.times import SECOND, first_time_ns, set_stamp
+from spacerobot_ros.times import SECOND, first_time_ns
 
 _WAITING_STATE_CHECK_PERIOD = 0.1
 """Wall time between two checks of postponed state messages, s."""
@@ -103,7 +102,7 @@ class CommanderNode(FlightNode):
         self.commander, config = self.make_commander(), self.config
         self._status_topic = self.create_publisher(DiagnosticStatus, status_topic, LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
-        self._last_status: DiagnosticStatus | None = None
+        self._last_status: StatusRecord | None = None
         self._diagnostics_period_ns = (config.diagnostics_period or math.inf) * SECOND
         self._diagnosed_ns, self._diagnosed = 0, time.monotonic()
         self._known_frames = KnownFrames(self)
@@ -186,9 +185,9 @@ class CommanderNode(FlightNode):
 
     def publish_status(self, status: Status) -> None:
         """Publish a status of the goal."""
-        name, level = self.get_fully_qualified_name(), bytes([status.state.level])
-        self._last_status = diagnostic_status(name, level, status.message, status.to_values())
-        self._status_topic.publish(self._last_status)
+        name, level = self.get_fully_qualified_name(), status.state.level
+        self._last_status = StatusRecord(name, level, status.message, status.to_values())
+        self._status_topic.publish(self._last_status.encoded())
 
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""
@@ -395,9 +394,7 @@ class CommanderNode(FlightNode):
             self._resubscribe_best_effort()
         ignored = commander.take_accepted_jump()
         if ignored or (
-            # A repeatable run depends on simulated time only.
-            self.events_have_wall_time
-            and self.config.diagnostics_period
+            self.config.diagnostics_period
             and self.is_active
             and time.monotonic() - self._diagnosed >= _LONGEST_DIAGNOSTICS_PERIOD
         ):
@@ -406,27 +403,16 @@ class CommanderNode(FlightNode):
     def _publish_diagnostics(self, warning: str = "") -> None:
         """Publish the commander's status and the number of ignored states, or a warning."""
         robot, stamps = self.commander.robot, self.commander.stamps
-        full = self.get_fully_qualified_name()
-        hardware = robot.description.name if robot is not None else ""
-        missing = self.commander.missing
-        level = DiagnosticStatus.WARN if warning or missing else DiagnosticStatus.OK
-        values = {"ignored": stamps.ignored}
+        ignored: dict[str, object] = {"ignored": stamps.ignored}
         if self._decoder is not None:
-            values |= {f"ignored: {what}": count for what, count in self._decoder.ignored.items()}
-        message = warning or (f"waiting for {missing}" if missing else "states are answered")
-        name = diagnostic_name(full, "states")
-        states = diagnostic_status(name, level, message, values, hardware)
-        array, last = DiagnosticArray(status=[states]), self._last_status
-        if last is not None and not warning:
-            array.status.append(
-                DiagnosticStatus(
-                    level=last.level,
-                    name=diagnostic_name(full, "goal"),
-                    message=last.message,
-                    hardware_id=hardware,
-                    values=last.values,
-                )
-            )
+            ignored |= {f"ignored: {what}": count for what, count in self._decoder.ignored.items()}
+        records = state_diagnostics(
+            self.get_fully_qualified_name(),
+            robot.description.name if robot is not None else "",
+            ignored,
+            self._last_status,
+            warning=warning,
+            missing=self.commander.missing,
+        )
         self._diagnosed_ns, self._diagnosed = stamps.now_ns, time.monotonic()
-        set_stamp(array.header.stamp, stamps.now_ns)
-        self._diagnostics.publish(array)
+        self._diagnostics.publish(encode_diagnostics(records, stamps.now_ns))

@@ -7,7 +7,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -28,18 +27,16 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError, describe_exception
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
 from spacerobot_ros.nodes.common.streams import (
-    AnnouncedPublisher,
     MatchedEndpoints,
     RawCallback,
     RawInput,
     RawOutput,
-    RawStream,
 )
 from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport
 from spacerobot_ros.parameters import Parameter, Value, configured, declared, values_of
@@ -108,17 +105,11 @@ class FlightNode(LifecycleNode):
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
         """Function that a finished node calls with its exit code."""
-        self.raw_streams: list[RawStream] = []
-        """Serialised streams of the node that a recorder takes, from configuration to cleanup."""
         self.raw_inputs: list[RawInput] = []
-        """Serialised messages that the node receives, likewise."""
-        self.before_cleanup: Callable[[], None] = lambda: None
-        """Function that is called before the streams of the node end."""
+        """Serialised messages that the node receives, from configuration to cleanup."""
         self._failure, self._destroyed = "", False
         self._liveness = Liveness(self, self.role, self.depends_on, self.on_silence)
         self._event_stream = self.send_raw(DiagnosticStatus, "events")
-        self.events_have_wall_time = True
-        """Whether wall time may influence published values; False in repeatable runs."""
         self._raising = False
         self._guard_transitions()
         try:
@@ -130,7 +121,6 @@ class FlightNode(LifecycleNode):
             self.add_on_set_parameters_callback(self._on_set_parameters)
             self.create_service(Trigger, "~/connections", self._on_connections)
             self.prepare()
-            self._permanent_streams = list(self.raw_streams)
             self._permanent = set(self._entities())
             if self._autostart if autostart is None else autostart:
                 self.start()
@@ -169,9 +159,7 @@ class FlightNode(LifecycleNode):
     def send_raw(self, kind: type[Any], topic: str, qos: QoSProfile = STREAM) -> RawOutput:
         """Return a new stream whose ``take`` publishes serialised messages."""
         latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        stream = RawOutput(self.create_publisher(kind, topic, qos), latched=latched)
-        self.raw_streams.append(stream)
-        return stream
+        return RawOutput(self.create_publisher(kind, topic, qos), latched=latched)
 
     def take_raw(
         self,
@@ -200,7 +188,6 @@ class FlightNode(LifecycleNode):
             return subscribe(kind, topic, receive, qos, raw=True, event_callbacks=event_callbacks)
 
         stream = RawInput(
-            self.resolve_topic_name(topic),
             callback,
             create=create,
             destroy=self.destroy_subscription,
@@ -214,7 +201,7 @@ class FlightNode(LifecycleNode):
         """Publish an event of this node; an event without a time gets the node's time."""
         if event.time_s is None:
             event = replace(event, time_s=self.simulated_time_s)
-        values = event.to_values(time.time() if self.events_have_wall_time else None)
+        values = event.to_values(time.time())
         name = self.get_fully_qualified_name()
         self._event_stream.take(StatusRecord(name, event.level, event.message, values).encoded())
 
@@ -224,11 +211,6 @@ class FlightNode(LifecycleNode):
         return None
 
     # -- callbacks ----------------------------------------------------------------------------
-
-    def create_publisher(self, msg_type: Any, topic: str, *args: Any, **kwargs: Any) -> Publisher:
-        """Return a new publisher, which announces each publication."""
-        kwargs.setdefault("publisher_class", AnnouncedPublisher)
-        return super().create_publisher(msg_type, topic, *args, **kwargs)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
@@ -286,9 +268,7 @@ class FlightNode(LifecycleNode):
         if isinstance(error, SpaceRobotError):
             message = str(error)
         else:
-            message = (
-                f"Node '{self.get_name()}' has failed at {what}: {_describe_exception(error)}."
-            )
+            message = f"Node '{self.get_name()}' has failed at {what}: {describe_exception(error)}."
         if message == self._failure:
             return  # The failure is reported already, and may recur with every message.
         self._report_failure(message, error)
@@ -297,7 +277,7 @@ class FlightNode(LifecycleNode):
                 self.trigger_deactivate()
         except Exception as second:  # A second failure must not cause a third one.
             self.get_logger().error(
-                f"Node '{self.get_name()}' cannot stop: {_describe_exception(second)}."
+                f"Node '{self.get_name()}' cannot stop: {describe_exception(second)}."
             )
         self.fault = SpaceRobotError(message)
 
@@ -307,7 +287,7 @@ class FlightNode(LifecycleNode):
         try:
             self.on_failure(message, error)
         except Exception as second:
-            self.get_logger().error(f"Node '{self.get_name()}': {_describe_exception(second)}.")
+            self.get_logger().error(f"Node '{self.get_name()}': {describe_exception(second)}.")
         self.report_event(Event(EventKind.FAILED, message, level=2))
 
     @property
@@ -486,7 +466,7 @@ class FlightNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             # rclpy drops exceptions of transitions, so they are logged here.
-            message = f"Node '{self.get_name()}' has failed: {_describe_exception(error)}."
+            message = f"Node '{self.get_name()}' has failed: {describe_exception(error)}."
             self.fault = SpaceRobotError(message)
             self.get_logger().debug(traceback.format_exc())
             self._report_failure(message, error)
@@ -528,8 +508,6 @@ class FlightNode(LifecycleNode):
     def _destroy_configured(self) -> None:
         """Destroy the entities of configure; the services of every ROS node stay."""
         self._set_parameters_read_only(fixed=False)
-        self.before_cleanup()
-        self.raw_streams[:] = self._permanent_streams
         self.raw_inputs.clear()
         destroy = {
             Timer: self.destroy_timer,
@@ -581,11 +559,3 @@ def described_robot(robot: SpaceRobot | None) -> str:
         return "the robot that robot_description will bring"
     mass = robot.description.total_mass
     return f"'{robot.description.name}' ({robot.n} joint(s), {mass:.4g} kg)"
-
-
-def _describe_exception(error: BaseException) -> str:
-    """Return type, text and source line of an unexpected exception."""
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    text = " ".join(str(error).split()).rstrip(".")
-    return f"{type(error).__name__}{': ' if text else ''}{text}{place}"

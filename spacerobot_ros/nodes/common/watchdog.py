@@ -15,9 +15,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
+from spacerobot_ros.messages.diagnostics import diagnostic_name
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.compilation import compilation_contexts
-from spacerobot_ros.nodes.common.messages import diagnostic_name, diagnostic_status
+from spacerobot_ros.nodes.common.messages import diagnostic_status
 
 TOPIC = "heartbeat"
 

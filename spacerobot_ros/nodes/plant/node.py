@@ -181,7 +181,7 @@ class PlantNode(FlightNode):
         self._tf_ticks = 0
         if self._transforms.publishes:
             self._tf_ticks = self._ticks_for_viewers(config.tf_period, _LONGEST_FRAME_PERIOD)
-        self._report_ticks = self._ticks(config.diagnostics_period)
+        self._report_ticks = config.ticks_of(config.diagnostics_period)
         self._clearance_ticks = self._ticks_for_viewers(
             config.clearance_period, _LONGEST_CLEARANCE_PERIOD
         )
@@ -195,9 +195,7 @@ class PlantNode(FlightNode):
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         for topic in (*self._readers, *(["base_wrench"] if self._undecided else [])):
             kind = message_class(TOPICS[topic].type)
-            stream = self.take_raw(kind, topic, partial(self._on_command, topic))
-            # Commands are recorded as the plant receives them.
-            self.raw_streams.append(stream)
+            self.take_raw(kind, topic, partial(self._on_command, topic))
         for topic, inject in (
             ("fault_injection", lambda text: self.plant.inject(text)),
             ("disturbance_injection", lambda text: self.plant.disturb(text)),
@@ -469,14 +467,11 @@ class PlantNode(FlightNode):
         if self._steady.now().nanoseconds - self._reported_ns >= _REPORT_PERIOD_NS:
             self._publish_report()
 
-    def _ticks(self, seconds: float) -> int:
-        return max(1, round(seconds * SECOND / self._period_ns)) if seconds else 0
-
     def _ticks_for_viewers(self, seconds: float, longest_wall: float) -> int:
         """Return the ticks of a period, which real time shortens for viewers."""
         if self._real_time is not None and seconds:
             seconds = min(seconds, longest_wall * self.config.real_time_factor)
-        return self._ticks(seconds)
+        return self.config.ticks_of(seconds)
 
     def _on_wall_tick(self) -> None:
         real_time = self._real_time
