@@ -37,7 +37,7 @@ class Fragile(FlightNode):
 
     def configure(self) -> None:
         self.create_subscription(JointState, "joints", self._raise, 10)
-        self.take_raw(JointState, "raw", self._raise)
+        self.create_subscription(JointState, "raw", self._raise, 10, raw=True)
         self.create_service(Trigger, "~/break", lambda request, response: self._raise(request))
 
     def on_failure(self, sentence: str, error: Exception) -> None:

@@ -39,7 +39,6 @@ from spacerobot_ros.nodes.common.messages import (
     goal_of,
 )
 from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
-from spacerobot_ros.nodes.common.streams import RawInput
 from spacerobot_ros.nodes.common.watchdog import Role, SilenceReport
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -111,7 +110,7 @@ class CommanderNode(FlightNode):
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
         """Name of a state topic with a publisher whose QoS the subscription does not match."""
-        self._inputs: dict[str, RawInput] = {}
+        self._inputs: dict[str, Subscription] = {}
         """Messages of states and references by their topics."""
         self._subscribe_states()
         self.create_timer(
@@ -205,19 +204,28 @@ class CommanderNode(FlightNode):
 
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of a topic of the state, or of a reference, is connected."""
-        return self._inputs[topic].has_publisher
+        return bool(self._inputs[topic].get_publisher_count())
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
         """Return the messages that wait in the subscriptions of odom and joint_states.
 
         Where no joints wait, nor are skipped, odom comes in its own order.
         """
-        joints = [*map(self._joined, self._inputs["joint_states"].waiting())]
-        odoms = self._inputs["odom"].waiting() if joints else []
+        joints = [*map(self._joined, self._waiting("joint_states"))]
+        odoms = self._waiting("odom") if joints else []
         return (
             [Stamped(first_time_ns(raw), raw) for raw in odoms],
             [Stamped(first_time_ns(raw), raw) for raw in joints if raw is not None],
         )
+
+    def _waiting(self, topic: str) -> list[bytes]:
+        """Take and return the messages that wait in a subscription."""
+        found: list[bytes] = []
+        handle, kind = self._inputs[topic].handle, self._inputs[topic].msg_type
+        with handle:
+            while (taken := handle.take_message(kind, True)) is not None:
+                found.append(taken[0])
+        return found
 
     # -- inputs -------------------------------------------------------------------------------
 
@@ -361,11 +369,12 @@ class CommanderNode(FlightNode):
             def on_incompatible(_: Any, topic: str = topic) -> None:
                 self._unheard = topic
 
-            self._inputs[topic] = self.take_raw(
+            self._inputs[topic] = self.create_subscription(
                 kind,
                 topic,
                 callback,
-                qos=BEST_EFFORT if self._best_effort else STREAM,
+                BEST_EFFORT if self._best_effort else STREAM,
+                raw=True,
                 event_callbacks=(
                     SubscriptionEventCallbacks(incompatible_qos=on_incompatible) if auto else None
                 ),
@@ -378,7 +387,8 @@ class CommanderNode(FlightNode):
         )
         self._unheard, self._best_effort = "", True
         for topic in ("odom", "joint_states"):
-            self._inputs[topic].subscribe(BEST_EFFORT)
+            self.destroy_subscription(self._inputs[topic])
+        self._subscribe_states()
 
     def _process_waiting_messages(self) -> None:
         """Process waiting statuses, and a postponed state once its time is accepted."""

@@ -14,7 +14,6 @@ from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy._rclpy_pybind11 import RCLError
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
@@ -34,8 +33,6 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed
 from spacerobot_ros.nodes.common.streams import (
     MatchedEndpoints,
-    RawCallback,
-    RawInput,
     RawOutput,
 )
 from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport
@@ -105,8 +102,6 @@ class FlightNode(LifecycleNode):
         self.fault: SpaceRobotError | None = None
         self.on_end: Callable[[int], None] = lambda code: None
         """Function that a finished node calls with its exit code."""
-        self.raw_inputs: list[RawInput] = []
-        """Serialised messages that the node receives, from configuration to cleanup."""
         self._failure, self._destroyed = "", False
         self._liveness = Liveness(self, self.role, self.depends_on, self.on_silence)
         self._event_stream = self.send_raw(DiagnosticStatus, "events")
@@ -160,42 +155,6 @@ class FlightNode(LifecycleNode):
         """Return a new stream whose ``take`` publishes serialised messages."""
         latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
         return RawOutput(self.create_publisher(kind, topic, qos), latched=latched)
-
-    def take_raw(
-        self,
-        kind: type[Any],
-        topic: str,
-        callback: RawCallback,
-        *,
-        qos: QoSProfile = STREAM,
-        event_callbacks: SubscriptionEventCallbacks | None = None,
-    ) -> RawInput:
-        """Subscribe to serialised messages and return their stream.
-
-        Parameters
-        ----------
-        kind, topic
-            Type of the messages and name of the topic.
-        callback
-            Called with each message.
-        qos, event_callbacks
-            Quality of service and event callbacks of the subscription.
-        """
-        # The stream guards its callback already: one call less for each message.
-        subscribe = super().create_subscription
-
-        def create(receive: Callable[..., None], qos: QoSProfile) -> Subscription:
-            return subscribe(kind, topic, receive, qos, raw=True, event_callbacks=event_callbacks)
-
-        stream = RawInput(
-            callback,
-            create=create,
-            destroy=self.destroy_subscription,
-            qos=qos,
-            on_error=lambda error: self._fail(f"a message on '{topic}'", error),
-        )
-        self.raw_inputs.append(stream)
-        return stream
 
     def report_event(self, event: Event) -> None:
         """Publish an event of this node; an event without a time gets the node's time."""
@@ -508,7 +467,6 @@ class FlightNode(LifecycleNode):
     def _destroy_configured(self) -> None:
         """Destroy the entities of configure; the services of every ROS node stay."""
         self._set_parameters_read_only(fixed=False)
-        self.raw_inputs.clear()
         destroy = {
             Timer: self.destroy_timer,
             Subscription: self.destroy_subscription,

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
-from rclpy.subscription import Subscription
 
 _MIDDLEWARE_TOPICS = ("/rosout", "/parameter_events")
 
@@ -114,60 +112,3 @@ class RawOutput:
         """Function that returns the number of matched subscriptions."""
         self.await_readers: Callable[[Duration], bool] = publisher.wait_for_all_acked
         """Function that waits for all readers' confirmations; returns whether all came."""
-
-
-class RawInput:
-    """Serialised messages received on a topic: ``take`` is the node's callback.
-
-    Parameters
-    ----------
-    take
-        Called with each message.
-    create, destroy
-        Create a subscription with a callback and a quality of service, and destroy one.
-    qos
-        Quality of service of the subscription.
-    on_error
-        Called with an exception of a callback: none leaves the executor.
-    """
-
-    def __init__(
-        self,
-        take: RawCallback,
-        *,
-        create: Callable[[Callable[..., None], QoSProfile], Subscription],
-        destroy: Callable[[Subscription], object],
-        qos: QoSProfile,
-        on_error: Callable[[Exception], None],
-    ) -> None:
-        self.take = take
-        """Called with each message; looked up every time, because it may be replaced."""
-        self._create, self._destroy = create, destroy
-
-        def receive(raw: bytes) -> None:
-            try:
-                self.take(raw)
-            except Exception as error:
-                on_error(error)
-
-        self._receive = receive
-        self._subscription = create(receive, qos)
-
-    def subscribe(self, qos: QoSProfile) -> None:
-        """Subscribe with another quality of service."""
-        self._destroy(self._subscription)
-        self._subscription = self._create(self._receive, qos)
-
-    @property
-    def has_publisher(self) -> bool:
-        """Whether a publisher is connected."""
-        return bool(self._subscription.get_publisher_count() > 0)
-
-    def waiting(self) -> list[bytes]:
-        """Take and return the messages that wait in the subscription."""
-        found: list[bytes] = []
-        handle, kind = self._subscription.handle, self._subscription.msg_type
-        with handle:
-            while (taken := handle.take_message(kind, True)) is not None:
-                found.append(taken[0])
-        return found

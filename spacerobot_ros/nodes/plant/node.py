@@ -195,7 +195,8 @@ class PlantNode(FlightNode):
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         for topic in (*self._readers, *(["base_wrench"] if self._undecided else [])):
             kind = message_class(TOPICS[topic].type)
-            self.take_raw(kind, topic, partial(self._on_command, topic))
+            take = partial(self._on_command, topic)
+            self.create_subscription(kind, topic, take, STREAM, raw=True)
         for topic, inject in (
             ("fault_injection", lambda text: self.plant.inject(text)),
             ("disturbance_injection", lambda text: self.plant.disturb(text)),
@@ -341,8 +342,7 @@ class PlantNode(FlightNode):
         """Bring the joints to rest, because the commanders end as well."""
         if self._active is not PlantState.RUNNING or self._real_time is None:
             return
-        for stream in self.raw_inputs:
-            stream.take = lambda raw: None
+        self._readers, self._undecided = {}, False  # No command counts any more.
         self._commands.rest()
         self._publish_changed_status()
         end, began = time.monotonic() + _LONGEST_REST, self._tick
