@@ -9,14 +9,13 @@ from functools import cache
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.lanes import LanesEngine
-from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
+from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
 
 ENGINE_FACTORIES: Mapping[str, Callable[[], Engine]] = {
     "lanes": LanesEngine,
     "flights": FlightsEngine,
-    "ros": RosEngine,
 }
 """The engines by name, the preferred ones first."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,7 +24,7 @@ from spacerobot_ros.campaign.lanes import (
     _PreparedDraw,
     _ScheduledLanes,
 )
-from spacerobot_ros.campaign.one_by_one import FlightsEngine, RosEngine
+from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.rows import Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.errors import SpaceRobotError
@@ -324,8 +323,8 @@ def test_a_batch_that_is_refused_is_left_to_another_engine(
 
 def test_sizes_of_batches_and_of_first_tasks() -> None:
     assert (_ScheduledLanes.max_batch_flights, _ControlledLanes.max_batch_flights) == (512, 128)
-    found = {each.name: each.efficient_flights for each in (LanesEngine, FlightsEngine, RosEngine)}
-    assert found == {"lanes": 64, "flights": 1, "ros": 1}
+    found = {each.name: each.efficient_flights for each in (LanesEngine, FlightsEngine)}
+    assert found == {"lanes": 64, "flights": 1}
 
 
 # -- measures of lanes ----------------------------------------------------------------------------
@@ -725,70 +724,11 @@ def test_a_flight_is_flown_with_the_limits_of_its_campaign(
     assert others["progress"](1.0, 2.0) is False
 
 
-def test_what_cannot_be_flown_without_ros_is_said() -> None:
+def test_what_cannot_be_flown_without_nodes_is_said() -> None:
     kills = replace(START, kills=("planner at 1",))  # type: ignore[arg-type]
-    assert RosEngine().refusal(replace(PLANNED, scenario=kills)) == "it kills nodes on the way"
-    assert RosEngine().refusal(PLANNED) == FlightsEngine().refusal(PLANNED) == ""
-
-
-@pytest.mark.parametrize(("duration", "interrupted"), [(7.5, False), (7.625, True)])
-def test_the_stack_flies_a_draw_in_a_process_of_its_own(
-    duration: float, interrupted: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Any] = []
-
-    def run(words: list[str]) -> Any:
-        file, bag = Path(words[3]), Path(words[5])
-        asked.append([*words[:3], file.name, words[4], bag.name, *words[6:]])
-        assert "ros__parameters" in file.read_text("utf-8")
-        assert file.parent.name.startswith("spacerobot_")
-        bag.write_bytes(b"bag")
-
-    flown = next(OneByOne().fly(PLANNED, [Draws(PLANNED)[0]], lambda: False))
-    assert isinstance(flown, Row)
-    read = _Flown(duration)
-    times = iter([3.0, 10.0])
-    monkeypatch.setattr(one_by_one, "time", SimpleNamespace(perf_counter=lambda: next(times)))
-    monkeypatch.setattr(one_by_one, "run_child", run)
-    monkeypatch.setattr(one_by_one, "read_run", lambda bag: read if bag.exists() else None)
-    monkeypatch.setattr(one_by_one, "replace", _replaced)
-    made = replace(PLANNED, max_flight_time=7.5)
-    found: Any = RosEngine().fly_draw(made, DrawnFlight.of(START), lambda: False)
-    assert asked == [
-        [*("-m", "spacerobot_ros", "run"), "draw.yaml", "--bag", "flight.mcap", "--longest", "7.5"]
-    ]
-    assert found.wall_time == 7.0
-    assert (getattr(found, "outcome", None) is Outcome.INTERRUPTED) is interrupted
-    if interrupted:
-        assert found.message == "Interrupted after 7.625 s of simulated time."
-
-
-class _Flown:
-    def __init__(self, duration: float) -> None:
-        self.duration = duration
-
-
-def _replaced(flown: Any, **given: Any) -> Any:
-    vars(flown).update(given)
-    return flown
-
-
-@pytest.mark.parametrize(
-    ("error", "output", "sentence"),
-    [
-        ("first\nNo robot.\n", "said", "spacerobot run ended with 2: No robot."),
-        ("", "one\nlast\n", "spacerobot run ended with 2: last"),
-        ("", "", "spacerobot run ended with 2: it left no bag"),
-    ],
-)
-def test_a_stack_without_a_bag_is_an_error(
-    error: str, output: str, sentence: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done = SimpleNamespace(stderr=error, stdout=output, returncode=2)
-    monkeypatch.setattr(one_by_one, "run_child", lambda words: done)
-    with pytest.raises(SpaceRobotError) as raised:
-        RosEngine().fly_draw(PLANNED, DrawnFlight.of(START), lambda: False)
-    assert str(raised.value) == sentence
+    refusal = FlightsEngine().refusal(replace(PLANNED, scenario=kills))
+    assert "it kills nodes on the way" in refusal
+    assert not FlightsEngine().refusal(PLANNED)
 
 
 def test_equal_planners_share_a_method(monkeypatch: pytest.MonkeyPatch) -> None:

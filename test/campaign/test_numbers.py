@@ -15,7 +15,6 @@ import pytest
 from scipy import stats
 from support.campaigns import campaign
 
-import spacerobot_ros.session.run as session
 from spacerobot_ros.campaign import dataset as datasets
 from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign import report as reports
@@ -509,9 +508,9 @@ def test_a_campaign_is_flown_by_the_engine_and_the_workers_that_it_is_given(
     now = iter([1.0] * 99)
     asked.clear()
     named = replace(MADE, engine="flights")
-    for options in ({}, {"engine": "ros"}, {"cluster": running.Cluster(scheduler="tcp://x")}):
+    for options in ({}, {"engine": "lanes"}, {"cluster": running.Cluster(scheduler="tcp://x")}):
         run_campaign(named, tmp_path, **options)
-    assert asked[::2] == ["flights", "ros", "flights"]
+    assert asked[::2] == ["flights", "lanes", "flights"]
     assert {workers for _, _, workers in asked[1::2]} == {None}
     asked.clear()
     run_campaign(replace(named, flights=9), tmp_path / "b", cluster=running.Cluster(0, "tcp://x"))
@@ -583,75 +582,6 @@ def test_what_is_said_of_a_rerun(given: dict[str, Any], agrees: bool, last: str)
 def test_a_rerun_without_dispersions() -> None:
     row = Row(Draw(0, 5, {}), "failed", "Off.")
     assert Rerun(row, None, "", "", Path("b")).report_lines[1] == "drawn       nothing; seed 5"
-
-
-@pytest.mark.parametrize(
-    ("engine", "outcome", "thrusters", "inertial", "note"),
-    [
-        ("flights", "reached", "urdf", None, ""),
-        ("flights", "reached", "urdf", "drawn", "Its masses are drawn: the plants of campaign and"),
-        ("flights", "reached", "", "drawn", ""),
-        ("lanes", "reached", "", None, ""),
-        (
-            *("flights", "interrupted", "", None),
-            "It was interrupted: the stack flies on for up to a fifth of a second of wall time.",
-        ),
-    ],
-)
-def test_a_flight_is_compared_with_its_row(
-    engine: str,
-    outcome: str,
-    thrusters: str,
-    inertial: str | None,
-    note: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    plant = SimpleNamespace(thrusters=thrusters)
-    made: Any = SimpleNamespace(
-        max_flight_time=7.5, measures_clearance="clearance", scenario=SimpleNamespace(plant=plant)
-    )
-    asked: list[Any] = []
-
-    def noted(what: Any, answer: Any = None) -> Any:
-        asked.append(what)
-        return answer
-
-    row = Row(DRAWN, "reached", "There.", {"a_m": 1.5, "b_s": 3.0})
-    in_urdf = SimpleNamespace(scenario="scenario")
-    flight = SimpleNamespace(inertial=inertial, with_draws_in_scenario=lambda: in_urdf)
-    dataset = SimpleNamespace(campaign=lambda: made)
-    stored: list[Any] = [(outcome, engine, {"a_m": 1.25, "b_s": 3.0})]
-
-    def measured(clearance: Any) -> str:
-        asked.append(clearance)
-        return "measures"
-
-    monkeypatch.setattr(running, "Dataset", lambda folder: dataset)
-    monkeypatch.setattr(running, "Draws", lambda given: ["draw 0", "draw 1"])
-    monkeypatch.setattr(running, "drawn_flight", lambda given, draw: noted(draw, flight))
-    monkeypatch.setattr(session, "run_scenario", lambda *given, **more: asked.append((given, more)))
-    monkeypatch.setattr(running, "read_run", lambda bag: SimpleNamespace(measured=measured))
-    monkeypatch.setattr(running, "Row", SimpleNamespace(of=lambda *given: noted(given[1:], row)))
-    monkeypatch.setattr(running, "stored_flight", lambda of, number: stored[0])
-    bag = tmp_path / "a.mcap"
-    found = running.rerun_flight(tmp_path, 1, bag)
-    assert asked == [
-        "draw 1",
-        (("scenario", bag), {"longest": 7.5}),
-        "clearance",
-        ("draw 1", "measures", "ros"),
-    ]
-    assert (found.deviation, found.worst_metric, found.outcome) == (0.2, "a_m", outcome)
-    assert found.note.startswith(note)
-    assert bool(found.note) is bool(note)
-    stored[0] = None
-    assert running.rerun_flight(tmp_path, 0, bag) == Rerun(row, None, "", "", bag)
-    with pytest.raises(ParameterError) as refused:
-        running.rerun_flight(tmp_path, 2, bag)
-    assert str(refused.value) == (
-        f"The campaign in {tmp_path} has 2 flights, 0 to 1, and no flight 2."
-    )
 
 
 def test_deviations_are_relative_above_one() -> None:
@@ -897,13 +827,13 @@ def test_a_campaign_without_dispersions_says_so() -> None:
 
 def test_a_row_of_an_error() -> None:
     draw = Draw(1, 2, {})
-    refused = Row.of_error(draw, SpaceRobotError("No\n robot."), "ros")
+    refused = Row.of_error(draw, SpaceRobotError("No\n robot."), "lanes")
     assert (refused.outcome, refused.reason, refused.engine) == (
         "error",
         str(SpaceRobotError("No\n robot.")),
-        "ros",
+        "lanes",
     )
-    other = Row.of_error(draw, KeyError("a\n  b"), "ros")
+    other = Row.of_error(draw, KeyError("a\n  b"), "lanes")
     assert other.reason.startswith("KeyError: ")
     assert (other.passed, other.metrics, other.fallback) == (False, {}, "")
     assert math.isnan(other.wall_time)

@@ -283,20 +283,18 @@ def test_what_the_command_line_changes_reaches_the_flight(
 
     taken: list[Any] = []
 
-    def fly(
-        scenario: Any, bag: Path, progress: Any, *, processes: bool, longest: float
-    ) -> RunResult:
-        taken[:] = [scenario, bag, processes, longest]
+    def fly(scenario: Any, bag: Path, progress: Any, *, nodes: bool, longest: float) -> RunResult:
+        taken[:] = [scenario, bag, nodes, longest]
         return RunResult(SUMMARY)
 
     monkeypatch.setattr(flights, "run_scenario", fly)
     monkeypatch.chdir(tmp_path)
     runner = CliRunner()
     runner.invoke(main, ["run", "sliding_masses"])
-    scenario, bag, processes, longest = taken
-    assert (str(bag), processes, scenario.lockstep) == ("out/sliding_masses.mcap", False, True)
+    scenario, bag, nodes, longest = taken
+    assert (str(bag), nodes, scenario.lockstep) == ("out/sliding_masses.mcap", False, True)
     assert longest == float("inf")
-    words = ["--goal", *"0120001", "--goal-rotvec", "0", "0", "1", "--realtime", "--processes"]
+    words = ["--goal", *"0120001", "--goal-rotvec", "0", "0", "1", "--realtime"]
     words += [
         "--longest",
         "7.5",
@@ -308,8 +306,8 @@ def test_what_the_command_line_changes_reaches_the_flight(
         "lie_bracket",
     ]
     runner.invoke(main, ["run", "sliding_masses", *words])
-    scenario, bag, processes, longest = taken
-    assert (str(bag), processes, longest) == ("b.mcap", True, 7.5)
+    scenario, bag, nodes, longest = taken
+    assert (str(bag), nodes, longest) == ("b.mcap", True, 7.5)
     assert scenario.plant.time_mode == "realtime"
     assert scenario.plant.real_time_factor == 1.0
     assert scenario.plant.tick_rate == 50.0
@@ -319,6 +317,10 @@ def test_what_the_command_line_changes_reaches_the_flight(
     assert scenario.goal.position.tolist() == [0.0, 1.0, 2.0]
     half = math.sin(0.5), math.cos(0.5)
     assert scenario.goal.quaternion == pytest.approx([0.0, 0.0, *half])
+    for word in ("--nodes", "--processes"):
+        runner.invoke(main, ["run", "sliding_masses", word])
+        scenario, _, nodes, _ = taken
+        assert (nodes, scenario.lockstep) == (True, True)
     runner.invoke(main, ["run", "sliding_masses", "--realtime", "2.5"])
     assert taken[0].plant.real_time_factor == 2.5
     # What is set goes before what real time brings with it.
@@ -623,7 +625,7 @@ def test_only_a_goal_that_is_reached_is_exit_0(
     monkeypatch: pytest.MonkeyPatch, outcome: str, code: int
 ) -> None:
     from spacerobot_ros.measures import Outcome
-    from spacerobot_ros.session import run
+    from spacerobot_ros.session import live
 
     sent: list[Any] = []
 
@@ -632,7 +634,7 @@ def test_only_a_goal_that_is_reached_is_exit_0(
         show("A sentence.")
         return Outcome(outcome)
 
-    monkeypatch.setattr(run, "send_goal", send)
+    monkeypatch.setattr(live, "send_goal", send)
     runner = CliRunner()
     words = ["--namespace", "/a", "--timeout", "7"]
     result = runner.invoke(main, ["goal", "1", "-2", "3", *words])

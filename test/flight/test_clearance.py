@@ -164,7 +164,7 @@ def test_the_nodes_report_what_a_flight_without_ros_does(
     through: Flight, tmp_path: Path, ros_domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
-    summary = run_scenario(through.scenario, tmp_path / "ros.mcap").summary
+    summary = run_scenario(through.scenario, tmp_path / "ros.mcap", nodes=True).summary
     assert summary["clearance_m"] == pytest.approx(through.measures.clearance, abs=1e-9)
     through.save(tmp_path / "alone.mcap")
     said = []

@@ -52,11 +52,11 @@ def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.mark.parametrize("name", scenario_names())
 def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Browser) -> None:
     scenario = load_scenario(name)
-    processes = bool(scenario.kills)
-    if processes:
+    nodes = bool(scenario.kills)
+    if nodes:
         scenario = scenario.in_real_time(4.0)
     bag, page = tmp_path / "flight.mcap", tmp_path / "flight.html"
-    summary = run_scenario(scenario, bag, processes=processes).summary
+    summary = run_scenario(scenario, bag, nodes=nodes).summary
     bag = Path(summary["bag"])
     began = time.process_time()
     write_report(bag, page)
