@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from lifecycle_msgs.msg import State
+from lifecycle_msgs.srv import GetState
 from rclpy.experimental import EventsExecutor
 from rclpy.logging import get_logger_effective_level, set_logger_level
 from rosgraph_msgs.msg import Clock
@@ -257,6 +259,7 @@ def _find_goal_commander(
                 # Other subscribers may have been discovered in the meantime.
                 while not client.is_connected() and time.monotonic() < deadline:
                     executor.spin_once(timeout_sec=0.05)
+                _await_active(client, executor, deadline)
                 return client
     links = [
         (path_topic if each.link in goal.links_with_paths else goal_topic)(
@@ -270,3 +273,15 @@ def _find_goal_commander(
         f"No commander takes goals on {topics} after {patience:g} s: start a planner or a "
         f"controller, `spacerobot up SCENARIO`, in the same ROS domain and namespace{listed}."
     )
+
+
+def _await_active(client: MissionClient, executor: EventsExecutor, deadline: float) -> None:
+    """Wait until a commander that is a managed node is active: before, it refuses goals."""
+    service = client.node.create_client(GetState, f"{client.decider}/get_state")
+    while time.monotonic() < deadline and service.service_is_ready():
+        answer = service.call_async(GetState.Request())
+        executor.spin_until_future_complete(answer, timeout_sec=_LONGEST_STATUS_WAIT)
+        state = answer.result()
+        if state is not None and state.current_state.id == State.PRIMARY_STATE_ACTIVE:
+            return
+        time.sleep(_CHECK_PERIOD)

@@ -77,6 +77,8 @@ class MissionClient:
         """Last status of the commander that decides the goal."""
         self.message = ""
         """Message of the last status that another goal is not the subject of; empty before."""
+        self.decider = decider
+        """The commander that decides."""
         self._done = rclpy.task.Future(executor=None)
         self._frame, self._now = world_frame, now
         self._joint_names = joint_names

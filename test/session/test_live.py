@@ -79,11 +79,9 @@ def test_each_node_in_a_process_of_its_own_flies_the_same_manoeuvre(
 
 @pytest.fixture
 def robot(spacerobot: Command) -> Iterator[WarmProcess]:
-    """Sliding masses that are up, twenty times as fast as real time."""
-    words = ("up", "sliding_masses", "--rate", "20", "--bag", "up.mcap", *GAIT)
+    """Sliding masses that are up, five times as fast as real time."""
+    words = ("up", "sliding_masses", "--rate", "5", "--bag", "up.mcap", *GAIT)
     with spacerobot.start(*words) as process:
-        assert process.stdout is not None
-        assert any("is up" in line for line in iter(process.stdout.readline, ""))
         yield process
 
 
