@@ -21,7 +21,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     MotionLimits,
     Trajectory,
 )
-from spacerobot_ros.planning.methods.resolved_rate import MIN_PROGRESS_RATE, ResolvedRateOptions
+from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateOptions
 
 Array = npt.NDArray[np.float64]
 
@@ -81,30 +81,6 @@ def test_turns_of_joints_and_momentum_are_those_of_another_integration(
     assert np.linalg.norm(Rotation.from_quat(exact).as_rotvec()) > 0.5
 
 
-class Shares:
-    """A generator of random numbers with given ones."""
-
-    def __init__(self, shares: Array) -> None:
-        self.shares, self.asked = shares, (0.0, 0.0, 0)
-
-    def uniform(self, low: float, high: float, count: int) -> Array:
-        self.asked = low, high, count
-        return self.shares
-
-
-def test_joints_that_coast_first_begin_later_and_go_the_same_way(guesses: InitialGuesses) -> None:
-    instants = np.linspace(0.0, 1.0, 61)
-    paths = np.array([START + np.outer(instants**p, FINAL - START) for p in (1.0, 2.0)])
-    shares = Shares(np.array([0.25, 0.6]))
-    found = guesses._loops_after_coasting(paths, shares)  # type: ignore[arg-type]
-    assert shares.asked == (0.0, 0.6, 2)
-    for path, share, power in zip(found, shares.shares, (1.0, 2.0), strict=True):
-        assert np.all(path[instants <= share] == START)
-        s = np.clip((instants - share) / (1 - share), 0, 1)
-        np.testing.assert_allclose(path, START + np.outer(s**power, FINAL - START), atol=2e-3)
-        np.testing.assert_allclose(path[-1], FINAL, atol=1e-12)
-
-
 def test_every_third_kind_of_guess_coasts_where_the_robot_drifts(guesses: InitialGuesses) -> None:
     boundary = BoundaryConditions(START, np.array([0.0, 0.0, 0.0, 1.0]), FINAL)
     still = [
@@ -123,70 +99,6 @@ PERIOD = 0.04
 def follower_of(**options: Any) -> TwistFollower:
     given = ResolvedRateOptions(**{**vars(FOLLOWER), **options})
     return TwistFollower(robot_of("three_joint_arm"), "end_effector", given, PERIOD)
-
-
-def test_a_joint_that_brakes_at_each_tick_comes_to_rest_within_its_room() -> None:
-    """Rates are held for a tick; from each to the next they change by what the joint can."""
-    follower, room = follower_of(), np.array([0.3, 0.02, 0.7])
-    a, h = np.array([0.6, 0.8, 1.1]), PERIOD
-    rates = follower._rates_that_can_stop(room)
-    # Uniform braking, v^2 / 2 a, half a tick at full rate, and what rounding to ticks adds.
-    np.testing.assert_allclose(rates**2 / (2 * a) + rates * h / 2 + a * h**2 / 8, room, rtol=1e-12)
-    for rate, one, most in zip(rates, room, a, strict=True):
-        moved, now = 0.0, float(rate)
-        while now > 0:
-            moved, now = moved + now * h, now - most * h
-        # From the middle of the first tick on.
-        assert moved - rate * h / 2 <= one
-        assert moved > 0.9 * (one - rate * h)
-    np.testing.assert_array_equal(follower._rates_that_can_stop(np.array([-0.1, 0.0, 1e-5])), 0.0)
-
-
-def test_rates_change_together_and_by_no_more_than_accelerations_allow() -> None:
-    follower, q = follower_of(), np.array([0.4, -0.9, 1.1])
-    before, wanted = np.array([0.01, -0.02, 0.0]), np.array([0.11, 0.03, 0.2])
-    found = follower._limited(wanted, q, before)
-    # 0.2 rad/s of the third joint take more than 1.1 rad/s^2 x 0.04 s; the others follow its share.
-    share = min(0.6 * PERIOD / 0.1, 0.8 * PERIOD / 0.05, 1.1 * PERIOD / 0.2)
-    np.testing.assert_allclose(found, before + share * (wanted - before), rtol=1e-12)
-    near = before + 0.1 * (wanted - before)
-    np.testing.assert_allclose(follower._limited(near, q, before), near, rtol=1e-12)
-
-
-def test_the_progress_near_a_singularity_decides_the_share_of_a_twist(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    follower, q = follower_of(), np.array([0.4, -0.9, 1.1])
-    twist = TwistCommand("end_effector", np.array([0.01, 0, 0]), np.zeros(3), TwistFrame.BASE)
-    rates, pose = np.array([0.02, -0.01, 0.005]), np.array([0, 0, 0, 0, 0, 0, 1.0])
-    asked: list[Array] = []
-
-    def progress(now: float, ahead: float) -> None:
-        def solution(at: Array, motion: Array) -> tuple[Array, float]:
-            asked.append(at)
-            return rates, now if np.array_equal(at, q) else ahead
-
-        monkeypatch.setattr(follower, "_solution", solution)
-
-    for share in (0.25, 0.8):
-        progress(MIN_PROGRESS_RATE * (1 + share), MIN_PROGRESS_RATE)
-        found, reason = follower._wanted(twist, pose, q)
-        np.testing.assert_allclose(found, share * rates, rtol=1e-9)
-        assert reason.startswith("'end_effector' is near a dynamic singularity: it moves by ")
-    # A thousandth of a radian of the joint that is fastest by its limit is looked ahead.
-    weights = follower._weights
-    np.testing.assert_allclose(asked[-1], q + 1e-3 * rates / np.abs(rates / weights).max())
-    progress(MIN_PROGRESS_RATE * 0.5, MIN_PROGRESS_RATE * 0.4)
-    assert not np.any(follower._wanted(twist, pose, q)[0])
-    progress(MIN_PROGRESS_RATE * 0.5, MIN_PROGRESS_RATE * 0.6)
-    found, reason = follower._wanted(twist, pose, q)
-    np.testing.assert_array_equal(found, rates)
-    assert not reason
-    progress(MIN_PROGRESS_RATE * 2.0, 0.0)
-    assert not follower._wanted(twist, pose, q)[1]
-    rates = np.zeros(3)
-    progress(0.0, 1.0)
-    assert "0 of its reach" in follower._wanted(twist, pose, q)[1]
 
 
 def test_twists_are_turned_into_the_base_from_their_frame() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.urdf_text import link
 
-from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.errors import NotFoundError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal, RobotState
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
@@ -385,15 +384,6 @@ def test_a_goal_that_no_shape_meets_is_not_found(arm: SpaceRobot) -> None:
 
 def replace_limits(limits: MotionLimits, lower: Array, upper: Array) -> MotionLimits:
     return MotionLimits(lower, upper, limits.velocity, limits.acceleration)
-
-
-def test_a_robot_without_joints_has_no_end_effector_to_move() -> None:
-    kind: Any = SimpleNamespace()
-    robot: Any = SimpleNamespace(n=0, description=SimpleNamespace(name="stone"))
-    request: Any = SimpleNamespace(state=None, goal=None, tolerance=None)
-    with pytest.raises(PlanningError) as error:
-        EndEffectorSpecification.boundary_conditions(kind, robot, request, None, kind, None)
-    assert str(error.value) == "Robot 'stone' has no joints that could move an end-effector."
 
 
 # -- radii --------------------------------------------------------------------------------------

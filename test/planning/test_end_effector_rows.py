@@ -9,7 +9,6 @@ from planning.test_end_effector_goals import ARM, ATTITUDE, FOLDER, PLACE, Array
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.errors import NotFoundError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
@@ -19,14 +18,10 @@ from spacerobot_ros.planning.methods.optimal.end_effectors import (
 )
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.problem import (
-    MotionLimits,
     OptimalOptions,
     PossibleEnd,
 )
 
-LOWER, UPPER = np.array([-1.2, -1.5, -0.4]), np.array([1.6, 0.3, 2.2])
-VELOCITY = np.array([0.4, 0.9, 0.2])
-LIMITS = MotionLimits(LOWER, UPPER, VELOCITY, np.ones(3))
 HAND = "end_effector"
 
 
@@ -122,85 +117,6 @@ def test_straight_ways_turn_the_base_as_momentum_says(
 def specification(arm: SpaceRobot, goal: Goal) -> EndEffectorSpecification:
     base = GoalSpecification.of(arm, OptimalOptions())
     return EndEffectorSpecification.of(arm, base, goal)
-
-
-def position_goal(arm: SpaceRobot, way: Array) -> tuple[EndEffectorSpecification, Array]:
-    """Return the specification of a position that the arm reaches, and its parameters."""
-    rows = EndEffectorRows(arm, [(HAND, False)], np.eye(3))
-    X = rows.turns_along_direct_path(ARM, way[np.newaxis])[0]
-    r_CE, _ = hand_from_center(Rotation.from_quat(X), way)
-    r_WC = PLACE + ATTITUDE.apply(arm.center_of_mass(ARM))
-    goal = Goal.of_end_effectors([EndEffectorGoal(HAND, r_WC + ATTITUDE.apply(r_CE))])
-    found = specification(arm, goal)
-    return found, found.rows.pack(at_rest(ARM), goal.end_effectors)
-
-
-def test_ends_of_guesses_are_at_the_goal_and_the_soonest_is_first(arm: SpaceRobot) -> None:
-    way = np.array([1.3, -0.2, 0.4])
-    found, parameters = position_goal(arm, way)
-    turn = np.array([0.0, 0.0, 0.0, 1.0])
-    ends = found._find_possible_ends(ARM, LIMITS, parameters, turn)
-    assert 1 <= len(ends) <= 6
-    times = [np.max(np.abs(each.shape - ARM) / VELOCITY) for each in ends]
-    assert times == sorted(times)
-    half = (UPPER - LOWER) / 2
-    for k, each in enumerate(ends):
-        r_CE, _ = hand_from_center(Rotation.from_quat(each.base_rotation), each.shape)
-        assert np.abs(r_CE - parameters[:3]).max() <= 2e-3
-        assert np.all((LOWER - 1e-12 <= each.shape) & (each.shape <= UPPER + 1e-12))
-        exact = found.rows.turns_along_direct_path(ARM, each.shape[np.newaxis])[0]
-        np.testing.assert_allclose(each.base_rotation, exact, atol=1e-12)
-        for other in ends[:k]:
-            assert np.max(np.abs(each.shape - other.shape) / half) > 0.05
-    again = found._find_possible_ends(ARM, LIMITS, parameters, turn)
-    for one, other in zip(ends, again, strict=True):
-        np.testing.assert_array_equal(one.shape, other.shape)
-
-
-@pytest.mark.parametrize("follows", [True, False])
-def test_inverse_kinematics_with_a_base_that_follows_is_given_or_turns_by_loops(
-    arm: SpaceRobot, follows: bool
-) -> None:
-    found, parameters = position_goal(arm, np.array([1.3, -0.2, 0.4]))
-    shapes = np.array([[1.0, -0.4, 0.6], [0.2, -0.9, 1.4], [1.6, -1.5, -0.4]])
-    given = Rotation.from_rotvec([0.1, -0.2, 0.15]).as_quat()
-    for attitude in (None, given):
-        turns = None if follows else found.rows.turns_along_direct_path(ARM, shapes)
-        turns = turns if attitude is None else np.tile(attitude, (3, 1))
-        q, X, miss = found._inverse_kinematics(
-            shapes, ARM, LIMITS, parameters, turns, fixed=attitude is not None
-        )
-        assert q.shape == (3, 3)
-        assert np.all((LOWER <= q) & (q <= UPPER))
-        assert miss[0] < 2e-3
-        for k in range(3):
-            r_CE, _ = hand_from_center(Rotation.from_quat(X[k]), q[k])
-            assert np.abs(r_CE - parameters[:3]).max() == pytest.approx(miss[k], abs=1e-9)
-            if attitude is not None:
-                np.testing.assert_array_equal(X[k], given)
-            elif follows:
-                exact = found.rows.turns_along_direct_path(ARM, q[k : k + 1])[0]
-                np.testing.assert_allclose(X[k], exact, atol=1e-12)
-    free = found.rows.turns_along_direct_path(ARM, shapes)
-    assert free.shape == (3, 4)
-
-
-def test_a_place_that_no_shape_reaches_is_not_found(arm: SpaceRobot) -> None:
-    found, parameters = position_goal(arm, np.array([1.3, -0.2, 0.4]))
-    inside = np.concatenate([[0.05, 0.0, 0.02], parameters[3:]])
-    with pytest.raises(NotFoundError) as refusal:
-        found._find_possible_ends(ARM, LIMITS, inside, np.array([0.0, 0.0, 0.0, 1.0]))
-    text = str(refusal.value)
-    assert text.startswith(
-        "No shape of robot 'three_joint_arm' that puts 'end_effector' to the goal was found from "
-        "128 shapes; the nearest is "
-    )
-    assert text.endswith(
-        " m or rad away. A nearer goal may help, a position instead of a pose, or more freedom of "
-        "the base."
-    )
-    nearest = float(text.split("the nearest is ")[1].split(" m")[0])
-    assert 0.05 < nearest < 1.0
 
 
 def test_the_parts_of_a_goal_are_what_is_controlled(arm: SpaceRobot) -> None:

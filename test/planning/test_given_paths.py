@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,9 +18,8 @@ from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, waypoint_counts
-from spacerobot_ros.planning.methods.registry import METHODS, method_options
-from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait, _RemainingProgress
-from spacerobot_ros.planning.methods.resolved_rate import JointPath, PathProgress, ResolvedRateGait
+from spacerobot_ros.planning.methods.registry import method_options
+from spacerobot_ros.planning.methods.resolved_rate import PathProgress
 
 Array = npt.NDArray[np.float64]
 
@@ -97,36 +95,6 @@ def test_the_hand_rests_at_a_sharp_corner_and_goes_on(start: Array, flown: GaitS
     assert min(there) < 1e-8
 
 
-def test_a_plan_in_between_goes_on_along_the_rest_of_the_path(
-    start: Array, flown: GaitSchedule
-) -> None:
-    method, goal = method_of(corner_tolerance=0.02), flown.goal
-    progress = flown.progress
-    assert isinstance(progress, PathProgress)
-    assert len(progress.travelled_lengths) == len(flown.positions)
-    assert progress.travelled_lengths[0] == 0.0
-    assert progress.travelled_lengths[-1] == pytest.approx(progress.route.lengths_at_poses[-1])
-    assert np.all(np.diff(progress.travelled_lengths) >= -1e-9)
-    corner = progress.route.lengths_at_poses[2] + 0.02
-    tick = int(np.searchsorted(progress.travelled_lengths, corner))
-    # Braking came before the schedule: its shapes do not count.
-    braked = replace(flown, positions=np.vstack([[9.0, 9.0, 9.0], flown.positions]))
-    r, _ = poses("three_joint_arm", flown.positions[: tick + 1], HAND)[HAND]
-    state = RobotState(r - start + PLACE, ATTITUDE.as_quat(), flown.positions[tick] + 1e-4)
-    request = PlanRequest(state, goal, NEAR, correction=True, previous=braked)
-    route = method._route(request, 0.01)
-    assert len(route.positions) == 3
-    done = progress.route.remaining_after(progress.travelled_lengths[tick]).positions
-    np.testing.assert_allclose(route.positions[1:], done, atol=1e-12)
-    np.testing.assert_allclose(route.positions[-1], start + WAY[-1], atol=1e-12)
-    at_end = replace(request, state=replace(state, q=flown.positions[-1]))
-    assert len(method._route(at_end, 0.01).positions) == 2
-    # Without an earlier schedule a correction goes straight.
-    assert len(method._route(replace(request, previous=None), 0.01).positions) == 2
-    first = method._route(PlanRequest(STATE, goal, NEAR), 0.0)
-    np.testing.assert_allclose(first.positions, np.vstack([start, start + WAY]), atol=1e-9)
-
-
 def test_a_hand_at_the_end_of_its_rest_stays(start: Array) -> None:
     aim = EndEffectorGoal.along(HAND, [start, start])
     goal = Goal.of_end_effectors([aim]).for_robot(robot_of("three_joint_arm").description)
@@ -141,21 +109,6 @@ def test_auto_takes_the_method_that_follows_paths(start: Array) -> None:
 
 
 # -- refusals -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", sorted(set(METHODS) - {"resolved_rate", "auto"}))
-def test_other_methods_name_the_one_that_follows_paths(name: str) -> None:
-    method: Any = SimpleNamespace(name=name)
-    goal = Goal.of_end_effectors([EndEffectorGoal.along("hand", [[1, 2, 3], [1, 2, 4]])])
-    with pytest.raises(PlanningError) as refusal:
-        METHODS[name]._require_no_path(method, goal)
-    assert str(refusal.value) == (
-        f"{name} does not follow paths, and 'hand' is to follow one: resolved_rate does."
-    )
-    assert not METHODS[name].follows_paths
-    METHODS[name]._require_no_path(
-        method, Goal.of_end_effectors([replace(goal.end_effectors[0], waypoints=None)])
-    )
 
 
 @pytest.mark.parametrize("name", ["optimal", "area_loop"])
@@ -194,43 +147,6 @@ def test_one_end_effector_follows_a_path_and_the_base_is_free() -> None:
 def test_paths_that_are_none_are_refused(path: Any, message: str) -> None:
     with pytest.raises(GoalError, match=message):
         EndEffectorGoal.along("hand", path)
-
-
-# -- contacts -----------------------------------------------------------------------------------
-
-
-def contact(beyond: float, obstacle: tuple[int, str] | None = None, *, last: int = 9) -> Any:
-    """Return the last place of a path of ten shapes whose joint comes too near beyond a value."""
-    shapes = np.arange(last + 1.0)[:, np.newaxis]
-    path = JointPath(
-        shapes[:, 0], shapes, np.tile([0.0, 0, 0, 1], (last + 1, 1)), *[shapes[:, 0]] * 2
-    )
-    asked: list[int] = []
-
-    def too_near(found: Array, base: Array, *, at_ticks: bool) -> str:
-        assert (len(base), at_ticks) == (len(found), False)
-        asked.append(len(found))
-        return f"links touch at {found[-1, 0]:g}" if found[-1, 0] > beyond else ""
-
-    method: Any = SimpleNamespace(_base_poses=lambda state, q, X: X, _too_near=too_near)
-    state: Any = SimpleNamespace(quaternion=np.array([0.0, 0.6, 0.0, 0.8]))
-    return ResolvedRateGait._find_contact(method, state, path, obstacle), asked
-
-
-def test_a_contact_on_the_way_ends_it_just_before() -> None:
-    assert contact(6.5)[0] == (6, "On the way links touch at 7.")
-    assert contact(0.0)[0] == (0, "On the way links touch at 1.")
-    assert contact(8.0)[0] == (8, "On the way links touch at 9.")
-    assert contact(9.0)[0] is None
-    _, asked = contact(6.5)
-    assert asked[0] == 10
-    assert len(asked) <= 5
-
-
-def test_the_first_of_a_contact_and_another_obstacle_counts() -> None:
-    assert contact(6.5, (4, "a limit"))[0] == (4, "a limit")
-    assert contact(2.5, (4, "a limit"))[0] == (2, "On the way links touch at 3.")
-    assert contact(-1.0, (0, "a limit"))[0] == (0, "a limit")
 
 
 # -- one place ----------------------------------------------------------------------------------
@@ -302,23 +218,6 @@ def test_a_path_is_followed_until_shortly_before_a_limit(start: Array) -> None:
     request = PlanRequest(state, schedule.goal, NEAR, correction=True, previous=schedule)
     with pytest.raises(PlanningError, match=r"optimal may reach"):
         method.plan(request)
-
-
-def test_without_stuck_joints_the_rest_of_the_path_is_planned(flown: GaitSchedule) -> None:
-    method: Any = SimpleNamespace(
-        _names=["auto"], _is_stuck=np.array([False, True, False]), _stuck={"shoulder_pitch": 0.2}
-    )
-    names, previous = RemainingJointsGait._methods_to_try(method, flown)
-    assert names == ["auto"]
-    assert previous is not None
-    assert previous.progress is flown.progress
-    np.testing.assert_array_equal(previous.positions, flown.positions[:, [0, 2]])
-    again = replace(
-        flown, progress=_RemainingProgress(frozenset({"elbow"}), "auto", flown.progress)
-    )
-    assert RemainingJointsGait._methods_to_try(method, again)[1] is not None
-    other = replace(flown, progress=_RemainingProgress(frozenset({"elbow"}), "auto", None))
-    assert RemainingJointsGait._methods_to_try(method, other) == (["auto"], None)
 
 
 def test_a_goal_with_a_path_is_displaced_with_its_waypoints() -> None:

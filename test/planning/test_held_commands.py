@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.core.prediction import BasePrediction
@@ -30,12 +28,6 @@ Array = npt.NDArray[np.float64]
 
 PERIOD = 0.1
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
-LIMITS = MotionLimits(
-    np.array([-1.0, -2.0, -np.inf]),
-    np.array([1.4, 2.0, np.inf]),
-    np.array([0.5, np.inf, 1.1]),
-    np.array([0.9, 0.7, 1.3]),
-)
 START, FINAL = np.array([0.3, -0.5, 0.2]), np.array([-0.4, 0.9, 0.8])
 
 
@@ -54,91 +46,6 @@ def holder(model: ManoeuvreModel) -> Any:
 def smooth(ticks: int) -> Array:
     s = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
     return np.asarray(START + (FINAL - START) * s**3 * (10 - 15 * s + 6 * s**2))
-
-
-def test_waves_are_sines_of_each_joint_by_its_speed(holder: Any) -> None:
-    positions = smooth(40)
-    waves = holder._build_waves(positions, LIMITS)
-    assert waves.shape == (41, 18, 3)
-    s = np.linspace(0.0, 1.0, 41)
-    # A joint without a speed limit has half its range for one.
-    speeds = [0.5, 2.0, 1.1]
-    for order in range(1, 7):
-        for joint in range(3):
-            wave = waves[:, 3 * (order - 1) + joint]
-            expected = np.sin(math.pi * s) * np.sin(order * math.pi * s) / order * speeds[joint]
-            np.testing.assert_allclose(wave[:, joint], expected, atol=1e-12)
-            assert not np.delete(wave, joint, axis=1).any()
-
-
-def test_waves_fade_where_joints_are_near_their_ends(holder: Any) -> None:
-    """Within 0.02 of half a range of 1.2 or 2: by a cubic from nothing at the end."""
-    near, at = [1.4 - 0.006, -2.0 + 0.04, 50.0], [-1.0, 2.0 + 1e-3, -50.0]
-    q = np.array([near, at, [1.4 - 0.024, 0.0, 0.0]])
-    found = holder._smooth_weights(q, LIMITS)
-    x = 0.006 / 0.024
-    np.testing.assert_allclose(
-        found, [[x**2 * (3 - 2 * x), 1.0, 1.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]], atol=1e-9
-    )
-    np.testing.assert_allclose(holder._smooth_weights(q[0], LIMITS), found[0])
-    still = MotionLimits(np.zeros(3), np.zeros(3), np.ones(3), np.ones(3))
-    np.testing.assert_array_equal(holder._smooth_weights(np.zeros(3), still), 0.0)
-
-
-def test_ramps_move_the_last_shape_alone(holder: Any) -> None:
-    s = np.linspace(0.0, 1.0, 11)[:, np.newaxis]
-    ramps = holder._build_ramps(s, LIMITS)
-    for joint, speed in enumerate([0.5, 2.0, 1.1]):
-        expected = np.zeros((11, 3))
-        expected[:, joint] = speed * (s**2 * (3 - 2 * s))[:, 0]
-        np.testing.assert_allclose(ramps[:, joint], expected, atol=1e-15)
-
-
-@pytest.mark.parametrize("ticks", [60, 450])
-def test_the_first_variation_is_that_of_the_prediction(
-    model: ManoeuvreModel, holder: Any, ticks: int
-) -> None:
-    positions = smooth(ticks)
-    s = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
-    waves = np.hstack([holder._build_waves(positions, LIMITS), holder._build_ramps(s, LIMITS)])
-
-    def end(q: Array) -> Rotation:
-        return Rotation.from_quat(model.prediction.attitudes(q, IDENTITY, np.zeros(3))[-1])
-
-    quaternions = model.prediction.attitudes(positions, IDENTITY, np.zeros(3))
-    boundary = BoundaryConditions(positions[0], IDENTITY, positions[-1])
-    by_shapes = holder._turns_by_shapes(positions, quaternions, boundary)
-    assert by_shapes.shape == (3, ticks + 1, 3)
-    turns = np.einsum("akn,kwn->aw", by_shapes, waves)
-    size = float(np.abs(turns).max())
-    for number in (0, 1, 5, 8, 13, 18, 19, 20):
-        h = 1e-4
-        after, before = (end(positions + sign * h * waves[:, number]) for sign in (1, -1))
-        exact = (before.inv() * after).as_rotvec() / (2 * h)
-        np.testing.assert_allclose(turns[:, number], exact, atol=0.02 * size)
-
-
-def test_commands_end_on_the_goal_by_another_integration(
-    model: ManoeuvreModel, holder: Any
-) -> None:
-    """The goal is a little off the turn of the path, and its last shape a little off, too."""
-    positions = smooth(40)
-    turn = Rotation.from_quat(model.prediction.attitudes(positions, IDENTITY, np.zeros(3))[-1])
-    goal = turn * Rotation.from_rotvec([2e-3, -1e-3, 1.5e-3])
-    final = FINAL + np.array([1e-3, -2e-3, 5e-4])
-    boundary = BoundaryConditions(START, goal.as_quat(), final, final)
-    held = holder._adjust_to_goal(positions, boundary, final, LIMITS, moves_end=False)
-    np.testing.assert_array_equal(held.positions[[0, -1]], [START, final])
-    assert held.end_error <= 1e-11
-    attitude = Rotation.identity()
-    for q, q_next in zip(held.positions[:-1], held.positions[1:], strict=True):
-        for k in range(10):
-            A = model.robot.connection(q + (k + 0.5) / 10 * (q_next - q))[3:]
-            attitude *= Rotation.from_rotvec(-A @ (q_next - q) / 10)
-    assert (attitude.inv() * goal).magnitude() < 1e-5
-    far = turn * Rotation.from_rotvec([2.0, -1.0, 1.5])
-    unreached = replace(boundary, goal_rotation=far.as_quat())
-    assert holder._adjust_to_goal(positions, unreached, final, LIMITS, moves_end=False) is None
 
 
 # -- stretching ---------------------------------------------------------------------------------
@@ -258,34 +165,3 @@ def test_efforts_stretch_a_path_too(model: ManoeuvreModel) -> None:
     assert held is not None
     assert ticks_of(holder) == [40, 46]
     assert holder.fitted == []
-
-
-@pytest.mark.parametrize(("free", "before"), [(False, 0.0), (True, np.array([0.02, 0.0, -0.03]))])
-def test_all_shapes_are_changed_where_waves_exceed_a_limit(
-    model: ManoeuvreModel, holder: Any, free: bool, before: Any
-) -> None:
-    """One joint moves at the limit of its velocity, to a goal 3 mrad from the turn of the path."""
-    positions = START + np.linspace(0.0, 1.0, 41)[:, np.newaxis] * (FINAL - START)
-    speed = np.abs(FINAL - START) / 4.0
-    fast = replace(LIMITS, velocity=speed * [1.01, 1.8, 2.1], acceleration=np.full(3, 1e3))
-    turn = Rotation.from_quat(model.prediction.attitudes(positions, IDENTITY, np.zeros(3))[-1])
-    goal = (turn * Rotation.from_rotvec([1e-3, -2e-3, 2e-3])).as_quat()
-    final = None if free else FINAL
-    boundary = BoundaryConditions(START, goal, FINAL, final)
-    velocities = np.tile((FINAL - START) / 4.0, (41, 1))
-    trajectory = Trajectory(PERIOD, positions, velocities, np.tile(IDENTITY, (41, 1)))
-    by_waves = holder._adjust_to_goal(positions, boundary, FINAL, fast, moves_end=False)
-    assert fast.excess(by_waves.positions, PERIOD, before)[0] > 1
-    held = holder.hold(trajectory, boundary, fast, fixed=True, before=before)
-    assert held is not None
-    assert len(held.positions) == 41
-    assert held.end_error <= 1e-8
-    factor, overrun = fast.excess(held.positions, PERIOD, before)
-    assert factor <= 1 + 1e-9
-    assert overrun <= 1e-9
-    np.testing.assert_array_equal(held.positions[0], START)
-    assert free != bool(np.all(held.positions[-1] == FINAL))
-    end = model.prediction.attitudes(held.positions, IDENTITY, np.zeros(3))[-1]
-    assert (Rotation.from_quat(goal).inv() * Rotation.from_quat(end)).magnitude() < 1e-8
-    slow = replace(fast, velocity=speed * [0.999, 1.8, 2.1])
-    assert holder.hold(trajectory, replace(boundary, final=FINAL), slow, fixed=True) is None

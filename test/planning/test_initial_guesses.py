@@ -11,12 +11,9 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.planning.methods.optimal import initial_guesses
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
 from spacerobot_ros.planning.methods.optimal.problem import (
-    BoundaryConditions,
     MotionLimits,
-    PossibleEnd,
     Trajectory,
 )
 
@@ -62,92 +59,6 @@ def attitude(trajectory: Trajectory) -> Rotation:
 
 def assert_rest_to_rest(path: Trajectory) -> None:
     np.testing.assert_array_equal(path.velocities[[0, -1]], 0.0)
-
-
-def test_a_guess_goes_from_the_start_to_the_end_within_the_limits(guesses: InitialGuesses) -> None:
-    turn = Rotation.from_rotvec([0.2, -0.1, 0.15]).as_quat()
-    boundary = BoundaryConditions(START, turn, FINAL)
-    found = list(itertools.islice(guesses.generate(boundary, LIMITS, FINAL), 8))
-    for each in found:
-        np.testing.assert_allclose(each.shapes[[0, -1]], [START, FINAL], atol=1e-12)
-        assert_rest_to_rest(each)
-        assert np.all(each.shapes >= LIMITS.lower)
-        assert np.all(each.shapes <= LIMITS.upper)
-        # Velocities are those of the shapes, and one joint is at a limit of its own.
-        middle = (each.shapes[2:] - each.shapes[:-2]) / 2 / each.step
-        np.testing.assert_allclose(each.velocities[1:-1], middle, atol=1e-12)
-        speed = (np.abs(each.velocities) / LIMITS.velocity).max()
-        change = (np.abs(np.diff(each.velocities, axis=0)) / each.step / LIMITS.acceleration).max()
-        assert max(speed, change) == pytest.approx(1.0)
-        end = Rotation.from_quat(each.quaternions[-1])
-        assert (attitude(each).inv() * end).magnitude() < 0.02
-    assert len({each.shapes.tobytes() for each in found}) == 8
-    again = next(guesses.generate(boundary, LIMITS, FINAL))
-    np.testing.assert_array_equal(again.shapes, found[0].shapes)
-    # Most loops turn the base nearer to the goal than the direct way.
-    (direct,) = guesses._build_trajectories(guesses._direct_path(START, FINAL)[np.newaxis], LIMITS)
-    left = [
-        (Rotation.from_quat(each.quaternions[-1]).inv() * Rotation.from_quat(turn)).magnitude()
-        for each in (direct, *found)
-    ]
-    assert sum(each < left[0] for each in left[1:]) >= 6
-
-
-def test_possible_ends_take_turns_and_their_direct_ways_come_first(
-    guesses: InitialGuesses,
-) -> None:
-    (direct,) = guesses._build_trajectories(guesses._direct_path(START, FINAL)[np.newaxis], LIMITS)
-    other = np.array([0.9, 0.1, -0.6])
-    near = PossibleEnd(FINAL, direct.quaternions[-1])
-    far = PossibleEnd(other, Rotation.from_rotvec([0.0, 0.5, 0.0]).as_quat())
-    boundary = BoundaryConditions(START, near.base_rotation, FINAL, possible_ends=(near, far))
-    found = list(itertools.islice(guesses.generate(boundary, LIMITS, FINAL), 4))
-    ends = [each.shapes[-1] for each in found]
-    np.testing.assert_allclose(ends, [FINAL, other, FINAL, other], atol=1e-12)
-    # The direct way turns the base as the first end asks: no loop is needed, and one comes later.
-    # A rounding error of 1e-16 rad takes a loop of the size 1e-8.
-    np.testing.assert_allclose(found[0].shapes, direct.shapes, atol=1e-7)
-    assert np.abs(found[2].shapes - direct.shapes).max() > 0.01
-
-
-def test_a_loop_of_the_size_turns_the_base_by_the_angle(guesses: InitialGuesses) -> None:
-    """A circle of that radius, in half ranges, sweeps its area times the curvature."""
-    half = np.array([0.6, 0.9, 0.4])
-    for angle in (0.02, 0.3):
-        size = guesses._loop_size(START, half, angle)
-        largest = max(
-            2 * np.abs(GAIN * np.cross(half[j] * np.eye(3)[j], half[k] * np.eye(3)[k])).sum()
-            for j, k in itertools.combinations(range(3), 2)
-        )
-        assert np.pi * size**2 * largest == pytest.approx(angle)
-    still = InitialGuesses(
-        guesses._turn, ca.Function("none", [ca.SX.sym("q", 3)], [ca.SX(6, 9)]), 10
-    )
-    assert still._loop_size(START, half, 0.3) == 1.0
-
-
-@pytest.mark.parametrize(
-    "loop", dict.fromkeys(initial_guesses._LOOPS), ids=lambda each: each.__name__
-)
-@pytest.mark.parametrize("joints", [2, 3, 5])
-def test_loops_are_closed_and_of_about_unit_size(loop: initial_guesses.Loop, joints: int) -> None:
-    s, rng, sizes = np.linspace(0.0, 1.0, 4001), np.random.default_rng(4), []
-    for _ in range(20):
-        path = loop(rng, s, joints)
-        np.testing.assert_allclose(path[[0, -1]], 0.0, atol=1e-12)
-        sizes.append(np.abs(path).max())
-        moving = np.flatnonzero(np.abs(path).max(axis=0))
-        if loop is initial_guesses._square_loop:
-            assert len(moving) == 2
-            slopes = np.abs(np.diff(path[:, moving], axis=0)) > 1e-9
-            # Of a square, one joint moves at a time; on the ways to it and back both do.
-            assert 0.5 < np.mean(slopes.sum(axis=1) == 1) < 0.9
-        else:
-            # They begin and end at rest.
-            assert np.abs(path[[1, -2]]).max() < 40 * s[1] * np.abs(path).max() * 5e-3
-            most = 3 if loop is initial_guesses._three_frequency_loop else joints
-            assert len(moving) == min(joints, most)
-    assert 0.3 < np.median(sizes) < 3.0
 
 
 def test_shapes_at_equal_intervals_become_the_fastest_guess_through_them(

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.methods.optimal.initial_guesses import (
-    _LOOPS,
     InitialGuesses,
 )
 from spacerobot_ros.planning.methods.optimal.problem import (
@@ -282,18 +281,6 @@ def test_guesses_go_from_start_to_end_as_fast_as_the_limits_allow(guesses: Initi
             attitude = attitude * Rotation.from_rotvec(TURN @ (v0 + v1) / 2 * guess.step)
         assert (attitude.inv() * Rotation.from_quat(guess.quaternions[-1])).magnitude() < 1e-9
         np.testing.assert_array_equal(guess.quaternions[0], IDENTITY)
-
-
-@pytest.mark.parametrize("number", range(len(_LOOPS)))
-@pytest.mark.parametrize("joints", [1, 2, 4])
-def test_loops_of_about_unit_size_end_where_they_begin(number: int, joints: int) -> None:
-    s, sizes = np.linspace(0.0, 1.0, 241), []
-    for seed in range(12):
-        path = _LOOPS[number](np.random.default_rng(seed), s, joints)
-        assert path.shape == (241, joints)
-        np.testing.assert_allclose(path[[0, -1]], 0.0, atol=1e-12)
-        sizes.append(np.abs(path).max())
-    assert 0.3 < np.median(sizes) < 3.0
 
 
 def test_a_guess_through_shapes_passes_them_at_equal_intervals(guesses: InitialGuesses) -> None:

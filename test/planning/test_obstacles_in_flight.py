@@ -11,18 +11,16 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from support.planner_loop import TICK, Loop
-from support.planner_phases import executing, planning, resting, stub_of, twisting
+from support.planner_phases import executing, resting, stub_of
 
 from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.model.urdf import load_robot, parse_world
+from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_obstacles_around
-from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.execution.worker import PlanningWorker
-from spacerobot_ros.resources import robot_file
 
 Array = npt.NDArray[np.float64]
 
@@ -47,26 +45,6 @@ def use(loop: Loop, approaches: Callable[..., Any], *, has_obstacles: bool = Tru
     loop.executive.use_obstacles(lambda: worker)
     loop._take()
     return worker
-
-
-def test_the_rest_of_the_schedule_is_looked_at_with_its_predicted_base() -> None:
-    loop, asked = executing(ticks=40), []
-
-    def approaches(positions: Array, base: Any) -> list[str]:
-        asked.append((positions, base))
-        return []
-
-    loop.tick(11)
-    schedule = loop.starts[-1].schedule
-    worker = use(loop, approaches)
-    ((positions, base),) = asked
-    np.testing.assert_array_equal(positions, schedule.positions[11:])
-    np.testing.assert_allclose(base.position, schedule.path.position[11:], atol=1e-15)
-    np.testing.assert_allclose(base.quaternion, schedule.path.quaternion[11:], atol=1e-15)
-    assert loop.executive.phase is Phase.EXECUTING
-    assert loop.executive._worker is worker
-    assert loop.states == ["executing"]
-    loop.until(PlannerState.REACHED)
 
 
 def test_the_joints_brake_before_an_obstacle_and_go_on_to_the_goal() -> None:
@@ -104,42 +82,6 @@ def test_a_goal_behind_an_obstacle_has_failed_with_both_reasons() -> None:
     assert "It is too far." in loop.until(PlannerState.FAILED).message
 
 
-def test_without_obstacles_nothing_is_looked_at() -> None:
-    loop = executing(ticks=40)
-    loop.tick(5)
-    use(loop, lambda positions, base: ["here"], has_obstacles=False)
-    assert loop.executive.phase is Phase.EXECUTING
-    loop.executive._worker.clearance = None
-    assert loop.executive._obstacle_clause(loop.executive._active_goal) == ""  # type: ignore[arg-type]
-
-
-def test_a_plan_that_is_made_is_made_again_for_a_goal_that_rests_or_waits() -> None:
-    loop = planning()
-    assert len(loop.held.tasks) == 1
-    loop.executive.use_obstacles(lambda: loop.held)
-    loop._take()
-    assert loop.executive.phase is Phase.MEASURING
-    loop.tick(2)
-    assert len(loop.held.tasks) == 2
-    idle = resting()
-    idle.tick(2)
-    use(idle, lambda positions, base: ["here"])
-    assert idle.executive.phase is Phase.IDLE
-
-
-def test_twists_keep_clear_of_the_new_obstacles() -> None:
-    loop = twisting()
-    before = loop.executive._teleoperation
-    assert before is not None
-    follower = before.follower
-    worker = use(loop, lambda positions, base: [])
-    after = loop.executive._teleoperation
-    assert after is not None
-    assert after.follower is not follower
-    assert after.follower._clearance is worker.clearance
-    assert loop.executive.phase is Phase.TELEOPERATING
-
-
 # -- parts --------------------------------------------------------------------------------------
 
 
@@ -153,13 +95,6 @@ def test_a_path_of_the_base_is_read_between_its_poses() -> None:
     wanted = Slerp([0.0, 1.0, 3.0], turns)([0.25, 1.0, 2.0, 3.0])
     assert (wanted.inv() * Rotation.from_quat(quaternion)).magnitude().max() < 1e-4
     np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0, atol=1e-14)
-
-
-def test_the_clearance_of_another_robot_is_among_the_same_obstacles() -> None:
-    robot = load_robot(robot_file("planar_chain"))
-    described = with_obstacles_around(robot, parse_world(BALL))
-    other = Clearance(described, 0.03).of(robot)
-    assert (other._robot.world, other.distance) == (described.world, 0.03)
 
 
 @pytest.mark.parametrize("obstacles", [True, False])

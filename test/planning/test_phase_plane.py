@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.integrate import dblquad, quad
 
 from spacerobot_ros.planning.methods.geometric_phase import (
     PhasePlane,
-    _find_grid_maxima,
-    _integrate_legs,
     centre_box,
     curvature_peaks,
     square_corners,
 )
-
-Array = npt.NDArray[np.float64]
 
 C = np.array(
     [
@@ -72,23 +67,6 @@ def test_corners_go_round_counter_clockwise() -> None:
     assert corners[1].tolist() == [[-0.25, -0.25], [0.25, -0.25], [0.25, 0.25], [-0.25, 0.25]]
 
 
-def test_legs_are_integrated_exactly_however_long() -> None:
-    """Polynomials of degree 19 are, in one piece of half a radian; sines, in many."""
-    starts, ends = np.array([[0.1, -0.1]]), np.array([[0.6, 0.3]])
-
-    def powers(points: Array) -> Array:
-        return np.stack([points[..., 0] ** 19, 0 * points[..., 1]], axis=-1)
-
-    assert _integrate_legs(powers, starts, ends)[0] == pytest.approx(-(0.6**20 - 0.1**20) / 20)
-    starts, ends = np.array([[-3.0, 1.0], [2.0, 0.0]]), np.array([[4.0, 6.0], [2.0, 0.0]])
-
-    def waves(points: Array) -> Array:
-        return np.stack([np.cos(3 * points[..., 0]), np.sin(points[..., 1])], axis=-1)
-
-    exact = -(np.sin(12.0) - np.sin(-9.0)) / 3 + (np.cos(6.0) - np.cos(1.0))
-    np.testing.assert_allclose(_integrate_legs(waves, starts, ends), [exact, 0.0], atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("at", "lower", "upper", "box"),
     [
@@ -133,20 +111,3 @@ def test_of_equal_peaks_the_nearest_is_taken_and_the_last_of_mirror_images() -> 
     ):  # fmt: skip
         found = curvature_peaks(plane, np.array(at), box)
         np.testing.assert_allclose(found, [peak], atol=2e-3)
-
-
-def test_the_highest_maxima_of_a_grid_come_first_and_are_four_at_most() -> None:
-    class Hills:
-        """Five hills of different heights, on points of the grid."""
-
-        def curvature(self, points: Array) -> Array:
-            step = np.radians(15.0)
-            total = np.zeros(points.shape[:-1])
-            for height, x, y in ((3, 2, 2), (-5, 2, 9), (2, 9, 2), (4, 9, 9), (1, 5, 5)):
-                beside = np.linalg.norm(points - np.array([x, y]) * step, axis=-1)
-                total += height * np.exp(-((beside / step) ** 2))
-            return total
-
-    box = np.array([[0.0, 0.0], [11.0, 11.0]]) * np.radians(15.0)
-    found = _find_grid_maxima(Hills(), box) / np.radians(15.0)  # type: ignore[arg-type]
-    np.testing.assert_allclose(found, [[2, 9], [9, 9], [2, 2], [9, 2]], atol=1e-9)

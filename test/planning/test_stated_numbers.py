@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import math
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,19 +18,16 @@ from support.slides_and_turns import PERIOD, goal_at, note, origin, planner, sta
 
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import PlanRequest, Tolerance, plan
+from spacerobot_ros.planning import Tolerance, plan
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Phase
 from spacerobot_ros.planning.execution.status import PlannerState
-from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
-from spacerobot_ros.planning.methods.auto import _MethodResult
 from spacerobot_ros.planning.methods.geometric_phase import (
     PlanarPhase,
     check_planar_chain,
     curvature_peaks,
 )
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
-from spacerobot_ros.planning.methods.nominal_shape import _most_central_index
 
 FOLDER = Path(__file__).parents[2] / "urdf"
 
@@ -114,24 +108,6 @@ def test_a_planar_robot_is_described_by_its_links_and_by_its_largest_curvature()
 # -- area_loop --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("k", [0.15, 0.9])
-def test_the_cycles_that_are_left_are_those_of_a_count(k: float) -> None:
-    """While edges are as long as they may be, a cycle turns by k times what they can make up for;
-    then by k times what is missing.
-    """
-    robot = SpaceRobot.from_file(FOLDER / "three_joint_arm.urdf")
-    method = planner_of("area_loop", robot, 0.25, Tolerance(1.0, 1.0), 0.05, k=k).method
-    assert isinstance(method, AreaLoopGait)
-    for missing, share in ((0.3, 1.0), (0.3, 0.2), (1.5, 0.05), (2e-3, 1.0)):
-        for enough in (1e-3, 0.9 * missing, 0.5 * missing * share):
-            left, cycles = missing, 0
-            while left > enough:
-                left -= k * min(left, missing * share)
-                cycles += 1
-            assert abs(method._count_cycles_left(missing, share, enough) - cycles) <= 1.1
-        assert math.isinf(method._count_cycles_left(missing, share, 0.0))
-
-
 def test_the_last_cycle_that_a_goal_may_take_is_flown() -> None:
     robot = SpaceRobot.from_file(FOLDER / "three_joint_arm.urdf")
     shape = np.radians([0.0, -45.0, 90.0])
@@ -193,21 +169,3 @@ def test_a_joint_with_limits_is_not_turned_round_to_a_nominal_shape() -> None:
     assert schedule.positions[:, 0].max() == pytest.approx(2.0, abs=0.5)
     assert np.all(schedule.positions >= robot.lower - 1e-12)
     assert np.all(schedule.positions <= robot.upper + 1e-12)
-
-
-def test_of_equally_good_shapes_the_one_nearest_to_the_middle_is_taken() -> None:
-    at = np.array([[-1.0, 0.2], [1.0, 0.2], [0.9, -0.1], [0.95, 0.1]])
-    assert _most_central_index(at, np.array([1.0, 1.0, 0.5, 1.0]), np.array([0.9, 0.0])) == 3
-    assert _most_central_index(at, np.array([1.0, 1.0, 0.5, 1.0]), np.array([-0.9, 0.0])) == 0
-
-
-def test_whether_a_plan_reaches_a_shape_is_told_by_where_it_ends() -> None:
-    controls: frozenset[Any] = frozenset({"position", "shape"})
-    state = origin()
-    aim = goal_at([0.05, -0.03, 0.02], Rotation.identity())
-    end = -8 * aim.position
-    for shape, reaches in ((end, True), (state.q, False), (end + 0.01, False)):
-        goal = replace(aim, joint_positions=shape)
-        request = PlanRequest(state, goal, Tolerance(1e-6, 1e-6, 1e-3))
-        schedule = replace(StubMethod().plan(request), controls=controls)
-        assert _MethodResult.of(StubMethod().robot, schedule, request).reaches_goal is reaches
