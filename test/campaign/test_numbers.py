@@ -7,7 +7,6 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,17 +14,15 @@ import pytest
 from scipy import stats
 from support.campaigns import campaign
 
-import spacerobot_ros.session.run as session
 from spacerobot_ros.campaign import dataset as datasets
 from spacerobot_ros.campaign import draws as sampling
-from spacerobot_ros.campaign import report as reports
 from spacerobot_ros.campaign import running as reruns
 from spacerobot_ros.campaign.config import Criterion, Distribution, load_campaign, meets_criterion
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, drawn_flights, sobol_problem
-from spacerobot_ros.campaign.report import Results, figure_with_axes
+from spacerobot_ros.campaign.report import figure_with_axes
 from spacerobot_ros.campaign.rows import Row
-from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation, run_campaign
+from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation
 from spacerobot_ros.campaign.statistics import (
     Influence,
     PairedDifference,
@@ -341,27 +338,6 @@ def test_samplers_are_those_of_scipy(sampler: str) -> None:
     np.testing.assert_allclose(found, expected * [2.0, 1.0] + [1.0, 0.0], atol=1e-11)
 
 
-def test_saltelli_samples_have_the_seed_of_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Any] = []
-
-    def sample(problem: Any, base: int, **given: Any) -> Any:
-        asked.append((problem["num_vars"], base, given))
-        return np.full((12, 2), 0.5)
-
-    monkeypatch.setattr(sampling, "import_salib", lambda name: SimpleNamespace(sample=sample))
-    values = {f"mass.mass_{k}": {"uniform": [1.0, 2.0]} for k in (1, 2)}
-    seed = int(np.random.SeedSequence(7).generate_state(1)[0]) // 2
-    for flights, base in ((8, 2), (15, 2), (16, 4), (31, 4), (35, 8)):
-        made = campaign(flights=flights, seed=7, sampler="saltelli", disperse=values)
-        assert len(Draws(made)) == 12
-        assert asked[-1] == (2, base, {"calc_second_order": False, "seed": seed})
-    with pytest.raises(ParameterError) as refused:
-        Draws(campaign(flights=7, sampler="saltelli", disperse=values))
-    assert str(refused.value) == (
-        "the sampler 'saltelli' needs at least 8 flights for 2 dispersion(s)."
-    )
-
-
 def test_a_draw_changes_its_flight() -> None:
     flight = drawn_flight(MADE, Draw(3, 17, {"mass.mass_1": 1.25}))
     assert flight.seeded_scenario.plant.sensors.seed == 17
@@ -458,92 +434,6 @@ def test_progress_has_a_time_left() -> None:
     assert Progress(30, 100, 0.0, 10.0).seconds_left == math.inf
 
 
-def test_a_campaign_is_flown_by_the_engine_and_the_workers_that_it_is_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Any] = []
-
-    def select(made: Any, name: str) -> Any:
-        asked.append(name)
-        return SimpleNamespace(name="lanes")
-
-    class Opened:
-        def __init__(self, cluster: Any, flights: int) -> None:
-            self.given = cluster.workers, cluster.scheduler, flights
-
-        def __enter__(self) -> Any:
-            return self.given
-
-        def __exit__(self, *of: object) -> None:
-            asked.append("closed")
-
-    def fly(made: Any, draws: Any, numbers: Any, engine: str, workers: Any, stopped: Any) -> Any:
-        asked.append((list(numbers), engine, workers))
-        yield []
-        for first in (0, 3):
-            yield [Row(draws[n], "reached", ".") for n in numbers[first : first + 3]]
-
-    now = iter([100.0, 101.0, 102.0, 104.0, 104.0])
-    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: next(now)))
-    monkeypatch.setattr(running, "select_engine", select)
-    monkeypatch.setattr(running, "open_workers", Opened)
-    monkeypatch.setattr(running, "_fly_rows", fly)
-    dataset = Dataset(tmp_path)
-    dataset.begin(MADE)
-    dataset.add([Row(Draws(MADE)[1], "reached", ".")])
-    dataset.close()
-    seen: list[Progress] = []
-    cluster = running.Cluster(workers=3)
-    end = run_campaign(MADE, tmp_path, cluster=cluster, show=seen.append)
-    assert asked == ["auto", ([0, 2, 3, 4, 5], "lanes", (3, "", 5)), "closed"]
-    assert [
-        (each.flown, each.total, each.flights_per_second, each.seconds) for each in [*seen, end]
-    ] == [
-        (1, 6, 0.0, 1.0),
-        (4, 6, 1.5, 2.0),
-        (6, 6, 1.25, 4.0),
-        (6, 6, 1.25, 4.0),
-    ]
-    assert Dataset(tmp_path).flown_numbers() == set(range(6))
-    # What is flown takes no workers, and this process needs none.
-    now = iter([1.0] * 99)
-    asked.clear()
-    named = replace(MADE, engine="flights")
-    for options in ({}, {"engine": "ros"}, {"cluster": running.Cluster(scheduler="tcp://x")}):
-        run_campaign(named, tmp_path, **options)
-    assert asked[::2] == ["flights", "ros", "flights"]
-    assert {workers for _, _, workers in asked[1::2]} == {None}
-    asked.clear()
-    run_campaign(replace(named, flights=9), tmp_path / "b", cluster=running.Cluster(0, "tcp://x"))
-    assert asked[1][2] == (0, "tcp://x", 9)
-
-
-@pytest.mark.parametrize(("workers", "numbers"), [(None, [1, 2]), ("workers", [1, 2]), (None, [])])
-def test_rows_are_flown_here_or_by_workers(
-    workers: Any, numbers: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    draws = Draws(MADE)
-
-    class Distributor:
-        def __init__(self, *given: Any) -> None:
-            assert given[:4] == ("workers", MADE, draws, "lanes")
-
-        def rows(self, of: list[int]) -> Any:
-            yield [], of
-
-    def fly(engine: Any, made: Any, given: Any, stopped: Any) -> Any:
-        assert engine == "engine lanes"
-        for draw in given:
-            yield draw.number
-
-    monkeypatch.setattr(running, "TaskDistributor", Distributor)
-    monkeypatch.setattr(running, "engine_by_name", lambda name: f"engine {name}")
-    monkeypatch.setattr(running, "fly_all", fly)
-    found: Any = list(running._fly_rows(MADE, draws, numbers, "lanes", workers, bool))
-    expected: Any = [([], numbers)] if workers else [[number] for number in numbers]
-    assert found == expected
-
-
 DRAWN = Draw(7, 123, {"mass": 1.23456789, "planner.method": "optimal"})
 
 
@@ -583,76 +473,6 @@ def test_what_is_said_of_a_rerun(given: dict[str, Any], agrees: bool, last: str)
 def test_a_rerun_without_dispersions() -> None:
     row = Row(Draw(0, 5, {}), "failed", "Off.")
     assert Rerun(row, None, "", "", Path("b")).report_lines[1] == "drawn       nothing; seed 5"
-
-
-@pytest.mark.parametrize(
-    ("engine", "outcome", "thrusters", "inertial", "note"),
-    [
-        ("lanes", "reached", "urdf", None, "It was flown in lanes: thrusters that are on or off"),
-        ("flights", "reached", "urdf", None, ""),
-        ("flights", "reached", "urdf", "drawn", "Its masses are drawn: the plants of campaign and"),
-        ("flights", "reached", "", "drawn", ""),
-        ("lanes", "reached", "", None, ""),
-        (
-            *("flights", "interrupted", "", None),
-            "It was interrupted: the stack flies on for up to a fifth of a second of wall time.",
-        ),
-    ],
-)
-def test_a_flight_is_compared_with_its_row(
-    engine: str,
-    outcome: str,
-    thrusters: str,
-    inertial: str | None,
-    note: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    plant = SimpleNamespace(thrusters=thrusters)
-    made: Any = SimpleNamespace(
-        max_flight_time=7.5, measures_clearance="clearance", scenario=SimpleNamespace(plant=plant)
-    )
-    asked: list[Any] = []
-
-    def noted(what: Any, answer: Any = None) -> Any:
-        asked.append(what)
-        return answer
-
-    row = Row(DRAWN, "reached", "There.", {"a_m": 1.5, "b_s": 3.0})
-    in_urdf = SimpleNamespace(scenario="scenario")
-    flight = SimpleNamespace(inertial=inertial, with_draws_in_scenario=lambda: in_urdf)
-    dataset = SimpleNamespace(campaign=lambda: made)
-    stored: list[Any] = [(outcome, engine, {"a_m": 1.25, "b_s": 3.0})]
-
-    def measured(clearance: Any) -> str:
-        asked.append(clearance)
-        return "measures"
-
-    monkeypatch.setattr(running, "Dataset", lambda folder: dataset)
-    monkeypatch.setattr(running, "Draws", lambda given: ["draw 0", "draw 1"])
-    monkeypatch.setattr(running, "drawn_flight", lambda given, draw: noted(draw, flight))
-    monkeypatch.setattr(session, "run_scenario", lambda *given, **more: asked.append((given, more)))
-    monkeypatch.setattr(running, "read_run", lambda bag: SimpleNamespace(measured=measured))
-    monkeypatch.setattr(running, "Row", SimpleNamespace(of=lambda *given: noted(given[1:], row)))
-    monkeypatch.setattr(running, "stored_flight", lambda of, number: stored[0])
-    bag = tmp_path / "a.mcap"
-    found = running.rerun_flight(tmp_path, 1, bag)
-    assert asked == [
-        "draw 1",
-        (("scenario", bag), {"longest": 7.5}),
-        "clearance",
-        ("draw 1", "measures", "ros"),
-    ]
-    assert (found.deviation, found.worst_metric, found.outcome) == (0.2, "a_m", outcome)
-    assert found.note.startswith(note)
-    assert bool(found.note) is bool(note)
-    stored[0] = None
-    assert running.rerun_flight(tmp_path, 0, bag) == Rerun(row, None, "", "", bag)
-    with pytest.raises(ParameterError) as refused:
-        running.rerun_flight(tmp_path, 2, bag)
-    assert str(refused.value) == (
-        f"The campaign in {tmp_path} has 2 flights, 0 to 1, and no flight 2."
-    )
 
 
 def test_deviations_are_relative_above_one() -> None:
@@ -778,69 +598,6 @@ def test_robots_that_are_files_travel_with_a_campaign(tmp_path: Path) -> None:
 # -- reports --------------------------------------------------------------------------------------
 
 
-def results(outcomes: list[str], **columns: Any) -> Results:
-    count = len(outcomes)
-    usual = {name: np.full(count, math.nan) for name in reports._MAIN_METRICS}
-    found = {"outcome": outcomes, "passed": np.ones(count), **usual, **columns}
-    return Results(MADE, Path("folder"), np.arange(float(count)), found, 9)
-
-
-@pytest.mark.parametrize(
-    ("numbers", "sentence"),
-    [
-        ([0, 1, 2], ""),
-        ([0, 2], "1 draw is not flown yet although later ones are, mostly because they take"),
-        ([1, 4], "3 draws are not flown yet although later ones are, mostly because they take"),
-        ([], ""),
-    ],
-)
-def test_missing_flights_are_counted(numbers: list[int], sentence: str) -> None:
-    found = replace(results(["reached"]), flight_numbers=np.array(numbers, float))
-    assert found.incompleteness_warning.startswith(sentence)
-    assert bool(found.incompleteness_warning) is bool(sentence)
-
-
-def test_the_worst_flights_are_ten() -> None:
-    """Those that failed, then those that did not pass, then by the distance from a bound."""
-    errors = np.array([0.5, 0.1, 0.9, 0.3, math.nan, 0.2, 0.7, 0.4, 0.6, 0.8, 0.05, 0.15])
-    outcomes = ["reached"] * 12
-    outcomes[1] = "failed"
-    passed = np.ones(12)
-    passed[[1, 3]] = 0.0
-    found = results(outcomes, passed=passed, position_error_m=errors)
-    # Without criteria by the position error.
-    assert found.worst_rows() == [1, 3, 2, 9, 6, 8, 0, 7, 5, 11]
-    bound = Criterion("position_error_m", 0.08, 1.0)
-    made = replace(MADE, criteria=(bound,))
-    assert replace(found, campaign=made).worst_rows()[:5] == [1, 3, 4, 10, 11]
-    # The spread is that of the values: two criteria are weighed by it.
-    both = replace(
-        MADE, criteria=(Criterion("position_error_m", maximum=1.0), Criterion("x_m", maximum=30.0))
-    )
-    wide = replace(found, campaign=both, columns={**found.columns, "x_m": 100.0 * errors[::-1]})
-    assert wide.worst_rows()[:3] == [1, 3, 4]
-    equal = replace(
-        found, campaign=made, columns={**found.columns, "position_error_m": np.ones(12)}
-    )
-    assert equal.worst_rows()[:4] == [1, 3, 0, 2]
-
-
-def test_shown_metrics_are_those_with_criteria_and_the_main_ones() -> None:
-    found = results(
-        ["reached"] * 2,
-        duration_s=np.array([1.0, math.nan]),
-        attitude_error_rad=np.array([0.5, 0.25]),
-        position_error_m=np.array([math.nan, 0.125]),
-    )
-    criteria = (Criterion("duration_s"), Criterion("attitude_error_rad", maximum=0.3))
-    found = replace(found, campaign=replace(MADE, criteria=criteria))
-    assert found.shown_metrics == ["duration_s", "attitude_error_rad", "position_error_m"]
-    assert list(found.metrics()) == found.shown_metrics
-    met = found.share_meeting(criteria[1])
-    assert (met.count, met.total) == (1, 2)
-    assert found.success_share.count == 2
-
-
 @pytest.mark.parametrize(
     ("count", "across", "rows", "hidden"), [(1, 3, 1, 2), (3, 3, 1, 0), (4, 3, 2, 2), (5, 2, 3, 1)]
 )
@@ -852,48 +609,6 @@ def test_figures_have_as_many_axes_as_are_wanted(
     assert len(axes) == count
     assert [each.get_visible() for each in figure.axes] == [True] * count + [False] * hidden
     assert figure_with_axes(1, 1)[0].get_size_inches()[1] == pytest.approx(2.4)
-
-
-def test_sobol_indices_stand_in_the_table_of_drivers() -> None:
-    found = [
-        Influence("a", "m", 0.5, 0.01, 0.25, 0.02, (0.125, 0.03), (0.375, 0.04)),
-        Influence("b", "m", -0.25, 0.5),
-    ]
-    text = reports._sensitivity_section(results(["reached"]), found)
-    assert "<td>0.125 ± 0.030</td><td>0.375 ± 0.040</td></tr>" in text
-    assert text.count("<td></td><td></td></tr>") == 1
-    assert "Sobol, first order" in text
-    assert "The sampler 'saltelli' adds" not in text
-    plain = reports._sensitivity_section(results(["reached"]), found[1:] * 16)
-    assert "Sobol, first order" not in plain
-    assert "The sampler &#x27;saltelli&#x27; adds Sobol indices." in plain
-    assert plain.count("<tr>") == 16
-    assert "No drawn number varies" in reports._sensitivity_section(results(["reached"]), [])
-
-
-def test_indices_are_computed_of_whole_saltelli_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = replace(
-        results(["reached"] * 9, position_error_m=np.arange(9.0)),
-        columns={
-            **results(["reached"] * 9, position_error_m=np.arange(9.0) ** 2).columns,
-            "draw.mass.mass_1": np.arange(9.0),
-        },
-    )
-    monkeypatch.setattr(
-        reports, "sobol_indices", lambda names, x: dict.fromkeys(names, (0.1, 0.2, 0.3, 0.4))
-    )
-    assert [each.total_order_index for each in found.influences()] == [None]
-    whole = replace(found, campaign=replace(MADE, sampler="saltelli"))
-    (each,) = whole.influences()
-    assert (each.first_order_index, each.total_order_index) == ((0.1, 0.2), (0.3, 0.4))
-    short = replace(whole, planned_flights=10)
-    assert [each.total_order_index for each in short.influences()] == [None]
-
-
-def test_a_campaign_without_dispersions_says_so() -> None:
-    assert reports._dispersions_section(replace(MADE, dispersions=())) == (
-        '<p class="missing">No dispersions: flights differ in their noise only.</p>'
-    )
 
 
 def test_a_row_of_an_error() -> None:

@@ -5,19 +5,16 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from scipy import stats
 from support.campaigns import campaign
 from support.chromium import browser, chromium
 
-from spacerobot_ros.campaign import report
 from spacerobot_ros.campaign.comparing import write_comparison
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset
@@ -265,38 +262,6 @@ def test_two_designs_are_compared_draw_by_draw(tmp_path: Path) -> None:
     four = filled(tmp_path / "four", other, bowl)
     with pytest.raises(ParameterError, match="do not have the same draws: 'seed' is 8 and 9"):
         write_comparison((one, four), tmp_path / "no.html")
-
-
-@pytest.mark.parametrize("count", [1, 10, 11, 24, 10_000])
-def test_counts_below_the_convergence_are_plain_numbers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
-) -> None:
-    """As figures do not read formulas, a label such as 2 times a power of ten would be one."""
-    labels: list[str] = []
-
-    def seen(figure: Figure, name: str, caption: str) -> str:
-        figure.draw_without_rendering()
-        for axes in figure.axes:
-            texts = [*axes.get_xticklabels(), *axes.get_xticklabels(minor=True)]
-            low, high = axes.get_xlim()
-            labels.extend(
-                text.get_text() for text in texts if low <= text.get_position()[0] <= high
-            )
-        return ""
-
-    few = campaign(disperse=MASSES, flights=min(count, 24), seed=8, criteria=CRITERIA)
-    results = Results.of(filled(tmp_path, few, bowl))
-    many = np.resize(np.arange(len(results)), count)
-    columns = {
-        name: values[many] if isinstance(values, np.ndarray) else values
-        for name, values in results.columns.items()
-    }
-    monkeypatch.setattr(report, "picture_part", seen)
-    results = replace(results, columns=columns, flight_numbers=many.astype(float))
-    # Of ten flights or fewer there is one point, which shows no convergence.
-    assert (report._convergence_section(results) == []) is (count <= 10)
-    assert any(labels) is (count > 10)
-    assert all(re.fullmatch(r"\d*", label) for label in labels), labels
 
 
 def test_messages_are_counted_by_outcome_without_their_numbers(tmp_path: Path) -> None:

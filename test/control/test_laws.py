@@ -252,15 +252,3 @@ def test_gains_are_bounded_so_that_commands_are_numbers(law: str) -> None:
     for part in (result.realised, result.excess):
         assert np.isfinite(part.wrench_B).all()
         assert np.isfinite(part.tau).all()
-
-
-def test_an_error_that_is_no_number_is_no_small_share() -> None:
-    law = law_of("transposed_jacobian", load("planar_manipulator"), PLANAR_GAINS)
-    bounds = np.linspace(0.5, 1.5, law._out["error"].size)
-    law._out["error"][:] = -0.25 * bounds
-    law._out["error"][1] = 0.75 * bounds[1]
-    assert law.largest_error_share(bounds) == pytest.approx(0.75)
-    for place in (0, 1, -1):
-        law._out["error"][:] = 0.1
-        law._out["error"][place] = np.nan
-        assert np.isnan(law.largest_error_share(bounds))

@@ -52,31 +52,6 @@ def numbers(found: Reference) -> np.ndarray:
     return np.concatenate([*parts, found.joints.q, found.joints.qdot, found.joints.qddot])
 
 
-def test_a_quintic_begins_and_ends_at_rest_and_is_the_integral_of_its_rates() -> None:
-    for T in (1.0, 2.5):
-        assert reference._quintic(0.0, T) == (0.0, 0.0, 0.0)
-        assert reference._quintic(1.0, T) == (1.0, 0.0, 0.0)
-        s, rate, acceleration = reference._quintic(0.5, T)
-        assert (s, rate, acceleration) == pytest.approx((0.5, 15 / 8 / T, 0.0))
-        h = 1e-5
-        for u in (0.1, 0.35, 0.8):
-            (a, va, _), (b, vb, _) = reference._quintic(u - h, T), reference._quintic(u + h, T)
-            _, rate, acceleration = reference._quintic(u, T)
-            assert rate == pytest.approx((b - a) / (2 * h * T), rel=1e-7)
-            assert acceleration == pytest.approx((vb - va) / (2 * h * T), rel=1e-7)
-
-
-def test_a_duration_is_the_shortest_within_both_limits() -> None:
-    """The peaks of rate and acceleration by sampling: one of them is at its limit."""
-    u = np.linspace(0.0, 1.0, 20001)
-    for distance, speed, acceleration in ((0.7, 0.1, 9.0), (0.7, 50.0, 0.2)):
-        T = reference.quintic_duration(distance, speed, acceleration)
-        _, rates, accelerations = reference._quintic(u, T)
-        shares = distance * rates.max() / speed, distance * accelerations.max() / acceleration
-        assert max(shares) == pytest.approx(1.0, rel=1e-6)
-    assert reference.quintic_duration(0.0, 1.0, 1.0) == 0.0
-
-
 def test_a_profile_lasts_as_long_as_its_slowest_part() -> None:
     made = QuinticReference(START, GOAL, LIMITS)
     peak, share = 15 / 8, 10 / math.sqrt(3)

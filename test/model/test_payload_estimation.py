@@ -5,18 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 from support.oracles import Array
 
-from spacerobot_ros.model.description import Inertia
 from spacerobot_ros.model.grasp import BodyMotion
 from spacerobot_ros.model.payload_estimation import (
     PAYLOAD_PARAMETERS,
     PayloadEstimate,
-    _from_log_cholesky,
-    _log_cholesky_jacobian,
-    _pseudo_inertia,
     estimate_payload,
     momentum_regressor,
     payload_parameters,
@@ -166,38 +161,3 @@ def test_a_motion_that_drowns_in_errors_shows_nothing() -> None:
     found = fitted(regressors, rng.normal(size=(150, 6)))
     assert found.undetermined == PAYLOAD_PARAMETERS
     assert found.payload is None
-
-
-def test_parameters_of_no_body_become_those_of_a_body() -> None:
-    """Momenta with a negative mass, and with a body that is flatter than any, fit no body."""
-    found = estimate(motions(), scale=-0.2)
-    assert found.corrected
-    assert found.parameters[0] > 0.0
-    assert np.linalg.eigvalsh(_pseudo_inertia(found.parameters)).min() >= -1e-12
-    flat = payload_parameters(Inertia(2.0, np.array([0.1, 0.2, -0.1]), np.diag([0.1, 0.1, 0.5])))
-    moving = motions()
-    regressors = np.array([momentum_regressor(motion, ABOUT) for motion in moving])
-    known = TOTAL - regressors @ flat
-    known += 1e-3 * np.random.default_rng(2).normal(size=known.shape)
-    found = fitted(regressors, known)
-    assert found.corrected
-    assert found.parameters[0] == pytest.approx(2.0, abs=0.01)
-    about = found.payload
-    assert about is not None
-    low, middle, high = np.linalg.eigvalsh(about.inertia.about_com)
-    assert high <= low + middle + 1e-9
-    assert high > 0.2
-
-
-def test_the_order_of_the_factor_is_that_of_the_parameters() -> None:
-    theta = np.array([0.1, -0.4, 0.3, 0.7, 0.2, -0.3, 0.5, 0.6, -0.1, 0.4])
-    L = np.diag(np.exp(theta[:4]))
-    L[1, 0], L[2, 0], L[2, 1] = theta[4:7]
-    L[3, :3] = theta[7:]
-    np.testing.assert_allclose(_pseudo_inertia(_from_log_cholesky(theta)), L @ L.T, atol=1e-13)
-    step = 1e-6
-    slopes = [
-        (_from_log_cholesky(theta + step * e) - _from_log_cholesky(theta - step * e)) / (2 * step)
-        for e in np.eye(10)
-    ]
-    np.testing.assert_allclose(_log_cholesky_jacobian(theta), np.transpose(slopes), atol=1e-8)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.methods.optimal.problem import (
     PathConstraints,
     UnusableCandidateError,
@@ -59,36 +55,3 @@ def test_shapes_may_touch_a_box_and_its_first_entry_is_told() -> None:
         UnusableCandidateError, match=r"^the shape enters a box of keep_out at 1 s$"
     ):
         kept.check(inside, attitudes, 0.5)
-
-
-# -- clearance at the start ---------------------------------------------------------------------
-
-
-class Geometry:
-    """Pairs at given distances, of which a bound below is known."""
-
-    def __init__(self, distances: list[float], bounds: list[float] | None = None) -> None:
-        self._distances, self._bounds = distances, bounds or distances
-        self.pairs = np.zeros((len(distances), 2))
-        self.asked: list[int] = []
-        self.unread_meshes: tuple[Any, ...] = ()
-
-    def poses(self, shapes: Array, base: object = None) -> tuple[Array, Array]:
-        return np.zeros((len(shapes), 1)), np.zeros((len(shapes), 1))
-
-    def lower_bounds(self, poses: tuple[Array, Array]) -> Array:
-        return np.tile(self._bounds, (len(poses[0]), 1))
-
-    def distances(self, pair: int, poses: tuple[Array, Array]) -> Array:
-        self.asked.append(pair)
-        return np.full(len(poses[0]), self._distances[pair])
-
-    def links_of(self, pair: int) -> Any:
-        return SimpleNamespace(subject=f"links 'a' and '{pair}'")
-
-
-def clearance(distances: list[float], bounds: list[float] | None = None) -> Any:
-    robot: Any = SimpleNamespace(links=())
-    made: Any = Clearance(robot, 0.02)
-    made.__dict__["geometry"] = Geometry(distances, bounds)
-    return made

@@ -28,7 +28,6 @@ Array = npt.NDArray[np.float64]
 
 PERIOD = 0.1
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
-START, FINAL = np.array([0.3, -0.5, 0.2]), np.array([-0.4, 0.9, 0.8])
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +40,6 @@ def model() -> ManoeuvreModel:
 @pytest.fixture(scope="module")
 def holder(model: ManoeuvreModel) -> Any:
     return CommandHolder(model)
-
-
-def smooth(ticks: int) -> Array:
-    s = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
-    return np.asarray(START + (FINAL - START) * s**3 * (10 - 15 * s + 6 * s**2))
 
 
 # -- stretching ---------------------------------------------------------------------------------

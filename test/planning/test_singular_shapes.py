@@ -2,26 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
-
-from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.core.workspaces import (
     Workspaces,
-    _Equations,
 )
-from spacerobot_ros.resources import robot_file
 
 TOOL = "end_effector"
-
-
-@pytest.fixture(scope="module")
-def arm() -> SpaceRobot:
-    return SpaceRobot.from_file(robot_file("three_joint_arm"))
-
-
-@pytest.fixture(scope="module")
-def equations(arm: SpaceRobot) -> _Equations:
-    return _Equations.of(arm, TOOL)
 
 
 def test_path_independent_distances_are_the_rest_of_the_reach_but_for_slivers() -> None:
