@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.batch import (
     BatchResult,
     Flights,
+    FollowedSchedule,
     HeldCommands,
     InitialStates,
     SensorErrors,
@@ -47,6 +48,40 @@ def flights(sliders: SpaceRobot, program: Any, **changes: Any) -> Flights:
 STILL = HeldCommands(np.zeros((5, 3)))
 NOT_A_NUMBER = np.zeros((2, 5, 3))
 NOT_A_NUMBER[1, 2, 0] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("program", "changes", "sentence"),
+    [
+        (STILL, {"actuation": "speed"}, "The actuation is 'speed', not velocity or effort."),
+        (STILL, {"ticks": 0}, "A flight of 0 ticks is too short; it needs one."),
+        (STILL, {"report_ticks": (0, 5, 11)},
+         "The instants (0, 5, 11) are not ascending ticks of a flight of 10."),
+        (STILL, {"report_ticks": (0, 5, 5)},
+         "The instants (0, 5, 5) are not ascending ticks of a flight of 10."),
+        (STILL, {"report_ticks": (-1, 5)},
+         "The instants (-1, 5) are not ascending ticks of a flight of 10."),
+        (STILL, {"sensors": range(3)}, "There are sensors of 3 flights, not 2."),
+        (FollowedSchedule(np.zeros((5, 3))), {"actuation": "effort"},
+         "A schedule needs velocity actuation."),
+        (FollowedSchedule(np.zeros((5, 2))), {}, "The joints are (5, 2), not (ticks, 3)."),
+        (FollowedSchedule(np.zeros((3, 5, 3))), {}, "There are joints of 3 flights, not 2."),
+        (HeldCommands(np.zeros(3)), {}, "The joints are (3,), not (ticks, 3)."),
+        (HeldCommands(np.zeros((1, 1, 2, 3))), {}, "The joints are (1, 1, 2, 3), not (ticks, 3)."),
+        (HeldCommands(np.zeros((0, 3))), {}, "The joints are (0, 3), not (ticks, 3)."),
+        (HeldCommands(NOT_A_NUMBER), {}, "The joints have a number that is not finite."),
+        (HeldCommands(np.zeros((5, 3)), np.zeros((5, 6))), {},
+         "A wrench on the base needs effort actuation."),
+        (HeldCommands(np.zeros((5, 3)), np.zeros((5, 5))), {"actuation": "effort"},
+         "The wrench are (5, 5), not (ticks, 6)."),
+    ],
+)  # fmt: skip
+def test_flights_are_refused_in_one_sentence(
+    sliders: SpaceRobot, program: Any, changes: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        flights(sliders, program, **changes)
+    assert str(refusal.value) == sentence
 
 
 def test_masses_are_those_of_all_bodies_of_all_flights(sliders: SpaceRobot) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import matplotlib as mpl
@@ -13,24 +12,19 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from support.made_flights import made_flight
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.flight import Signal
-from spacerobot_ros.model.description import Array, Pose
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
-from spacerobot_ros.report import figures, figures_space, page, scene, solids
-from spacerobot_ros.report.events import _MARKS, FlightEvent, draw_events, timed_events
+from spacerobot_ros.report import figures, scene
+from spacerobot_ros.report.events import timed_events
 from spacerobot_ros.report.figures import (
-    TraceGroup,
     draw_traces,
     drawing,
-    end_labels,
     largest_over_time,
     legend_above,
-    new_figure,
-    panel,
     room_for,
     scaled,
     set_range,
@@ -39,17 +33,12 @@ from spacerobot_ros.report.figures import (
     short,
 )
 from spacerobot_ros.report.figures_over_time import (
-    _match_times,
-    draw_whole_flight,
     power_of_ten,
     range_without_peaks,
-    time_figure,
 )
-from spacerobot_ros.report.page import charts_of, thin_out
+from spacerobot_ros.report.page import thin_out
 from spacerobot_ros.report.signals import (
     Cycles,
-    _farthest_sample,
-    _period_in_samples,
     envelope,
     find_cycles,
     nearest_rotvec,
@@ -57,7 +46,6 @@ from spacerobot_ros.report.signals import (
     simplified,
 )
 from spacerobot_ros.report.solids import Canvas, Edge, Face, View
-from spacerobot_ros.report.tables import _count_decimals, _format_attitude, _recorded_text
 
 
 def axes_of(low: float = 0.0, high: float = 1.0) -> Axes:
@@ -111,24 +99,6 @@ def test_the_time_of_an_axis(span: tuple[float, float], bounds: tuple[float, flo
     assert axes.get_xlabel() == ""
     set_time(axes, *span)
     assert axes.get_xlabel() == "time (s)"
-
-
-def test_labels_at_the_ends_of_traces_keep_apart() -> None:
-    axes = axes_of(10.0, 20.0)
-    end_labels(axes, [(15.0, "b", "#111111"), (15.0, "c", "#222222"), (40.0, "d", "#333333")])
-    places = {text.get_text(): text.xy[1] for text in axes.texts}  # type: ignore[attr-defined]
-    gap = 0.155 / 4.0
-    assert places["d"] == 1.0
-    assert places["b"] == pytest.approx(0.5 - gap / 2, abs=2e-4)
-    assert places["c"] == pytest.approx(0.5 + gap / 2, abs=2e-4)
-    assert [text.get_color() for text in axes.texts] == ["#111111", "#222222", "#333333"]
-    np.testing.assert_allclose(
-        figures._separate_labels(np.array([0.0, 0.0, 0.5]), 0.25), [0.0, 0.25, 0.5], atol=2e-3
-    )
-    low = Figure(figsize=(5.0, 0.2)).add_axes((0.0, 0.0, 1.0, 1.0))
-    end_labels(low, [(0.5, str(k), "#111111") for k in range(3)])
-    heights = [text.xy[1] for text in low.texts]  # type: ignore[attr-defined]
-    assert heights == pytest.approx([0.0, 0.5, 1.0], abs=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -274,55 +244,6 @@ def test_a_key_stands_above_its_axes() -> None:
     assert axes.get_legend() is not None
 
 
-def test_goals_limits_and_peaks_of_a_group() -> None:
-    """Two limits of one value are one line; limits out of sight are left out."""
-    flight: Any = SimpleNamespace(executing=[SimpleNamespace(time=0.5)], end=3.0)
-    signal = signal_of([0.0, 1.0, 0.5], [1.0, 0.0, 0.25])
-    group = TraceGroup(signal, ["a", "b"], "label", "m", ["#0000ff", "#ff0000"])
-    axes = axes_of()
-    limits = [(0, 1.125), (1, 1.125), (1, -0.125), (0, 9.0)]
-    assert not draw_whole_flight(axes, flight, replace(group, limits=limits))
-    levels = {line.get_ydata()[0]: line.get_color() for line in axes.lines[:2]}  # type: ignore[index]
-    assert levels == {1.125: figures.SECONDARY_COLOUR, -0.125: "#ff0000"}
-    assert len(axes.lines) == 4
-    assert axes.get_ylabel() == "label (m)"
-    assert axes.get_xlim() == (0.0, 3.0)
-    legend = axes.get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == ["limit (URDF)"]
-    axes = axes_of()
-    draw_whole_flight(axes, flight, replace(group, window=(0.0, 0.5)))
-    assert axes.get_title("left") == "peaks of 1 m are beyond the axis"
-    assert axes.get_ylim() == pytest.approx((0.25 - 0.28, 0.25 + 0.28))
-    axes = axes_of()
-    draw_whole_flight(axes, flight, replace(group, window=(0.0, 0.5), limits=[(0, 0.5)]))
-    assert axes.get_title("right") == "peaks of 1 m are beyond the axis"
-
-
-def test_duty_cycles_have_rows() -> None:
-    """A value holds from the sample before; dense ones are the largest in each slice."""
-    flight: Any = SimpleNamespace(events=(), cycles=None, end=10.0)
-    for count, dense in ((1920, False), (1921, True)):
-        values = np.zeros((count, 2))
-        values[100, 0] = 1.0
-        signal = Signal(np.linspace(0, 10, count), values)
-        group = TraceGroup(signal, ["a", "b"], "thrusters", "share", ["#0000ff", "#ff0000"])
-        with drawing():
-            found = time_figure(flight, "name", "Heading", "Caption", [replace(group, rows=True)])
-        assert isinstance(found, figures.ReportFigure)
-        (axes,) = found.figure.axes
-        assert ("Where a trace has more samples" in found.caption) is dense
-        assert axes.get_ylim() == (-0.2, 2)
-        assert axes.get_yticks().tolist() == [1.4, 0.4]
-        assert [each.get_text() for each in axes.get_yticklabels()] == ["a", "b"]
-        assert axes.get_title("left") == "thrusters (share)"
-        first, second = list[Any](axes.collections)
-        heights = np.concatenate([path.vertices[:, 1] for path in first.get_paths()])
-        assert (heights.min(), heights.max()) == (1.0, 1.8)
-        assert not second.get_paths() or not len(second.get_paths()[0].vertices)
-        assert found.figure.get_size_inches()[1] == pytest.approx(0.3 + 0.68 + 0.5)
-
-
 @pytest.mark.parametrize(
     ("peak", "window"),
     [(2.9, None), (3.1, (-0.3, 1.3)), (1e4 + 1, None), (9.9e3, (-0.3, 1.3)), (-1.9, None)],
@@ -336,16 +257,6 @@ def test_peaks_beyond_a_range(peak: float, window: tuple[float, float] | None) -
     else:
         assert found == pytest.approx((0.0, 1.3))
     assert range_without_peaks(Signal.empty(2)) is None
-
-
-def test_measured_times_are_matched_within_a_nanosecond() -> None:
-    true = signal_of([5.0, 6.0, 7.0], step=1.0)
-    time = np.array([-1.0, 0.0, 1.0 + 9e-10, 1.0 + 2e-9, 2.0 - 9e-10, 3.0])
-    found, at = _match_times(Signal(time, np.arange(6.0)[:, np.newaxis]), true)
-    assert found.values[:, 0].tolist() == [1.0, 2.0, 4.0]
-    assert at.tolist() == [0, 1, 2]
-    none, at = _match_times(signal_of([1.0]), Signal.empty(1))
-    assert (len(none), len(at), none.width) == (0, 0, 1)
 
 
 # -- time series ----------------------------------------------------------------------------------
@@ -384,15 +295,6 @@ def test_a_line_is_simplified_whose_time_begins_again() -> None:
     assert 1.0 < off < np.inf
     kept, off = simplified(Signal(time, np.zeros((600, 1))), 200)
     assert (len(kept), off) == (65, 0.0)
-
-
-def test_a_sample_counts_by_its_distance_from_the_line_in_time() -> None:
-    time = np.array([0.0, 1.0, 10.0])
-    motion = Signal(time, np.array([[0.0, 0.0], [2.0, -3.0], [10.0, 0.0]]))
-    assert _farthest_sample(motion, 0, 2) == (-3.0, 0, 2, 1)
-    assert _farthest_sample(motion, 0, 1) == (0.0, 0, 1, 0)
-    still = Signal(np.zeros(3), motion.values)
-    assert _farthest_sample(still, 0, 2) == (-3.0, 0, 2, 1)
 
 
 @pytest.mark.parametrize(
@@ -463,14 +365,6 @@ def test_cycles_that_differ_by_a_tenth_of_the_peak_are_equal() -> None:
     # The same with one joint that rests, and in any unit.
     wide = np.column_stack([1e-3 * rates.values, np.zeros(len(rates))])
     assert find_cycles(Signal(rates.time, wide)) is not None
-
-
-def test_the_period_in_samples() -> None:
-    phase = 2 * np.pi * np.arange(240) / 12
-    values = np.column_stack([np.sin(phase), 0.25 * np.sin(2 * phase)])
-    assert _period_in_samples(values) == 12
-    assert _period_in_samples(np.ones((60, 1))) is None
-    assert _period_in_samples(np.random.default_rng(3).normal(size=(90, 2))) is None
 
 
 def test_the_last_cycles() -> None:
@@ -577,52 +471,7 @@ def test_edges_are_three_fine_pixels_wide_and_hidden_behind_faces() -> None:
         assert drawn([], [edge]).any() == seen
 
 
-def test_a_base_without_visuals_is_a_cross() -> None:
-    pose = Pose(np.array([[0.0, -1, 0], [1.0, 0, 0], [0, 0, 1.0]]), np.array([1.0, 2.0, 3.0]))
-    lines = solids._cross_lines(pose)
-    np.testing.assert_allclose(lines[0], [[1.0, 1.9, 3.0], [1.0, 2.1, 3.0]])
-    np.testing.assert_allclose(lines[1], [[1.1, 2.0, 3.0], [0.9, 2.0, 3.0]])
-    np.testing.assert_allclose(lines[2], [[1.0, 2.0, 2.9], [1.0, 2.0, 3.1]])
-    assert [solids.body_color(k) for k in (0, 1, 2)] == ["#c4c9d2", "#0072B2", "#D55E00"]
-
-
-@pytest.mark.parametrize(
-    ("longest", "length"), [(1.0, 1.0), (1.99, 1.0), (2.0, 2.0), (0.0499, 0.02), (70.0, 50.0)]
-)
-def test_lengths_of_scale_bars_are_round(longest: float, length: float) -> None:
-    assert figures_space._round_length(longest) == pytest.approx(length)
-
-
 # -- events and tables ----------------------------------------------------------------------------
-
-
-def event(time: float, kind: EventKind = EventKind.CORRECTION, **about: str) -> FlightEvent:
-    return FlightEvent(time, "/planner", Event(kind, f"At {time:g} s.", about=about))
-
-
-@pytest.mark.parametrize(
-    ("count", "folded", "more"), [(20, False, 0), (21, True, 0), (200, True, 0), (201, True, 1)]
-)
-def test_tables_of_many_events_are_folded_and_cut(count: int, folded: bool, more: int) -> None:
-    text = "".join(page._events_html([event(float(count - k)) for k in range(count)]))
-    assert ("<details>" in text) is folded
-    assert (f"<summary>{count} events</summary>" in text) is folded
-    assert (f'<p class="facts">{more} more are in the bag.</p>' in text) is (more > 0)
-    assert text.count("<tr>") == 1 + min(count, 200)
-    assert text.index("At 1 s.") < text.index("At 2 s.")
-    assert page._events_html([]) == []
-
-
-def test_events_of_charts_are_the_first_five_hundred() -> None:
-    events = [event(k / 4) for k in range(502)][::-1]
-    found = page._chart_events(SimpleNamespace(events=events))  # type: ignore[arg-type]
-    assert len(found) == 500
-    assert (found[0]["time"], found[-1]["time"]) == (0.0, 499 / 4)
-    twice = [event(1.0), event(1.0), event(1.0, EventKind.LATCHED)]
-    found = page._chart_events(SimpleNamespace(events=twice))  # type: ignore[arg-type]
-    assert [each["text"] for each in found] == ["correction", "correction (+1)", "latched"]
-    assert found[1]["sentence"] == "At 1 s. At 1 s."
-    assert [each["strong"] for each in found] == [False, False, True]
 
 
 def test_times_of_events_are_stamps_or_log_times() -> None:
@@ -642,75 +491,11 @@ def test_times_of_events_are_stamps_or_log_times() -> None:
     assert [each.time for each in found] == [0.5, 1.5, 2.5, 3.5]
 
 
-@pytest.mark.parametrize(("kinds", "size"), [(8, 7.0), (9, 5.5)])
-def test_the_key_of_events_is_smaller_where_there_are_many(kinds: int, size: float) -> None:
-    shown = [event(0.5, kind) for kind in list(_MARKS)[:kinds]]
-    for width, columns in ((9.6, kinds), (4.0, 4)):
-        with drawing(width):
-            figure = new_figure(4.0)
-            axes = panel(figure, 0.0, 2.0, width, 1.0)
-            draw_events(axes, [*shown, event(1.5), event(-0.5)])
-            lane = figure.axes[1]
-            legend = lane.get_legend()
-            assert legend is not None
-            assert legend._ncols == columns  # type: ignore[attr-defined]
-            assert {text.get_fontsize() for text in legend.get_texts()} == {size}
-            assert len(legend.get_texts()) == kinds
-            bounds = np.array(lane.get_position().bounds) * [width, 4.0, width, 4.0]
-            np.testing.assert_allclose(bounds, [0.0, 2.0 - 0.44 - 0.24, width, 0.24])
-
-
-def test_texts_of_tables() -> None:
-    assert [_count_decimals(x) for x in (1.0, 1.25, 1e-7, 30.5)] == [0, 2, 0, 1]
-    assert _format_attitude([0.0, -0.3, 0.4]) == (
-        "rotation vector (0.00000, -0.30000, 0.40000) rad, 28.648° in all"
-    )
-    one: Any = SimpleNamespace(position=signal_of([1.0]))
-    assert _recorded_text(one) == "1 state"
-    two: Any = SimpleNamespace(position=signal_of([1.0, 2.0]), tick=0.25)
-    assert _recorded_text(two) == "0.25 s, 1 ticks of 0.25 s"
-
-
 # -- charts and key frames ------------------------------------------------------------------------
 
 
 def numbers(text: str, kind: str) -> list[float]:
     return [float(x) for x in np.frombuffer(base64.b64decode(text), kind)]
-
-
-def test_charts_of_groups() -> None:
-    flight: Any = SimpleNamespace(end=1.0, events=[])
-    signal = signal_of([0.0, 1e-3, 100.0], [1.0, 2.0, 0.0])
-    group = TraceGroup(signal, ["a", "b"], "label", "m", ["#0", "#1"], goals=[(0.0, 1.0, 1, 50.0)])
-    limits = [(0, -19.0), (1, -21.0), (0, 119.0), (1, 121.0)]
-
-    def chart(**given: Any) -> dict[str, Any]:
-        drawn = figures.ReportFigure("n", "h", "c", Figure(), [replace(group, **given)])
-        content = charts_of(flight, ["missing", drawn, None]).data["charts"]
-        assert (content["end"], content["events"]) == (1.0, [])
-        (made,) = content["charts"]
-        return dict(made)
-
-    plain = chart(limits=limits)
-    assert numbers(plain["time"], "<f8") == [0.0, 0.25, 0.5]
-    assert [numbers(each, "<f4") for each in plain["values"]] == [
-        pytest.approx([0.0, 1e-3, 100.0]),
-        [1.0, 2.0, 0.0],
-    ]
-    assert plain["goals"] == [[0.0, 1.0, 1.0, 50.0]]
-    assert plain["limits"] == [[0, -19.0], [0, 119.0]]
-    assert (plain["log"], plain["rows"], plain["window"]) == (False, False, None)
-    windowed = chart(limits=[(0, 1.19), (0, 1.21), (0, -0.19)], window=(0.0, 1.0))
-    assert windowed["limits"] == [[0, 1.19], [0, -0.19]]
-    decades = chart(decades=4)
-    assert decades["log"] is True
-    assert numbers(decades["values"][0], "<f4") == [-2.0, -2.0, 2.0]
-    rows = chart(rows=True)
-    assert numbers(rows["values"][1], "<f4") == pytest.approx([0.8, 1.6, 0.0])
-    assert numbers(rows["values"][0], "<f4") == pytest.approx([1.0, 1.0008, 81.0])
-    zero = chart(signal=signal_of([0.0, 0.0]), decades=4)
-    assert numbers(zero["values"][0], "<f4") == [-19.0, -19.0]
-    assert charts_of(flight, ["missing", None]).data == {}
 
 
 def test_short_signals_are_not_thinned_out() -> None:
@@ -745,39 +530,6 @@ def test_key_frames_of_many_cycles_are_at_one_phase() -> None:
     assert scene.key_frames(motion, None).every == 0
 
 
-def test_paths_in_space_have_few_points() -> None:
-    flight = made_flight("controlled")
-    points = np.column_stack([np.arange(8003.0)] * 3)
-    still = np.zeros((5, 7))
-    position = Signal(np.arange(8003.0), points)
-    changed = replace(flight, position=position)
-    vars(changed)["tool"] = Signal(np.arange(5.0), still)
-    (command,) = scene._path_commands(changed)
-    assert command["path"] == "/flight/path of the base"
-    values = command["object"]["geometries"][0]["data"]["attributes"]["position"]["array"]
-    assert values[::3] == [*range(0, 8002, 2), 8002]
-    vars(changed)["tool"] = Signal(np.arange(5.0), still + np.arange(5.0)[:, np.newaxis])
-    assert [each["path"] for each in scene._path_commands(changed)] == [
-        "/flight/path of the base",
-        "/flight/path of the end-effector",
-    ]
-    one = replace(flight, position=signal_of([1.0], [2.0], [3.0]))
-    vars(one)["tool"] = Signal.empty(7)
-    assert scene._path_commands(one) == []
-
-
-def test_the_grid_is_on_whole_multiples() -> None:
-    lines = scene._grid_commands(np.array([0.3, -0.2, 5.0]), 1.0, 0.5, flat=False)
-    xs = sorted({float(x) for x in lines[:, 0]})
-    assert (xs[0], xs[-1]) == (-1.0, 2.0)
-    ys = sorted({float(y) for y in lines[:, 1]})
-    assert (ys[0], ys[-1]) == (-1.5, 1.5)
-    assert len(lines) == 2 * (7 + 7)
-    assert set(lines[:, 2]) == {4.2}
-    flat = scene._grid_commands(np.array([0.3, -0.2, 5.0]), 1.0, 0.5, flat=True)
-    assert set(flat[:, 2]) == {5.0}
-
-
 def test_quaternions_of_a_clip_keep_their_sign() -> None:
     values = np.array([[0.0, 0, 0, 1.0], [0.0, 0, -0.6, -0.8], [0.0, 0, -0.8, -0.6], [0, 0, 1, 0]])
     made = scene.clip("/a", np.array([0.0, 0.123456, 1.0, 2.0]), {"quaternion": values})
@@ -785,12 +537,6 @@ def test_quaternions_of_a_clip_keep_their_sign() -> None:
     assert track["values"] == [0, 0, 0, 1, 0, 0, 0.6, 0.8, 0, 0, 0.8, 0.6, 0, 0, 1, 0]
     assert track["times"] == [0.0, 0.1235, 1.0, 2.0]
     assert (track["name"], track["type"]) == (".quaternion", "quaternion")
-
-
-def test_a_mesh_of_many_corners_has_longer_indices() -> None:
-    for count, kind in ((65535, "Uint16Array"), (65536, "Uint32Array")):
-        mesh: Any = SimpleNamespace(vertices=np.zeros((count, 3)), faces=np.array([[0, 1, 2]]))
-        assert scene._mesh_geometry(mesh)["data"]["index"] == {"type": kind, "array": [0, 1, 2]}
 
 
 def test_without_meshcat_there_is_no_3d_view(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -801,23 +547,3 @@ def test_without_meshcat_there_is_no_3d_view(monkeypatch: pytest.MonkeyPatch) ->
         '<p class="missing">The 3D view needs the Python package meshcat: pip install meshcat.</p>'
     )
     assert scene.player_of("No <robot>.").markup == '<p class="missing">No &lt;robot&gt;.</p>'
-
-
-@pytest.mark.parametrize("flat", [False, True])
-@pytest.mark.parametrize(
-    "sizes", [(1.0, 1.0, 1.0), (0.1, 0.2, 1.9), (1.8, 0.1, 0.3), (0.2, 1.7, 0.05)]
-)
-def test_the_whole_scene_is_in_the_picture_and_fills_it(
-    sizes: tuple[float, float, float], flat: bool
-) -> None:
-    """By the projection that graphics libraries use, for the narrowest picture."""
-    points = np.random.default_rng(4).uniform(-0.5, 0.5, (60, 3)) * sizes
-    eye = scene._camera_position(points, flat)
-    forward = -eye / np.linalg.norm(eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    seen = (points - eye) @ np.column_stack([right, np.cross(right, forward), forward])
-    half = np.tan(np.radians(30.0) / 2)
-    x, y = seen[:, 0] / (1.3 * half * seen[:, 2]), seen[:, 1] / (half * seen[:, 2])
-    largest = max(np.abs(x).max(), np.abs(y).max())
-    assert 0.8 < largest < 1.0

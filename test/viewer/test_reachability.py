@@ -226,7 +226,6 @@ def looked(checker: GoalChecker, until: Callable[[GoalCheck], bool]) -> list[Goa
     return found
 
 
-@pytest.mark.slow
 def test_the_last_goal_is_the_one_that_is_answered(checker: GoalChecker) -> None:
     for x in (0.1, 0.2, 9.0, 0.05):
         checker.ask(question(x, 0.0, 0.0))
