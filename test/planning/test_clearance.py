@@ -13,7 +13,7 @@ import pytest
 
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
-from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.planning import (
@@ -26,10 +26,17 @@ from spacerobot_ros.planning import (
     method_options,
     plan,
 )
-from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.core.clearance import Approach, Clearance
 from spacerobot_ros.planning.core.method import InitialMotion
+from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal import OptimalGait
+from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
+from spacerobot_ros.planning.methods.optimal.problem import (
+    BoundaryConditions,
+    MotionLimits,
+    Trajectory,
+)
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import InitialState
@@ -232,3 +239,38 @@ def test_the_clearance_of_the_planner_is_kept(arm: SpaceRobot) -> None:
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
     with pytest.raises(PlanningError, match=r"planner\.clearance = 0\.6 m"):
         problem.method("optimal").plan(PlanRequest(state, goal, TOLERANCE))
+
+
+def test_a_clear_path_keeps_to_the_planes_between_its_links() -> None:
+    """Planes are where the path has its links, however little more than the clearance that is."""
+    robot = SpaceRobot(load_robot(robot_file("servicer")))
+    away, near = np.array([0.0, -1.4, 0.5, 0, 0, 0]), np.array([0.0, 0.6, 0.5, 0, 0, 0])
+    geometry = Clearance(robot.description, 0.0).geometry
+    closest = geometry.nearest(near)
+    assert closest is not None
+    distance, pair = closest[:2]
+    library = DistanceLibrary(
+        Clearance(robot.description, distance - 1e-4), robot, BasePrediction(robot, 0.05, 0.01)
+    )
+    no_turn = np.array([0.0, 0.0, 0.0, 1.0])
+    boundary = BoundaryConditions(away, no_turn, near, near)
+    kept = library.begin(boundary, turn_is_known=True).by_planes()
+    s = np.linspace(0.0, 1.0, 41)[:, np.newaxis]
+    path = Trajectory(
+        0.05,
+        away + s * (near - away),
+        np.tile((near - away) / 2.0, (41, 1)),
+        np.tile(no_turn, (41, 1)),
+    )
+    assert not kept.approaches_of(path)
+    kept.add([Approach(geometry.links_of(pair), pair, distance, 40, near)])
+    still = MotionLimits(robot.lower, robot.upper, np.ones(6), np.ones(6))
+    planes = kept.within(still, path).distances.reshape(-1, 7)
+    shapes, _ = kept.along(path)
+    distances, own = library.planes(boundary, pair, geometry.poses(shapes))
+    np.testing.assert_allclose(
+        planes[:, [0, 1, 2, 4, 5, 6]], own[:, [0, 1, 2, 4, 5, 6]], atol=1e-12
+    )
+    asked = planes[:, 3] - own[:, 3]
+    assert np.all(asked <= distances + 1e-12)
+    assert np.ptp(asked) > 1e-3, "far from each other links have the room of all"

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from planning.drifting import END_ERROR, angle_between, flown_by_pinocchio
 from planning.test_optimal import ARM_START, FOLDER
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from support.planners import planner_of
 
-from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError
+from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, matrices_from_quaternions
@@ -22,7 +21,6 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.held_commands import DriftVariation
-from spacerobot_ros.planning.methods.optimal.method import OptimalGait, _PlanResult
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
 
 ATTITUDE = Rotation.from_rotvec([0.4, -0.3, 0.7]).as_quat()
@@ -170,108 +168,25 @@ def test_shape_and_position_of_a_base_that_coasts_are_refused() -> None:
         )
 
 
-@pytest.mark.slow
-def test_a_base_that_coasts_is_at_its_goal_when_the_plan_ends() -> None:
+@pytest.mark.parametrize("asked", [{}, {"duration": 2.0}])
+def test_a_base_that_coasts_is_at_its_goal_when_the_plan_ends(asked: dict[str, float]) -> None:
     momentum = [0.3, -0.2, 0.1]
-    schedule = plan("sliding_masses", position=(0.1, 0.05, 0), linear_momentum=momentum, cache=0)
+    few = {**QUICK, "starts": 4, "intervals": 20, **asked}
+    schedule = plan("sliding_masses", position=(0.1, 0.05, 0), linear_momentum=momentum, **few)
     state = RobotState(np.zeros(3), NO_TURN, np.zeros(3), np.array(momentum))
     r_WB, quaternion = flown_by_pinocchio("sliding_masses", schedule, state)
     np.testing.assert_allclose(r_WB, [0.1, 0.05, 0.0], atol=END_ERROR)
     assert angle_between(quaternion, NO_TURN) < END_ERROR
+    assert schedule.duration == pytest.approx(asked.get("duration", schedule.duration))
 
 
-@pytest.mark.slow
-def test_joints_rest_until_the_drift_leads_past_the_goal(
-    arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nothing is found at the start and at the closest pass; the next one is met."""
-    asked: list[Any] = []
-    moves = ARM_START + np.outer(np.linspace(0.0, 1.0, 31) ** 2, [0.2, -0.3, 0.1])
-
-    def search(self: OptimalGait, request: Any, boundary: Any, *others: Any) -> _PlanResult:
-        asked.append((request.state, boundary, others[1].longest, *others[3:]))
-        # The start; then by turns at zero momentum, and with that of the robot.
-        if len(asked) == 1:
-            raise NotFoundError("Nothing was found.")
-        if len(asked) == 3:
-            raise PlanningError("Links are in contact.")
-        manoeuvre: Any = None
-        return _PlanResult(manoeuvre, moves, {"starts": 2.0})
-
-    monkeypatch.setattr(OptimalGait, "_begin_now", search)
-    goal = (Rotation.from_quat(ATTITUDE) * TURN).as_rotvec()
-    found = plan(arm, rotvec=goal, start=START, base_position=2, longest=300.0, **QUICK)
-    omega = arm.base_twist(ATTITUDE, ARM_START, np.zeros(3), L_W=START.angular_momentum)[1]
-    rate, h = np.linalg.norm(omega), found.control_period
-    assert len(asked) == 5
-    begins, free, first, free_again, second = asked
-    assert begins[2:] == (pytest.approx(np.radians(40.0) / rate), 8)
-    for still, drifting in ((free, first), (free_again, second)):
-        assert not still[1].angular_momentum.any()
-        assert still[2] == 300.0
-        assert drifting[2:4] == (pytest.approx(2.5 * 30 * h), 3)
-        # The guess is the way at zero momentum, to where the goal is seen from the pass.
-        np.testing.assert_array_equal(drifting[4].shapes, moves[np.newaxis])
-        np.testing.assert_array_equal(drifting[4].turns, still[1].turn[np.newaxis])
-        seen = Rotation.from_quat(still[0].quaternion).inv() * Rotation.from_rotvec(goal)
-        assert angle_between(still[1].turn, seen.as_quat()) < 1e-9
-        # The manoeuvre would end at the pass.
-        L_W = Rotation.from_quat(drifting[0].quaternion).apply(drifting[1].angular_momentum)
-        np.testing.assert_allclose(L_W, START.angular_momentum, atol=1e-12)
-    resting_time = found.notes["coasting_time"]
-    assert isinstance(resting_time, float)
-    rests = round(resting_time / h)
-    np.testing.assert_array_equal(found.positions[: rests + 1], np.tile(ARM_START, (rests + 1, 1)))
-    np.testing.assert_array_equal(found.positions[rests:], moves)
-    assert found.notes["starts"] == 2.0
-    rested = attitude_with_joints_at_rest(arm, START, rests * h)
-    assert angle_between(second[0].quaternion, rested) < 1e-6
-    # Where the joints rested, the base is at the pass a manoeuvre later.
-    resting = attitude_with_joints_at_rest(arm, START, rests * h + 30 * h)
-    assert angle_between(free_again[0].quaternion, resting) < 1e-6
-    r_WB, quaternion = flown_by_pinocchio("three_joint_arm", found, START)
-    assert angle_between(quaternion, found.path.quaternion[-1]) < END_ERROR
-    np.testing.assert_allclose(r_WB, found.path.position[-1], atol=END_ERROR)
-
-
-def attitude_with_joints_at_rest(
-    robot: SpaceRobot, state: RobotState, duration: float
-) -> np.ndarray:
-    """Return the attitude (4,) after a time, by Euler's equations of one rigid body."""
-    inverse = np.linalg.inv(robot.inertia_matrix(state.q)[3:6, 3:6])
-
-    def rate(_: float, x: np.ndarray) -> np.ndarray:
-        R = Rotation.from_quat(x).as_matrix()
-        wx, wy, wz = inverse @ R.T @ state.angular_momentum
-        Omega = np.array([[0, wz, -wy, wx], [-wz, 0, wx, wy], [wy, -wx, 0, wz], [-wx, -wy, -wz, 0]])
-        return np.asarray(Omega @ x / 2)
-
-    flown = solve_ivp(rate, (0.0, duration), state.quaternion, rtol=1e-10, atol=1e-12)
-    return np.asarray(flown.y[:, -1])
-
-
-def test_a_goal_that_is_never_in_reach_has_the_refusal_of_the_whole_search(
-    arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls = []
-
-    def never(*asked: Any) -> Any:
-        calls.append(asked)
-        raise NotFoundError(f"Nothing was found by search {len(calls)}.")
-
-    monkeypatch.setattr(OptimalGait, "_begin_now", never)
-    goal = (Rotation.from_quat(ATTITUDE) * TURN).as_rotvec()
-    with pytest.raises(NotFoundError, match=r"by search \d+"):
-        plan(arm, rotvec=goal, start=START, base_position=2, longest=9.0, **QUICK)
-    few = len(calls)
-    with pytest.raises(NotFoundError) as refusal:
-        plan(arm, rotvec=goal, start=START, base_position=2, **QUICK)
-    assert str(refusal.value).startswith(f"Nothing was found by search {len(calls)}. It is proved")
-    omega = arm.base_twist(ATTITUDE, ARM_START, np.zeros(3), L_W=START.angular_momentum)[1]
-    assert calls[-1][4].longest == pytest.approx(8 * np.pi / np.linalg.norm(omega))
-    assert len(calls[-1]) == 6, "it is not to end early"
-    # All goals' passes in four turns of the base, without an end before.
-    assert len(calls) - few > few >= 2
+def test_a_base_that_coasts_turns_where_its_position_does_not_count() -> None:
+    few = {**QUICK, "starts": 2, "intervals": 20}
+    turn = {"rotvec": (0.0, 0.0, 0.3), "base_position": 2}
+    still = plan("planar_chain", **turn, **few)
+    coasting = plan("planar_chain", **turn, linear_momentum=[0.3, -0.2, 0.0], **few)
+    np.testing.assert_allclose(coasting.positions, still.positions, atol=1e-9)
+    assert coasting.path.position[-1] @ [0.3, -0.2, 0.0] > still.path.position[-1] @ [0.3, -0.2, 0]
 
 
 @pytest.mark.parametrize("kind", ["linear_momentum", "angular_momentum"])
