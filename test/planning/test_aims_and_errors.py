@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,15 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.planner_loop import TICK, robot_of
 
-from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState, Tolerance
-from spacerobot_ros.planning.core.goal import EndEffectorGoal, PoseError
+from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, Tolerance
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.path_deviation import PathCheck
-from spacerobot_ros.planning.execution.status import (
-    PlannerState,
-    PlannerStatus,
-    manoeuvre_time,
-)
 
 ARM = robot_of("three_joint_arm")
 SHAPE = np.array([0.2, -0.6, 1.3])
@@ -86,72 +80,3 @@ def test_the_aim_for_an_end_effector_leaves_a_share_of_each_tolerance(
     assert given.quaternion is not None
     turn = Rotation.from_quat(given.quaternion).inv() * wanted
     np.testing.assert_allclose(turn.as_rotvec(), [0.0, 0.0, left[1]], atol=1e-9)
-
-
-def test_a_pose_of_a_path_is_due_within_half_a_tick_of_its_stamp() -> None:
-    """Poses are two ticks apart; between them, and after the last, none is due."""
-    tick = round(TICK * 1e9)
-    check = checked_path()
-    for stamp, due in (
-        (-tick // 2 - 1, False),
-        (-tick // 2, True),
-        (tick // 2, True),
-        (tick // 2 + 1, False),
-        (2 * tick - tick // 2 - 1, False),
-        (2 * tick, True),
-        (20 * tick + tick // 2, True),
-        (20 * tick + tick // 2 + 1, False),
-    ):
-        assert bool(check.due(BEGIN_NS + stamp)) is due, stamp
-
-
-@pytest.mark.parametrize(
-    ("off", "angle", "found"),
-    [(0.5, 0.25, False), (0.51, 0.0, True), (0.0, 0.26, True), (0.51, 0.26, True)],
-)
-def test_a_path_is_left_beyond_either_bound(off: float, angle: float, found: bool) -> None:
-    check = checked_path(drift_position=0.505, drift_attitude=0.255)
-    assert check.due(BEGIN_NS)
-    turned = END * Rotation.from_rotvec([angle, 0.0, 0.0])
-    error = check.error(RobotState(np.array([0.0, off, 0.0]), turned.as_quat(), SHAPE))
-    assert (error is not None) is found
-    if error is not None:
-        assert (error.distance, error.angle) == pytest.approx((off, angle))
-
-
-@pytest.mark.parametrize(
-    ("last", "end", "flown"),
-    [
-        # The planner counts whole schedules; the flight was cut off 1.5 s before the last one.
-        ((PlannerState.EXECUTING, 10.0), 6.5, 8.5),
-        ((PlannerState.EXECUTING, 10.0), 8.0, 10.0),
-        ((PlannerState.EXECUTING, 10.0), 9.0, 10.0),
-        ((PlannerState.REACHED, 10.0), 3.0, 10.0),
-        # After an abort nothing is counted: the time since the beginning.
-        ((PlannerState.ABORTED, 0.0), 30.0, 3.0),
-        ((PlannerState.EXECUTING, 1.0), 4.5, 3.5),
-        ((PlannerState.REFUSED, 10.0), 9.0, 4.0),
-    ],
-)
-def test_the_time_that_was_flown_is_the_planners_count_less_what_was_cut_off(
-    last: tuple[PlannerState, float], end: float, flown: float
-) -> None:
-    begun = PlannerStatus(PlannerState.EXECUTING, duration_s=4.0, manoeuvre_time_s=4.0)
-    state, counted = last
-    again = replace(begun, state=state, manoeuvre_time_s=counted)
-    assert manoeuvre_time([(1.0, begun), (4.0, again)], end) == pytest.approx(flown)
-    assert manoeuvre_time([(4.0, replace(begun, state=PlannerState.REFUSED))], end) is None
-
-
-def test_the_worst_parts_of_an_error_are_named() -> None:
-    hands = (
-        PoseError(np.array([0.0, 3.0, 4.0]), np.array([0.0, 0.1, 0.0])),
-        PoseError(np.array([0.0, 0.0, 1.0]), np.array([0.3, 0.4, 0.0])),
-    )
-    error = PoseError(np.array([2.0, 3.0, 6.0]), np.zeros(3), np.array([0.1, -0.7]), hands)
-    assert (error.distance, error.angle, error.max_joint_error) == (7.0, 0.0, 0.7)
-    assert error.largest_end_effector_distance == 5.0
-    assert error.largest_end_effector_angle == 0.5
-    alone = PoseError(np.zeros(3), np.zeros(3))
-    assert (alone.max_joint_error, alone.largest_end_effector_distance) == (0.0, 0.0)
-    assert alone.largest_end_effector_angle == 0.0

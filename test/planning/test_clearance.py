@@ -78,7 +78,6 @@ def nearest_of(geometry: CollisionGeometry, positions: Array) -> float:
     return min(float(geometry.distances(p, poses).min()) for p in range(len(geometry.pairs)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("distance", [0.03, pytest.param(0.01, marks=pytest.mark.slow)])
 def test_optimal_goes_round_a_contact(arm: SpaceRobot, distance: float) -> None:
     goal = (0.09, -0.26, -0.21), np.zeros(3)
@@ -93,6 +92,13 @@ def test_optimal_goes_round_a_contact(arm: SpaceRobot, distance: float) -> None:
     assert error < 1e-9
 
 
+def test_where_no_clear_way_is_fast_enough_the_fastest_is_named(arm: SpaceRobot) -> None:
+    few = {"starts": 4, "answers": 1, "intervals": 12, "cache": 0, "control_period": 0.1}
+    turn, start = (0.09, -0.26, -0.21), np.zeros(3)
+    with pytest.raises(PlanningError, match=r"= 4\.5 s: the fastest that was found takes 5"):
+        plan(arm, rotvec=turn, start=start, clearance=0.03, longest=4.5, **few)
+
+
 def test_a_plan_that_is_clear_stays_the_same(arm: SpaceRobot) -> None:
     goal = (0.27, 0.17, -0.05), np.zeros(3)
     plain = planned(arm, "optimal", *goal, None, **QUICK)
@@ -100,7 +106,6 @@ def test_a_plan_that_is_clear_stays_the_same(arm: SpaceRobot) -> None:
     assert np.array_equal(plain.positions, clear.positions)
 
 
-@pytest.mark.slow
 def test_a_plan_in_motion_keeps_clear(arm: SpaceRobot) -> None:
     goal = (0.09, -0.26, -0.21), np.zeros(3)
     clearance = Clearance(arm.description, 0.01)

@@ -12,7 +12,7 @@ from planning.test_optimal import ARM_START, FOLDER
 from scipy.spatial.transform import Rotation
 from support.planners import planner_of
 
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import attitude_error, matrices_from_quaternions
@@ -178,6 +178,16 @@ def test_a_base_that_coasts_is_at_its_goal_when_the_plan_ends(asked: dict[str, f
     np.testing.assert_allclose(r_WB, [0.1, 0.05, 0.0], atol=END_ERROR)
     assert angle_between(quaternion, NO_TURN) < END_ERROR
     assert schedule.duration == pytest.approx(asked.get("duration", schedule.duration))
+
+
+def test_where_nothing_is_found_the_passes_of_a_drifting_goal_are_tried_before(
+    arm: SpaceRobot,
+) -> None:
+    """So few iterations find nothing: neither at once nor where the drift leads past the goal."""
+    goal = (Rotation.from_quat(ATTITUDE) * TURN).as_rotvec()
+    never = {**QUICK, "intervals": 20, "iterations": 2, "starts": 2}
+    with pytest.raises(NotFoundError, match=r"was found from 2 start\(s\).* It is proved"):
+        plan(arm, rotvec=goal, start=START, base_position=2, **never)
 
 
 def test_a_base_that_coasts_turns_where_its_position_does_not_count() -> None:

@@ -61,7 +61,6 @@ def chain(links: int) -> str:
 # -- on the way -------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_the_base_turns_no_faster_than_it_may(arm: SpaceRobot) -> None:
     turn = [0.2, -0.1, 0.3]
     slow = of_arm(arm, turn, max_base_rate=0.12)
@@ -71,7 +70,6 @@ def test_the_base_turns_no_faster_than_it_may(arm: SpaceRobot) -> None:
     assert reached(slow, turn) <= 1e-6
 
 
-@pytest.mark.slow
 def test_an_axis_stays_out_of_a_cone(arm: SpaceRobot) -> None:
     turn = [0.0, 0.0, 0.6]
 
@@ -85,7 +83,6 @@ def test_an_axis_stays_out_of_a_cone(arm: SpaceRobot) -> None:
     assert reached(away, turn) <= 1e-6
 
 
-@pytest.mark.slow
 def test_joints_stay_out_of_a_box(arm: SpaceRobot) -> None:
     turn, far = [0.2, -0.1, 0.3], 1e9
     assert of_arm(arm, turn).positions[:, 1].max() > 0.0
@@ -93,7 +90,6 @@ def test_joints_stay_out_of_a_box(arm: SpaceRobot) -> None:
     assert of_arm(arm, turn, keep_out=box).positions[:, 1].max() <= -0.7
 
 
-@pytest.mark.slow
 def test_margins_are_kept_but_where_the_goal_is_in_them(arm: SpaceRobot) -> None:
     turn, margin = [0.2, -0.1, 0.3], np.array([2.5, 1.0, 0.0])
     schedule = of_arm(arm, turn, joint_margin=margin.tolist())
@@ -139,7 +135,6 @@ def test_a_search_cut_short_gives_the_best_so_far(arm: SpaceRobot) -> None:
     assert_within(hasty, arm.velocity_limit, arm.velocity_limit / 0.5)
 
 
-@pytest.mark.slow
 def test_a_plan_is_the_same_on_a_busy_machine(
     arm: SpaceRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
