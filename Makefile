@@ -103,12 +103,6 @@ passage: $(STAMP)/test ## change every parameter in a flight: it reaches the qua
 expected: $(STAMP)/test ## write what the tests expect of parameters and plans anew, where a change is wanted
 	PYTHONPATH=.:test $(BIN)/python3 -m support.expected
 
-MUTANTS := 400
-.PHONY: mutants
-mutants: $(STAMP)/mutants ## put random errors into the whole package; see out/mutants; MUTANTS=400 SEED=[another each time]
-	PYTHONPATH=.:test nice $(BIN)/python3 test/mutation/run.py --sample $(MUTANTS) --at-least 15 \
-	    $(if $(filter command line,$(origin SEED)),--seed $(SEED))
-
 .PHONY: hostile-bags
 hostile-bags: $(STAMP)/test ## read bags that were made to harm their reader, each in a process of its own
 	$(BIN)/python3 -m pytest -m 'slow or not slow' -rP test/bag/test_hostile_bags.py
@@ -283,13 +277,12 @@ $(STAMP)/venv:
 
 $(STAMP)/demo: EXTRAS := jazzy,viewer,collision
 $(STAMP)/test: EXTRAS := jazzy,test
-$(STAMP)/mutants: EXTRAS := jazzy,test,mutants
 $(STAMP)/bench: EXTRAS := jazzy,campaign,bench
 $(STAMP)/docs: EXTRAS := jazzy,docs
 
 # A changed declaration or a new stamp: the package with its dependencies. Changed sources: the
 # package alone. What is left in build/lib would be installed again, deleted files too.
-$(STAMP)/demo $(STAMP)/test $(STAMP)/mutants $(STAMP)/bench $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
+$(STAMP)/demo $(STAMP)/test $(STAMP)/bench $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
 	@rm -rf build/lib
 	@echo "Installing spacerobot_ros[$(EXTRAS)] into $(VENV)$(if $(ALL), (once; a minute or two)) ..."
 	@$(PIP) install --no-build-isolation \

@@ -14,13 +14,11 @@ import pytest
 from scipy import stats
 from support.campaigns import campaign
 
-from spacerobot_ros.campaign import dataset as datasets
 from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign import running as reruns
 from spacerobot_ros.campaign.config import Criterion, Distribution, load_campaign, meets_criterion
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, drawn_flights, sobol_problem
-from spacerobot_ros.campaign.report import figure_with_axes
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation
 from spacerobot_ros.campaign.statistics import (
@@ -35,8 +33,7 @@ from spacerobot_ros.campaign.statistics import (
     sobol_indices,
 )
 from spacerobot_ros.campaign.targets import DrawnFlight
-from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
-from spacerobot_ros.measures import Outcome
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
 running: Any = reruns
 MADE = campaign(flights=6, disperse={"mass.mass_1": {"uniform": [0.5, 1.0]}})
@@ -82,30 +79,6 @@ def test_percentiles_are_of_finite_values() -> None:
     values = np.array([math.nan, *range(101), math.inf])
     assert percentiles(values) == [5.0, 50.0, 95.0, 99.0]
     assert all(math.isnan(x) for x in percentiles(np.array([math.nan])))
-
-
-def test_what_is_said_of_an_influence() -> None:
-    plain = Influence("mass", "error_m", -0.456, 0.01, 0.4, 0.02)
-    assert str(plain) == "mass of error_m: -0.46"
-    assert plain.strength == 0.456
-    away = replace(plain, distance_correlation=-0.5)
-    assert str(away) == "mass of error_m: -0.50 with its distance from the median"
-    assert away.strength == 0.5
-    whole = replace(away, first_order_index=(0.125, 0.01), total_order_index=(0.375, 0.02))
-    assert str(whole) == "mass of error_m: total Sobol index 0.38"
-    assert whole.strength == 0.375
-    bare = Influence("a", "b", 0.25, 0.5)
-    assert (
-        bare.distance_correlation,
-        bare.distance_p_value,
-        bare.first_order_index,
-        bare.total_order_index,
-    ) == (
-        0.0,
-        1.0,
-        None,
-        None,
-    )
 
 
 @pytest.mark.parametrize(
@@ -401,15 +374,6 @@ def test_draws_that_are_made_together_are_those_made_alone() -> None:
         assert flight.inertial.vector.tobytes() == alone.inertial.vector.tobytes()
 
 
-def test_draws_share_a_scenario_that_they_leave() -> None:
-    """What differs from one to the next, seeds and masses, is beside it."""
-    flights = [
-        drawn for _, drawn in drawn_flights(MADE, Draws(MADE), DrawnFlight.of(MADE.scenario))
-    ]
-    assert {id(flight.scenario) for flight in flights} == {id(MADE.scenario)}  # type: ignore[union-attr]
-    assert len({flight.seed for flight in flights}) == len(MADE.dispersions) * 6  # type: ignore[union-attr]
-
-
 def test_a_seed_that_is_dispersed_is_that_of_the_flight() -> None:
     made = campaign(disperse={"plant.sensors.seed": {"choice": [41]}})
     flight = drawn_flight(made, Draws(made)[0])
@@ -502,40 +466,6 @@ def test_a_stored_flight_has_its_metrics(tmp_path: Path) -> None:
 # -- datasets -------------------------------------------------------------------------------------
 
 
-def test_rows_are_written_after_two_thousand_or_five_seconds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = [50.0]
-    monkeypatch.setattr(datasets.time, "monotonic", lambda: now[0])  # type: ignore[attr-defined]
-    dataset = Dataset(tmp_path)
-    dataset.begin(MADE)
-    row = Row(Draws(MADE)[0], "reached", ".")
-
-    def files() -> int:
-        return len(list((tmp_path / "flights").glob("part-*.parquet")))
-
-    dataset.add([row])
-    now[0] = 55.0
-    dataset.add([])
-    assert files() == 0
-    now[0] = 55.5
-    dataset.add([])
-    assert files() == 1
-    now[0] = 60.5
-    dataset.add([row] * 1999)
-    assert files() == 1
-    dataset.add([row])
-    assert files() == 2
-    now[0] = 70.0
-    dataset.add([])
-    assert files() == 2
-    dataset.add([row])
-    assert files() == 3
-    dataset.close()
-    names = sorted(path.name for path in (tmp_path / "flights").iterdir())
-    assert names == [f"part-{k:06d}.parquet" for k in range(3)]
-
-
 def test_the_files_of_a_dataset(tmp_path: Path) -> None:
     dataset = Dataset(tmp_path)
     assert dataset.begin(replace(MADE, description="D")) == set()
@@ -593,36 +523,3 @@ def test_robots_that_are_files_travel_with_a_campaign(tmp_path: Path) -> None:
     assert (sent.planner.robot, sent.planner.robot_description) == ("", "")
     both = campaign(set={"plant.robot": str(file), "planner.robot": str(file)})
     assert self_contained(both).scenario.planner.robot_description == sent.plant.robot_description
-
-
-# -- reports --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("count", "across", "rows", "hidden"), [(1, 3, 1, 2), (3, 3, 1, 0), (4, 3, 2, 2), (5, 2, 3, 1)]
-)
-def test_figures_have_as_many_axes_as_are_wanted(
-    count: int, across: int, rows: int, hidden: int
-) -> None:
-    figure, axes = figure_with_axes(count, across, 2.5)
-    assert figure.get_size_inches().tolist() == pytest.approx([9.6, 2.5 * rows + 0.2])
-    assert len(axes) == count
-    assert [each.get_visible() for each in figure.axes] == [True] * count + [False] * hidden
-    assert figure_with_axes(1, 1)[0].get_size_inches()[1] == pytest.approx(2.4)
-
-
-def test_a_row_of_an_error() -> None:
-    draw = Draw(1, 2, {})
-    refused = Row.of_error(draw, SpaceRobotError("No\n robot."), "ros")
-    assert (refused.outcome, refused.reason, refused.engine) == (
-        "error",
-        str(SpaceRobotError("No\n robot.")),
-        "ros",
-    )
-    other = Row.of_error(draw, KeyError("a\n  b"), "ros")
-    assert other.reason.startswith("KeyError: ")
-    assert (other.passed, other.metrics, other.fallback) == (False, {}, "")
-    assert math.isnan(other.wall_time)
-    assert math.isnan(other.plan_time)
-    assert isinstance(RecordingError("a"), SpaceRobotError)
-    assert Outcome.REACHED.value == "reached"

@@ -5,21 +5,18 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
-import casadi as ca
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot, parse_robot
-from spacerobot_ros.model.grasp import BodyMotion, GraspImpact
+from spacerobot_ros.model.grasp import GraspImpact
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation import capture, effort_plant, sensors, status
+from spacerobot_ros.simulation import capture, sensors
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.capture import CaptureReport, GrappleMotion, ReleaseReport
 from spacerobot_ros.simulation.config import CaptureConfig, PlantConfig, TargetConfig
@@ -27,74 +24,8 @@ from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 RUNNING = PlantStatus(PlantState.RUNNING, "It runs.", time_s=7.5)
 
-E = EventKind
-
 
 # -- status -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("before", "now", "events"),
-    [
-        ({}, {"resets": 1}, [(E.RESET, 0, {})]),
-        ({"rearms": 2}, {"rearms": 1}, [(E.REARMED, 0, {})]),
-        ({}, {"latched_fault": "stuck", "reason": "abort"},
-         [(E.LATCHED, 2, {"reason": "abort"})]),
-        ({"latched_fault": "stuck"}, {"latched_fault": "hot", "reason": "watchdog"},
-         [(E.LATCHED, 2, {"reason": "watchdog"})]),
-        ({"latched_fault": "stuck"}, {"latched_fault": "stuck"}, []),
-        ({"latched_fault": "stuck"}, {}, []),
-        ({"faults": ("a", "b")}, {"faults": ("b", "c")},
-         [(E.FAULT_INJECTED, 1, {"fault": "c"}), (E.FAULT_ENDED, 0, {"fault": "a"})]),
-        ({"faults": ("a",)}, {},
-         [(E.FAULT_ENDED, 0, {"fault": "a"}), (E.FAULTS_CLEARED, 0, {})]),
-        ({"disturbances": ("a", "b")}, {"disturbances": ("b", "c")},
-         [(E.DISTURBANCE, 1, {"disturbance": "c"}),
-          (E.DISTURBANCE_ENDED, 0, {"disturbance": "a"})]),
-        ({"state": PlantState.PAUSED}, {}, [(E.RESUMED, 0, {}), (E.RUNNING, 0, {})]),
-        ({"state": PlantState.PAUSED}, {"state": PlantState.INACTIVE}, []),
-        ({"state": PlantState.LATCHED}, {}, [(E.RUNNING, 0, {})]),
-        ({}, {"state": PlantState.PAUSED}, [(E.PAUSED, 0, {})]),
-        ({}, {"state": PlantState.FAILED, "reason": "model"}, []),
-        ({}, {"state": PlantState.RESTING, "reason": "timeout"},
-         [(E.RESTING, 1, {"reason": "timeout"})]),
-        ({}, {"state": PlantState.RESTING, "reason": "no_command"},
-         [(E.RESTING, 0, {"reason": "no_command"})]),
-        ({"state": PlantState.RESTING, "reason": "no_command"},
-         {"state": PlantState.RESTING, "reason": "timeout"},
-         [(E.RESTING, 1, {"reason": "timeout"})]),
-        ({"state": PlantState.RESTING, "reason": "timeout"},
-         {"state": PlantState.RESTING, "reason": "no_command"},
-         [(E.RESTING, 0, {"reason": "no_command"})]),
-        ({"reason": "abort"}, {"reason": "watchdog"}, []),
-    ],
-)  # fmt: skip
-def test_each_change_of_a_status_has_its_event(
-    before: dict[str, Any], now: dict[str, Any], events: list[Any]
-) -> None:
-    found = status._events_between(replace(RUNNING, **before), replace(RUNNING, **now))
-    assert [(each.kind, each.level, dict(each.about)) for each in found] == events
-    assert {each.time_s for each in found} <= {7.5}
-
-
-def test_events_of_a_status_are_sentences_in_a_plausible_order() -> None:
-    before = PlantStatus(PlantState.PAUSED, faults=("a",), disturbances=("push",))
-    now = PlantStatus(
-        *(PlantState.RUNNING, "It runs.", "", "broken", 3.0, 1, 1, (), ("pull",)),
-    )
-    assert [each.message for each in status._events_between(before, now)] == [
-        "The robot is back in its initial state.",
-        "Commands pass again.",
-        "A fault is latched: broken.",
-        "A fault has ended: a.",
-        "No fault is active any more.",
-        "A disturbance begins: pull.",
-        "A disturbance has ended: push.",
-        "Time goes on.",
-        "It runs.",
-    ]
-    (begun,) = status._events_between(now, replace(now, faults=("stuck",)))
-    assert begun.message == "A fault begins: stuck."
 
 
 @pytest.mark.parametrize(
@@ -138,159 +69,6 @@ def test_a_status_is_pairs_of_words() -> None:
     assert (values["last_command_s"], values["latched_fault"]) == ("0.000000000", "hot")
     assert PlantStatus.from_values(values) == whole
     assert PlantStatus.from_values({"state": "failed"}, "m") == PlantStatus(PlantState.FAILED, "m")
-
-
-@pytest.mark.parametrize(
-    ("activity", "message", "latched"),
-    [
-        (PlantState.INACTIVE, "The plant is inactive", ", and a fault is latched: hot"),
-        (PlantState.PAUSED, "Time is stopped until '~/pause' resumes it",
-         ", and a fault is latched: hot"),
-    ],
-)  # fmt: skip
-def test_a_plant_at_rest_says_whether_a_fault_is_latched(
-    activity: PlantState, message: str, latched: str
-) -> None:
-    monitor: Any = object.__new__(status.PlantMonitor)
-    for fault, wanted in (("", f"{message}."), ("hot", f"{message}{latched}.")):
-        monitor._commands = SimpleNamespace(fault=fault, fault_reason="abort" if fault else "")
-        found = monitor._status(activity)
-        assert (found.message, found.latched_fault, found.state) == (wanted, fault, activity)
-        assert found.reason == ("abort" if fault else "")
-
-
-# -- stops of joints -----------------------------------------------------------------------------
-
-
-def stops_of(lower: list[float], upper: list[float], step: Any, equations: Any = None) -> Any:
-    functions = {"holding_step": step, "shape_equations": equations}
-    robot = SimpleNamespace(
-        n=len(lower),
-        lower=np.array(lower),
-        upper=np.array(upper),
-        buffered=functions.__getitem__,
-    )
-    return effort_plant.JointStops(cast(Any, robot), 0.3)
-
-
-def test_joints_are_outside_a_rounding_beyond_their_limits() -> None:
-    stops = stops_of([-0.25, -8.0], [0.5, 4.0], None)
-    for q, outside in (
-        ([-0.25 - 0.9e-12, -8.0 - 7e-12], False),
-        ([0.5 + 0.9e-12, 4.0 + 3.6e-12], False),
-        ([-0.25 - 1.1e-12, 0.0], True),
-        ([0.0, -8.0 - 9e-12], True),
-        ([0.5 + 1.1e-12, 0.0], True),
-        ([0.0, 4.0 + 4.5e-12], True),
-    ):
-        x = np.concatenate([q, np.zeros(15)])
-        assert stops._is_outside_limits(x) is outside, q
-
-
-def drifting_step(x: Any, command: Any, free: Any, step: float) -> list[Any]:
-    """Move free joints at their rates, which stay."""
-    after = x.copy()
-    after[:2] += step * x[6:8] * free
-    return [after]
-
-
-def test_a_joint_arrives_at_its_stop_and_stays_while_another_goes_on() -> None:
-    """Two joints without inertia between them, at 0.5 and -0.1 a second for 1.7 s."""
-    equations = np.array([2.0, 0.0, 0.0, 3.0]), np.zeros(2)
-    taken: list[float] = []
-
-    def step(x: Any, command: Any, free: Any, duration: float) -> list[Any]:
-        taken.append(duration)
-        return drifting_step(x, command, free, duration)
-
-    stops = stops_of([-1.0, -1.0], [0.4, 1.0], step, lambda *_: equations)
-    x = np.zeros(17)
-    x[6:8] = 0.5, -0.1
-    after, stopped = stops.advance(x, np.zeros(8), 1.7)
-    np.testing.assert_allclose(after[:2], [0.4, -0.17], atol=1e-12)
-    assert after[0] == 0.4
-    np.testing.assert_allclose(after[6:8], [0.0, -0.1])
-    assert stopped.tolist() == [True, False]
-    # Two whole steps, the third to the arrival at 0.8 s, three whole ones and what is left: 0 s.
-    assert stops._time_to_stop(x, np.zeros(8), np.zeros(2, bool), 1.0) == pytest.approx(0.8)
-    assert x[0] == 0.0
-    # Without a stop the steps are the longest ones and the rest.
-    taken.clear()
-    stops.advance(x, np.zeros(8), 0.7)
-    assert taken == pytest.approx([0.3, 0.3, 0.1])
-    # A locked joint is at rest from the beginning.
-    after, stopped = stops.advance(x, np.zeros(8), 0.7, np.array([True, False]))
-    np.testing.assert_allclose(after[:2], [0.0, -0.07])
-    np.testing.assert_allclose(after[6:8], [0.0, -0.1])
-    assert stopped.tolist() == [False, False]
-
-
-@pytest.mark.parametrize(
-    ("q", "rate", "push", "held"),
-    [
-        ([0.4, 0.0], [0.0, 0.0], [1.0, 0.0], [True, False]),
-        ([0.4, 0.0], [0.0, 0.0], [-1.0, 0.0], [False, False]),
-        ([-1.0, 0.0], [0.0, 0.0], [1.0, 0.0], [False, False]),
-        ([-1.0, 0.0], [0.0, 0.0], [-1.0, 0.0], [True, False]),
-        ([0.4, -1.0], [0.1, -0.2], [0.0, 0.0], [False, False]),
-        ([0.4, -1.0], [0.0, 0.0], [2.0, -2.0], [True, True]),
-        # Coupled by +1 in K: what pushes the first out pulls the second off its stop at -1.
-        ([0.0, -1.0], [0.0, 0.0], [-2.0, 0.0], [False, False]),
-        ([0.0, -1.0], [0.0, 0.0], [2.0, 0.0], [False, True]),
-        ([0.0, 0.0], [5.0, 5.0], [9.0, 9.0], [False, False]),
-    ],
-)
-def test_stops_hold_the_joints_that_something_pushes_outwards(
-    q: list[float], rate: list[float], push: list[float], held: list[bool]
-) -> None:
-    K = np.array([2.0, 1.0, 1.0, 3.0])
-    stops = stops_of([-1.0, -1.0], [0.4, 1.0], None, lambda *_: (K, np.array(push)))
-    x = np.zeros(17)
-    x[:2], x[6:8] = q, rate
-    none = np.zeros(2, bool)
-    found, touched = stops._bring_to_rest(x, np.zeros(8), none, none)
-    assert found.tolist() == held
-    # Rates outwards have been brought to rest: both arrive with the first and the fifth case's.
-    arrived = [outward > 0 for outward in (rate[0] * (q[0] >= 0.4), -rate[1] * (q[1] <= -1.0))]
-    assert touched.tolist() == [a or b for a, b in zip(held, arrived, strict=True)]
-    if any(arrived):
-        assert x[6:8].tolist() == [0.0, 0.0]
-    else:
-        assert x[6:8].tolist() == rate
-
-
-def test_motion_that_is_not_finite_says_how_to_go_on() -> None:
-    stops = stops_of([-1.0], [1.0], lambda x, *_: [x * math.nan])
-    with pytest.raises(SpaceRobotError) as refusal:
-        stops.advance(np.ones(15) * 0.1, np.zeros(7), 1.0)
-    assert str(refusal.value) == (
-        "The motion is no longer finite: the commands drive the robot too fast for the "
-        "integration step. Reduce the commands, or parameter 'integration_step'."
-    )
-
-
-def test_wheels_at_their_largest_rate_are_made_no_faster() -> None:
-    robot: Any = SimpleNamespace(
-        effort_limit=np.array([5.0, 0.2, 0.3]),
-        velocity_limit=np.array([1.0, 40.0, 50.0]),
-        joint_names=("arm", "wheel_1", "wheel_2"),
-        description=SimpleNamespace(wheel_names=("wheel_1", "wheel_2")),
-    )
-    qdot = ca.MX.sym("qdot", 3)
-    bounds = ca.Function("bounds", [qdot], list(effort_plant._effort_bounds(robot, qdot)))
-    for rates, lowest, highest in (
-        ([9.0, 40.0, -50.0], [-5.0, -0.2, 0.0], [5.0, 0.0, 0.3]),
-        ([-9.0, -40.0, 50.0], [-5.0, 0.0, -0.3], [5.0, 0.2, 0.0]),
-        ([0.0, 39.9, -49.9], [-5.0, -0.2, -0.3], [5.0, 0.2, 0.3]),
-    ):
-        found = [np.array(each).ravel().tolist() for each in bounds(rates)]
-        assert found == [lowest, highest]
-    robot.description.wheel_names = ()
-    least, most = effort_plant._effort_bounds(robot, qdot)
-    assert (cast(Any, least).tolist(), cast(Any, most).tolist()) == (
-        [-5.0, -0.2, -0.3],
-        [5.0, 0.2, 0.3],
-    )
 
 
 # -- captures ------------------------------------------------------------------------------------
@@ -378,34 +156,6 @@ def test_an_approach_may_be_at_its_limits() -> None:
     ]
 
 
-def test_relative_differences_are_of_the_larger_momentum() -> None:
-    expected = np.array([3.0, 0.0, 4.0, 0.0, 2.0, 0.0])
-    for change, wanted in (
-        ([0.0] * 6, 0.0),
-        ([0.0, 1.0, 0.0, 0.0, 0.0, 0.0], 0.2),
-        ([0.0, 0.0, 0.0, 0.5, 0.0, 0.0], 0.25),
-        ([0.3, 0.0, 0.4, 0.0, 0.0, 0.6], 0.3),
-    ):
-        assert capture._relative_difference(expected + change, expected) == pytest.approx(wanted)
-    still = np.array([0.0, 0.0, 0.0, 0.0, 2.0, 0.0])
-    assert capture._relative_difference(still, still) == 0.0
-    assert capture._relative_difference(still + np.eye(6)[0], still) == math.inf
-    # A small momentum counts as a large one.
-    assert capture._relative_difference(still / 1e4, still / 2e4) == pytest.approx(1.0)
-
-
-def test_poses_are_relative_to_the_first_frame() -> None:
-    first, second = Rotation.random(2, random_state=4)
-    r, s = np.array([1.0, 2.0, -3.0]), np.array([0.5, -1.0, 4.0])
-    still = np.zeros(3)
-    pose = capture._relative_pose(
-        BodyMotion(first.as_matrix(), r, still, still),
-        BodyMotion(second.as_matrix(), s, still, still),
-    )
-    np.testing.assert_allclose(pose.R, (first.inv() * second).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(pose.r, first.inv().apply(s - r), atol=1e-12)
-
-
 def test_targets_float_where_no_parameter_says_otherwise() -> None:
     config = configured(TargetConfig, {})
     assert not config.given
@@ -455,26 +205,3 @@ def test_covariances_are_those_of_the_noise_on_the_diagonals() -> None:
         np.testing.assert_array_equal(found.reshape(6, 6), np.diag(diagonal))
     assert made.used
     assert not made.dropout
-
-
-def test_links_that_a_robot_has_not_are_refused() -> None:
-    robot = SpaceRobot.from_file(robot_file("sliding_masses"))
-    links = list(robot.link_names)
-    assert sensors._link_indices(robot, (links[2], links[0])) == [2, 0]
-    assert sensors._link_indices(robot, ()) == []
-    known = ", ".join(links)
-    for call, sentence in (
-        (lambda: sensors._link_indices(robot, ("claw",)),
-         f"Parameter 'end_effectors' names 'claw', but the robot has no such link; "
-         f"it has {known}."),
-        (lambda: sensors._link_indices(robot, (links[1], links[1])),
-         "Parameter 'end_effectors' names links with one topic NAME/pose: "
-         f"{links[1]}, {links[1]}; name each once."),
-        (lambda: sensors._end_effector_index(robot, "claw"),
-         f"Parameter 'end_effector_frame' is 'claw', but the robot has no such link; "
-         f"it has {known}."),
-    ):  # fmt: skip
-        with pytest.raises(ParameterError) as refusal:
-            call()
-        assert str(refusal.value) == sentence
-    assert sensors._end_effector_index(robot, links[2]) == 2
