@@ -123,27 +123,27 @@ servicing-campaign: $(STAMP)/test ## fly DRAWS draws of the campaign servicing; 
 CLEAR_GOALS ?= 50
 .PHONY: clear-plans
 clear-plans: $(STAMP)/test ## plan CLEAR_GOALS random goals each of six robots with and without clearance, and list distances
-	SPACEROBOT_CLEAR_GOALS=$(CLEAR_GOALS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_clear_plans.py
+	SPACEROBOT_CLEAR_GOALS=$(CLEAR_GOALS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k "random_goals or clearance_costs"
 
 DRIFTING_CASES ?= 7
 .PHONY: drifting-plans
 drifting-plans: $(STAMP)/test ## plan DRIFTING_CASES random cases each of three robots and three drifts, flown by Pinocchio, and list durations
-	SPACEROBOT_DRIFTING_CASES=$(DRIFTING_CASES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_drifting_plans.py
+	SPACEROBOT_DRIFTING_CASES=$(DRIFTING_CASES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_drift.py -k robots_that_drift_are_planned_for
 
 FLOWN_TIMES ?= 10
 .PHONY: flown-times
 flown-times: $(STAMP)/test ## compare the times of FLOWN_TIMES plans each of ten robots with those of the solutions
-	SPACEROBOT_FLOWN_TIMES=$(FLOWN_TIMES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_flown_times.py
+	SPACEROBOT_FLOWN_TIMES=$(FLOWN_TIMES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k flown_times
 
 LONG_SEARCHES ?= 12
 .PHONY: long-searches
 long-searches: $(STAMP)/test ## compare the durations of LONG_SEARCHES plans each of three robots, with a position or a shape, with those of searches from 60 guesses
-	SPACEROBOT_LONG_SEARCHES=$(LONG_SEARCHES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_long_searches.py
+	SPACEROBOT_LONG_SEARCHES=$(LONG_SEARCHES) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k long_searches
 
 CLEAR_FLIGHTS ?= 100
 .PHONY: clear-flights
 clear-flights: $(STAMP)/test ## fly CLEAR_FLIGHTS draws each of four robots with noise, wrong masses and corrections, and list the smallest distances
-	SPACEROBOT_CLEAR_FLIGHTS=$(CLEAR_FLIGHTS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_clear_flights.py
+	SPACEROBOT_CLEAR_FLIGHTS=$(CLEAR_FLIGHTS) $(BIN)/python3 -m pytest -q -s -m slow test/planning/test_many_plans.py -k flights_with_errors
 
 COUNT ?= 2000
 SEED ?= 1

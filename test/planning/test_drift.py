@@ -1,8 +1,11 @@
-"""Plans of ``optimal`` at momentum that is not zero, and the functions behind them."""
+"""Plans of robots with momentum: from drifting bases, and made while the base drifts."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,18 +13,30 @@ import pytest
 from planning.drifting import END_ERROR, angle_between, flown_by_pinocchio
 from planning.test_optimal import ARM_START, FOLDER
 from scipy.spatial.transform import Rotation
+from support.planner_loop import TICK, TICK_NS, Loop, StubMethod, goal_at
 from support.planners import planner_of
 
-from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError
+from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import attitude_error, matrices_from_quaternions
+from spacerobot_ros.model.rotations import (
+    attitude_error,
+    matrices_from_quaternions,
+    quaternion_from_rotvec,
+    quaternion_multiply,
+    rotvec_from_quaternion,
+)
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, plan
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts
+from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.optimal.held_commands import DriftVariation
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
+from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation import InitialState
 
 ATTITUDE = Rotation.from_rotvec([0.4, -0.3, 0.7]).as_quat()
 NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
@@ -217,3 +232,196 @@ def test_a_momentum_counts_where_a_method_for_robots_at_rest_refuses_it(
         counts.append(refused)
     assert counts == sorted(counts)
     assert len(set(counts)) == 2
+
+
+# -- plans in the background for robots that drift: each begins where the base is by then --------
+
+
+VELOCITY = np.array([0.004, -0.003, 0.002])
+"""Of the centre of mass, m/s: in 2 s it moves ten times as far as the tolerance."""
+
+GOAL = ([0.04, -0.03, 0.02], [0.0, 0.0, 0.0])
+
+
+class Coasting(StubMethod):
+    """Slides the base relative to a centre of mass that coasts."""
+
+    def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
+        velocity = request.state.linear_momentum / self.robot.total_mass
+        there = request.goal.position - velocity * self.ticks * TICK
+        moved = replace(request, goal=replace(request.goal, position=there))
+        schedule = super().plan(moved, cancellation)
+        path = schedule.path
+        drifted = path.position + np.outer(path.time, velocity)
+        return replace(schedule, goal=request.goal, path=replace(path, position=drifted))
+
+
+def loop_of(**parameters: object) -> Loop:
+    mass = Coasting().robot.total_mass
+    momentum = InitialState(linear_momentum=VELOCITY * mass)
+    given = {"max_corrections": 0, "position_tolerance": 8e-4, **parameters}
+    return Loop(given, method=Coasting(20), initial=momentum, held=True)
+
+
+def test_a_plan_begins_with_a_rest_while_which_it_is_made() -> None:
+    loop = loop_of()
+    loop.tick(3)
+    loop.propose_goal(goal_at(GOAL))
+    loop.tick(18)
+    loop.held.release()
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert status.state is PlannerState.REACHED, status.message
+    (start,) = loop.starts
+    assert start.stamp_ns == 3 * TICK_NS
+    rests = 40
+    positions = start.schedule.positions
+    np.testing.assert_array_equal(positions[: rests + 1], np.tile(positions[0], (rests + 1, 1)))
+    assert np.abs(positions[rests + 1] - positions[0]).max() > 0
+    assert not any(loop.speeds[: 3 + rests])
+    assert loop.speeds[3 + rests] > 0
+    ahead = loop.plant.pose[:3] - goal_at(GOAL).position
+    assert np.linalg.norm(ahead) < 8e-4
+
+
+@pytest.mark.parametrize("late", [41, 67])
+def test_a_plan_that_comes_too_late_is_made_again(late: int) -> None:
+    loop = loop_of()
+    loop.propose_goal(goal_at(GOAL))
+    loop.tick(late + 1)
+    loop.held.release()
+    loop.tick(2)
+    assert loop.states == []
+    (told,) = [each for each in loop.notices if "made again" in each]
+    assert f"The plan came {(late + 1) * TICK - 2.0:.3g} s after its start" in told
+    loop.held.release()
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert status.state is PlannerState.REACHED, status.message
+    (start,) = loop.starts
+    assert start.stamp_ns == 0
+    # Twice the time that planning took.
+    assert len(start.schedule.positions) - 1 - 20 == 2 * (late + 1)
+    assert np.linalg.norm(loop.plant.pose[:3] - goal_at(GOAL).position) < 8e-4
+
+
+def test_planning_that_takes_too_long_is_refused() -> None:
+    loop = loop_of()
+    loop.propose_goal(goal_at(GOAL))
+    loop.tick(601 * 20)
+    loop.held.release()
+    loop.tick(2)
+    status = loop.statuses[-1]
+    assert status.state is PlannerState.REFUSED
+    assert "601 s of planning were not enough" in status.message
+
+
+def test_a_correction_begins_with_a_rest_too() -> None:
+    loop = loop_of(max_corrections=1)
+    method = loop.held._method
+    assert isinstance(method, Coasting)
+    method.overshoot = 0.2
+    loop.propose_goal(goal_at(GOAL))
+    loop.tick(2)
+    loop.held.release()
+    for _ in range(200):
+        loop.tick()
+        if len(loop.held.tasks) == 2:
+            break
+    method.overshoot = 0.0
+    loop.tick(11)
+    loop.held.release()
+    status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
+    assert status.state is PlannerState.REACHED, status.message
+    second = loop.starts[1].schedule
+    np.testing.assert_array_equal(second.positions[40], second.positions[0])
+    assert len(second.positions) == 61
+
+
+def test_a_robot_at_rest_begins_at_once() -> None:
+    loop = Loop(method=StubMethod(), held=True)
+    loop.propose_goal(goal_at(GOAL))
+    loop.tick(7)
+    loop.held.release()
+    loop.until(PlannerState.REACHED)
+    (start,) = loop.starts
+    assert (start.schedule.ticks, start.stamp_ns) == (8, 7 * TICK_NS)
+
+
+# -- random cases of robots that drift: most are planned, and Pinocchio ends where plans ---------
+
+
+CASES = int(os.environ.get("SPACEROBOT_DRIFTING_CASES", "1"))
+"""Cases of each robot and drift."""
+
+ROBOTS = ("three_joint_arm", "seven_joint_arm", "servicer")
+
+LEAST_PLANNED = {3.0: 0.95, 10.0: 0.95, 30.0: 0.80}
+"""Least share of planned cases by the drift over the manoeuvre, deg."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A start that drifts and a goal, from which a robot at rest takes ``at_rest`` s, CPU ``cpu``
+    s."""
+
+    robot: SpaceRobot
+    state: RobotState
+    rotvec: np.ndarray
+    at_rest: float
+    cpu: float
+
+
+def cases(name: str, drift: float, count: int) -> Iterator[Case]:
+    robot = SpaceRobot.from_file(robot_file(name))
+    rng = np.random.default_rng([ROBOTS.index(name), round(drift), 2026])
+    low, high = np.maximum(robot.lower, -0.6), np.minimum(robot.upper, 0.6)
+    found = 0
+    while found < count:
+        q, quaternion = rng.uniform(low, high), quaternion_from_rotvec(rng.normal(size=3))
+        turn, about = rng.normal(size=(2, 3))
+        turn *= rng.uniform(0.05, 0.5) / np.linalg.norm(turn)
+        goal = quaternion_from_rotvec(turn)
+        p = rng.normal(size=3) * 0.01 * robot.total_mass
+        rotvec = rotvec_from_quaternion(quaternion_multiply(quaternion, goal))
+        rest = RobotState(rng.normal(size=3), quaternion, q)
+        began = time.process_time()
+        try:
+            schedule = plan(robot, rotvec=rotvec, start=rest, cache=0, base_position=2)
+        except PlanningError:
+            continue
+        cpu = time.process_time() - began
+        omega = about / np.linalg.norm(about) * np.radians(drift) / schedule.duration
+        L = robot.momentum(quaternion, q, np.zeros(3), omega, np.zeros(robot.n))[1]
+        state = RobotState(rest.position, quaternion, q, p, L)
+        found += 1
+        yield Case(robot, state, rotvec, schedule.duration, cpu)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drift", LEAST_PLANNED)
+def test_robots_that_drift_are_planned_for(drift: float) -> None:
+    planned, count = 0, 0
+    for name in ROBOTS:
+        for case in cases(name, drift, CASES):
+            count += 1
+            began = time.process_time()
+            try:
+                schedule = plan(
+                    case.robot, rotvec=case.rotvec, start=case.state, cache=0, base_position=2
+                )
+            except (NotFoundError, UnreachableError) as refusal:
+                print(f"{name}, {drift:g} deg: {refusal}", flush=True)
+                continue
+            cpu = time.process_time() - began
+            r_WB, quaternion = flown_by_pinocchio(name, schedule, case.state)
+            off = angle_between(quaternion, schedule.path.quaternion[-1])
+            missed = angle_between(quaternion, quaternion_from_rotvec(case.rotvec))
+            print(
+                f"{name}, {drift:g} deg: {schedule.duration:.4g} s, {case.at_rest:.4g} s at rest; "
+                f"CPU {cpu:.3g} s, {case.cpu:.3g} s at rest; off by {off:.1e} rad",
+                flush=True,
+            )
+            assert max(off, missed) < END_ERROR
+            np.testing.assert_allclose(r_WB, schedule.path.position[-1], atol=END_ERROR)
+            planned += 1
+    print(f"{drift:g} deg: planned {planned} of {count}", flush=True)
+    assert planned >= LEAST_PLANNED[drift] * count - (CASES < 7)

@@ -1,4 +1,4 @@
-"""What a plant reports of itself, without ROS: each change once, with its reason."""
+"""What a plant reports of itself, who drives its time, and how plans are tried in it."""
 
 from __future__ import annotations
 
@@ -6,15 +6,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from support.planner_loop import QUICK, TICK, StubMethod, goal_at, robot_of
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.parameters import configured
+from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.actuators import build_plant
+from spacerobot_ros.simulation import InitialState
+from spacerobot_ros.simulation.actuators import PLANTS, build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
+from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
+from spacerobot_ros.simulation.trials import PlanningProblem, random_goals, try_goals, try_method
 
 SECOND = 10**9
 SLIDERS = SpaceRobot.from_file(robot_file("sliding_masses"))
@@ -202,3 +210,236 @@ def test_a_status_is_ok_only_without_faults_timeouts_and_latches(
     stopped = state in (PlantState.LATCHED, PlantState.FAILED) or bool(latched)
     assert status.level == (2 if stopped else 1 if faults or reason == "timeout" else 0)
     assert PlantStatus.from_values(status.to_values()).level == status.level
+
+
+# -- who drives the time: looks of a plant in lockstep, and the bookkeeping of one in ------------
+
+
+MS = 1_000_000
+
+
+def test_a_plant_without_a_pose_steps_at_its_second_look_in_a_tick() -> None:
+    config = PlantConfig(time_mode="lockstep")
+    plant = build_plant(SpaceRobot.from_file(robot_file("sliding_masses")), config)
+    commands = CommandValidator(plant, config)
+    for first in (0, 1, 2):
+        assert not Lockstep(commands).must_step_at_check(first, pose_lost=True), "its first look"
+    time = Lockstep(commands)
+    assert not time.may_step
+    assert [time.must_step_at_check(3, pose_lost=True), time.waits] == [False, False]
+    assert [time.must_step_at_check(3, pose_lost=False), time.waits] == [False, True]
+    assert [time.must_step_at_check(3, pose_lost=True), time.waits] == [True, True]
+    assert [time.must_step_at_check(4, pose_lost=True), time.waits] == [False, False]
+    commands.sources[0].arrived = True
+    assert time.may_step
+    assert time.must_step_at_check(5, pose_lost=False)
+
+
+def test_ticks_are_due_by_the_clock_two_at_a_time_and_ten_at_most() -> None:
+    time = RealTime(10 * MS, factor=2.0)
+    assert time.period == pytest.approx(0.005)
+    time.start(1000 * MS, 7)
+    # The state of tick 7 is due at 1000 ms, the next ones every 5 ms.
+    for now, tick, wanted in (
+        (1000, 7, 0),
+        (1004, 7, 0),
+        (1005, 7, 1),
+        (1009, 8, 0),
+        (1010, 7, 2),
+        (1015, 7, 2),
+        (1015, 9, 1),
+        (1050, 7, 2),
+    ):
+        assert time.due_ticks(now * MS, tick) == wanted, (now, tick)
+    assert time.ticks_lost == 0
+    assert time.due_ticks(1065 * MS, 7) == 2
+    assert time.ticks_lost == 3, "13 behind, ten are made up"
+    assert time.due_ticks(1065 * MS, 17) == 0
+    assert time.due_ticks(1070 * MS, 17) == 1
+
+
+def test_reports_count_ticks_and_answers_since_the_start_and_the_rate_since_the_last() -> None:
+    time = RealTime(10 * MS)
+    time.start(0, 0)
+    for tick in range(5):
+        # After tick k its successor is due at 10 (k + 1) ms, and late from 10 (k + 2) ms on.
+        time.count_tick((10 * (tick + 1) + (12 if tick == 3 else 0)) * MS, tick)
+    first = time.report()
+    assert first.tick_rate == pytest.approx(5 / 0.05)
+    assert (first.ticks, first.ticks_late) == (5, 1)
+    assert first.worst_tick == pytest.approx(0.002)
+    assert first.worse
+    time.count_command(45 * MS, 40 * MS)
+    time.count_command(46 * MS, 40 * MS)
+    time.count_command(66 * MS, 50 * MS)
+    for tick in range(5, 9):
+        time.count_tick((50 + 20 * (tick - 4)) * MS, tick)
+    second = time.report()
+    assert second.tick_rate == pytest.approx(4 / 0.08)
+    assert second.ticks == 9
+    assert (second.commands, second.commands_late) == (2, 1)
+    assert second.worst_command == pytest.approx(0.006)
+    assert second.command_age == pytest.approx(0.03)
+    assert second.worse
+    third = time.report()
+    assert (third.tick_rate, third.ticks, third.worse) == (0.0, 9, False)
+
+
+# -- plans that are tried in the plant: when a manoeuvre is at its end, and what random ----------
+
+
+AWAY = goal_at(([0.05, -0.03, 0.02], [0.0, 0.0, 0.0]))
+
+
+def problem(robot: str = "sliding_masses", **start: Any) -> PlanningProblem:
+    config = configured(PlannerConfig, {**QUICK, "position_tolerance": 1e-3})
+    return PlanningProblem("a test", robot_of(robot), InitialState(**start), AWAY, config)
+
+
+class Halves(StubMethod):
+    """Goes half of the way with each schedule; ``enough`` of them reach the goal."""
+
+    enough = 1000
+
+    def plan(self, request: PlanRequest, *_: Any) -> GaitSchedule:
+        self.partial = True
+        self.overshoot = 1.0 if len(self.requests) + 1 >= self.enough else 0.0
+        return super().plan(request)
+
+
+def test_partial_schedules_follow_each_other_until_the_goal_is_reached() -> None:
+    method = Halves(ticks=20)
+    trial = try_method(problem(), "stub", method)
+    # 0.0616 m halved six times is less than 1 mm.
+    assert (len(trial.pieces), trial.reached, trial.limited) == (6, True, 0)
+    assert trial.error.distance == pytest.approx(0.03082207 / 32, rel=1e-5)
+    assert trial.duration == pytest.approx(6 * 20 * TICK)
+    assert trial.positions.shape == (121, 3)
+    assert [request.correction for request in method.requests] == [False] + 5 * [True]
+    assert method.requests[0].previous is None
+    assert [r.previous for r in method.requests[1:]] == [*trial.pieces[:-1]]
+    time = trial.path.time
+    assert (time[0], time[-1]) == (0.0, pytest.approx(6.0))
+    assert np.all(np.diff(time) >= 0)
+
+
+def test_what_has_reached_the_goal_goes_no_further_though_it_is_partial() -> None:
+    method = Halves(ticks=40)
+    method.enough = 1
+    trial = try_method(problem(), "stub", method)
+    assert (len(trial.pieces), trial.reached) == (1, True)
+
+
+def test_a_whole_schedule_is_the_last_one_though_it_misses() -> None:
+    method = StubMethod(ticks=40)
+    method.overshoot = 0.1
+    trial = try_method(problem(), "stub", method)
+    assert (len(trial.pieces), trial.reached) == (1, False)
+    assert trial.error.distance == pytest.approx(0.1 * np.linalg.norm(AWAY.position), rel=1e-6)
+
+
+@pytest.mark.parametrize(("robot", "axes"), [("sliding_masses", 3), ("planar_chain", 1)])
+def test_random_goals_are_spread_evenly_over_a_ball_and_over_angles(robot: str, axes: int) -> None:
+    at = problem(robot, position=(0.3, -0.2, 0.5))
+    pose = at.plant().pose
+    goals = random_goals(at, 600, 0.4, 0.7)
+    offsets = np.array([goal.position for goal in goals]) - pose[:3]
+    radii = np.linalg.norm(offsets, axis=1)
+    assert radii.max() <= 0.4
+    # Of the volume: the share within r is (r / 0.4)^3.
+    shares = np.sort((radii / 0.4) ** 3)
+    assert np.abs(shares - (np.arange(600) + 0.5) / 600).max() < 0.06
+    assert np.abs(offsets.mean(axis=0)).max() < 0.04
+    turns = Rotation.from_quat(pose[3:]).inv() * Rotation.from_quat([g.quaternion for g in goals])
+    angles = turns.magnitude()
+    assert angles.max() <= 0.7
+    assert np.abs(np.sort(angles / 0.7) - (np.arange(600) + 0.5) / 600).max() < 0.06
+    spread = np.linalg.svd(turns.as_rotvec(), compute_uv=False)
+    assert np.count_nonzero(spread > 0.1 * spread[0]) == axes
+    # To either side.
+    assert np.abs(turns.as_rotvec().mean(axis=0)).max() < 0.04
+    again = random_goals(at, 3, 0.4, 0.7)
+    assert all(np.array_equal(a.position, b.position) for a, b in zip(goals, again, strict=False))
+    for bounds in ((np.nan, 0.7), (0.4, np.inf), (-0.1, 0.7), (0.4, -0.7)):
+        with pytest.raises(ParameterError, match="Random goals lie within"):
+            random_goals(at, 3, *bounds)
+
+
+def test_goals_are_counted_by_what_became_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are reached within 1e-5, whatever the tolerance of the planner is."""
+    method = StubMethod(ticks=40)
+    monkeypatch.setattr(PlanningProblem, "method", lambda self, name: method)
+    far = Goal(np.array([2.0, 0.0, 0.0]), AWAY.quaternion)
+    lines: list[str] = []
+
+    def show(line: str) -> None:
+        lines.append(line)
+        method.overshoot = 1e-2
+
+    (record,) = try_goals(problem(), [AWAY, far, AWAY], ["stub"], show)
+    assert (record.reached, record.missed, record.refused) == (1, 1, ["It is too far."])
+    assert len(record.durations) == len(record.plan_times) == 2
+    assert record.durations == pytest.approx([2.0, 2.0])
+    assert lines[0].startswith("goal 1, stub: 2 s, ")
+    assert lines[1] == "goal 2, stub: It is too far."
+    assert lines[2].endswith(f" rad and {1e-2 * np.linalg.norm(AWAY.position):.2g} m off")
+
+
+def test_a_method_that_refuses_is_no_trial() -> None:
+    method = StubMethod()
+    method.refusing = True
+    with pytest.raises(PlanningError, match="too far"):
+        try_method(problem(), "stub", method)
+
+
+# -- plants from their configuration: which steps are refused, and what the steps do -------------
+
+
+ARM = SpaceRobot.from_file(robot_file("three_joint_arm"))
+
+
+def config(**parameters: Any) -> PlantConfig:
+    return PlantConfig(**{"tick_rate": 10.0, **parameters})
+
+
+@pytest.mark.parametrize("step", [0.9e-5, 1e-300])
+def test_steps_that_lose_more_than_they_gain_are_refused(step: float) -> None:
+    with pytest.raises(ParameterError, match=r"must be 0 .* or at least 1e-05 s"):
+        build_plant(ARM, config(integration_step=step))
+
+
+def test_more_steps_in_a_tick_than_anybody_waits_for_are_refused() -> None:
+    with pytest.raises(ParameterError, match=r"more than 1e\+06 steps in a tick of 10.1 s"):
+        build_plant(ARM, config(tick_rate=1 / 10.1, integration_step=1e-5))
+
+
+def test_steps_of_the_configuration_are_taken() -> None:
+    """One Runge-Kutta step of half a second is off by its fifth power; shorter ones are not."""
+    ends = {}
+    for step in (0.0, 0.5, 0.25, 0.01):
+        plant = build_plant(
+            ARM, config(tick_rate=2.0, integration_step=step, angular_momentum=(30.0, -50.0, 40.0))
+        )
+        for _ in range(4):
+            plant.step(np.array([0.4, -0.3, 0.45]))
+        ends[step] = plant.pose[3:].copy()
+    exact = ends[0.01]
+    errors = {step: float(np.abs(end - exact).max()) for step, end in ends.items()}
+    assert errors[0.5] > 4 * errors[0.25] > 4e-9
+    assert errors[0.0] < errors[0.25], "the default is a short step"
+
+
+def test_an_initial_state_takes_the_place_of_that_of_the_configuration() -> None:
+    given = config(initial_joint_positions=(0.1, -0.2, 0.3), initial_position=(1.0, 2.0, 3.0))
+    assert build_plant(ARM, given).q.tolist() == [0.1, -0.2, 0.3]
+    other = InitialState(joint_positions=np.array([0.3, -0.1, 0.2]))
+    assert build_plant(ARM, given, other).q.tolist() == [0.3, -0.1, 0.2]
+
+
+def test_thrusters_need_a_plant_that_takes_a_wrench() -> None:
+    assert {name: kind.wrench for name, kind in PLANTS.items()} == {
+        "velocity": False,
+        "effort": True,
+    }
+    with pytest.raises(ParameterError, match="has no wrench on the base"):
+        build_plant(ARM, config(actuation="velocity", thrusters="urdf"))
