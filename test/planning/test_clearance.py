@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from spacerobot_ros.collision import CollisionGeometry
+from spacerobot_ros.collision.nearest import Approach
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.description import Array
@@ -26,7 +27,7 @@ from spacerobot_ros.planning import (
     method_options,
     plan,
 )
-from spacerobot_ros.planning.core.clearance import Approach, Clearance
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -93,7 +94,7 @@ def test_optimal_goes_round_a_contact(arm: SpaceRobot, distance: float) -> None:
 
 
 def test_where_no_clear_way_is_fast_enough_the_fastest_is_named(arm: SpaceRobot) -> None:
-    few = {"starts": 4, "answers": 1, "intervals": 12, "cache": 0, "control_period": 0.1}
+    few: dict[str, Any] = {**QUICK, "starts": 4, "intervals": 12, "control_period": 0.1}
     turn, start = (0.09, -0.26, -0.21), np.zeros(3)
     with pytest.raises(PlanningError, match=r"= 4\.5 s: the fastest that was found takes 5"):
         plan(arm, rotvec=turn, start=start, clearance=0.03, longest=4.5, **few)

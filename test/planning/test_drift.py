@@ -207,7 +207,7 @@ def test_where_nothing_is_found_the_passes_of_a_drifting_goal_are_tried_before(
 
 def test_a_base_that_coasts_turns_where_its_position_does_not_count() -> None:
     few = {**QUICK, "starts": 2, "intervals": 20}
-    turn = {"rotvec": (0.0, 0.0, 0.3), "base_position": 2}
+    turn: dict[str, Any] = {"rotvec": (0.0, 0.0, 0.3), "base_position": 2}
     still = plan("planar_chain", **turn, **few)
     coasting = plan("planar_chain", **turn, linear_momentum=[0.3, -0.2, 0.0], **few)
     np.testing.assert_allclose(coasting.positions, still.positions, atol=1e-9)

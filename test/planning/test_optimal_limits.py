@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -274,6 +275,18 @@ def test_a_goal_that_takes_too_long_is_refused(arm: SpaceRobot) -> None:
 def test_bad_options_are_refused(arm: SpaceRobot, options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         of_arm(arm, [0, 0, 0.1], **options)
+
+
+def test_joints_without_a_velocity_limit_are_refused_with_the_remedies() -> None:
+    text = (FOLDER / "planar_chain.urdf").read_text("utf-8").replace("revolute", "continuous")
+    free = SpaceRobot.from_urdf(re.sub(r"<limit[^>]*/>", "", text))
+    with pytest.raises(ParameterError) as refusal:
+        plan(free, rotvec=[0, 0, 0.2], **QUICK)
+    assert str(refusal.value) == (
+        "Joint 'pin_1' has no velocity limit, within which optimal plans: give it "
+        '<limit velocity="..." effort="..."/> in the URDF, or optimal.max_velocity.'
+    )
+    assert plan(free, rotvec=[0, 0, 0.2], max_velocity=[0.5, 0.5], **QUICK).ticks > 0
 
 
 def test_a_start_that_breaks_a_constraint_is_refused(arm: SpaceRobot) -> None:
