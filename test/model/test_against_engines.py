@@ -295,15 +295,22 @@ def case_of(urdf: str, rng: np.random.Generator) -> LoadedCase:
 
 
 @cache
-def random_case_of_composite_rigid_body(seed: int) -> LoadedCase:
+def random_loaded_case(seed: int) -> LoadedCase:
     rng = np.random.default_rng(seed)
     return case_of(random_robot_urdf(rng, joints=3 + seed % 4), rng)
 
 
-def test_the_inertia_matrix_is_the_barycentric_one(case: LoadedCase) -> None:
-    kin = tree_kinematics(case.robot.description)
+@pytest.fixture(params=SEEDS, ids=lambda seed: f"robot{seed}")
+def loaded(request: pytest.FixtureRequest) -> LoadedCase:
+    return random_loaded_case(request.param)
+
+
+def test_the_inertia_matrix_is_the_barycentric_one(loaded: LoadedCase) -> None:
+    kin = tree_kinematics(loaded.robot.description)
     paper = ca.Function("H", [kin.q], [barycentric_inertia(kin).H_plus])
-    assert_agrees(case.robot.inertia_matrix(case.motion.q), paper(case.motion.q).full(), 1e-13)
+    assert_agrees(
+        loaded.robot.inertia_matrix(loaded.motion.q), paper(loaded.motion.q).full(), 1e-13
+    )
 
 
 def test_a_chain_of_24_joints_takes_few_operations() -> None:
@@ -320,61 +327,69 @@ def test_a_chain_of_24_joints_takes_few_operations() -> None:
     assert ca.Function("locked", [kin.q], ca.cse([parts.D, parts.D_q])).n_instructions() < 10_000
 
 
-def test_same_as_the_paper(case: LoadedCase) -> None:
-    assert_agrees(case.dynamics(), case.robot.forward_dynamics(*case.arguments()), 1e-12)
+def test_same_as_the_paper(loaded: LoadedCase) -> None:
+    assert_agrees(loaded.dynamics(), loaded.robot.forward_dynamics(*loaded.arguments()), 1e-12)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_same_as_the_engines(case: LoadedCase, engine: type) -> None:
-    oracle = engine(case.urdf, case.robot.joint_names)
-    assert_agrees(case.dynamics(), oracle.forward_dynamics(case.motion, case.wrench_B, case.tau))
+def test_same_as_the_engines(loaded: LoadedCase, engine: type) -> None:
+    oracle = engine(loaded.urdf, loaded.robot.joint_names)
+    assert_agrees(
+        loaded.dynamics(), oracle.forward_dynamics(loaded.motion, loaded.wrench_B, loaded.tau)
+    )
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_bodies_with_axes_of_symmetry(engine: type) -> None:
     """They are built from fewer directions than others."""
-    case = case_of(SERVICER.read_text(encoding="utf-8"), np.random.default_rng(21))
-    oracle = engine(case.urdf, case.robot.joint_names)
-    assert_agrees(case.dynamics(), oracle.forward_dynamics(case.motion, case.wrench_B, case.tau))
+    loaded = case_of(SERVICER.read_text(encoding="utf-8"), np.random.default_rng(21))
+    oracle = engine(loaded.urdf, loaded.robot.joint_names)
+    assert_agrees(
+        loaded.dynamics(), oracle.forward_dynamics(loaded.motion, loaded.wrench_B, loaded.tau)
+    )
 
 
 @pytest.mark.parametrize("joints", [0, 1, 2, 12])
 def test_chains(joints: int) -> None:
     rng = np.random.default_rng(100 + joints)
-    case = case_of(random_chain_urdf(rng, joints), rng)
-    assert_agrees(case.dynamics(), case.robot.forward_dynamics(*case.arguments()), 1e-12)
+    loaded = case_of(random_chain_urdf(rng, joints), rng)
+    assert_agrees(loaded.dynamics(), loaded.robot.forward_dynamics(*loaded.arguments()), 1e-12)
 
 
-def test_shape_equations_are_the_schur_complement(case: LoadedCase) -> None:
+def test_shape_equations_are_the_schur_complement(loaded: LoadedCase) -> None:
     """Of the paper's ``H+`` with respect to the base, at momenta that do not matter."""
-    robot, n = case.robot, case.robot.n
+    robot, n = loaded.robot, loaded.robot.n
     x = np.zeros(2 * n + 13)
     shape, attitude, rates, *_ = state_slices(n)
-    x[shape], x[attitude], x[rates] = case.motion.q, case.motion.quaternion_WB, case.motion.qdot
+    x[shape], x[attitude], x[rates] = (
+        loaded.motion.q,
+        loaded.motion.quaternion_WB,
+        loaded.motion.qdot,
+    )
     K, _ = robot.buffered("shape_equations")(x, np.zeros(n + 6))
-    H = robot.inertia_matrix(case.motion.q)
+    H = robot.inertia_matrix(loaded.motion.q)
     assert_agrees(K, H[6:, 6:] - H[6:, :6] @ np.linalg.solve(H[:6, :6], H[:6, 6:]), 1e-12)
     assert_agrees(K, K.T, 0.0)
 
 
-def test_shape_forces_from_the_papers_acceleration(case: LoadedCase) -> None:
+def test_shape_forces_from_the_papers_acceleration(loaded: LoadedCase) -> None:
     """``K qddot`` at the momenta of the state is ``Q``."""
-    robot, m = case.robot, case.motion
+    robot, m = loaded.robot, loaded.motion
     L_W = matrix_from_quaternion(m.quaternion_WB) @ robot.inertia_matrix(m.q)[3:6] @ m.z0dot
     x = np.concatenate([m.q, m.quaternion_WB, m.qdot, np.zeros(3), L_W, np.zeros(3)])
-    K, Q = robot.buffered("shape_equations")(x, np.concatenate([case.tau, case.wrench_B]))
-    assert_agrees(K @ robot.forward_dynamics(*case.arguments())[6:], Q, 1e-12)
+    K, Q = robot.buffered("shape_equations")(x, np.concatenate([loaded.tau, loaded.wrench_B]))
+    assert_agrees(K @ robot.forward_dynamics(*loaded.arguments())[6:], Q, 1e-12)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_efforts_of_a_motion_at_zero_momentum(case: LoadedCase, engine: type) -> None:
+def test_efforts_of_a_motion_at_zero_momentum(loaded: LoadedCase, engine: type) -> None:
     """An engine's robot at zero momentum accelerates under them as they were asked for."""
-    robot, n = case.robot, case.robot.n
-    oracle = engine(case.urdf, robot.joint_names)
-    H = oracle.mass_matrix(case.motion)
-    qdot, qddot = case.motion.qdot, np.linspace(2.0, -3.0, n)
+    robot, n = loaded.robot, loaded.robot.n
+    oracle = engine(loaded.urdf, robot.joint_names)
+    H = oracle.mass_matrix(loaded.motion)
+    qdot, qddot = loaded.motion.qdot, np.linspace(2.0, -3.0, n)
     omega = -np.linalg.solve(H[3:6, 3:6], H[3:6, 6:] @ qdot)
-    motion = replace(case.motion, v_cm_B=np.zeros(3), omega_WB_B=omega)
+    motion = replace(loaded.motion, v_cm_B=np.zeros(3), omega_WB_B=omega)
     tau = robot.joint_efforts(motion.q, qdot, qddot)
     reached = oracle.forward_dynamics(motion, np.zeros(6), tau)
     assert_agrees(reached[6:], qddot, 1e-9)
@@ -389,7 +404,7 @@ def test_costs_less_than_half_of_the_papers() -> None:
 
 
 def test_compiled_numbers(compiled_code: Path) -> None:
-    interpreted = random_case_of_composite_rigid_body(0)
+    interpreted = random_loaded_case(0)
     robot = SpaceRobot(interpreted.robot.description)
     function = robot.function("dynamics")
     assert function.class_name() == "External"
