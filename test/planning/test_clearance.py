@@ -260,7 +260,7 @@ def test_a_clear_path_keeps_to_the_planes_between_its_links() -> None:
     )
     no_turn = np.array([0.0, 0.0, 0.0, 1.0])
     boundary = BoundaryConditions(away, no_turn, near, near)
-    kept = library.begin(boundary, turn_is_known=True).by_planes()
+    kept = library.begin(boundary, turn_is_known=True)
     s = np.linspace(0.0, 1.0, 41)[:, np.newaxis]
     path = Trajectory(
         0.05,

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from support.planner_loop import TICK, Loop
 from support.planner_phases import executing, resting, stub_of
 
-from spacerobot_ros.collision.rows import DistanceRows
+from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array, Pose
@@ -306,80 +306,38 @@ def test_a_worker_plans_among_the_obstacles_that_it_is_given(*, obstacles: bool)
 N = 2
 
 
-def rows_of_links() -> DistanceRows:
-    q, multiplier = ca.SX.sym("q", N), ca.SX.sym("lambda")
-    d = ca.sin(q[0]) * q[1] + q[0] ** 2
-    return DistanceRows(
-        ca.Function("d", [q], [d]),
-        ca.Function("J", [q], [ca.jacobian(d, q)]),
-        ca.Function("H", [q, multiplier], [ca.hessian(multiplier * d, q)[0]]),
-    )
-
-
-def rows_of_obstacles() -> DistanceRows:
-    y, w, multiplier = ca.SX.sym("y", N + 4), ca.SX.sym("w", 12), ca.SX.sym("lambda")
-    d = y[0] * y[3] + ca.cos(y[1]) * y[5] * w[2] + w[11] * y[2] * y[4]
-    return DistanceRows(
-        ca.Function("d", [y, w], [d]),
-        ca.Function("J", [y, w], [ca.jacobian(d, y)]),
-        ca.Function("H", [y, w, multiplier], [ca.hessian(multiplier * d, y)[0]]),
-        is_of_obstacle=True,
-    )
-
-
-def planes_of_links() -> DistanceRows:
+def planes_of_links() -> PlaneDistance:
     q, plane, multiplier = ca.SX.sym("q", N), ca.SX.sym("plane", 7), ca.SX.sym("lambda")
     d = ca.sin(q[0]) * q[1] * plane[1] + q[0] ** 2 - plane[3]
-    return DistanceRows(
+    return PlaneDistance(
         ca.Function("d", [q, plane], [d]),
         ca.Function("J", [q, plane], [ca.jacobian(d, q)]),
         ca.Function("H", [q, plane, multiplier], [ca.hessian(multiplier * d, q)[0]]),
-        is_plane=True,
     )
 
 
-def planes_of_obstacles() -> DistanceRows:
+def planes_of_obstacles() -> PlaneDistance:
     y, plane, multiplier = ca.SX.sym("y", N + 4), ca.SX.sym("plane", 7), ca.SX.sym("lambda")
     d = y[0] * y[3] + ca.cos(y[1]) * y[5] * plane[2] + plane[6] * y[2] * y[4]
-    return DistanceRows(
+    return PlaneDistance(
         ca.Function("d", [y, plane], [d]),
         ca.Function("J", [y, plane], [ca.jacobian(d, y)]),
         ca.Function("H", [y, plane, multiplier], [ca.hessian(multiplier * d, y)[0]]),
         is_of_obstacle=True,
-        is_plane=True,
     )
 
 
 H, START = 0.4, np.array([0.3, -0.7])
 V, V_NEXT = np.array([0.5, -0.2]), np.array([-0.1, 0.6])
 X, X_NEXT = np.array([0.1, -0.2, 0.3, 0.9]), np.array([0.2, -0.1, 0.25, 0.92])
-WORLD = np.linspace(-1.0, 1.2, 12)
-LEAST = np.array([0.05, -0.3])
 # The variable s of a knot is q + h v / 2.
 LACK = 0.03
 Z = np.concatenate([[H], X, START + H * V / 2, V, X_NEXT, V_NEXT, [LACK]])
-P = np.concatenate([LEAST, WORLD])
+PLANES = np.random.default_rng(5).normal(size=(3, 2, 7))
+ROWS = [planes_of_links(), planes_of_obstacles()]
 
 
 def by_hand(z: np.ndarray) -> np.ndarray:
-    """Return the rows at thirds of an interval in which velocities change linearly."""
-    h, X0, s, v, X1, v1, lack = z[0], z[1:5], z[5:7], z[7:9], z[9:13], z[13:15], z[15]
-    found = []
-    for tau in (1 / 3, 2 / 3, 1.0):
-        t = tau * h
-        q = s - h * v / 2 + v * t + (v1 - v) / h * t**2 / 2
-        turn = (1 - tau) * X0 + tau * X1
-        y = np.concatenate([q, turn])
-        found.append(np.sin(q[0]) * q[1] + q[0] ** 2 - LEAST[0] + lack)
-        of_obstacle = y[0] * y[3] + np.cos(y[1]) * y[5] * WORLD[2] + WORLD[11] * y[2] * y[4]
-        found.append(of_obstacle - LEAST[1] + lack)
-    return np.array(found)
-
-
-PLANES = np.random.default_rng(5).normal(size=(3, 2, 7))
-
-
-def planes_by_hand(z: np.ndarray) -> np.ndarray:
     """Return the rows at thirds of an interval in which velocities change linearly."""
     h, X0, s, v, X1, v1, lack = z[0], z[1:5], z[5:7], z[7:9], z[9:13], z[13:15], z[15]
     found = []
@@ -393,21 +351,8 @@ def planes_by_hand(z: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-Kind = tuple[list[DistanceRows], np.ndarray, Callable[[np.ndarray], np.ndarray]]
-KINDS = pytest.mark.parametrize(
-    "kind",
-    [
-        ([rows_of_links(), rows_of_obstacles()], P, by_hand),
-        ([planes_of_links(), planes_of_obstacles()], PLANES.ravel(), planes_by_hand),
-    ],
-    ids=["smooth", "planes"],
-)
-
-
-@KINDS
-def test_rows_are_those_of_the_shapes_between_the_knots(kind: Kind) -> None:
-    rows, p, by_hand = kind
-    block = _distance_block(N, rows, 3)
+def test_rows_are_those_of_the_shapes_between_the_knots() -> None:
+    block, p = _distance_block(N, ROWS, 3), PLANES.ravel()
     np.testing.assert_allclose(block.values(Z, p).full().ravel(), by_hand(Z), atol=1e-13)
     values, J = block.jacobian(Z, p)
     np.testing.assert_allclose(values.full().ravel(), by_hand(Z), atol=1e-13)
@@ -416,10 +361,8 @@ def test_rows_are_those_of_the_shapes_between_the_knots(kind: Kind) -> None:
     np.testing.assert_allclose(J.full(), np.column_stack(differences), atol=1e-8)
 
 
-@KINDS
-def test_second_derivatives_are_those_of_differences(kind: Kind) -> None:
-    rows, p, _ = kind
-    block = _distance_block(N, rows, 3)
+def test_second_derivatives_are_those_of_differences() -> None:
+    block, p = _distance_block(N, ROWS, 3), PLANES.ravel()
     multipliers = np.array([0.7, -1.2, 0.4, 2.0, -0.6, 1.1])
 
     def gradient(z: np.ndarray) -> np.ndarray:

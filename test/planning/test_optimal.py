@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,6 @@ from support.oracles import PinocchioOracle
 from support.planners import planner_of
 from support.urdf_text import link
 
-from spacerobot_ros.collision import CollisionGeometry
-from spacerobot_ros.collision.rows import DistanceRows
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, plan
@@ -370,57 +367,6 @@ def test_a_solution_from_moving_joints_turns_the_base_as_momentum_says(arm: Spac
         middle, move = (q + q_next) / 2, q_next - q
         attitude = attitude * Rotation.from_rotvec(-oracle.connection(middle)[3:] @ move)
     assert (attitude.inv() * TURN).magnitude() <= 2e-3
-
-
-@pytest.mark.slow
-def test_other_distances_are_solved_for_from_the_last_solution_in_no_more_steps(
-    arm: SpaceRobot,
-) -> None:
-    options = OptimalOptions()
-    geometry = CollisionGeometry(arm.description)
-    plain = solved(arm)
-    rows = DistanceRows.of(geometry, [1])
-    lowest = float(rows.values(plain.at_ticks(100).T).full().min())
-    stages = Stages.of(arm, np.eye(3), False, PathConstraints.of(arm, options))
-    boundary = BoundaryConditions(ARM_START, TURN.as_quat(), ARM_START)
-    continued, cold = (MultipleShooting(stages.with_distances([rows], 4), 40) for _ in range(2))
-    curvature = arm.function("curvature", compile=False)
-    guess = InitialGuesses(stages.rotation_of_step, curvature, 40).resample(plain)
-    asked = StopRule(300), DurationBounds(1.0, 60.0)
-    for room in (0.02, 0.022, 0.021):
-        least = np.array([[lowest + room]])
-        limits = replace(MotionLimits.of(arm, options), distances=least)
-        last = continued.solve(boundary, limits, guess, *asked)
-        other = cold.solve(boundary, limits, replace(guess), *asked)
-        assert last is not None
-        assert other is not None
-        # Begun anew, in more time, it may end at a slower path.
-        assert last.duration <= other.duration * (1 + 1e-4)
-        assert continued.iterations <= cold.iterations
-        kept = rows.values(last.at_ticks(160).T).full().min() - lowest
-        assert kept == pytest.approx(room, abs=1e-5)
-        guess = last
-
-
-@pytest.mark.slow
-def test_a_continued_solution_that_takes_too_many_steps_is_begun_anew(arm: SpaceRobot) -> None:
-    """The last solution is far from one whose links keep 0.2 m more."""
-    options = OptimalOptions()
-    geometry = CollisionGeometry(arm.description)
-    rows = DistanceRows.of(geometry, [0])
-    stages = Stages.of(arm, np.eye(3), False, PathConstraints.of(arm, options))
-    boundary = BoundaryConditions(ARM_START, TURN.as_quat(), ARM_START)
-    solver = MultipleShooting(stages.with_distances([rows], 4), INTERVALS)
-    limits = replace(MotionLimits.of(arm, options), distances=np.array([[-1.0]]))
-    bounds = DurationBounds(1.0, 60.0)
-    first = solver.solve(boundary, limits, solved(arm), StopRule(300), bounds)
-    assert first is not None
-    narrow = replace(limits, distances=np.array([[10.0]]))
-    assert solver.solve(boundary, narrow, first, StopRule(40), bounds) is None
-    assert not solver.converged
-    again = solver.solve(boundary, limits, first, StopRule(300), bounds)
-    assert again is not None
-    assert again.duration == pytest.approx(first.duration, rel=1e-4)
 
 
 @pytest.mark.slow
