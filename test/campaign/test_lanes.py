@@ -325,3 +325,23 @@ def test_what_all_lanes_share_is_not_dispersed(name: str) -> None:
 )
 def test_what_lanes_do_not_fly_of_a_controller(given: dict[str, Any], reason: str) -> None:
     assert LanesEngine().refusal(controlled(set=given)) == reason
+
+
+@pytest.mark.parametrize(
+    ("corrections", "longest", "outcome", "fallback"),
+    [
+        (0, 300.0, "failed", ""),
+        (3, 300.0, "failed", "needed corrections"),
+        (0, 1.0, "interrupted", "took longer than the campaign allows"),
+    ],
+)
+def test_what_a_first_schedule_does_not_decide_is_left_to_the_planner(
+    corrections: int, longest: float, outcome: str, fallback: str
+) -> None:
+    """The tolerance is smaller than what noise and gaits of first order leave."""
+    tight = {"planner.position_tolerance": 1e-9, "planner.attitude_tolerance": 1e-9}
+    given = {**tight, "planner.max_corrections": corrections}
+    made = campaign(disperse=DISPERSED, flights=2, set=given, longest=longest)
+    rows = flown(LanesEngine(), made)
+    assert {row.outcome for row in rows.values()} == {outcome}
+    assert {row.fallback for row in rows.values()} == {fallback}
