@@ -2,9 +2,9 @@
 
 A file is replaced as a whole or not at all, because disks get full and processes are killed.
 
-Files that are executed, flown or resumed are read only where no other user of the machine could
-have written them: the folder of the cache may be a shared one. A :class:`Cache` keeps files that
-can be made again; it treats a damaged or untrusted file as missing, and warns once.
+Files that are executed, flown or resumed are read only if no other user of the machine can have
+written them. A :class:`Cache` keeps files that can be made again in a folder of this user alone; it
+treats a damaged file as missing, and warns once.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import pwd
 import secrets
 import stat
 import sys
@@ -29,9 +28,6 @@ _OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _CACHE_MAGIC = b"spacerobot_ros cache 2"
 """Beginning of the last line of a cache file, with the number of the file format."""
 
-_MAX_PRIVATE_FILE_SIZE = 256 * 2**20
-"""Largest file that :func:`read_private` reads, bytes."""
-
 _MCAP_MAGIC = b"\x89MCAP"
 """First bytes of a bag."""
 
@@ -40,9 +36,6 @@ _MAX_YAML_CHARACTERS = 1_000_000
 
 _MAX_YAML_VALUES = 100_000
 """Largest number of values of a YAML text, with those that aliases repeat."""
-
-_MAX_YAML_DEPTH = 50
-"""Largest number of levels of a YAML text."""
 
 _logged_warnings: set[str] = set()
 
@@ -61,15 +54,13 @@ def warn_once(message: str) -> None:
 # -- whole files ------------------------------------------------------------------------------
 
 
-def write_whole(path: Path, content: bytes, *, durable: bool = True, mode: int = 0o600) -> None:
+def write_whole(path: Path, content: bytes, *, mode: int = 0o600) -> None:
     """Replace a file as a whole or not at all.
 
     Parameters
     ----------
     path, content
         The file and its new content.
-    durable
-        Whether to wait for the disk, so that the file is whole after a loss of power as well.
     mode
         Permissions of the file, without those that the umask forbids; by default only this user
         may read it.
@@ -83,20 +74,11 @@ def write_whole(path: Path, content: bytes, *, durable: bool = True, mode: int =
     try:
         with os.fdopen(os.open(new_file, os.O_CREAT | os.O_WRONLY | os.O_EXCL, mode), "wb") as file:
             file.write(content)
-            file.flush()
-            if durable:
-                os.fsync(file.fileno())
         os.replace(new_file, path)
     except BaseException:
         with suppress(OSError):
             os.unlink(new_file)
         raise
-    if durable:
-        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
 
 
 def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
@@ -136,7 +118,7 @@ def _write_output(path: Path, data: bytes, mode: int) -> None:
         return
     if before is not None:
         mode = stat.S_IMODE(before.st_mode)
-    write_whole(path, data, durable=False, mode=mode)
+    write_whole(path, data, mode=mode)
 
 
 # -- YAML -------------------------------------------------------------------------------------
@@ -155,8 +137,8 @@ def load_yaml(text: str, loader: Any = None) -> Any:
     Raises
     ------
     ValueError
-        The text is no YAML or is too long, too deeply nested, or refers to itself; or its aliases
-        stand for too much (a file of 1 kB may hold a thousand million values).
+        The text is no YAML, or is too long or too deeply nested, or its aliases stand for too much:
+        a file of 1 kB may hold a thousand million values.
     """
     import yaml
 
@@ -168,7 +150,7 @@ def load_yaml(text: str, loader: Any = None) -> Any:
             node = reader.get_single_node()
             if node is None:
                 return None
-            _count_values(node, {})
+            _limit_values(node)
             return reader.construct_document(node)
         finally:
             reader.dispose()
@@ -178,28 +160,18 @@ def load_yaml(text: str, loader: Any = None) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
-def _count_values(node: Any, sizes: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
-    """Return the number of values that a node stands for, and its depth.
-
-    ``sizes`` has those of nodes by their id, and None for the nodes around this one.
-    """
-    if id(node) not in sizes:
-        sizes[id(node)] = None
-        children = () if isinstance(node.value, str) else node.value
-        count, depth = 1, 0
-        for child in children:
-            for each in child if isinstance(child, tuple) else (child,):
-                child_count, child_depth = _count_values(each, sizes)
-                count, depth = count + child_count, max(depth, child_depth)
-            if count > _MAX_YAML_VALUES:
-                raise ValueError(f"its aliases stand for more than {_MAX_YAML_VALUES} values")
-        if depth >= _MAX_YAML_DEPTH:
-            raise ValueError("it is nested too deeply")
-        sizes[id(node)] = count, depth + 1
-    size = sizes[id(node)]
-    if size is None:
-        raise ValueError("it refers to itself")
-    return size
+def _limit_values(root: Any) -> None:
+    """Refuse a YAML node with too many values below it; keys count as well."""
+    nodes, count = [root], 0
+    while nodes:
+        count += 1
+        if count > _MAX_YAML_VALUES:
+            raise ValueError(
+                f"it has more than {_MAX_YAML_VALUES} values, with those that its aliases repeat"
+            )
+        value = nodes.pop().value
+        for child in () if isinstance(value, str) else value:
+            nodes.extend(child if isinstance(child, tuple) else (child,))
 
 
 # -- files of this user -----------------------------------------------------------------------
@@ -213,76 +185,35 @@ def read_private(path: Path) -> bytes:
     OSError
         It cannot be read.
     UntrustedFileError
-        It belongs to another user, or others may write it, or it is too large.
+        It belongs to another user, or others may write it.
     """
-    # Opening a pipe of another user would block.
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-        # The open file is checked, because its name may stand for another file by now.
-        facts = os.fstat(file.fileno())
-        if not stat.S_ISREG(facts.st_mode):
-            raise UntrustedFileError(f"'{path}' is not a regular file; remove it.")
-        _require_own_path(path, facts)
-        if facts.st_size > _MAX_PRIVATE_FILE_SIZE:
-            raise UntrustedFileError(f"'{path}' has {facts.st_size} bytes; remove it.")
-        return file.read(facts.st_size)
+    _require_own(path)
+    return path.read_bytes()
 
 
-def trusted_folder(folder: Path) -> Path:
-    """Return the resolved path of a folder into which only this user, or root, can write.
-
-    Raises
-    ------
-    OSError
-        There is no such folder.
-    UntrustedFileError
-        It belongs to another user, others may write it, or others may replace it.
-    """
-    real = folder.resolve(strict=True)
-    if not real.is_dir():
-        raise UntrustedFileError(f"'{folder}' is not a folder; remove it.")
-    _require_own_path(real, real.stat())
-    for parent in real.parents:
-        mode = parent.stat().st_mode
-        # In a folder with the sticky bit, such as /tmp, users cannot rename each other's files.
-        if mode & _OTHERS_MAY_WRITE and not mode & stat.S_ISVTX:
-            raise UntrustedFileError(_writable_by_others(parent, mode))
-    return real
-
-
-def _require_own_path(path: Path, facts: os.stat_result) -> None:
+def _require_own(path: Path) -> None:
+    """Refuse a file or folder that another user owns or may write."""
+    facts = path.stat()
     if facts.st_uid not in (0, os.geteuid()):
-        raise UntrustedFileError(
-            f"'{path}' belongs to {_user_name(facts.st_uid)}; use one of your own."
-        )
+        raise UntrustedFileError(f"'{path}' belongs to user {facts.st_uid}; use one of your own.")
     if facts.st_mode & _OTHERS_MAY_WRITE:
-        raise UntrustedFileError(_writable_by_others(path, facts.st_mode))
-
-
-def _writable_by_others(path: Path, mode: int) -> str:
-    return (
-        f"others may write '{path}' (mode {stat.S_IMODE(mode):o}); make it yours alone with "
-        f"chmod go-w '{path}'."
-    )
-
-
-def _user_name(number: int) -> str:
-    try:
-        return f"user {number} ({pwd.getpwuid(number).pw_name})"
-    except KeyError:
-        return f"user {number}"
+        raise UntrustedFileError(
+            f"others may write '{path}' (mode {stat.S_IMODE(facts.st_mode):o}); make it yours "
+            f"alone with chmod go-w '{path}'."
+        )
 
 
 class Cache:
     """A folder of files that can be computed again. Its methods log warnings instead of raising.
 
-    The last line of a file holds its key, length and SHA-256, against disks that get full and
-    processes that are killed. The folder and the file must belong to this user, and no other user
-    may write them, because they are executed and flown.
+    The last line of a file holds its key, length and SHA-256, against disks that get full.
+    The folder must belong to this user, and no other user may write into it, because its files are
+    executed and flown.
 
     Parameters
     ----------
     folder
-        Made where it is missing.
+        Made with mode 0700 if it is missing.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -290,38 +221,35 @@ class Cache:
 
     def load(self, name: str, key: str) -> tuple[Path, bytes] | None:
         """Return path and content of a file stored under this key; None without one."""
+        path = self.folder / name
+        if not path.is_file():
+            return None
         try:
-            path = trusted_folder(self.folder) / name
+            _require_own(self.folder)
+            return path, _content_of_entry(path.read_bytes(), key)
         except UntrustedFileError as error:
             self._warn_of_untrusted_cache(error)
-            return None
-        except OSError:
-            return None
-        try:
-            return path, _content_of_entry(read_private(path), key)
         except FileNotFoundError:
-            return None
-        except (OSError, ValueError, UntrustedFileError) as error:
-            self.discard(
-                name, _os_error_reason(error) if isinstance(error, OSError) else str(error)
-            )
-            return None
+            pass  # Another process has deleted it.
+        except (OSError, ValueError) as error:
+            self.discard(name, getattr(error, "strerror", None) or str(error))
+        return None
 
     def store(self, name: str, key: str, content: bytes) -> Path | None:
         """Store content under a key; return its path, None if storing failed."""
+        path = self.folder / name
         try:
-            _make_private_folder(self.folder)
-            path = trusted_folder(self.folder) / name
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _require_own(self.folder)
             write_whole(path, content + _trailer(content, key))
         except UntrustedFileError as error:
             self._warn_of_untrusted_cache(error)
-            return None
         except OSError as error:
-            warn_once(
-                f"Nothing can be kept in the cache '{self.folder}': {_os_error_reason(error)}."
-            )
-            return None
-        return path
+            reason = error.strerror or str(error)
+            warn_once(f"Nothing can be kept in the cache '{self.folder}': {reason}.")
+        else:
+            return path
+        return None
 
     def discard(self, name: str, reason: str) -> None:
         """Delete a cached file and log the reason as a warning."""
@@ -343,28 +271,16 @@ def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: st
     Parameters
     ----------
     folder
-        The cache, which remembers under ``name`` that the warning was given. Where it cannot, the
+        The cache, which remembers under ``name`` that the warning was given. If it cannot, the
         warning is given each time.
     """
     cache = Cache(folder)
     # Installations that share a cache have a file each.
     entry = f"{name}-{hashlib.sha256(sys.prefix.encode()).hexdigest()[:32]}"
-    known = cache.load(entry, sys.prefix) is not None
+    known = cache.load(entry, entry) is not None
     logger.log(logging.DEBUG if known else logging.WARNING, message)
     if not known:
-        cache.store(entry, sys.prefix, b"")
-
-
-def _os_error_reason(error: OSError) -> str:
-    return error.strerror or str(error)
-
-
-def _make_private_folder(folder: Path) -> None:
-    """Make a folder and the folders above it, for this user alone whatever the umask."""
-    for each in (*reversed(folder.parents), folder):
-        if not each.exists():
-            with suppress(FileExistsError):
-                each.mkdir(mode=0o700)
+        cache.store(entry, entry, b"")
 
 
 def _trailer(content: bytes, key: str) -> bytes:

@@ -79,8 +79,6 @@ def robot_file(name: str, beside: Path | None = None) -> Path:
             return folder / name
     if any((folder / name).is_dir() for folder in folders):
         raise ParameterError(f"'{name}' is a folder; name the URDF file in it.")
-    if any((folder / name).exists() for folder in folders):
-        raise ParameterError(f"'{name}' is no regular file; name a URDF file.")
     nearby = sorted(path.name for path in Path(name).parent.glob("*") if is_path(path.name))
     nearby += resource_names("urdf", ".urdf")
     raise ParameterError(

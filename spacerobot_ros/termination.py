@@ -2,27 +2,25 @@
 
 A process is guarded from its first import on (:func:`guarded`). SIGINT, SIGTERM and SIGHUP then
 raise :class:`Terminated` in the main thread; work that must be completed, such as a flight or a
-bag, receives a request instead (:func:`ended_on_request`). A thread ends the process when the main
-thread does not react, and at once on a second signal.
+bag, receives a request instead (:func:`graceful_shutdown`). A second signal, a second later or
+more, ends the process at once, and so does a timer where a library swallows the exception. Python
+handles signals as soon as a call of C code has returned.
 
-Processes that are started with :func:`child_options` end when this one does, however that ends:
-the kernel closes a pipe that they read, and on Linux sends them a signal as well.
+On Linux the kernel signals the end of a process to the children of :func:`start_child`.
 """
 
 from __future__ import annotations
 
 import io
 import os
-import select
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     import subprocess
@@ -36,27 +34,18 @@ _MESSAGE_BY_SIGNAL = {
 _LONGEST_UNWINDING_TIME = 1.2
 """Wall time within which the main thread must end after a signal's exception, s."""
 
-_LONGEST_NOTICE_TIME = 5.0
-"""Wall time in which work must notice a request, s: a plan may have to end first."""
-
-_TIME_AFTER_PARENT_END = 1.7
-"""Wall time within which a process must end after its parent has ended, s."""
-
 _SAME_SIGNAL_TIME = 1.0
 """Wall time between signals that count as one, s: launcher and terminal both send a signal."""
 
-_KILL_WAIT = 0.3
-"""Longest wait for the end of killed processes, wall s."""
+_TIME_AFTER_PARENT_END = 1.5
+"""Wall time after the end of the parent at which the kernel kills this process, s."""
 
-_LIFELINE_VARIABLE = "SPACEROBOT_LIFELINE"
-"""Environment variable of a child: process id of its parent, and a pipe held open by the parent."""
+_PARENT_VARIABLE = "SPACEROBOT_PARENT"
+"""Environment variable of a child: process id of its parent."""
 
 _PARENT_ENDED_SIGNAL = signal.SIGUSR2
-"""Signal of the kernel to a child whose parent has ended (Linux)."""
 
 _PR_SET_PDEATHSIG = 1
-
-_END_BYTE = b"\0"
 
 
 class Terminated(KeyboardInterrupt):
@@ -78,161 +67,89 @@ class Terminated(KeyboardInterrupt):
         return 128 + self.number
 
 
-class _Request(NamedTuple):
-    """Functions called on a signal: one in the main thread, one at once in the guard's thread."""
-
-    main: Callable[[], None]
-    at_once: Callable[[], None]
-
-
 class _Guard:
-    """The signal handlers of this process and the thread that watches over its end."""
+    """The signal handlers of this process, and what they have received."""
 
-    def __init__(self, *, announcing: bool) -> None:
-        self.number: int | None = None
-        """Number of the signal that ends the process; None before a signal."""
-        self.request: _Request | None = None
-        self.tools: set[subprocess.Popen[bytes]] = set()
-        self._announcing = announcing
-        self._raised = False
-        self._errors: TextIO | None = None
+    def __init__(self) -> None:
+        self.ending: Terminated | None = None
+        """The first signal; None before one."""
+        self.on_request: Callable[[], None] | None = None
         self._since = 0.0
-        self._notice_by: float | None = None
-        self._end_by: float | None = None
-        self._lifeline_read_end, self._parent = _parent_lifeline()
-        self._reader, self._writer = os.pipe()
-        os.set_blocking(self._writer, False)
-        self._handlers = {
-            number: signal.signal(number, self._on_signal)
-            for number in _MESSAGE_BY_SIGNAL
-            # nohup has a process ignore the end of its terminal.
-            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
-        }
-        if self._lifeline_read_end is not None:
-            signal.signal(_PARENT_ENDED_SIGNAL, lambda *_: None)
-            _die_with_parent()
-        self._wakeup = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
-        self._thread = threading.Thread(target=self._watch_for_end, name="termination", daemon=True)
-        self._thread.start()
-        if self._lifeline_read_end is not None and os.getppid() != self._parent:
-            self._on_parent_end()
+        self._errors: TextIO | None = None
+        # nohup has a process ignore the end of its terminal.
+        ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        numbers = [each for each in _MESSAGE_BY_SIGNAL if not (ignored and each == signal.SIGHUP)]
+        self._parent = int(os.environ.pop(_PARENT_VARIABLE, "0"))
+        if self._parent:
+            numbers.append(_PARENT_ENDED_SIGNAL)
+        self._handlers = {each: signal.signal(each, self._on_signal) for each in numbers}
 
     def remove(self) -> None:
         """Restore the earlier signal handlers."""
         self.restore_stderr()
-        signal.set_wakeup_fd(self._wakeup)
+        if signal.getsignal(signal.SIGALRM) == self._end_process:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
-        os.write(self._writer, _END_BYTE)
-        self._thread.join()
-        os.close(self._reader)
-        os.close(self._writer)
-
-    def signal_received(self) -> bool:
-        """Return whether a signal has come; the caller then completes its work."""
-        if self.number is not None:
-            self._notice_by = None
-        return self.number is not None
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        """Handle a signal in the main thread, as soon as it executes Python code."""
-        self._note_signal(number)
-        if self.request is not None:
-            self.request.main()
-        elif not self._raised:
-            self._raised = True
-            if self._announcing:
-                # Libraries such as a solver print warnings when the exception passes through them.
-                self._errors, sys.stderr = sys.stderr, io.StringIO()
-            raise Terminated(number)
 
     def restore_stderr(self) -> None:
         """Restore standard error."""
         if self._errors is not None:
             self._errors, sys.stderr = None, self._errors
 
-    def _note_signal(self, number: int) -> bool:
-        """Take note of a signal; return whether it is the first."""
-        if self.number is not None:
-            return False
-        self._since = time.monotonic()
-        self.number = number
-        grace = _LONGEST_UNWINDING_TIME if self.request is None else _LONGEST_NOTICE_TIME
-        self._notice_by = self._since + grace
-        return True
+    def watch_parent(self) -> None:
+        """Have the kernel (Linux) signal the end of the parent, which may have ended before."""
+        if not self._parent:
+            return
+        with suppress(ImportError, OSError, AttributeError):
+            import ctypes
 
-    def _watch_for_end(self) -> None:
-        poll = select.poll()
-        poll.register(self._reader, select.POLLIN)
-        if self._lifeline_read_end is not None:
-            poll.register(self._lifeline_read_end, select.POLLIN | select.POLLHUP)
-        handled = False
-        while True:
-            deadline = self._deadline()
-            wait = None if deadline is None else max(0.0, 1e3 * (deadline - time.monotonic()))
-            for file, _ in poll.poll(wait):
-                if file == self._lifeline_read_end:
-                    poll.unregister(file)
-                    self._on_parent_end()
-                    continue
-                for number in os.read(self._reader, 64):
-                    if number == _END_BYTE[0]:
-                        return
-                    if number == _PARENT_ENDED_SIGNAL and os.getppid() != self._parent:
-                        self._on_parent_end()
-                    elif number in _MESSAGE_BY_SIGNAL:
-                        self._note_signal(number)
-                        if handled and time.monotonic() - self._since > _SAME_SIGNAL_TIME:
-                            self._end_process()
-            if self.number is not None and not handled:
-                handled = True
-                self._kill_tools()
-                if self.request is not None:
-                    self.request.at_once()
-            deadline = self._deadline()
-            if deadline is not None and time.monotonic() >= deadline:
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(_PARENT_ENDED_SIGNAL), 0, 0, 0)
+        signal.raise_signal(_PARENT_ENDED_SIGNAL)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        parent_ended = number == _PARENT_ENDED_SIGNAL
+        if parent_ended:
+            if os.getppid() == self._parent:
+                return  # Only the thread that has started this process has ended.
+            number = signal.SIGTERM
+            _set_timer(_TIME_AFTER_PARENT_END, signal.SIG_DFL)
+        if self.ending is not None:
+            if not parent_ended and time.monotonic() - self._since > _SAME_SIGNAL_TIME:
                 self._end_process()
+            return
+        self.ending, self._since = Terminated(number), time.monotonic()
+        if self.on_request is not None:
+            self.on_request()
+            return
+        if not parent_ended:
+            _set_timer(_LONGEST_UNWINDING_TIME, self._end_process)
+        # Libraries such as a solver print warnings when the exception passes through them.
+        self._errors, sys.stderr = sys.stderr, io.StringIO()
+        raise self.ending
 
-    def _deadline(self) -> float | None:
-        """Return the time (monotonic, s) at which this process is ended, None without one."""
-        deadlines = [by for by in (self._notice_by, self._end_by) if by is not None]
-        return min(deadlines, default=None)
+    def _end_process(self, *_: object) -> None:
+        assert self.ending is not None
+        announce(self.ending)
+        os._exit(self.ending.exit_code)
 
-    def _on_parent_end(self) -> None:
-        """End this process soon, as by SIGTERM."""
-        if self._end_by is None:
-            self._end_by = time.monotonic() + _TIME_AFTER_PARENT_END
-            signal.raise_signal(signal.SIGTERM)
 
-    def _kill_tools(self) -> None:
-        for tool in tuple(self.tools):
-            with suppress(OSError):
-                os.killpg(tool.pid, signal.SIGKILL)
-
-    def _end_process(self) -> None:
-        """End the process now, whatever the main thread does."""
-        self._kill_tools()
-        error = Terminated(self.number or signal.SIGTERM)
-        if self._announcing:
-            with suppress(OSError):
-                os.write(2, f"{error}\n".encode())
-        os._exit(error.exit_code)
+def _set_timer(seconds: float, handler: Any) -> None:
+    """Have a timer call a signal handler; ``SIG_DFL``: the kernel kills this process."""
+    signal.signal(signal.SIGALRM, handler)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
 _guard: _Guard | None = None
 
 
 @contextmanager
-def guarded(*, announcing: bool = False) -> Iterator[bool]:
+def guarded() -> Iterator[bool]:
     """Have signals, and the end of the parent, end the process in this context.
 
     Yields whether the guard is new: inside another one nothing changes. Outside the main thread,
     which alone has signals, nothing is done.
-
-    Parameters
-    ----------
-    announcing
-        Whether one line on standard error says so when the main thread cannot.
 
     Raises
     ------
@@ -243,8 +160,9 @@ def guarded(*, announcing: bool = False) -> Iterator[bool]:
     if _guard is not None or threading.current_thread() is not threading.main_thread():
         yield False
         return
-    _guard = _Guard(announcing=announcing)
+    _guard = _Guard()
     try:
+        _guard.watch_parent()
         yield True
     finally:
         _guard.remove()
@@ -252,20 +170,17 @@ def guarded(*, announcing: bool = False) -> Iterator[bool]:
 
 
 @contextmanager
-def ended_on_request(
-    main: Callable[[], None] = lambda: None, at_once: Callable[[], None] = lambda: None
+def graceful_shutdown(
+    on_request: Callable[[], None] = lambda: None,
 ) -> Iterator[Callable[[], bool]]:
     """Turn signals into a request while work is completed.
 
-    Yields a function that returns whether the end was requested. It must be called now and then;
-    once it has returned True there is no time limit. A second signal ends the process at once.
+    Yields a function that returns whether the end was requested; the work calls it now and then.
 
     Parameters
     ----------
-    main
-        Called in the main thread, as soon as that runs Python again.
-    at_once
-        Called in another thread, also while the main one computes: may cancel a computation.
+    on_request
+        Called in the main thread on the first signal: may cancel a computation.
 
     Raises
     ------
@@ -273,22 +188,29 @@ def ended_on_request(
         A signal has come before.
     """
     with guarded():
-        guard = _guard
-        if guard is None or threading.current_thread() is not threading.main_thread():
-            yield lambda: False
-            return
-        if guard.number is not None:
-            raise Terminated(guard.number)
-        before, guard.request = guard.request, _Request(main, at_once)
-        try:
-            yield guard.signal_received
-        finally:
-            guard.request = before
+        if (ending := termination()) is not None:
+            raise ending
+        with _on_first_signal(on_request) as guard:
+            yield lambda: guard is not None and guard.ending is not None
+
+
+@contextmanager
+def _on_first_signal(on_request: Callable[[], None] | None) -> Iterator[_Guard | None]:
+    """Have the first signal in this context call a function; None: raise an exception."""
+    guard = _guard
+    if guard is None or threading.current_thread() is not threading.main_thread():
+        yield None
+        return
+    before, guard.on_request = guard.on_request, on_request
+    try:
+        yield guard
+    finally:
+        guard.on_request = before
 
 
 def termination() -> Terminated | None:
     """Return the signal that ends this process, None without one."""
-    return None if _guard is None or _guard.number is None else Terminated(_guard.number)
+    return None if _guard is None else _guard.ending
 
 
 def announce(ending: Terminated) -> None:
@@ -300,42 +222,33 @@ def announce(ending: Terminated) -> None:
         sys.stderr.flush()
 
 
-def child_options(environment: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return arguments of ``subprocess.Popen`` for a process that ends with this one.
-
-    The child has to be guarded. ``environment`` is its own, else that of this process.
-    """
-    reader = _lifeline_read_end()
-    variables = os.environ if environment is None else environment
-    return {
-        "env": {**variables, _LIFELINE_VARIABLE: f"{reader}:{os.getpid()}"},
-        "pass_fds": (reader,),
-    }
-
-
 def start_child(
     words: Sequence[str], environment: Mapping[str, str] | None = None, **options: Any
 ) -> subprocess.Popen[bytes]:
     """Start Python with arguments ``words`` as a new session, which ends with this process.
 
-    ``options`` are those of ``subprocess.Popen``; see :func:`child_options` for ``environment``.
+    The child has to be guarded. ``environment`` is its own, else that of this process; ``options``
+    are those of ``subprocess.Popen``.
     """
     import subprocess
 
-    own = child_options(environment)
-    return subprocess.Popen([sys.executable, *words], start_new_session=True, **own, **options)
+    variables = _child_environment(environment)
+    return subprocess.Popen(
+        [sys.executable, *words], env=variables, start_new_session=True, **options
+    )
 
 
-def run_child(
-    words: Sequence[str], environment: Mapping[str, str] | None = None, **options: Any
-) -> subprocess.CompletedProcess[str]:
+def run_child(words: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
     """Run Python with arguments ``words`` until it or this process ends; return its output."""
     import subprocess
 
-    own = child_options(environment)
-    return subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, check=False, **own, **options
-    )
+    options = {"capture_output": True, "text": True, "check": False, **options}
+    return subprocess.run([sys.executable, *words], env=_child_environment(), **options)
+
+
+def _child_environment(environment: Mapping[str, str] | None = None) -> dict[str, str]:
+    variables = os.environ if environment is None else environment
+    return {**variables, _PARENT_VARIABLE: f"{os.getpid()}"}
 
 
 def end_with_parent() -> None:
@@ -378,10 +291,10 @@ def end_child(process: subprocess.Popen[bytes], signals: Mapping[int, float]) ->
 
 @contextmanager
 def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a program that does not end by itself with this process, and kill it at the end.
+    """Start a program, such as a compiler, and kill it with its children at the end of the context.
 
-    The program and its children are also killed when this process is asked to end or is gone.
-    It is in a session of its own and has no input.
+    It is in a session of its own, which is also killed when this process is gone, and has no
+    input. A signal raises :class:`Terminated` in this context, whatever else it would request.
 
     Parameters
     ----------
@@ -390,98 +303,37 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
 
     Raises
     ------
-    OSError
+    FileNotFoundError
         There is no such program.
-    Terminated
-        This process is to end, and has ended the program.
     """
     import shutil
     import subprocess
 
     if shutil.which(words[0]) is None:
         raise FileNotFoundError(f"There is no program '{words[0]}'.")
-    reader, writer = os.pipe()
-    try:
-        process = subprocess.Popen(
-            [sys.executable, "-I", "-S", "-c", _TOOL_KEEPER_SCRIPT, str(reader), *words],
-            stdin=subprocess.DEVNULL,
-            pass_fds=(reader,),
-            **options,
-        )
-        guard = _guard
-        if guard is not None:
-            guard.tools.add(process)
+    keeper = [sys.executable, "-I", "-S", "-c", _TOOL_KEEPER_SCRIPT, *words]
+    with (
+        _on_first_signal(None),
+        subprocess.Popen(
+            keeper, stdin=subprocess.PIPE, start_new_session=True, **options
+        ) as process,
+    ):
         try:
             yield process
         finally:
-            if guard is not None:
-                guard.tools.discard(process)
             if process.poll() is None:
-                _kill_tool(process)
-    finally:
-        os.close(writer)
-        os.close(reader)
-    ending = termination()
-    if ending is not None and process.returncode:
-        raise ending
-
-
-def _kill_tool(process: subprocess.Popen[bytes]) -> None:
-    """Kill a tool and its children."""
-    # If the session does not exist yet, closing the pipe ends the tool.
-    with suppress(OSError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.kill()
-    process.wait()
-    end = time.monotonic() + _KILL_WAIT
-    with suppress(OSError):
-        while time.monotonic() < end:
-            os.killpg(process.pid, 0)
-            time.sleep(0.005)
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 _TOOL_KEEPER_SCRIPT = """
-import os, signal, sys
-lifeline, words = int(sys.argv[1]), sys.argv[2:]
-os.setsid()
-watcher = os.fork()
-if not watcher:
-    null = os.open(os.devnull, os.O_RDWR)
-    os.dup2(null, 1)
-    os.dup2(null, 2)
-    os.read(lifeline, 1)
+import os, signal, subprocess, sys, threading
+def kill_with_parent():
+    os.read(0, 1)
     os.killpg(0, signal.SIGKILL)
-code = os.spawnvp(os.P_WAIT, words[0], words)
-os.kill(watcher, signal.SIGKILL)
-os.waitpid(watcher, 0)
+threading.Thread(target=kill_with_parent, daemon=True).start()
+code = subprocess.call(sys.argv[1:], stdin=subprocess.DEVNULL)
 if code < 0:
-    signal.signal(-code, signal.SIG_DFL) if -code != signal.SIGKILL else None
     os.kill(os.getpid(), -code)
 os._exit(code)
 """
-"""Runs a program in a session of its own, which is killed when the pipe breaks."""
-
-
-@cache
-def _lifeline_read_end() -> int:
-    """Return the read end of a pipe for children; its write end closes when this process ends."""
-    reader, _ = os.pipe()
-    return reader
-
-
-def _parent_lifeline() -> tuple[int | None, int]:
-    """Return the pipe (None: no pipe) that the parent process holds open, and the parent's id."""
-    text = os.environ.pop(_LIFELINE_VARIABLE, "")
-    if not text:
-        return None, 0
-    file, _, parent = text.partition(":")
-    os.set_inheritable(int(file), False)
-    return int(file), int(parent)
-
-
-def _die_with_parent() -> None:
-    """Let the kernel (Linux) send a signal to this process when its parent ends."""
-    with suppress(ImportError, OSError, AttributeError):
-        import ctypes
-
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(_PARENT_ENDED_SIGNAL), 0, 0, 0)
+"""Runs a program in its session, which is killed when the pipe to the parent breaks."""

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,7 +14,16 @@ from pathlib import Path
 import pytest
 from support.awaited import await_end
 
-from spacerobot_ros.termination import Terminated, ended_on_request, guarded, tool
+from spacerobot_ros.termination import (
+    Terminated,
+    announce,
+    end_child,
+    graceful_shutdown,
+    guarded,
+    start_child,
+    termination,
+    tool,
+)
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 30.0
@@ -21,17 +31,15 @@ SOON = 2.0
 """Wall s within which everything ends."""
 
 HEAD = """
-import hashlib, os, signal, subprocess, sys, time
+import os, signal, subprocess, sys, time
 from spacerobot_ros.termination import *
 # The tests may have been started by nohup.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.alarm(20)
 def ready():
     print("ready", flush=True)
 """
 """What the scripts below begin with."""
-
-COMPUTE = "hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)"
-"""Computes for minutes without running Python, as a solver does."""
 
 
 @contextmanager
@@ -56,6 +64,7 @@ def script(text: str, **options: object) -> Iterator[subprocess.Popen[str]]:
             os.killpg(process.pid, signal.SIGKILL)
         with suppress(subprocess.TimeoutExpired):  # What it has left behind may hold its output.
             process.communicate(timeout=SOON)
+        process.wait()
 
 
 def ended(process: subprocess.Popen[str], within: float = PATIENCE) -> tuple[int, str]:
@@ -89,37 +98,33 @@ except Terminated as ending:
         assert ended(process) == (1, f"{line} {128 + number}\n")
 
 
-def test_a_computation_that_runs_no_python_is_ended_with_one_line() -> None:
-    text = f"""
-with guarded(announcing=True):
-    try:
-        ready()
-        {COMPUTE}
-    except Terminated:  # The signal came before.
-        {COMPUTE}
-"""
-    with script(text) as process:
-        process.send_signal(signal.SIGINT)
-        assert ended(process) == (130, "Interrupted.\n")
-
-
 def test_an_exception_that_is_swallowed_ends_the_process_all_the_same() -> None:
     text = """
-with guarded(announcing=True):
+with guarded():
     while True:
         try:
             ready()
             time.sleep(60)
         except KeyboardInterrupt:
-            pass
+            print("a warning of a library", file=sys.stderr)
 """
     with script(text) as process:
         process.send_signal(signal.SIGTERM)
-        assert ended(process) == (143, "Terminated.\n")
+        assert ended(process, SOON) == (143, "Terminated.\n")
+
+
+def await_second_signal(process: subprocess.Popen[str], number: signal.Signals) -> None:
+    """Send a signal until the process ends; within a second it still counts as the first."""
+    for _ in range(50):
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(0.1)
+            return
+        process.send_signal(number)
+    pytest.fail("the second signal was ignored")
 
 
 REQUESTED = """
-with guarded(), ended_on_request(at_once=lambda: print("told", flush=True)) as requested:
+with guarded(), graceful_shutdown(lambda: print("told", flush=True)) as requested:
     ready()
     while not requested():
         time.sleep(0.01)
@@ -140,26 +145,8 @@ def test_what_has_work_to_complete_completes_it() -> None:
 def test_a_second_signal_ends_it_at_once() -> None:
     with script(REQUESTED.format(work=600)) as process:
         process.send_signal(signal.SIGINT)
-        # Those that come in the same moment as the first are still the first.
-        for _ in range(50):
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(0.1)
-                break
-            process.send_signal(signal.SIGINT)
+        await_second_signal(process, signal.SIGINT)
         assert process.returncode == 130
-
-
-def test_a_request_that_nobody_notices_ends_the_process() -> None:
-    text = """
-from spacerobot_ros import termination
-termination._LONGEST_NOTICE_TIME = 0.2
-with guarded(), ended_on_request() as requested:
-    ready()
-    time.sleep(600)
-"""
-    with script(text) as process:
-        process.send_signal(signal.SIGTERM)
-        assert ended(process)[0] == 143
 
 
 def test_the_end_of_the_terminal_is_ignored_under_nohup() -> None:
@@ -174,61 +161,92 @@ sys.exit(7)
 
 
 CHILD = """
-with guarded(), ended_on_request() as requested:
-    print("ready", flush=True)
+with guarded(), graceful_shutdown() as requested:
+    ready()
     while not requested():
         time.sleep(0.01)
 """
-PARENT = """
-subprocess.Popen([sys.executable, "-c", {child!r}], **{options})
-{more}
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+def test_a_child_ends_with_its_parent(hangs: bool) -> None:
+    child = HEAD + CHILD + ("time.sleep(600)" if hangs else "")
+    parent = f"""
+print(start_child(["-c", {child!r}]).pid, file=sys.stderr, flush=True)
 time.sleep(600)
 """
-
-
-@pytest.mark.parametrize(
-    ("before", "more"),
-    [
-        # Without the signal of the kernel, which only Linux sends.
-        ("from spacerobot_ros import termination; termination._die_with_parent = int", ""),
-        # A fork of the parent has its end of the pipe, too.
-        ("", "print(os.fork(), file=sys.stderr, flush=True)"),
-    ],
-)
-def test_a_child_ends_with_its_parent(before: str, more: str) -> None:
-    child = f"{HEAD}\n{before}\n{CHILD}"
-    parent = PARENT.format(child=child, options="child_options()", more=more)
     with script(parent) as process:
         assert process.stderr is not None
-        # The fork prints 0, and its parent the fork.
-        fork = max(int(process.stderr.readline()) for _ in range(2)) if more else 0
-        os.kill(process.pid, signal.SIGKILL)
-        assert not await_end(lambda: set(processes_of(process.pid)) - {fork}, SOON)
-        assert (fork in processes_of(process.pid)) == bool(more)
+        started = int(process.stderr.readline())
+        process.kill()
+        assert not await_end(lambda: [started] * is_alive(started), SOON)
 
 
-def processes_of(session: int) -> list[int]:
-    """Return the processes of a session that have not ended."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            fields = (folder / "stat").read_text().rpartition(")")[2].split()
-            if int(fields[3]) == session and fields[0] not in "ZX":
-                found.append(int(folder.name))
-    return found
+def test_a_child_outlives_the_thread_that_started_it_and_is_killed_with_its_parent() -> None:
+    """Between the start of the child and its guard, the parent may end, too."""
+    child = f"{HEAD}\nsys.stdin.readline()\n{CHILD}"
+    parent = f"""
+import threading
+pipe, writer = os.pipe()
+def start():
+    print(start_child(["-c", {child!r}], stdin=pipe).pid, file=sys.stderr, flush=True)
+thread = threading.Thread(target=start)
+thread.start()
+thread.join()
+os.write(writer, b"\\n")
+time.sleep(600)
+"""
+    with script(parent) as process:
+        assert process.stderr is not None
+        started = int(process.stderr.readline())
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.3)
+        assert is_alive(started)
+        process.kill()
+        assert not await_end(lambda: [started] * is_alive(started), SOON)
+
+
+def is_alive(pid: int) -> bool:
+    """Return whether there is such a process and it has not ended."""
+    with suppress(OSError):
+        text = Path(f"/proc/{pid}/stat").read_text()
+        return text.rpartition(")")[2].split()[0] not in "ZX"
+    return False
 
 
 def test_a_process_of_somebody_else_outlives_what_has_started_it() -> None:
     """``ros2 run`` and ``nohup``: the end of a launcher or of its pipes is no end."""
-    parent = PARENT.format(
-        child=HEAD + CHILD, options="dict(stdin=subprocess.PIPE)", more="os._exit(0)"
-    )
+    parent = f"""
+child = subprocess.Popen([sys.executable, "-c", {HEAD + CHILD!r}], stdin=subprocess.PIPE)
+print(child.pid, file=sys.stderr, flush=True)
+os._exit(0)
+"""
     with script(parent) as process:
         process.wait(PATIENCE)
-        (child,) = processes_of(process.pid)
+        assert process.stderr is not None
+        child = int(process.stderr.readline())
         with pytest.raises(subprocess.TimeoutExpired):
             process.communicate(timeout=0.3)
         os.kill(child, signal.SIGTERM)
+
+
+@pytest.mark.parametrize(
+    ("ignored", "code"),
+    [((), -signal.SIGINT), ((2,), -signal.SIGTERM), ((2, 15), -signal.SIGKILL)],
+)
+def test_a_child_gets_one_signal_after_the_other(ignored: tuple[int, ...], code: int) -> None:
+    text = f"""{HEAD}
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+for number in {ignored}:
+    signal.signal(number, signal.SIG_IGN)
+ready()
+time.sleep(600)
+"""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    child = start_child(["-c", text], environment, stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    assert child.stdout.readline() == b"ready\n"
+    assert end_child(child, {signal.SIGINT: 0.3, signal.SIGTERM: 0.3}) == code
 
 
 TOOL = ["sh", "-c", "echo ready; sleep 600 & sleep 600"]
@@ -237,7 +255,7 @@ TOOL = ["sh", "-c", "echo ready; sleep 600 & sleep 600"]
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_a_tool_and_what_it_starts_end_with_the_process(number: signal.Signals) -> None:
     text = f"""
-with guarded(), ended_on_request(), tool({TOOL!r}) as process:
+with guarded(), graceful_shutdown(), tool({TOOL!r}) as process:
     process.wait()
 """
     with script(text) as process:
@@ -263,10 +281,39 @@ def test_a_tool_reports_how_it_ended(tmp_path: Path) -> None:
 
 def test_signals_are_given_back() -> None:
     before = signal.getsignal(signal.SIGTERM)
-    with guarded() as new, guarded() as again, ended_on_request() as requested:
+    with guarded() as new, guarded() as again, graceful_shutdown() as requested:
         assert new
         assert not again
         assert signal.getsignal(signal.SIGTERM) is not before
         assert not requested()
+        assert termination() is None
     assert signal.getsignal(signal.SIGTERM) is before
-    assert Terminated(signal.SIGINT).exit_code == 130
+
+
+def test_warnings_on_the_way_out_are_hidden_and_work_begins_no_more(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with guarded():
+        with pytest.raises(Terminated) as caught:
+            signal.raise_signal(signal.SIGINT)
+        assert termination() is caught.value
+        print("a warning of a library", file=sys.stderr)
+        with pytest.raises(Terminated), graceful_shutdown():
+            pytest.fail("a signal has come before")
+        announce(caught.value)
+    assert termination() is None
+    assert capsys.readouterr().err == "Interrupted.\n"
+
+
+def test_another_thread_has_no_signals() -> None:
+    answers: list[bool] = []
+
+    def work() -> None:
+        with guarded() as new, graceful_shutdown() as requested:
+            answers.extend((new, requested()))
+
+    with guarded():
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+    assert answers == [False, False]

@@ -6,7 +6,6 @@ import importlib
 import logging
 import math
 import os
-import signal
 import stat
 import subprocess
 import sys
@@ -20,7 +19,7 @@ import numpy as np
 import pytest
 import yaml
 
-from spacerobot_ros import errors, files, measures, parameters, resources, termination, times
+from spacerobot_ros import errors, measures, resources, times
 from spacerobot_ros.errors import (
     GoalError,
     NotFoundError,
@@ -153,21 +152,12 @@ def test_topics_of_end_effectors() -> None:
 # -- files ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("durable", "synced"), [(True, 2), (False, 0)])
-def test_files_that_last_are_synced_with_their_folder(
-    durable: bool, synced: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[int] = []
-    monkeypatch.setattr(os, "fsync", calls.append)
+def test_a_whole_file_is_of_this_user_alone(tmp_path: Path) -> None:
     path = tmp_path / ("n" * 150)
-    write_whole(path, b"content", durable=durable)
+    write_whole(path, b"content")
     assert path.read_bytes() == b"content"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert len(calls) == synced
     assert os.listdir(tmp_path) == [path.name]
-    calls.clear()
-    write_whole(path, b"more")
-    assert len(calls) == 2
     with pytest.raises(OSError, match="No such file"):
         write_whole(tmp_path / "none" / "a", b"")
 
@@ -201,16 +191,13 @@ def test_outputs_keep_the_permissions_of_older_files(tmp_path: Path) -> None:
     )
 
 
-def nested(depth: int) -> str:
-    return "[" * depth + "1" + "]" * depth
-
-
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
         ("a" * 1_000_001, "it has more than 1000000 characters"),
-        (nested(51), "it is nested too deeply"),
-        ("&a [*a]", "it refers to itself"),
+        ("[" * 10_000, "it is nested too deeply"),
+        ("&a [*a]", "it has more than 100000 values"),
+        (f"[&a [{'1, ' * 1000}], {'*a, ' * 100}]", "it has more than 100000 values"),
         ("a: [", "while parsing a flow node"),
     ],
 )
@@ -221,24 +208,12 @@ def test_yaml_of_unknown_origin_is_limited(text: str, reason: str) -> None:
     assert "\n" not in str(refused.value)
 
 
-def test_yaml_up_to_its_limits_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_yaml_up_to_its_limits_is_read() -> None:
     assert load_yaml("a" * 1_000_000) == "a" * 1_000_000
-    found = load_yaml(nested(49))
-    for _ in range(49):
-        (found,) = found
-    assert found == 1
-    with pytest.raises(ValueError, match="too deeply"):
-        load_yaml(nested(50))
+    assert len(load_yaml(f"[&a [{'1, ' * 1000}], {'*a, ' * 98}]")) == 99
     assert load_yaml("") is None
     assert load_yaml("[&a [1, 2], *a]") == [[1, 2], [1, 2]]
     assert load_yaml("{a: 1, 2: b}") == {"a": 1, 2: "b"}
-    assert files._MAX_YAML_VALUES == 100_000
-    # Mappings count with their keys.
-    monkeypatch.setattr(files, "_MAX_YAML_VALUES", 10)
-    assert load_yaml("[1, {a: 2, b: 3}, &a [4, 5]]") == [1, {"a": 2, "b": 3}, [4, 5]]
-    for more in ("[1, {a: 2, b: 3}, &a [4, 5], 6]", "[1, 2, 3, &a [4, 5], *a, 6]"):
-        with pytest.raises(ValueError, match="its aliases stand for more than 10 values"):
-            load_yaml(more)
 
 
 def test_a_private_file_is_of_this_user_alone(
@@ -246,15 +221,9 @@ def test_a_private_file_is_of_this_user_alone(
 ) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"12345")
-    path.chmod(0o600)
-    assert read_private(path) == b"12345"
-    assert files._MAX_PRIVATE_FILE_SIZE == 268_435_456
-    monkeypatch.setattr(files, "_MAX_PRIVATE_FILE_SIZE", 5)
-    assert read_private(path) == b"12345"
-    monkeypatch.setattr(files, "_MAX_PRIVATE_FILE_SIZE", 4)
-    with pytest.raises(UntrustedFileError) as refused:
-        read_private(path)
-    assert str(refused.value) == f"'{path}' has 5 bytes; remove it."
+    for mode in (0o600, 0o644):
+        path.chmod(mode)
+        assert read_private(path) == b"12345"
     for mode in (0o620, 0o602):
         path.chmod(mode)
         with pytest.raises(UntrustedFileError) as refused:
@@ -263,19 +232,13 @@ def test_a_private_file_is_of_this_user_alone(
             f"others may write '{path}' (mode {mode:o}); make it yours alone with "
             f"chmod go-w '{path}'."
         )
-    path.chmod(0o644)
-    monkeypatch.setattr(os, "geteuid", lambda: 4_000_000)
-    facts = SimpleNamespace(st_uid=4_000_001, st_mode=0o600)
-    with pytest.raises(UntrustedFileError) as refused:
-        files._require_own_path(path, facts)  # type: ignore[arg-type]
-    assert str(refused.value) == f"'{path}' belongs to user 4000001; use one of your own."
-    assert files._user_name(0) == "user 0 (root)"
-    for owner in (0, 4_000_000):
-        files._require_own_path(path, SimpleNamespace(st_uid=owner, st_mode=0o600))  # type: ignore[arg-type]
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    with pytest.raises(UntrustedFileError, match="is not a regular file; remove it"):
-        read_private(pipe)
+    path.chmod(0o600)
+    if (owner := path.stat().st_uid) == 0:
+        os.chown(path, 4_000_001, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+    with pytest.raises(UntrustedFileError, match=r"belongs to user \d+; use one of your own\.$"):
+        read_private(path)
 
 
 def test_a_cache_gives_what_was_stored_under_a_key(
@@ -285,7 +248,7 @@ def test_a_cache_gives_what_was_stored_under_a_key(
     assert cache.load("x", "key") is None
     path = cache.store("x", "key", b"content")
     assert path == tmp_path / "a" / "b" / "x"
-    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o700
+    assert stat.S_IMODE((tmp_path / "a" / "b").stat().st_mode) == 0o700
     assert cache.load("x", "key") == (path, b"content")
     assert path.read_bytes().splitlines()[-1].startswith(b"spacerobot_ros cache 2 key 7 ")
     with caplog.at_level(logging.WARNING):
@@ -351,10 +314,8 @@ def test_robots_that_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert resources.robot_file("robot.urdf") == Path("robot.urdf")
     beside = tmp_path / "beside"
     assert resources.robot_file("robot.urdf", beside) == beside / "robot.urdf"
-    os.mkfifo(tmp_path / "pipe.urdf")
     for name, sentence in (
         ("folder.urdf", "'folder.urdf' is a folder; name the URDF file in it."),
-        ("pipe.urdf", "'pipe.urdf' is no regular file; name a URDF file."),
         (
             "robt.urdf",
             "There is no robot 'robt.urdf': there is no such URDF file. Did you mean 'robot.urdf'?",
@@ -675,105 +636,6 @@ def test_parameters_of_a_scenario_have_their_types(tmp_path: Path) -> None:
     assert silent.config("recorder").tf_period == 0.0
     assert not fast.lockstep
     assert isinstance(fast.planner, PlannerConfig)
-
-
-# -- termination ----------------------------------------------------------------------------------
-
-
-class Child:
-    """A process that ends by one of its signals."""
-
-    def __init__(self, ends_by: int | None) -> None:
-        self.ends_by, self.sent = ends_by, list[tuple[int, float]]()
-        self.pid, self.code = 4711, None if ends_by is None else 7
-        self.ended = False
-        self.stdin = SimpleNamespace(close=lambda: self.sent.append((0, -1.0)))
-        self.stdout = None
-
-    def send_signal(self, number: int) -> None:
-        self.number = number
-
-    def wait(self, patience: float | None = None) -> int:
-        if patience is None:
-            return 9
-        self.sent.append((self.number, patience))
-        if self.number != self.ends_by:
-            raise subprocess.TimeoutExpired("it", patience)
-        self.ended = True
-        return 7
-
-    def poll(self) -> int | None:
-        return self.code if self.ended else None
-
-
-@pytest.mark.parametrize(
-    ("ends_by", "sent", "killed"),
-    [
-        (signal.SIGINT, [(signal.SIGINT, 1.5)], False),
-        (signal.SIGTERM, [(signal.SIGINT, 1.5), (signal.SIGTERM, 0.5)], False),
-        (None, [(signal.SIGINT, 1.5), (signal.SIGTERM, 0.5)], True),
-    ],
-)
-def test_a_child_is_ended_by_one_signal_after_the_other(
-    ends_by: int | None,
-    sent: list[tuple[int, float]],
-    killed: bool,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    killings: list[Any] = []
-    monkeypatch.setattr(os, "killpg", lambda *given: killings.append(given))
-    child: Any = Child(ends_by)
-    assert termination.end_child(child, {signal.SIGINT: 1.5, signal.SIGTERM: 0.5}) == 9
-    assert child.sent == [*sent, (0, -1.0)]
-    assert killings == ([(4711, signal.SIGKILL)] if killed else [])
-
-
-def test_children_hold_a_pipe_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[Any] = []
-    monkeypatch.setattr(termination, "_lifeline_read_end", lambda: 5)
-    monkeypatch.setattr(subprocess, "Popen", lambda *given, **more: started.append((given, more)))
-    monkeypatch.setattr(subprocess, "run", lambda *given, **more: started.append((given, more)))
-    lifeline = f"5:{os.getpid()}"
-    assert termination.child_options({"A": "b"}) == {
-        "env": {"A": "b", "SPACEROBOT_LIFELINE": lifeline},
-        "pass_fds": (5,),
-    }
-    assert termination.child_options()["env"] == {**os.environ, "SPACEROBOT_LIFELINE": lifeline}
-    own = termination.child_options({})
-    termination.start_child(["-m", "x"], {}, stdout=3)
-    termination.run_child(["-c", "y"], {}, timeout=4)
-    assert started == [
-        (([sys.executable, "-m", "x"],), {"start_new_session": True, **own, "stdout": 3}),
-        (
-            ([sys.executable, "-c", "y"],),
-            {"capture_output": True, "text": True, "check": False, **own, "timeout": 4},
-        ),
-    ]
-
-
-def test_a_lifeline_is_that_of_the_parent(monkeypatch: pytest.MonkeyPatch) -> None:
-    changed: list[Any] = []
-    monkeypatch.setattr(os, "set_inheritable", lambda *given: changed.append(given))
-    monkeypatch.delenv("SPACEROBOT_LIFELINE", raising=False)
-    assert termination._parent_lifeline() == (None, 0)
-    monkeypatch.setenv("SPACEROBOT_LIFELINE", "12:345")
-    assert termination._parent_lifeline() == (12, 345)
-    assert changed == [(12, False)]
-    assert "SPACEROBOT_LIFELINE" not in os.environ
-
-
-def test_what_is_said_of_a_signal() -> None:
-    words = {
-        signal.SIGINT: "Interrupted.",
-        signal.SIGTERM: "Terminated.",
-        signal.SIGHUP: "Hung up.",
-    }
-    for number, text in words.items():
-        ending = termination.Terminated(number)
-        assert (str(ending), ending.number, ending.exit_code) == (text, number, 128 + number)
-    assert str(termination.Terminated(signal.SIGUSR1)) == "Terminated."
-    assert termination.termination() is None
-    assert parameters.Value is not None
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """MCAP bags that any ROS 2 tool opens: writing, reading, replaying and verifying them."""
 
 from spacerobot_ros.bag.mcap_file import LATCHED, QosProfile
-from spacerobot_ros.bag.playback import Playback, ReplayMessage, ReplayTopic, Timeline
+from spacerobot_ros.bag.playback import Playback, ReplayMessage, ReplayTopic
 from spacerobot_ros.bag.reader import Bag, RecordedRobot, iterate_raw, read_bag
 from spacerobot_ros.bag.recording import Derived, FirstTime, Recording, RecordingState
 from spacerobot_ros.bag.series import TopicSeries
@@ -23,7 +23,6 @@ __all__ = [
     "RecordingState",
     "ReplayMessage",
     "ReplayTopic",
-    "Timeline",
     "TopicSeries",
     "free_name",
     "iterate_raw",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 
 from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.reader import Bag
@@ -89,53 +90,6 @@ class ReplayMessage:
     topic: str
     log_time_ns: int
     data: bytes
-
-
-class Timeline:
-    """The time of a bag as a function of a monotonic clock.
-
-    Parameters
-    ----------
-    rate
-        Seconds of the bag in a second of the clock, positive.
-    bag_ns
-        Where in the bag to begin, in nanoseconds; it stands there until ``run``.
-    """
-
-    def __init__(self, rate: float, bag_ns: int) -> None:
-        self._rate = rate
-        self._bag_ns = bag_ns
-        self._clock_ns = 0
-        self._running = False
-
-    @property
-    def running(self) -> bool:
-        """Whether the time of the bag advances."""
-        return self._running
-
-    def start(self, clock_ns: int) -> None:
-        """Let time advance; ``clock_ns`` is the present time of the clock."""
-        if not self._running:
-            self._clock_ns, self._running = clock_ns, True
-
-    def stop(self, clock_ns: int) -> None:
-        """Stop time."""
-        self._bag_ns = self.bag_time(clock_ns)
-        self._running = False
-
-    def seek(self, bag_ns: int, clock_ns: int) -> None:
-        """Jump to ``bag_ns`` in the bag when the clock is at ``clock_ns``."""
-        self._bag_ns, self._clock_ns = bag_ns, clock_ns
-
-    def bag_time(self, clock_ns: int) -> int:
-        """Return the time in the bag, in nanoseconds."""
-        if not self._running:
-            return self._bag_ns
-        return self._bag_ns + math.floor((clock_ns - self._clock_ns) * self._rate)
-
-    def clock_time(self, bag_ns: int) -> int:
-        """Return the clock's time at which ``bag_ns`` is reached if nothing stops before."""
-        return self._clock_ns + math.ceil((bag_ns - self._bag_ns) / self._rate)
 
 
 class SubscriberWait:
@@ -245,9 +199,11 @@ class Playback:
         self._topic_by_channel = {
             number: topic.name for topic in self.topics for number in bag.channel_ids(topic.name)
         }
-        self._timeline = Timeline(rate, self._start_ns)
-        self._remaining_messages = self._messages(self._start_ns)
-        self._next_message = next(self._remaining_messages, None)
+        self._rate = rate
+        self._bag_ns = self._start_ns
+        self._clock_ns: int | None = None
+        """Time of the clock when that of the bag was `_bag_ns`; None: time stands still there."""
+        self._begin()
         if self._next_message is None:
             raise RecordingError(
                 f"The bag {bag.path} has no message to replay from {start:g} s on"
@@ -260,14 +216,9 @@ class Playback:
         """Whether all messages have been replayed."""
         return self._next_message is None
 
-    @property
-    def running(self) -> bool:
-        """Whether the time of the bag advances."""
-        return self._timeline.running
-
     def bag_time(self, clock_ns: int) -> int:
         """Return the time in the bag, in nanoseconds, when the clock is at ``clock_ns``."""
-        now = self._timeline.bag_time(clock_ns)
+        now = self._time(clock_ns)
         if self._next_message is None:
             return now
         # Pending messages are published late, not skipped.
@@ -275,11 +226,12 @@ class Playback:
 
     def run(self, clock_ns: int) -> None:
         """Let time advance; ``clock_ns`` is the present time of the clock."""
-        self._timeline.start(clock_ns)
+        if self._clock_ns is None:
+            self._clock_ns = clock_ns
 
     def pause(self, clock_ns: int) -> None:
         """Stop time."""
-        self._timeline.stop(clock_ns)
+        self._bag_ns, self._clock_ns = self._time(clock_ns), None
 
     def take_due(self, clock_ns: int, max_count: int) -> list[ReplayMessage]:
         """Return the messages that are due, at most ``max_count``.
@@ -290,23 +242,24 @@ class Playback:
             The bag turns out damaged.
         """
         taken: list[ReplayMessage] = []
-        while self._next_message is not None and self._timeline.running and len(taken) < max_count:
-            if self._next_message.log_time_ns > self._timeline.bag_time(clock_ns):
+        while self._next_message is not None and self._clock_ns is not None:
+            due = self._next_message.log_time_ns <= self._time(clock_ns)
+            if not due or len(taken) >= max_count:
                 break
             taken.append(self._take_next_message())
         return taken
 
     def next_due_time(self) -> int | None:
         """Return the clock time of the next message, ns; None at the end or during a pause."""
-        if self._next_message is None or not self._timeline.running:
+        if self._next_message is None or self._clock_ns is None:
             return None
-        return self._timeline.clock_time(self._next_message.log_time_ns)
+        return self._clock_ns + self._clock_span(self._next_message.log_time_ns)
 
     def step(self, clock_ns: int) -> ReplayMessage | None:
         """Return the next message at once, due or not; None at the end of the replay."""
         if self._next_message is None:
             return None
-        self._timeline.seek(max(self._next_message.log_time_ns, self._start_ns), clock_ns)
+        self._set_time(max(self._next_message.log_time_ns, self._start_ns), clock_ns)
         return self._take_next_message()
 
     def seek(self, bag_ns: int, clock_ns: int) -> list[ReplayMessage]:
@@ -323,21 +276,11 @@ class Playback:
         """
         at = min(max(bag_ns, self._start_ns), self._last_ns)
         recent = max(at - _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS, self._start_ns)
-        last = {message.topic: message for message in self._latched_messages_before(at)}
-        begins = at == self._start_ns and not self._timeline.running
-        for message in self._messages_between(
-            set(self._topic_by_channel), recent, at if begins else at - 1
-        ):
-            last[message.topic] = message
-        self._remaining_messages.close()
-        self._remaining_messages = self._messages_between(
-            set(self._topic_by_channel), at, self._end_ns
-        )
-        self._timeline.seek(at, clock_ns)
-        self._next_message = next(self._remaining_messages, None)
-        # Sorted by publication; none is later than the next message of the replay.
-        ordered = sorted(last.values(), key=lambda message: message.log_time_ns)
-        return [replace(message, log_time_ns=at) for message in ordered]
+        begins = at == self._start_ns and self._clock_ns is None
+        shown = self._last_messages(at, recent, at if begins else at - 1)
+        self._set_time(at, clock_ns)
+        self._set_coming(self._messages(set(self._topic_by_channel), at, self._end_ns))
+        return shown
 
     @property
     def start_ns(self) -> int:
@@ -351,43 +294,64 @@ class Playback:
 
     def close(self) -> None:
         """Close the bag; the replay has no more messages."""
-        self._remaining_messages.close()
-        self._next_message = None
+        self._set_coming(iter(()))
+
+    def _time(self, clock_ns: int) -> int:
+        if self._clock_ns is None:
+            return self._bag_ns
+        return self._bag_ns + math.floor((clock_ns - self._clock_ns) * self._rate)
+
+    def _clock_span(self, bag_ns: int) -> int:
+        """Return how long the clock takes from the last change of time to a time in the bag."""
+        return math.ceil((bag_ns - self._bag_ns) / self._rate)
+
+    def _set_time(self, bag_ns: int, clock_ns: int) -> None:
+        self._bag_ns = bag_ns
+        self._clock_ns = None if self._clock_ns is None else clock_ns
+
+    def _set_coming(self, messages: Iterator[ReplayMessage]) -> None:
+        self._coming = messages
+        self._next_message = next(messages, None)
+
+    def _begin(self) -> None:
+        """Let all messages from the start on come, after those that were latched before it."""
+        found = self._messages(set(self._topic_by_channel), self._start_ns, self._end_ns)
+        first = list(islice(found, 1))
+        start = self._start_ns
+        earlier = self._last_messages(start, start, start - 1) if first else []
+        self._set_coming(chain(earlier, first, found))
 
     def _take_next_message(self) -> ReplayMessage:
         message = self._next_message
         assert message is not None
-        self._next_message = next(self._remaining_messages, None)
+        self._next_message = next(self._coming, None)
         if self._next_message is None and self._loop:
             # A repeated replay begins at the log time of the last message.
-            last = max(message.log_time_ns, self._start_ns)
-            self._timeline.seek(self._start_ns, self._timeline.clock_time(last))
-            self._remaining_messages = self._messages(self._start_ns)
-            self._next_message = next(self._remaining_messages, None)
+            span = self._clock_span(max(message.log_time_ns, self._start_ns))
+            self._set_time(self._start_ns, (self._clock_ns or 0) + span)
+            self._begin()
         return message
 
-    def _messages(self, start_ns: int) -> Generator[ReplayMessage, None, None]:
-        earlier = {message.topic: message for message in self._latched_messages_before(start_ns)}
-        in_time = self._messages_between(set(self._topic_by_channel), start_ns, self._end_ns)
-        first = next(in_time, None)
-        if first is None:
-            return
-        yield from (replace(m, log_time_ns=start_ns) for m in earlier.values())
-        yield first
-        yield from in_time
+    def _last_messages(self, time_ns: int, since_ns: int, until_ns: int) -> list[ReplayMessage]:
+        """Return the last message of each topic, by age, as due at a time.
 
-    def _latched_messages_before(self, time_ns: int) -> Iterator[ReplayMessage]:
-        """Yield the messages of latched topics before a time; the last of each counts."""
+        They are those of latched topics before that time, and of others in a span.
+        """
         latched = {n for t in self.topics if t.latched for n in self._bag.channel_ids(t.name)}
-        if latched and time_ns > self._bag.start_time_ns:
-            yield from self._messages_between(latched, 0, time_ns - 1)
+        last: dict[str, ReplayMessage] = {}
+        spans = (latched, 0, time_ns - 1), (set(self._topic_by_channel), since_ns, until_ns)
+        for channels, begin, end in spans:
+            last.update((each.topic, each) for each in self._messages(channels, begin, end))
+        ordered = sorted(last.values(), key=lambda message: message.log_time_ns)
+        return [replace(message, log_time_ns=time_ns) for message in ordered]
 
-    def _messages_between(
+    def _messages(
         self, channel_ids: set[int], start_ns: int, end_ns: int
-    ) -> Generator[ReplayMessage, None, None]:
-        found = self._bag.raw_messages(channel_ids, start_ns, end_ns)
-        for channel_id, log_time_ns, _, data in found:
-            yield ReplayMessage(self._topic_by_channel[channel_id], log_time_ns, data)
+    ) -> Iterator[ReplayMessage]:
+        if start_ns <= end_ns:
+            found = self._bag.raw_messages(channel_ids, start_ns, end_ns)
+            for channel_id, log_time_ns, _, data in found:
+                yield ReplayMessage(self._topic_by_channel[channel_id], log_time_ns, data)
 
 
 def _replay_topic(bag: Bag, name: str) -> ReplayTopic:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from html import escape
@@ -11,20 +11,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
-from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata
 from numpy.typing import NDArray
 
 from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.mcap_reading import (
     RawMessage,
+    RecordT,
+    blocks_in_file_order,
     blocks_in_time_order,
     file_size,
-    indexed_records,
-    messages_in_file_order,
-    messages_in_time_order,
+    messages_of,
     open_bag,
-    parse_record,
+    read_record,
     read_summary,
 )
 from spacerobot_ros.bag.series import TopicSeries
@@ -87,7 +86,8 @@ def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, i
             channel.id: (channel.topic, _type_name(summary.schemas, channel))
             for channel in summary.channels.values()
         }
-        for channel_id, log_time_ns, publish_time_ns, data in messages_in_file_order(file):
+        blocks = blocks_in_file_order(file)
+        for channel_id, log_time_ns, publish_time_ns, data in messages_of(blocks):
             if channel_id not in names:
                 raise ValueError(f"its summary lacks channel {channel_id}")
             topic, type_name = names[channel_id]
@@ -205,18 +205,20 @@ class Bag:
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
         """Keys and values of every metadata record by its name; of equal names the last counts."""
-        with open_bag(self.path) as file:
-            found = indexed_records(file, self._summary.metadata_indexes, Opcode.METADATA)
-            read = (parse_record(Metadata.read, body, place) for place, body in found)
-            return {metadata.name: metadata.metadata for metadata in read}
+        records = self._records(self._summary.metadata_indexes, Metadata)
+        return {metadata.name: metadata.metadata for metadata in records}
 
     @cached_property
     def attachments(self) -> dict[str, bytes]:
         """Content of every attachment by its name; of equal names the last counts."""
+        records = self._records(self._summary.attachment_indexes, Attachment)
+        return {attachment.name: attachment.data for attachment in records}
+
+    def _records(self, indexes: Sequence[Any], kind: type[RecordT]) -> list[RecordT]:
+        """Read the records that an index of the summary names, each once."""
         with open_bag(self.path) as file:
-            found = indexed_records(file, self._summary.attachment_indexes, Opcode.ATTACHMENT)
-            read = (parse_record(Attachment.read, body, place) for place, body in found)
-            return {attachment.name: attachment.data for attachment in read}
+            places = dict.fromkeys(index.offset for index in indexes)
+            return [read_record(file, place, kind) for place in places]
 
     @property
     def start_time(self) -> float:
@@ -258,7 +260,8 @@ class Bag:
         ------
         Channel, log time and publish time in nanoseconds, serialised message.
         """
-        return messages_in_time_order(self.path, channel_ids, start_ns, end_ns, self._summary)
+        blocks = blocks_in_time_order(self.path, channel_ids, start_ns, end_ns, self._summary)
+        return messages_of(blocks)
 
     def qos(self, topic: str) -> list[QosProfile]:
         """Return the recorded quality of service of the publishers of a topic."""

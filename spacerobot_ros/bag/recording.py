@@ -276,7 +276,8 @@ class Recording:
             published = np.insert(published, after + 1, [each.published_ns for each in derived])
             logged = np.insert(logged, after + 1, logged[after])
         try:
-            self.writer.write_many(numbers, messages, logged, published)
+            for message in zip(numbers, messages, logged.tolist(), published.tolist(), strict=True):
+                self._write(*message)
         except RecordingError as error:
             self._written = self.writer.messages_written
             self._fail(error)

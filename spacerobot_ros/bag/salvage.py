@@ -3,42 +3,38 @@
 from __future__ import annotations
 
 import os
-import struct
 import tempfile
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Header, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    Header,
+    Message,
+    Metadata,
+    Schema,
+)
+from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import MCAP0_MAGIC
 
-from spacerobot_ros.bag.mcap_file import (
-    METADATA_NAME,
-    Entries,
-    McapFile,
-    QosProfile,
-    RecordedTopic,
-    encode,
-    no_entries,
-)
+from spacerobot_ros.bag.mcap_file import METADATA_NAME, McapFile, QosProfile, RecordedTopic
 from spacerobot_ros.bag.mcap_reading import (
-    DAMAGE_ERRORS,
-    RECORD_HEADER,
-    InflationLimit,
-    chunk_size,
+    ChunkUnpacker,
+    blocks_in_file_order,
     file_size,
-    messages_in_file_order,
     open_bag,
     open_file,
     parse_record,
+    read_record,
     read_summary,
     records,
     records_in_chunk,
-    unpack_chunk,
 )
 from spacerobot_ros.bag.reader import Array, RecordedRobot, columns, read_bag
 from spacerobot_ros.errors import RecordingError
@@ -47,9 +43,6 @@ from spacerobot_ros.times import SECOND
 _STATE_TOPICS = ("odom", "joint_states", "momentum")
 _WITHOUT_STATES = ("inactive", "failed")
 """States of a plant that publishes no states of the robot."""
-_CHUNK_SIZE = 65536
-_CHANNEL_AND_TIME = struct.Struct("<H4xQ")
-"""Head of a message: channel, sequence number (skipped) and log time."""
 
 
 @dataclass(frozen=True)
@@ -96,30 +89,31 @@ def salvage_bag(
     target = Path(out) if out is not None else source.with_name(f"{source.stem}-salvaged.mcap")
     if is_complete(source):
         raise RecordingError(f"The bag {source} is complete: there is nothing to salvage.")
-    found = _ReadableRecords(source)
-    first = next(found.records, None)
-    if first is None:
-        raise RecordingError(f"Nothing in the bag {source} can be read.")
-    file = McapFile(target, compression="zstd", overwrite=False, profile=found.profile)
-    try:
-        copy = _SalvagedBag(file)
-        copy.add(*first)
-        for opcode, body in found.records:
-            copy.add(opcode, body)
-        copy.finish(found.profile)
-    except BaseException:
-        file.close()
-        target.unlink(missing_ok=True)
-        raise
-    file.close()
-    span = (file.end_ns or 0) - (file.start_ns or 0)
+    with open_file(source) as old:
+        start = old.read(MAGIC_SIZE)
+        if start != MCAP0_MAGIC:
+            empty = start == MCAP0_MAGIC[: len(start)]
+            what = "holds nothing yet" if empty else "is not an MCAP file"
+            raise RecordingError(f"{source} {what}: there is nothing to salvage.")
+        profile = "ros2"
+        with suppress(ValueError):
+            profile = read_record(old, MAGIC_SIZE, Header).profile
+        new = McapFile(target, overwrite=False, profile=profile)
+        try:
+            copy = _Copy(new)
+            copy.add_readable_records(old)
+            if copy.empty:
+                raise RecordingError(f"Nothing in the bag {source} can be read.")
+            topics = copy.topics()
+            new.finish(topics if profile == "ros2" else None)
+        except BaseException:
+            new.close()
+            target.unlink(missing_ok=True)
+            raise
+    span = (new.end_ns or 0) - (new.start_ns or 0)
+    count = new.message_counts.total()
     return Salvaged(
-        target,
-        sum(file.message_counts.values()),
-        span / SECOND,
-        found.lost_chunks,
-        found.lost_bytes,
-        found.reason,
+        target, count, span / SECOND, copy.lost_chunks, copy.lost_bytes, copy.loss_reason
     )
 
 
@@ -128,145 +122,102 @@ def is_complete(path: Path) -> bool:
     try:
         with open_bag(path) as file:
             summary = read_summary(path, file)
-            count = sum(1 for _ in messages_in_file_order(file))
+            count = sum(len(messages) for *_, messages in blocks_in_file_order(file))
             return summary.statistics is not None and summary.statistics.message_count == count
     except RecordingError:
         return False
 
 
-def _complete_records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
-    """Iterate over the records between two bytes of a file, up to the first incomplete one."""
-    # Only reading is inside the try: errors of the caller must not be caught.
-    with suppress(ValueError):
-        yield from records(file, start, end)
-
-
-class _ReadableRecords:
-    """The readable records of a bag, with those in chunks."""
-
-    def __init__(self, path: Path) -> None:
-        self.profile = "ros2"
-        self.lost_chunks = self.lost_bytes = 0
-        self.reason = ""
-        """Reason why the first lost chunk cannot be read."""
-        self._path = path
-        self.records = self._read_records()
-
-    def _read_records(self) -> Iterator[tuple[int, bytes]]:
-        with open_file(self._path) as file:
-            size = file_size(file)
-            start = file.read(len(MCAP0_MAGIC))
-            if start != MCAP0_MAGIC:
-                empty = start == MCAP0_MAGIC[: len(start)]
-                what = "holds nothing yet" if empty else "is not an MCAP file"
-                raise RecordingError(f"{self._path} {what}: there is nothing to salvage.")
-            whole, allowance = len(start), InflationLimit(size)
-            for place, opcode, body in _complete_records(file, len(start), size):
-                whole = place + RECORD_HEADER.size + len(body)
-                if opcode == Opcode.HEADER:
-                    with suppress(*DAMAGE_ERRORS):
-                        self.profile = parse_record(Header.read, body, place).profile
-                elif opcode == Opcode.CHUNK:
-                    yield from self._records_in_chunk(body, place, allowance)
-                elif opcode == Opcode.DATA_END:
-                    # The summary repeats earlier records.
-                    return
-                else:
-                    yield opcode, body
-            self.lost_bytes = size - whole
-
-    def _records_in_chunk(
-        self, body: bytes, place: int, allowance: InflationLimit
-    ) -> Iterator[tuple[int, bytes]]:
-        try:
-            allowance.count(chunk_size(body), place)
-            data = unpack_chunk(body, place)
-        except DAMAGE_ERRORS as error:
-            self.lost_chunks += 1
-            self.reason = self.reason or str(error) or type(error).__name__
-            return
-        with suppress(ValueError):
-            for opcode, start, end in records_in_chunk(data, place):
-                yield opcode, data[start + RECORD_HEADER.size : end]
-
-
-class _SalvagedBag:
-    """A bag written from the readable records of another bag."""
+class _Copy:
+    """The readable records of a bag in a new file."""
 
     def __init__(self, file: McapFile) -> None:
+        self.empty = True
+        self.lost_chunks = self.lost_bytes = 0
+        self.loss_reason = ""
         self._file = file
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._records_in_chunk = bytearray()
-        self._entries: dict[int, Entries] = {}
+        self._new_schema_ids = {0: 0}
+        self._new_channel_ids: dict[int, int] = {}
 
-    def add(self, opcode: int, body: bytes) -> None:
-        """Add a record; an unreadable record is left out."""
-        with suppress(*DAMAGE_ERRORS):
-            if opcode == Opcode.MESSAGE:
-                self._add_message(body)
-            elif opcode == Opcode.SCHEMA:
-                schema = parse_record(Schema.read, body, 0)
-                self._schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL:
-                channel = parse_record(Channel.read, body, 0)
-                self._channels[channel.id] = channel
-            elif opcode == Opcode.ATTACHMENT:
-                self._file.append_attachment(parse_record(Attachment.read, body, 0))
-            elif opcode == Opcode.METADATA:
-                metadata = parse_record(Metadata.read, body, 0)
-                if metadata.name != METADATA_NAME:
-                    self._file.append_metadata(metadata)
+    def add_readable_records(self, old: BinaryIO) -> None:
+        """Add what can be read of a file, up to the first record that is cut."""
+        size, whole = file_size(old), MAGIC_SIZE
+        chunks = ChunkUnpacker(size)
+        # A ValueError ends the iteration: none comes from what is done with a record.
+        with suppress(ValueError):
+            for place, opcode, record in records(old, MAGIC_SIZE):
+                whole = place + len(record)
+                if opcode == Opcode.DATA_END:
+                    # The summary repeats earlier records.
+                    return
+                if opcode == Opcode.CHUNK:
+                    self._add_chunk(record, place, chunks)
+                else:
+                    self._add(record, place)
+        self.lost_bytes = size - whole
 
-    def finish(self, profile: str) -> None:
-        """Write the last chunk, rosbag2's record and the summary."""
-        self._flush()
-        self._file.schemas += self._schemas.values()
-        self._file.channels += self._channels.values()
-        if profile == "ros2":
-            self._append_rosbag2_metadata()
-        self._file.finish()
-
-    def _add_message(self, body: bytes) -> None:
-        channel_id, log_time_ns = _CHANNEL_AND_TIME.unpack_from(body)
-        if channel_id not in self._channels:
+    def _add_chunk(self, record: bytes, place: int, chunks: ChunkUnpacker) -> None:
+        try:
+            data = chunks.unpack(cast("Chunk", parse_record(record, place)), place)
+        except ValueError as error:
+            self.lost_chunks += 1
+            self.loss_reason = self.loss_reason or str(error)
             return
-        if channel_id not in self._entries:
-            # Streaming readers need schema and channel before the message.
-            self._entries[channel_id] = no_entries()
-            channel = self._channels[channel_id]
-            if channel.schema_id in self._schemas:
-                self._records_in_chunk += encode(self._schemas[channel.schema_id])
-            self._records_in_chunk += encode(channel)
-        self._entries[channel_id].extend((log_time_ns, len(self._records_in_chunk)))
-        self._records_in_chunk += RECORD_HEADER.pack(Opcode.MESSAGE, len(body)) + body
-        if len(self._records_in_chunk) >= _CHUNK_SIZE:
-            self._flush()
+        with suppress(ValueError):
+            for begin, end in records_in_chunk(data, place):
+                self._add(data[begin:end], place)
 
-    def _flush(self) -> None:
-        if any(self._entries.values()):
-            self._file.append_chunk(self._records_in_chunk, self._entries)
-            self._records_in_chunk = bytearray()
-            for entries in self._entries.values():
-                del entries[:]
+    def _add(self, record: bytes, place: int) -> None:
+        """Add a record; one that cannot be read, or is of an unknown channel, is left out."""
+        found = None
+        with suppress(ValueError):
+            found = parse_record(record, place)
+        self.empty &= found is None or isinstance(found, Header)
+        match found:
+            case Message() as message if message.channel_id in self._channels:
+                channel_id = self._new_channel_id(message.channel_id)
+                self._file.write(channel_id, message.data, message.log_time, message.publish_time)
+            case Schema() as schema:
+                self._schemas[schema.id] = schema
+            case Channel() as channel:
+                self._channels[channel.id] = channel
+            case Attachment() as file:
+                self._file.add_attachment(file.name, file.data, file.media_type, file.log_time)
+            case Metadata() as metadata if metadata.name != METADATA_NAME:
+                self._file.add_metadata(metadata.name, metadata.metadata)
 
-    def _append_rosbag2_metadata(self) -> None:
+    def topics(self) -> list[RecordedTopic]:
+        """Return all topics for rosbag2's record; those without a message are in the file too."""
         topics = []
         for channel in self._channels.values():
-            words = channel.metadata
+            count = self._file.message_counts[self._new_channel_id(channel.id)]
+            schema, words = self._schemas.get(channel.schema_id), channel.metadata
+            type_name, type_hash = schema.name if schema else "", words.get("topic_type_hash", "")
             with suppress(RecordingError):
                 profiles = QosProfile.from_yaml(words.get("offered_qos_profiles", ""))
-                schema = self._schemas.get(channel.schema_id)
-                topics.append(
-                    RecordedTopic(
-                        channel.topic,
-                        schema.name if schema else "",
-                        words.get("topic_type_hash", ""),
-                        profiles[0] if profiles else QosProfile(),
-                        self._file.message_counts.get(channel.id, 0),
-                    )
+                qos = profiles[0] if profiles else QosProfile()
+                topics.append(RecordedTopic(channel.topic, type_name, type_hash, qos, count))
+        return topics
+
+    def _new_channel_id(self, channel_id: int) -> int:
+        """Return the channel of the new file for one of the old file."""
+        if channel_id not in self._new_channel_ids:
+            channel = self._channels[channel_id]
+            number = channel.schema_id if channel.schema_id in self._schemas else 0
+            if number not in self._new_schema_ids:
+                schema = self._schemas[number]
+                self._new_schema_ids[number] = self._file.add_schema(
+                    schema.name, schema.encoding, schema.data
                 )
-        self._file.append_rosbag2_metadata(topics)
+            self._new_channel_ids[channel_id] = self._file.add_channel(
+                channel.topic,
+                channel.message_encoding,
+                self._new_schema_ids[number],
+                channel.metadata,
+            )
+        return self._new_channel_ids[channel_id]
 
 
 # -- the state to resume from -----------------------------------------------------------------

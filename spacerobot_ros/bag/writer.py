@@ -6,35 +6,17 @@ import os
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
-import numpy as np
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Schema
-from numpy.typing import NDArray
-
-from spacerobot_ros.bag.mcap_file import (
-    BagExistsError,
-    Entries,
-    McapFile,
-    QosProfile,
-    RecordedTopic,
-    encode,
-    no_entries,
-)
-from spacerobot_ros.bag.mcap_reading import MESSAGE_HEADERS
+from spacerobot_ros.bag.mcap_file import BagExistsError, McapFile, QosProfile, RecordedTopic
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.messages.definitions import message_definition, type_hash
 
-_MESSAGE_HEADER = struct.Struct("<BQHIQQ")
-"""Head of a message record: opcode, length, channel, sequence, log time, publish time."""
-
-_pack_header = _MESSAGE_HEADER.pack
-_HEADER_LENGTH = _MESSAGE_HEADER.size - 9
-_MESSAGE = int(Opcode.MESSAGE)
+_TIMES = struct.Struct("<QQ")
+"""The times of a message in MCAP, ns."""
 
 
 def free_name(path: Path, first: int = 0) -> Path:
@@ -45,14 +27,6 @@ def free_name(path: Path, first: int = 0) -> Path:
         if not os.path.lexists(name):
             return name
         number += 1
-
-
-def _places_by_value(numbers: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    """Yield each of some numbers with its places, in order."""
-    order = np.argsort(numbers, kind="stable")
-    ascending = numbers[order]
-    begins = np.flatnonzero(np.diff(ascending, prepend=-1))
-    yield from zip(ascending[begins].tolist(), np.split(order, begins[1:]), strict=True)
 
 
 class BagWriter:
@@ -109,25 +83,24 @@ class BagWriter:
         self._limits = max_size, max_duration_ns
         self._file_number = 0
         self._compression, self._overwrite = compression, overwrite and not next_free
+        self._chunk_size = chunk_size
         self._next_free = next_free
         self.splits = 0
         """Number of files begun after the first one."""
-        self._earlier_counts: Counter[str] = Counter()
-        self._repeated_records: list[Attachment | Metadata] = []
-        self._file = self._open_first_file()
-        self._chunk_size = chunk_size
-        self._chunk = bytearray()
-        # For each channel: log time of each message and its offset in the chunk. Empty as soon as
-        # nothing more can be written, so that `write` needs no test of its own for that.
-        self._entries: dict[int, Entries] = {}
+        self._earlier_counts: Counter[int] = Counter()
+        self._repeated: list[Callable[[McapFile], None]] = []
+        """Puts an attachment or metadata record into a file, for each of them."""
         self._topics: dict[str, tuple[int, str, QosProfile]] = {}
         self._schema_ids: dict[str, int] = {}
+        self._channel_ids: set[int] = set()
+        """Channels that take messages: none as soon as nothing more can be written."""
         self._refusal: str | None = None
         self._closed = False
+        self._file = self._open_first_file()
         try:
             # rosbag2 writes this record at both ends. The first tells the readers of a cut file
             # that its QoS policies are words.
-            self._append_rosbag2_metadata()
+            self._file.add_rosbag2_metadata([])
         except RecordingError:
             self._file.close()
             raise
@@ -140,10 +113,8 @@ class BagWriter:
     @property
     def message_counts(self) -> dict[str, int]:
         """Number of messages of each topic in the bag, with the chunk in progress."""
-        return {
-            name: self._earlier_counts[name] + self._message_count(channel)
-            for name, (channel, _, _) in self._topics.items()
-        }
+        counts = self._earlier_counts + self._file.message_counts
+        return {name: counts[channel] for name, (channel, _, _) in self._topics.items()}
 
     @property
     def bytes_written(self) -> int:
@@ -153,7 +124,7 @@ class BagWriter:
     @property
     def bytes_waiting(self) -> int:
         """Size of the chunk in progress, which is not in the file yet, bytes."""
-        return len(self._chunk)
+        return self._file.bytes_waiting
 
     @property
     def messages_written(self) -> int:
@@ -192,20 +163,10 @@ class BagWriter:
                 )
             return channel_id
         profile = QosProfile() if qos is None else qos
-        hash_string = type_hash(type_name)
-        schema_id = self._schema_ids.get(type_name) or self._add_schema(type_name)
-        channel = Channel(
-            id=len(self._file.channels) + 1,
-            topic=name,
-            message_encoding="cdr",
-            metadata={"offered_qos_profiles": profile.to_yaml(), "topic_type_hash": hash_string},
-            schema_id=schema_id,
-        )
-        self._chunk += encode(channel)
-        self._file.channels.append(channel)
-        self._topics[name] = channel.id, type_name, profile
-        self._entries[channel.id] = no_entries()
-        return channel.id
+        channel = self._register(name, type_name, profile)
+        self._topics[name] = channel, type_name, profile
+        self._channel_ids.add(channel)
+        return channel
 
     def write(self, channel_id: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         """Add one message.
@@ -227,99 +188,46 @@ class BagWriter:
             The disk refused it, nothing more can be written, the channel is unknown, or a time is
             not a whole number of at least 0.
         """
-        chunk = self._chunk
         try:
-            header = _pack_header(
-                _MESSAGE,
-                _HEADER_LENGTH + len(data),
-                channel_id,
-                0,
-                log_time_ns,
-                publish_time_ns,
-            )
-            entries = self._entries[channel_id]
-        except (KeyError, struct.error):
+            _TIMES.pack(log_time_ns, publish_time_ns)
+        except struct.error:
             raise self._explain_refusal(channel_id) from None
-        record = header + data
-        entries.extend((log_time_ns, len(chunk)))
-        chunk += record
-        if len(chunk) >= self._chunk_size:
-            self._finish_chunk()
-
-    def write_many(
-        self,
-        channel_ids: Sequence[int],
-        messages: Sequence[bytes],
-        log_times_ns: NDArray[np.int64],
-        publish_times_ns: NDArray[np.int64],
-    ) -> None:
-        """Add messages as :meth:`write` does one by one, in a fifth of the time.
-
-        Parameters
-        ----------
-        channel_ids, messages
-            Channel and bytes of each message.
-        log_times_ns, publish_times_ns
-            (k,) its times, not negative.
-
-        Raises
-        ------
-        RecordingError
-            As by :meth:`write`; messages before the refused chunk are in the bag.
-        """
-        channels = np.array(channel_ids)
-        headers = np.zeros(len(messages), MESSAGE_HEADERS)
-        headers["opcode"], headers["channel"] = _MESSAGE, channels
-        headers["log_time"], headers["publish_time"] = log_times_ns, publish_times_ns
-        sizes = np.fromiter(map(len, messages), np.int64, len(messages))
-        headers["length"] = sizes + _HEADER_LENGTH
-        size = MESSAGE_HEADERS.itemsize
-        pieces: list[bytes] = [b""] * (2 * len(messages))
-        pieces[::2] = headers.view(f"V{size}").tolist()
-        pieces[1::2] = messages
-        ends = np.cumsum(sizes + size)
-        first = 0
-        while first < len(messages):
-            begin = int(ends[first - 1]) if first else 0
-            # A chunk is finished after the message that makes it full.
-            room = self._chunk_size - len(self._chunk) + begin
-            last = min(int(np.searchsorted(ends, room)) + 1, len(messages))
-            offsets = len(self._chunk) - begin + ends[first:last] - sizes[first:last] - size
-            entries = np.column_stack([log_times_ns[first:last], offsets])
-            for channel, places in _places_by_value(channels[first:last]):
-                if channel not in self._entries:
-                    raise self._explain_refusal(channel)
-                self._entries[channel].frombytes(entries[places].tobytes())
-            self._chunk += b"".join(pieces[2 * first : 2 * last])
-            if len(self._chunk) >= self._chunk_size:
-                self._finish_chunk()
-            first = last
+        if channel_id not in self._channel_ids:
+            raise self._explain_refusal(channel_id)
+        if not isinstance(data, bytes | bytearray | memoryview):
+            raise TypeError(f"A message is bytes, not {type(data).__name__}.")
+        try:
+            completed_chunk = self._file.write(channel_id, data, log_time_ns, publish_time_ns)
+        except RecordingError as error:
+            self._refuse_further_writes(str(error))
+            raise
+        if completed_chunk and self._is_full():
+            with self._refusing_after_failure():
+                self._begin_next_file()
 
     def add_attachment(self, name: str, data: bytes, media_type: str, log_time_ns: int) -> None:
         """Put a whole file into the bag.
 
         ``media_type`` is such as ``application/xml``, ``log_time_ns`` when it was recorded.
         """
-        self._require_open()
-        attachment = Attachment(
-            create_time=0, log_time=log_time_ns, name=name, media_type=media_type, data=data
-        )
-        self._repeated_records.append(attachment)
-        with self._refusing_after_failure():
-            self._file.append_attachment(attachment)
+        self._add(lambda file: file.add_attachment(name, data, media_type, log_time_ns))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
         """Put a record of keys and values into the bag."""
+        self._add(lambda file: file.add_metadata(name, data))
+
+    def _add(self, record: Callable[[McapFile], None]) -> None:
         self._require_open()
-        metadata = Metadata(name=name, metadata=data)
-        self._repeated_records.append(metadata)
+        self._repeated.append(record)
         with self._refusing_after_failure():
-            self._file.append_metadata(metadata)
+            record(self._file)
 
     def flush(self) -> None:
         """Hand the chunk in progress to the operating system: a kill loses nothing of it."""
         self._require_open()
-        self._finish_chunk()
+        with self._refusing_after_failure():
+            if self._file.flush() and self._is_full():
+                self._begin_next_file()
 
     def close(self) -> None:
         """Write pending messages and the summary, and close the file; a second call does nothing.
@@ -332,18 +240,13 @@ class BagWriter:
         if self._closed:
             return
         self._closed = True
-        failed_before = self._refusal is not None
-        failure: RecordingError | None = None
-        # Each step is worth trying when the one before failed: a summary is smaller than a chunk.
-        for step in (self._finish_chunk, self._append_rosbag2_metadata, self._file.finish):
-            try:
-                step()
-            except RecordingError as error:
-                failure = failure or error
-        self._file.close()
-        self._refuse_further_writes(self._refusal or f"The bag {self.path} is closed.")
-        if failure is not None and not failed_before:
-            raise failure
+        refusal = self._refusal
+        self._refuse_further_writes(refusal or f"The bag {self.path} is closed.")
+        try:
+            self._file.finish(self._recorded_topics())
+        except RecordingError:
+            if refusal is None:
+                raise
 
     def __enter__(self) -> BagWriter:
         return self
@@ -356,29 +259,14 @@ class BagWriter:
     ) -> None:
         self.close()
 
-    def _add_schema(self, type_name: str) -> int:
-        schema = Schema(
-            id=len(self._file.schemas) + 1,
-            data=message_definition(type_name).encode(),
-            encoding="ros2msg",
-            name=type_name,
-        )
-        self._chunk += encode(schema)
-        self._file.schemas.append(schema)
-        self._schema_ids[type_name] = schema.id
-        return schema.id
-
-    def _finish_chunk(self) -> None:
-        if not any(self._entries.values()):
-            return
-        with self._refusing_after_failure():
-            self._file.append_chunk(self._chunk, self._entries)
-        self._chunk = bytearray()
-        for entries in self._entries.values():
-            del entries[:]
-        if not self._closed and self._is_full():
-            with self._refusing_after_failure():
-                self._begin_next_file()
+    def _register(self, name: str, type_name: str, qos: QosProfile) -> int:
+        """Put a topic into the present file; it gets the same channel in every file."""
+        hash_string = type_hash(type_name)
+        if type_name not in self._schema_ids:
+            text = message_definition(type_name).encode()
+            self._schema_ids[type_name] = self._file.add_schema(type_name, "ros2msg", text)
+        metadata = {"offered_qos_profiles": qos.to_yaml(), "topic_type_hash": hash_string}
+        return self._file.add_channel(name, "cdr", self._schema_ids[type_name], metadata)
 
     def _is_full(self) -> bool:
         max_size, max_duration_ns = self._limits
@@ -427,28 +315,25 @@ class BagWriter:
         path = self._unsplit_path
         if any(self._limits):
             path = path.with_name(f"{path.stem}_{self._file_number}{path.suffix}")
-        return McapFile(path, compression=self._compression, overwrite=self._overwrite)
+        return McapFile(
+            path,
+            compression=self._compression,
+            chunk_size=self._chunk_size,
+            overwrite=self._overwrite,
+        )
 
     def _begin_next_file(self) -> None:
         """Complete the present file and begin the next one, with the same schemas and channels."""
-        self._append_rosbag2_metadata()
-        self._file.finish()
-        self._file.close()
-        for name, (channel, _, _) in self._topics.items():
-            self._earlier_counts[name] += self._message_count(channel)
-        schemas, channels = self._file.schemas, self._file.channels
+        self._file.finish(self._recorded_topics())
+        self._earlier_counts += self._file.message_counts
         self._file = self._open_next_file()
         self.splits += 1
-        self._append_rosbag2_metadata()
-        for record in self._repeated_records:
-            if isinstance(record, Attachment):
-                self._file.append_attachment(record)
-            else:
-                self._file.append_metadata(record)
-        self._file.schemas += schemas
-        self._file.channels += channels
-        for known in (*schemas, *channels):
-            self._chunk += encode(known)
+        self._file.add_rosbag2_metadata(self._recorded_topics())
+        for record in self._repeated:
+            record(self._file)
+        self._schema_ids = {}
+        for name, (_, type_name, qos) in self._topics.items():
+            self._register(name, type_name, qos)
 
     def _open_next_file(self) -> McapFile:
         while True:
@@ -460,18 +345,12 @@ class BagWriter:
                 if self._overwrite:
                     raise
 
-    def _append_rosbag2_metadata(self) -> None:
-        topics = [
-            RecordedTopic(
-                name, type_name, type_hash(type_name), qos, self._message_count(channel_id)
-            )
-            for name, (channel_id, type_name, qos) in self._topics.items()
+    def _recorded_topics(self) -> list[RecordedTopic]:
+        counts = self._file.message_counts
+        return [
+            RecordedTopic(name, type_name, type_hash(type_name), qos, counts[channel])
+            for name, (channel, type_name, qos) in self._topics.items()
         ]
-        self._file.append_rosbag2_metadata(topics)
-
-    def _message_count(self, channel_id: int) -> int:
-        in_progress = len(self._entries.get(channel_id, ())) // 2
-        return self._file.message_counts.get(channel_id, 0) + in_progress
 
     def _require_open(self) -> None:
         if self._refusal is not None:
@@ -487,13 +366,12 @@ class BagWriter:
 
     def _refuse_further_writes(self, reason: str) -> None:
         self._refusal = reason
-        self._chunk = bytearray()
-        self._entries = {}
+        self._channel_ids = set()
 
     def _explain_refusal(self, channel_id: int) -> RecordingError:
         if self._refusal is not None:
             return RecordingError(self._refusal)
-        if channel_id not in self._entries:
+        if channel_id not in self._channel_ids:
             return RecordingError(
                 f"The bag {self.path} has no channel {channel_id}: add_topic gives the channels."
             )

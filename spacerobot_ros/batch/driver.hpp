@@ -335,30 +335,3 @@ extern "C" long long fly_until(const Job *job, long long until) {
   }
   return waiting;
 }
-
-// CasADi's interface with a number for each V: for the trial of a new object.
-static int trial(Function *function, const long long *sizes_in, long long count_in,
-                 const long long *sizes_out, long long count_out,
-                 const double **arguments, double **results) {
-  const V *in[ARGUMENT_POINTERS];
-  V *out[RESULT_POINTERS];
-  static V memory[TRIAL_SIZE];
-  static long long integers[INTEGER_SIZE];
-  V *next = memory;
-  for (long long i = 0; i < count_in; ++i) {
-    in[i] = next;
-    for (long long k = 0; k < sizes_in[i]; ++k) *next++ = V(arguments[i][k]);
-  }
-  for (long long i = 0; i < count_out; ++i) {
-    out[i] = next;
-    next += sizes_out[i];
-  }
-  const int code = function(in, out, integers, work_memory(), 0);
-  for (long long i = 0; i < count_out; ++i)
-    for (long long k = 0; k < sizes_out[i]; ++k) {
-      results[i][k] = out[i][k].x[0];
-      for (int lane = 1; lane < LANES; ++lane)
-        if (out[i][k].x[lane] != out[i][k].x[0]) results[i][k] = HUGE_VAL;
-    }
-  return code;
-}

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,9 @@ from spacerobot_ros.control.thrusters import PULSE_INPUTS, PULSE_OUTPUTS, pulse_
 from spacerobot_ros.model.compilation import (
     NoLibraryError,
     compilation_settings,
-    native_library,
-    vector_source,
+    load_library,
 )
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions
-from spacerobot_ros.model.vector_machine import VectorUnit, vector_unit
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.simulation import effort_plant, velocity_plant
 
@@ -42,6 +41,51 @@ each other, which takes a fifth of the time of flights and changes no number."""
 
 _CASADI_SELECTION = re.compile(r"\((\w+|\(\*\w+\+\+\))\?(\w+(?:\[i\])?):0\)")
 """CasADi's texts for a number, alone or in a loop, that is zero unless a condition holds."""
+
+
+@dataclass(frozen=True)
+class VectorUnit:
+    """Vector registers of a processor.
+
+    Attributes
+    ----------
+    name
+        For people.
+    lanes
+        Numbers of 64 bits in a register.
+    flags
+        Options of the compiler.
+    libmvec
+        Letter of its functions in the vector library of the C library; empty: none.
+    """
+
+    name: str
+    lanes: int
+    flags: tuple[str, ...]
+    libmvec: str
+
+
+VECTOR_UNITS: dict[str, VectorUnit] = {
+    "avx512f": VectorUnit("AVX-512", 8, ("-mavx512f", "-mprefer-vector-width=512"), "e"),
+    "avx2": VectorUnit("AVX2", 4, ("-mavx2",), "d"),
+    "sse2": VectorUnit("SSE2", 2, ("-msse2",), "b"),
+}
+"""Vector registers by the name of the processor's flag, the widest first."""
+
+_PORTABLE_UNIT = VectorUnit("two at a time", 2, (), "")
+"""The vector unit of other processors, whose registers the compiler chooses."""
+
+
+@lru_cache(maxsize=1)
+def vector_unit() -> VectorUnit:
+    """Return the widest registers that this processor and its kernel support."""
+    try:
+        text = Path("/proc/cpuinfo").read_text("utf-8", errors="replace")
+    except OSError:
+        return _PORTABLE_UNIT
+    flags = re.search(r"^flags\s*:(.*)$", text, re.MULTILINE)
+    features = flags[1].split() if flags else []
+    return next((unit for name, unit in VECTOR_UNITS.items() if name in features), _PORTABLE_UNIT)
 
 
 class Program(IntEnum):
@@ -370,15 +414,13 @@ def _compile_library(
     functions: Mapping[str, ca.Function], declarations: str, unit: VectorUnit, thrusters: int
 ) -> ctypes.CDLL:
     given = list(functions.values())
-    renamed = [_rename_function(function, f"vector_{function.name()}") for function in given]
     parts = [
         _read_source("lanes.hpp"),
-        _CASADI_SELECTION.sub(r"where(\1,\2)", vector_source(renamed, "V")),
-        *(f"#define {name} {each.name()}" for name, each in zip(functions, renamed, strict=True)),
+        _CASADI_SELECTION.sub(r"where(\1,\2)", _vector_source(given)),
+        *(f"#define {name} {function.name()}" for name, function in functions.items()),
         declarations,
         _read_source("thrusters.hpp"),
         _read_source("driver.hpp"),
-        *map(_trial_function_source, given),
     ]
     # Vectors as arguments between functions of this file: no other is called with them.
     flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *_SCHEDULING, *unit.flags)
@@ -386,9 +428,20 @@ def _compile_library(
     if unit.libmvec:
         source = "\n".join([_define_sizes(given, unit, unit.libmvec, thrusters), *parts])
         with suppress(NoLibraryError):
-            return native_library(name, source, flags, ("-lmvec",), given)
+            return load_library(
+                name, source, ctypes.CDLL, flags=flags, libraries=("-lmvec",), language="cpp"
+            )
     source = "\n".join([_define_sizes(given, unit, "", thrusters), *parts])
-    return native_library(name, source, flags, (), given)
+    return load_library(name, source, ctypes.CDLL, flags=flags, language="cpp")
+
+
+def _vector_source(functions: Sequence[ca.Function]) -> str:
+    """Return C++ of functions in which every number has the type ``V``."""
+    options = {"with_header": False, "cpp": True, "casadi_real": "V"}
+    generator = ca.CodeGenerator(functions[0].name(), options)
+    for function in functions:
+        generator.add(function)
+    return str(generator.dump())
 
 
 def _shared_declarations(
@@ -419,12 +472,6 @@ def _shared_declarations(
     return "\n".join(lines)
 
 
-def _rename_function(function: ca.Function, name: str) -> ca.Function:
-    inputs = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
-    outputs = function.call(inputs, True, False)
-    return ca.Function(name, inputs, outputs, function.name_in(), function.name_out())
-
-
 def _define_sizes(
     functions: Sequence[ca.Function], unit: VectorUnit, libmvec: str, thrusters: int
 ) -> str:
@@ -435,7 +482,6 @@ def _define_sizes(
         "ARGUMENT_POINTERS": max(function.sz_arg() for function in functions) + 1,
         "RESULT_POINTERS": max(function.sz_res() for function in functions) + 1,
         "INTEGER_SIZE": max(function.sz_iw() for function in functions) + 1,
-        "TRIAL_SIZE": max(function.nnz_in() + function.nnz_out() for function in functions) + 1,
     }
     lines = [f"#define {name} {value}" for name, value in numbers.items()]
     if libmvec:
@@ -446,20 +492,6 @@ def _define_sizes(
             for name in ("sin", "cos")
         ]
     return "\n".join(lines)
-
-
-def _trial_function_source(function: ca.Function) -> str:
-    """Return the C++ that gives the vector function CasADi's interface for single numbers."""
-    name = function.name()
-    count_in, count_out = function.n_in(), function.n_out()
-    sizes_in = _cpp_list(function.nnz_in(i) for i in range(count_in))
-    sizes_out = _cpp_list(function.nnz_out(i) for i in range(count_out))
-    return (
-        f'extern "C" int {name}(const double **arguments, double **results, long long *, double *, '
-        f"int) {{\n  static const long long in[] = {sizes_in}, out[] = {sizes_out};\n"
-        f"  return trial(vector_{name}, in, {count_in}, out, {count_out}, arguments, "
-        "results);\n}\n"
-    )
 
 
 def _cpp_list(numbers: Iterable[int]) -> str:

@@ -148,7 +148,7 @@ def _fly_campaign(
     """Fly a campaign, print its progress, and return its folder; ``name`` replaces its name."""
     from spacerobot_ros.campaign.config import load_campaign
     from spacerobot_ros.campaign.running import run_campaign
-    from spacerobot_ros.termination import ended_on_request
+    from spacerobot_ros.termination import graceful_shutdown
 
     campaign = load_campaign(file, flights)
     if name:
@@ -156,7 +156,7 @@ def _fly_campaign(
     folder = out or Path("out") / campaign.name
     for line in campaign.description_lines:
         click.echo(line)
-    with ended_on_request() as stopped, _progress_bar(campaign.name) as show:
+    with graceful_shutdown() as stopped, _progress_bar(campaign.name) as show:
         progress = run_campaign(
             campaign, folder, engine=engine, cluster=cluster, show=show, stopped=stopped
         )

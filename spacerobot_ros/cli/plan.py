@@ -141,7 +141,7 @@ def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:
     if robot.description.world is not None:
         step = problem.config.integration_step
         start = RobotState(trial.path.position[0], trial.path.quaternion[0], positions[0])
-        base = BasePrediction(robot.compiled_on_demand, problem.control_period, step).poses(
+        base = BasePrediction(robot.interpreted, problem.control_period, step).poses(
             start, positions
         )
     nearest = PathCheck(geometry).nearest(positions, base)

@@ -65,7 +65,7 @@ def sentences() -> Iterator[None]:
     ends it with one line and 128 plus its number, even if a library has replaced its exception.
     """
     try:
-        with guarded(announcing=True):
+        with guarded():
             try:
                 yield
             except Exception as error:

@@ -28,7 +28,7 @@ from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.world import (
     links_with_shapes,
     obstacles_from_topic,
-    with_obstacles_around,
+    with_world,
 )
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -160,7 +160,7 @@ class PlannerCommander(Commander):
         """Return a worker that plans around the present obstacles."""
         described = robot.description
         if self._obstacles is not None:
-            described = with_obstacles_around(described, self._world)
+            described = with_world(described, self._world)
         return PlanningWorker(robot, self.config, method, self._on_long_work, described)
 
     def end_schedule(self, end: TrajectoryEnd) -> None:

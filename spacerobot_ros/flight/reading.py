@@ -33,7 +33,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.model.world import obstacles_from_topic, with_obstacles_around
+from spacerobot_ros.model.world import obstacles_from_topic, with_world
 from spacerobot_ros.parameters import declared, known_values
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
@@ -155,7 +155,7 @@ class FlightBag:
                 except (RobotDescriptionError, UnicodeDecodeError):
                     continue
                 came = self.obstacles
-                return with_obstacles_around(found, came[-1][1]) if came else found
+                return with_world(found, came[-1][1]) if came else found
         return None
 
     @cached_property

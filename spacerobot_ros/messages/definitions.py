@@ -37,14 +37,6 @@ _SHORT_TYPE_NAME = re.compile(
 # text of a schema could differ from the text that `ros2 bag record` writes.
 _FIELD_TYPE = re.compile(r"(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+", re.ASCII)
 
-_OWN_DEFINITIONS = {
-    ("tf2_msgs", "TFMessage"): (
-        "geometry_msgs/TransformStamped[] transforms\n",
-        "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
-    )
-}
-"""Text and hash of types that this package writes even if ROS does not have them installed."""
-
 _EVENT = """\
 service_msgs/ServiceEventInfo info
 {0}_Request[<=1] request
@@ -94,24 +86,27 @@ def message_definition(type_name: str) -> str:
 
     Returns
     -------
-    The concatenated definition (encoding ``ros2msg``).
+    The concatenated definition (encoding ``ros2msg``). Where a package is not installed, it is that
+    of ROS 2 Jazzy, without comments.
 
     Raises
     ------
     RecordingError
-        The name is not one of a message type, or a package that it needs is not installed.
+        The name is not one of a message type, or a package that it needs is neither installed nor
+        one of Jazzy's.
     """
-    return _with_dependencies(type_name, set())
+    try:
+        return _with_dependencies(type_name, set())
+    except RecordingError:
+        name = _InterfaceName.of(type_name).full
+        if name not in _types_of_jazzy().fielddefs:
+            raise
+        return _types_of_jazzy().generate_msgdef(name, ros_version=2)[0]
 
 
 def _with_dependencies(type_name: str, seen: set[str]) -> str:
     name = _InterfaceName.of(type_name)
-    try:
-        text = name.text()
-    except RecordingError:
-        if (name.package, name.whole) not in _OWN_DEFINITIONS:
-            raise
-        text, _ = _OWN_DEFINITIONS[name.package, name.whole]
+    text = name.text()
     types = {
         found if "/" in found else f"{name.package}/{found}"
         for found in _FIELD_TYPE.findall(text)
@@ -138,25 +133,32 @@ def type_hash(type_name: str) -> str:
     try:
         description = name.file().with_suffix(".json")
     except RecordingError:
-        if (name.package, name.whole) not in _OWN_DEFINITIONS:
+        if name.full not in _types_of_jazzy().fielddefs:
             raise
-        return _OWN_DEFINITIONS[name.package, name.whole][1]
+        return _types_of_jazzy().hash_rihs01(name.full)
     if not description.is_file():
         return ""
     hashes = json.loads(description.read_bytes())["type_hashes"]
-    full = f"{name.package}/{name.kind}/{name.whole}"
-    return next((str(h["hash_string"]) for h in hashes if h["type_name"] == full), "")
+    return next((str(h["hash_string"]) for h in hashes if h["type_name"] == name.full), "")
+
+
+@cache
+def _types_of_jazzy() -> Typestore:
+    """Return the types of ROS 2 Jazzy, which ``rosbags`` brings."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def message_module(type_name: str) -> tuple[str, str, str]:
     """Return the Python module of an installed message type, and the names of two classes in it.
 
     Those are of the interface that the module exports, in whose own module the other one is, and of
-    the message itself: they differ for parts of services and actions. Raises as
-    :func:`message_definition` does.
+    the message itself: they differ for parts of services and actions. RecordingError: the name is
+    not one of a message type, or the package is not installed.
     """
-    message_definition(type_name)
     name = _InterfaceName.of(type_name)
+    name.file()
     return f"{name.package}.{name.kind}", name.interface, name.whole
 
 
@@ -185,6 +187,11 @@ class _InterfaceName:
     def whole(self) -> str:
         """Name of the message without its package."""
         return self.interface + (self.part if self.kind != "msg" else "")
+
+    @property
+    def full(self) -> str:
+        """Name of the message with its package and folder."""
+        return f"{self.package}/{self.kind}/{self.whole}"
 
     def file(self) -> Path:
         """Return the file that declares the message."""

@@ -33,9 +33,6 @@ from spacerobot_ros.resources import share_directory
 _MAX_MESH_BYTES = 100_000_000
 _MAX_TRIANGLES = 2_000_000
 
-_MAX_COORDINATE = 1e6
-"""Largest coordinate in any unit; a file with larger coordinates is damaged."""
-
 _STL_HEADER_BYTES = 84
 """Bytes of a binary STL file before its triangles: a text of 80, and their number."""
 
@@ -216,8 +213,8 @@ def read_mesh(path: str | Path) -> TriangleMesh:
         else:
             mesh = _read_by_trimesh(path, data)
         return _require_sound_mesh(mesh)
-    except _DamagedError as error:
-        raise MeshError(f"The mesh {path} cannot be read: {error}.") from error
+    except (_DamagedError, *_PARSE_ERRORS) as error:
+        raise _mesh_error(str(path), error) from error
 
 
 def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
@@ -230,8 +227,8 @@ def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
     """
     try:
         return _require_sound_mesh(_read_stl(data))
-    except _DamagedError as error:
-        raise MeshError(f"The mesh {name} cannot be read: {error}.") from error
+    except (_DamagedError, *_PARSE_ERRORS) as error:
+        raise _mesh_error(name, error) from error
 
 
 def stl_of(mesh: TriangleMesh) -> bytes:
@@ -250,13 +247,22 @@ class _DamagedError(Exception):
     """The content of a mesh file is damaged; the text is a clause."""
 
 
+_PARSE_ERRORS = (ValueError, IndexError, OverflowError)
+
+
+def _mesh_error(name: str, error: Exception) -> MeshError:
+    # The text of a parse error would quote the file.
+    why = error if isinstance(error, _DamagedError) else "a coordinate or index is no number"
+    return MeshError(f"The mesh {name} cannot be read: {why}.")
+
+
 def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
     """Return a mesh without faces of zero area; refuse invalid coordinates and indices."""
     vertices, faces = mesh.vertices, mesh.faces
     if len(faces) > _MAX_TRIANGLES:
         raise _DamagedError(f"it has {len(faces)} triangles, and at most {_MAX_TRIANGLES} are read")
-    if not np.all(np.abs(vertices) < _MAX_COORDINATE):  # This also finds NaN.
-        raise _DamagedError(f"a coordinate is not finite, or beyond {_MAX_COORDINATE:g}")
+    if not np.isfinite(vertices).all():
+        raise _DamagedError("a coordinate is not finite")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise _DamagedError("a face has the index of a missing vertex")
     faces = _without_degenerate_faces(faces)
@@ -285,10 +291,10 @@ def _read_stl(data: bytes) -> TriangleMesh:
         raise _DamagedError("it is no STL, or the file is cut")
     if b"endsolid" not in data:
         raise _DamagedError("its end is missing: the file is cut")
-    corners = _STL_VERTEX_PATTERN.findall(data)
+    corners = np.array(_STL_VERTEX_PATTERN.findall(data), dtype=bytes).astype(float)
     if len(corners) % 3:
         raise _DamagedError("a triangle has not three corners")
-    return mesh_from_corners(_parse_coordinates(corners).reshape(-1, 3))
+    return mesh_from_corners(corners.reshape(-1, 3))
 
 
 def mesh_from_corners(corners: npt.NDArray[Any]) -> TriangleMesh:
@@ -302,44 +308,23 @@ def mesh_from_corners(corners: npt.NDArray[Any]) -> TriangleMesh:
     return TriangleMesh(rows[first].astype(float), inverse.reshape(-1, 3).astype(np.int32))
 
 
-def _parse_coordinates(texts: Any) -> Array:
-    try:
-        return np.array(texts, dtype=bytes).astype(float)
-    except ValueError:
-        raise _DamagedError("a coordinate is no number") from None
-
-
 def _read_obj(data: bytes) -> TriangleMesh:
     """Read vertices and faces of OBJ; a face of many corners becomes a fan of triangles."""
-    corners: list[list[bytes]] = []
+    corners: list[tuple[float, float, float]] = []
     faces: list[tuple[int, int, int]] = []
     for line in data.replace(b"\\\n", b" ").replace(b"\\\r\n", b" ").splitlines():
         words = line.split()
         if not words:
             continue
         if words[0] == b"v":
-            if len(words) < 4:
-                raise _DamagedError("a vertex has not three coordinates")
-            corners.append(words[1:4])
+            corners.append((float(words[1]), float(words[2]), float(words[3])))
         elif words[0] == b"f":
-            face = [_parse_corner_index(word, len(corners)) for word in words[1:]]
+            # Corners are v/vt/vn; files count from 1, or from the last -1.
+            numbers = [int(word.split(b"/")[0]) for word in words[1:]]
+            face = [each - 1 if each > 0 else len(corners) + each for each in numbers]
             faces += [(face[0], a, b) for a, b in pairwise(face[1:])]
-            if len(faces) > _MAX_TRIANGLES:
-                raise _DamagedError(f"it has more than {_MAX_TRIANGLES} triangles")
-    return TriangleMesh(
-        _parse_coordinates(corners).reshape(-1, 3), np.array(faces, dtype=np.int32).reshape(-1, 3)
-    )
-
-
-def _parse_corner_index(word: bytes, count: int) -> int:
-    """Return the index from 0 of a corner ``v/vt/vn``; files count from 1, or from the last -1."""
-    try:
-        number = int(word.split(b"/")[0])
-    except ValueError:
-        raise _DamagedError("a corner of a face is no number") from None
-    if not 0 < abs(number) <= _MAX_MESH_BYTES:
-        raise _DamagedError("a face has the index of a missing vertex")
-    return number - 1 if number > 0 else count + number
+    vertices = np.array(corners, dtype=float).reshape(-1, 3)
+    return TriangleMesh(vertices, np.array(faces, dtype=np.int32).reshape(-1, 3))
 
 
 def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
@@ -370,7 +355,4 @@ def _unit_in_metres(path: Path, data: bytes) -> float:
     if path.suffix.lower() != ".dae":
         return 1.0
     found = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)[\"']", data)
-    unit = 1.0 if found is None else float(_parse_coordinates([found[1]])[0])
-    if not 0 < unit < _MAX_COORDINATE:
-        raise _DamagedError("its unit is no length")
-    return unit
+    return 1.0 if found is None else float(found[1])

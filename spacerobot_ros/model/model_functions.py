@@ -15,12 +15,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from spacerobot_ros.model.compilation import (
     compilation_settings,
     compiled,
-    compiled_before,
     dense_function,
 )
 from spacerobot_ros.model.composite_rigid_body import (
@@ -80,14 +78,14 @@ class ModelFunctions:
         self._kin = tree_kinematics(robot, mass_properties)
         self._inertia = composites(self._kin)
         self._symbolic: dict[str, ca.Function] = {}
-        self._compiled: dict[tuple[str, ...], ca.Function] = {}
+        self._compiled: dict[tuple[Hashable, ...], ca.Function] = {}
         self.derived: dict[Hashable, Any] = {}
         """Cache of objects that other modules derive from the model, by key."""
 
     @classmethod
     def of(cls, robot: RobotDescription) -> ModelFunctions:
         """Return the model with a robot's constants; equal robots of a process share it."""
-        return _model_of_key(_RobotKey(hashlib.sha256(pickle.dumps(robot)).hexdigest(), robot))
+        return _model_of_key(_RobotKey.of(robot, robot))
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
         """Return a function of the model by name (the keys of ``_builders``).
@@ -103,27 +101,12 @@ class ModelFunctions:
             return self._symbolic[name]
         return self.composed(name, lambda: self._symbolic[name])
 
-    def composed(
-        self, name: str, build: Callable[[], ca.Function], *, lasting: bool = False
-    ) -> ca.Function:
-        """Return a function composed of those of the model, compiled once per name.
-
-        ``lasting`` is that of :func:`.compiled`.
-        """
-        key = (name, *compilation_settings())
-        if key not in self._compiled:
-            self._compiled[key] = compiled(build(), lasting=lasting)
-        return self._compiled[key]
-
-    def is_compiled(self, name: str) -> bool:
-        """Whether a function of the model is there compiled, in this process or in the cache."""
-        key = (name, *compilation_settings())
-        if key not in self._compiled:
-            kept = compiled_before(self.function(name, compile=False))
-            if kept is None:
-                return False
-            self._compiled[key] = kept
-        return True
+    def composed(self, key: Hashable, build: Callable[[], ca.Function]) -> ca.Function:
+        """Return a function composed of those of the model, compiled once per key."""
+        place = (key, *compilation_settings())
+        if place not in self._compiled:
+            self._compiled[place] = compiled(build())
+        return self._compiled[place]
 
     @property
     def total_mass(self) -> float:
@@ -374,10 +357,14 @@ _MAX_SYMBOLIC_MODELS = 8
 
 @dataclass(frozen=True)
 class _RobotKey:
-    """A robot identified by a hash of its whole description."""
+    """A robot identified by a hash of facts about it."""
 
     key: str
     robot: RobotDescription = field(compare=False)
+
+    @classmethod
+    def of(cls, robot: RobotDescription, facts: object) -> _RobotKey:
+        return cls(hashlib.sha256(pickle.dumps(facts)).hexdigest(), robot)
 
 
 @lru_cache(maxsize=_MAX_SYMBOLIC_MODELS)
@@ -418,20 +405,18 @@ class Composition:
 class SymbolicModels:
     """Models with mass properties as an argument, for all robots of the same structure."""
 
-    def __init__(self, robot: RobotDescription, free: npt.NDArray[np.bool_]) -> None:
-        self._robot, self._free = robot, free
+    def __init__(self, robot: RobotDescription) -> None:
+        self._robot = robot
+        self._free = possibly_nonzero_entries(InertialParameters.of(robot))
         self._models: dict[bool, ModelFunctions] = {}
 
     @classmethod
     def of(cls, robot: RobotDescription) -> SymbolicModels:
         """Return the models for all robots that differ from this robot in mass properties alone."""
+        bodies = [(body.name, body.joint, body.parent, body.origin) for body in robot.bodies]
         free = possibly_nonzero_entries(InertialParameters.of(robot))
-        key = _structure_key(robot, free)
-        found = _symbolic_models.pop(key, None) or cls(robot, free)
-        _symbolic_models[key] = found
-        if len(_symbolic_models) > _MAX_SYMBOLIC_MODELS:
-            del _symbolic_models[next(iter(_symbolic_models))]
-        return found
+        facts = (robot.name, bodies, robot.frames, [link.name for link in robot.links], free)
+        return _models_of_key(_RobotKey.of(robot, facts))
 
     def model(self, parameters: InertialParameters) -> tuple[ModelFunctions, Array]:
         """Return the model for inertial parameters (..., B), and its argument ``p`` (..., k).
@@ -447,11 +432,6 @@ class SymbolicModels:
         return self._models[usual], np.ascontiguousarray(vector[..., free])
 
 
-_symbolic_models: dict[str, SymbolicModels] = {}
-
-
-def _structure_key(robot: RobotDescription, free: npt.NDArray[np.bool_]) -> str:
-    """Return a hash of a description without its mass properties."""
-    bodies = [(body.name, body.joint, body.parent, body.origin) for body in robot.bodies]
-    facts = (robot.name, bodies, robot.frames, [link.name for link in robot.links], free)
-    return hashlib.sha256(pickle.dumps(facts)).hexdigest()
+@lru_cache(maxsize=_MAX_SYMBOLIC_MODELS)
+def _models_of_key(equal: _RobotKey) -> SymbolicModels:
+    return SymbolicModels(equal.robot)

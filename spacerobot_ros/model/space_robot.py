@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.model.compilation import BufferedFunction, compilation_settings, compiled
+from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions, SymbolicModels
@@ -64,7 +64,7 @@ class SpaceRobot:
         self.effort_limit = description.limits("effort")
         self._model, self._p = self._chosen_model(build)
         self._buffers: dict[str, BufferedFunction] = {}
-        self._compiles_on_demand = False
+        self._compiles = True
         self._require_positive_inertia()
 
     @classmethod
@@ -268,21 +268,15 @@ class SpaceRobot:
 
     def buffered(self, name: str) -> BufferedFunction:
         """Return a function with input and output buffers of its own, for one caller."""
-        model = self._model
-        if self._compiles_on_demand and not model.is_compiled(name):
-            interpreted = model.function(name, compile=False)
-            return BufferedFunction(interpreted, self._p, lambda: model.function(name))
-        return BufferedFunction(model.function(name), self._p)
+        return BufferedFunction(self._model.function(name, compile=self._compiles), self._p)
 
     @cached_property
-    def compiled_on_demand(self) -> SpaceRobot:
-        """The same robot for callers with few calls: a function runs in CasADi's virtual machine,
-        with the same numbers, bit for bit, until it was called so often that compiling pays.
+    def interpreted(self) -> SpaceRobot:
+        """The same robot for callers with few calls, for whom compiling does not pay: functions of
+        the model run in CasADi's virtual machine, with the same numbers, bit for bit.
         """
-        if self._compiles_on_demand:
-            return self
         robot = copy.copy(self)
-        robot._buffers, robot._compiles_on_demand = {}, True
+        robot._buffers, robot._compiles = {}, False
         return robot
 
     def velocity_step(self, substeps: int) -> BufferedFunction:
@@ -300,23 +294,20 @@ class SpaceRobot:
         evaluated in every tick.
         """
         model = self._model
-        function = model.composed(name, lambda: build(Composition(model, ca.MX)), lasting=True)
+        function = model.composed(name, lambda: build(Composition(model, ca.MX)))
         return BufferedFunction(function, self._p)
 
     def expressions(self) -> Composition:
         """Return the model's functions as SX expressions for larger functions; see :meth:`view`."""
         return Composition(self._model, ca.SX)
 
-    def view(self, function: ca.Function, key: Hashable | None = None) -> BufferedFunction:
+    def view(self, function: ca.Function, key: Hashable) -> BufferedFunction:
         """Compile a function of :meth:`expressions`, and return it with its own buffers.
 
-        The argument ``p``, if it has one, is set to this robot's mass properties. With a ``key``,
-        which no other function has, it is compiled as :meth:`cached_object` says.
+        The argument ``p``, if it has one, is set to this robot's mass properties. Functions with
+        one ``key`` are the same: it is compiled once, as :meth:`cached_object` says.
         """
-        if key is None:
-            return BufferedFunction(compiled(function), self._p)
-        code = self.cached_object((key, *compilation_settings()), lambda: compiled(function))
-        return BufferedFunction(code, self._p)
+        return BufferedFunction(self._model.composed(key, lambda: function), self._p)
 
     def cached_object(self, key: Hashable, make: Callable[[], _Made]) -> _Made:
         """Return an object that is made of :meth:`expressions`, once per key for all robots that

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
-import re
 import subprocess
 import sys
 from collections import Counter
@@ -54,12 +52,6 @@ _MAX_LINKS = 200
 
 _XACRO_CPU_TIME = 10
 """Limit of processor time for the expansion of a xacro file, s; six times as much wall time."""
-
-_XACRO_VARIABLES = (
-    *("PATH", "PYTHONPATH", "LANG"),
-    *("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH", "ROS_DISTRO"),
-)
-"""Environment variables that xacro files may read."""
 
 
 def load_robot(path: str | Path) -> RobotDescription:
@@ -142,21 +134,17 @@ def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescri
 
 
 def _expand_xacro(path: Path) -> str:
-    """Return the URDF text of a xacro file, which a confined process expands.
-
-    Robot files are exchanged between strangers: see :mod:`spacerobot_ros.model.xacro_files`.
-    """
+    """Return the URDF text of a xacro file; see :mod:`spacerobot_ros.model.xacro_files`."""
     by_hand = f"`xacro {path.name} > {path.name.split('.')[0]}.urdf`"
     if find_spec("xacro") is None:
         raise RobotDescriptionError(
             f"{path} is a xacro file, and the package xacro is not installed: `pip install xacro`, "
             f"or expand it where it is: {by_hand}."
         )
-    environment = {name: os.environ[name] for name in _XACRO_VARIABLES if name in os.environ}
+    words = [xacro_files.__file__, str(path), f"{_XACRO_CPU_TIME}"]
     try:
         done = subprocess.run(
-            [sys.executable, xacro_files.__file__, str(path), f"{_XACRO_CPU_TIME}"],
-            env={**environment, "PYTHONIOENCODING": "utf-8"},
+            [sys.executable, "-X", "utf8", *words],
             capture_output=True,
             encoding="utf-8",
             errors="replace",
@@ -171,8 +159,8 @@ def _expand_xacro(path: Path) -> str:
         reasons = [line for line in done.stderr.splitlines() if line.startswith("REASON ")]
         reason = reasons[-1][7:] if reasons else "it needs too much time or memory"
     raise RobotDescriptionError(
-        f"The xacro file {path} cannot be expanded: {reason.rstrip('.')}. If you trust it, expand "
-        f"it yourself: {by_hand}."
+        f"The xacro file {path} cannot be expanded: {reason.rstrip('.')}. Correct it, or expand it "
+        f"by hand: {by_hand}."
     )
 
 
@@ -582,7 +570,7 @@ def _require_mass(robot: RobotDescription) -> None:
 
 # -- form of the text -------------------------------------------------------------------------
 
-_OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model", "COLLADA": "a COLLADA file"}
+_OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model"}
 """Descriptions of other file formats by their root elements."""
 
 _ELEMENTS_READ = {
@@ -671,7 +659,11 @@ def _checked_root(text: str) -> Element:
             f"The robot description is not valid URDF: it is no XML ({error})."
         ) from error
     if root.tag != "robot":
-        raise RobotDescriptionError(_other_root_message(root.tag))
+        raise RobotDescriptionError(
+            "The robot description is not valid URDF but "
+            f"{_OTHER_FORMATS.get(root.tag, 'something else')}: its root element is <{root.tag}>, "
+            "and that of a URDF is <robot>. Export or convert it to URDF."
+        )
     for element in [root, *root.findall("link"), *root.findall("joint")]:
         unused = {child.tag for child in element} - set(_ELEMENTS_READ[element.tag])
         _remove_children(element, unused)
@@ -717,19 +709,6 @@ class _MalformedError(RobotDescriptionError):
 
     def __init__(self, flaw: str, remedy: str) -> None:
         super().__init__(f"The robot description is not valid URDF: {flaw}; write {remedy}.")
-
-
-def _other_root_message(tag: str) -> str:
-    namespace = re.fullmatch(r"\{(.*)\}robot", tag)
-    if namespace is not None:
-        return (
-            "The robot description is not valid URDF: its elements are in the namespace "
-            f"'{namespace[1]}'; remove xmlns=\"...\" from <robot>."
-        )
-    return (
-        f"The robot description is not valid URDF but {_OTHER_FORMATS.get(tag, 'something else')}: "
-        f"its root element is <{tag}>, and that of a URDF is <robot>. Export or convert it to URDF."
-    )
 
 
 def _require_type(joint: Element, where: str) -> None:

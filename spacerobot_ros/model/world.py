@@ -15,33 +15,23 @@ from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_world, require_found_meshes
 
-MAX_OBSTACLES_TEXT = 1_000_000
-"""Largest number of characters of obstacles on a topic."""
-
 _CARRIED = re.compile(r"\s*<world>.*</world>", re.DOTALL)
 _END = re.compile(r"</robot\s*>")
 
 
-def with_world(robot: RobotDescription, world: RobotDescription) -> RobotDescription:
-    """Return a robot among obstacles (:func:`.load_world`), in place of those around it so far."""
+def with_world(robot: RobotDescription, world: RobotDescription | None) -> RobotDescription:
+    """Return a robot among obstacles (:func:`.load_world`), in place of those around it so far.
+
+    Without a world there are none around it.
+    """
     urdf = _CARRIED.sub("", robot.urdf)
-    root = fromstring(world.urdf)
-    root.tail = None
-    carried = f"  <world>{tostring(root, encoding='unicode')}</world>\n"
-    ends = list(_END.finditer(urdf))
-    if ends:
+    if world is not None and (ends := list(_END.finditer(urdf))):
+        root = fromstring(world.urdf)
+        root.tail = None
         place = ends[-1].start()
+        carried = f"  <world>{tostring(root, encoding='unicode')}</world>\n"
         urdf = urdf[:place] + carried + urdf[place:]
     return replace(robot, world=world, urdf=urdf)
-
-
-def with_obstacles_around(
-    robot: RobotDescription, world: RobotDescription | None
-) -> RobotDescription:
-    """Return a robot with other obstacles around it; None: there are none around it."""
-    if world is None:
-        return replace(robot, world=None, urdf=_CARRIED.sub("", robot.urdf))
-    return with_world(robot, world)
 
 
 def obstacles_from_topic(text: str) -> RobotDescription | None:
@@ -52,14 +42,9 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
     Raises
     ------
     RobotDescriptionError
-        It is too long, has obstacles of its own around it or a mesh that is not found, or
-        :func:`.parse_world` refuses it.
+        It has obstacles of its own around it or a mesh that is not found, or :func:`.parse_world`
+        refuses it.
     """
-    if len(text) > MAX_OBSTACLES_TEXT:
-        raise RobotDescriptionError(
-            f"The obstacles are a text of {len(text)} characters, which may have at most "
-            f"{MAX_OBSTACLES_TEXT}: give them fewer links, or meshes in files."
-        )
     if not text.strip():
         return None
     if "<world" in text:

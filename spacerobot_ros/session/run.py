@@ -37,7 +37,7 @@ from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.processes import MultiProcessStack
 from spacerobot_ros.session.stack import InProcessStack, Stack, checked_namespace
-from spacerobot_ros.termination import ended_on_request
+from spacerobot_ros.termination import graceful_shutdown
 from spacerobot_ros.times import SECOND, stamp_to_ns
 from spacerobot_ros.topics import goal_topic, path_topic
 
@@ -155,7 +155,7 @@ def run_scenario(
     with ros(private=private, one_process=not processes):
         stack = make_stack(scenario, bag, processes=processes)
         try:
-            with ended_on_request(at_once=stack.interrupt) as stopped:
+            with graceful_shutdown(stack.interrupt) as stopped:
                 began = time.perf_counter()
                 stack.start(scenario.goal)
                 time_limit = 0.0
@@ -258,7 +258,7 @@ def run_until_stopped(
             scenario, bag, processes=processes, namespace=namespace, restarts=restarts, show=show
         )
         try:
-            with ended_on_request(at_once=stack.interrupt) as stopped:
+            with graceful_shutdown(stack.interrupt) as stopped:
                 stack.start(None)
                 with suppress(OSError):
                     topic = f"{stack.namespace}/goal_pose" if stack.namespace else "goal_pose"
@@ -322,7 +322,7 @@ def send_goal(
             client = _find_goal_commander(
                 clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY), goal
             )
-            with ended_on_request() as stopped:
+            with graceful_shutdown() as stopped:
                 client.send(goal)
                 began, statuses = time.monotonic(), _StatusPrinter(client, show)
 

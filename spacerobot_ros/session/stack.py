@@ -174,7 +174,7 @@ class Stack(ABC):
             raise
 
     def interrupt(self) -> None:  # noqa: B027
-        """Cancel long computations; called from another thread when the process must end."""
+        """Cancel long computations; called when the process must end."""
 
     def _supervise(self) -> None:  # noqa: B027
         """Check the nodes; called five times a second."""

@@ -44,12 +44,8 @@ def rows() -> Iterator[list[str]]:
 
 def put_files(attack: Attack, folder: Path) -> None:
     for name, content in attack.files.items():
-        if callable(content):
-            content(folder / name)
-        elif isinstance(content, bytes):
-            (folder / name).write_bytes(content)
-        else:
-            (folder / name).write_text(content, "utf-8")
+        data = content.encode() if isinstance(content, str) else content
+        (folder / name).write_bytes(data)
 
 
 def test_attacks_are_at_least_forty_and_each_has_a_name_of_its_own() -> None:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from spacerobot_ros.bag import BagWriter, Recording, iterate_raw, read_bag
-from spacerobot_ros.bag.mcap_reading import messages_in_time_order
 
 COUNT = 1_000_000
 TOPICS = 8
@@ -64,7 +63,7 @@ def test_a_million_messages_in_one_bag(tmp_path: Path) -> None:
     assert number == COUNT - 1
     streamed = time.perf_counter() - began
     last = -1
-    for number, (_, log_ns, _, _) in enumerate(messages_in_time_order(path, set(channels))):
+    for number, (_, log_ns, _, _) in enumerate(read_bag(path).raw_messages(set(channels))):
         assert log_ns >= last
         last = log_ns
         if not number % 50_000:

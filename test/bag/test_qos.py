@@ -53,11 +53,12 @@ def test_numbers_of_earlier_versions_are_read() -> None:
         )
     ]
     assert QosProfile.from_yaml(HUMBLE)[0].deadline_ns == INFINITE_NS
-    assert QosProfile.from_yaml("- history: 9")[0].history == "unknown"
+    for word in ("9", "sometimes"):
+        assert QosProfile.from_yaml(f"- history: {word}")[0].history == "unknown"
     assert QosProfile.from_yaml("") == []
 
 
-@pytest.mark.parametrize("text", ["- [", "- 5", "- history: sometimes", "- deadline: 3", "7"])
+@pytest.mark.parametrize("text", ["- [", "- 5", "- depth: -1", "- deadline: 3", "7"])
 def test_what_is_no_profile_is_refused(text: str) -> None:
     with pytest.raises(RecordingError):
         QosProfile.from_yaml(text)

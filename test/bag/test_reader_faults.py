@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import struct
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,6 @@ from spacerobot_ros.bag import (
     message_definition,
     read_bag,
 )
-from spacerobot_ros.bag.mcap_reading import open_file
 
 STRING = "std_msgs/msg/String"
 
@@ -203,23 +200,3 @@ def test_a_topic_that_is_not_there(path: Path) -> None:
     for ask in (bag.__getitem__, bag.times, bag.messages, bag.message_count):
         with pytest.raises(RecordingError, match="has no topic /odm: it has /silent, /odom"):
             ask("/odm")
-
-
-def test_a_bag_that_becomes_a_pipe_is_refused_and_not_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "regular").touch()
-    regular, pipe = os.stat(tmp_path / "regular"), tmp_path / "pipe.mcap"
-    os.mkfifo(pipe)
-    # Who waits for a writer is released, too late.
-    release = threading.Timer(5.0, lambda: os.close(os.open(pipe, os.O_RDWR | os.O_NONBLOCK)))
-    release.start()
-    try:
-        with monkeypatch.context() as patched:
-            patched.setattr(os, "stat", lambda _: regular)
-            with pytest.raises(RecordingError, match="it is a pipe"), open_file(pipe):
-                pass
-        assert release.is_alive()
-    finally:
-        release.cancel()
-        release.join()

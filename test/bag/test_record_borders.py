@@ -12,22 +12,21 @@ from io import BytesIO
 from pathlib import Path
 
 import lz4.frame
-import numpy as np
 import pytest
 import zstandard
 from mcap.opcode import Opcode
+from mcap.records import Chunk, Footer, Header
 from mcap.writer import MCAP0_MAGIC
 from rosbags.interfaces import Nodetype
+from support.hostile.records import Part, bag, encoded, plain, string
 
-from spacerobot_ros.bag import RecordingError, read_bag
+from spacerobot_ros.bag import RecordingError, iterate_raw, read_bag
 from spacerobot_ros.bag.mcap_reading import (
     INFLATED_SIZE_VARIABLE,
-    InflationLimit,
-    _check_entries,
+    ChunkUnpacker,
     read_record,
     records,
     records_in_chunk,
-    unpack_chunk,
 )
 from spacerobot_ros.messages.definitions import MessageTypes, _FieldCounts
 
@@ -44,44 +43,35 @@ def message(data: bytes, claims: int | None = None) -> bytes:
 
 
 def test_a_record_may_end_where_the_file_does() -> None:
-    first, last = record(Opcode.HEADER, b"abc"), record(Opcode.FOOTER, b"")
-    content = first + last
-    file = BytesIO(content)
-    assert list(records(file, 0, len(content))) == [
-        (0, Opcode.HEADER, b"abc"),
-        (12, Opcode.FOOTER, b""),
-    ]
-    assert read_record(file, 0, Opcode.HEADER) == b"abc"
-    assert read_record(file, 12, Opcode.FOOTER) == b""
-    with pytest.raises(ValueError, match="the file has no footer at byte 0"):
-        read_record(file, 0, Opcode.FOOTER)
-    with pytest.raises(ValueError, match="its index names byte 13, and it has 21 bytes"):
-        read_record(file, 13, Opcode.FOOTER)
+    first, last = encoded(Header("ros2", "")), encoded(Footer(1, 2, 3))
+    file = BytesIO(first + last)
+    place = len(first)
+    assert list(records(file, 0)) == [(0, Opcode.HEADER, first), (place, Opcode.FOOTER, last)]
+    assert read_record(file, 0, Header) == Header("ros2", "")
+    assert read_record(file, place, Footer) == Footer(1, 2, 3)
+    for wrong in (0, place + len(last), 2**64 - 1):
+        with pytest.raises(ValueError, match=f"the file has no Footer record at byte {wrong}"):
+            read_record(file, wrong, Footer)
 
 
 def test_a_record_that_claims_one_byte_more_than_is_left_is_refused() -> None:
     content = record(Opcode.HEADER, b"abc") + record(Opcode.CHUNK, b"de", claims=3)
     words = "the record at byte 12 claims 3 bytes, where 2 are left"
     with pytest.raises(ValueError, match=words):
-        list(records(BytesIO(content), 0, len(content)))
+        list(records(BytesIO(content), 0))
     with pytest.raises(ValueError, match=words):
-        read_record(BytesIO(content), 12, Opcode.CHUNK)
-    # What lies behind the end that is asked for does not count.
-    with pytest.raises(ValueError, match="claims 3 bytes, where 1 are left"):
-        list(records(BytesIO(content), 0, len(content) - 1))
-    with pytest.raises(ValueError, match="claims 3 bytes, where 0 are left"):
-        list(records(BytesIO(content), 0, 15))
+        read_record(BytesIO(content), 12, Chunk)
 
 
 def test_a_file_may_end_inside_of_the_head_of_a_record() -> None:
     content = record(Opcode.HEADER, b"abc") + record(Opcode.FOOTER, b"")[:8]
     with pytest.raises(ValueError, match="it ends inside of the record at byte 12"):
-        list(records(BytesIO(content), 0, len(content)))
+        list(records(BytesIO(content), 0))
 
 
 def test_records_of_a_chunk_end_with_it() -> None:
     whole = message(b"") + record(Opcode.SCHEMA, b"")
-    assert list(records_in_chunk(whole, 40)) == [(Opcode.MESSAGE, 0, 31), (Opcode.SCHEMA, 31, 40)]
+    assert list(records_in_chunk(whole, 40)) == [(0, 31), (31, 40)]
     assert list(records_in_chunk(b"", 40)) == []
     for chunk, words in (
         (whole[:-1], "the chunk at byte 40 ends inside of a record"),
@@ -92,48 +82,30 @@ def test_records_of_a_chunk_end_with_it() -> None:
             list(records_in_chunk(chunk, 40))
 
 
-# -- indexes of messages ----------------------------------------------------------------------
-
-
-def test_an_index_may_name_the_last_message_though_it_holds_nothing() -> None:
-    chunk = message(b"text") + message(b"")
-    _check_entries(chunk, np.array([35, 0], np.uint64), 40)
-    _check_entries(chunk, np.array([], np.uint64), 40)
-
-
-@pytest.mark.parametrize(
-    ("chunk", "places"),
-    [
-        (message(b"text") + message(b""), [0, 36]),
-        (message(b"text") + message(b""), [0, 2**63]),
-        (message(b"text") + message(b""), [35, 35]),
-        # Messages that claim more than there is, less than a message has, or what follows them.
-        (message(b"text") + message(b"", claims=23), [0, 35]),
-        (message(b"text") + message(b"", claims=21), [0, 35]),
-        (message(b"text", claims=27) + message(b""), [0, 35]),
-        (message(b"text") + message(b"", claims=2**64 - 1), [0, 35]),
-        (message(b"text") + record(Opcode.SCHEMA, bytes(22)), [0, 35]),
-    ],
-)
-def test_an_index_that_names_anything_else_does_not_fit(chunk: bytes, places: list[int]) -> None:
-    with pytest.raises(ValueError, match="the message indexes of the chunk at byte 40 do not fit"):
-        _check_entries(chunk, np.array(places, np.uint64), 40)
+def test_a_message_may_hold_nothing_and_has_a_whole_head(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(bag(plain(message(string("text")), message(b""))))
+    assert [data for *_, data in iterate_raw(path)] == [string("text"), b""]
+    path.write_bytes(bag(plain(message(string("text")), record(Opcode.MESSAGE, bytes(21)))))
+    for read in (lambda: list(iterate_raw(path)), lambda: read_bag(path)["/a"]):
+        with pytest.raises(RecordingError, match=r"is damaged: a message .* is shorter"):
+            read()
 
 
 # -- what chunks inflate to -------------------------------------------------------------------
 
 
 def test_chunks_may_inflate_to_the_limit_together_and_no_further() -> None:
-    allowance = InflationLimit(1000)
-    assert allowance.max_bytes == 32_000_000
-    allowance.count(31_999_999, 8)
-    allowance.count(1, 50)
-    allowance.count(0, 60)
+    chunks = ChunkUnpacker(1000)
+    assert chunks.max_bytes == 32_000_000
+    chunks.count(31_999_999, 8)
+    chunks.count(1, 50)
+    chunks.count(0, 60)
     words = "the chunk at byte 70 it inflates to 32000001 bytes, more than the 32000000 that"
     with pytest.raises(ValueError, match=words):
-        allowance.count(1, 70)
-    assert InflationLimit(160_000).max_bytes == InflationLimit(0).max_bytes == 32_000_000
-    assert InflationLimit(160_001).max_bytes == 32_000_200
+        chunks.count(1, 70)
+    assert ChunkUnpacker(160_000).max_bytes == ChunkUnpacker(0).max_bytes == 32_000_000
+    assert ChunkUnpacker(160_001).max_bytes == 32_000_200
 
 
 @pytest.mark.parametrize(
@@ -152,7 +124,7 @@ def test_the_limit_is_a_positive_number_of_megabytes(
     text: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(INFLATED_SIZE_VARIABLE, text)
-    assert InflationLimit(0).max_bytes == most
+    assert ChunkUnpacker(0).max_bytes == most
 
 
 PACKED: dict[str, Callable[[bytes], bytes]] = {
@@ -162,33 +134,28 @@ PACKED: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
-def chunk(compression: str, data: bytes, size: int, crc: int = 0, off: int = 0) -> bytes:
-    packed, name = PACKED[compression](data), compression.encode()
-    head = struct.pack("<QQQII", 0, 0, size, crc, len(name)) + name
-    return head + struct.pack("<Q", len(packed) + off) + packed
-
-
 @pytest.mark.parametrize("compression", PACKED)
 def test_a_chunk_holds_what_it_claims_to_the_byte(compression: str) -> None:
+    def unpacked(data: bytes, size: int, crc: int = 0) -> bytes:
+        packed = PACKED[compression](data)
+        return ChunkUnpacker(0).unpack(Chunk(compression, packed, 0, 0, crc, size), 40)
+
     data = message(b"text") * 3
     for held in (data, b"", b"x"):
-        assert unpack_chunk(chunk(compression, held, len(held)), 40) == held
-        assert unpack_chunk(chunk(compression, held, len(held), zlib.crc32(held)), 40) == held
+        assert unpacked(held, len(held)) == held
+        assert unpacked(held, len(held), zlib.crc32(held)) == held
     for size in (len(data) - 1, len(data) + 1):
-        with pytest.raises(ValueError, match="the chunk at byte 40 "):
-            unpack_chunk(chunk(compression, data, size), 40)
+        with pytest.raises(ValueError, match=f"chunk at byte 40 does not hold the {size} bytes"):
+            unpacked(data, size)
     with pytest.raises(ValueError, match="the checksum of the chunk at byte 40 is wrong"):
-        unpack_chunk(chunk(compression, data, len(data), zlib.crc32(data) ^ 1), 40)
-    packed = len(PACKED[compression](data))
-    words = f"holds {packed} packed bytes, not the {packed + 1} that it claims"
-    with pytest.raises(ValueError, match=words):
-        unpack_chunk(chunk(compression, data, len(data), off=1), 40)
+        unpacked(data, len(data), zlib.crc32(data) ^ 1)
 
 
-@pytest.mark.parametrize(("size", "more"), [(2, "more"), (4, "less")])
-def test_whether_a_chunk_holds_more_or_less_is_said(size: int, more: str) -> None:
-    with pytest.raises(ValueError, match=f"holds {more} than the {size} bytes it claims"):
-        unpack_chunk(chunk("", b"abc", size), 40)
+def test_a_chunk_and_its_index_agree(tmp_path: Path) -> None:
+    path, data = tmp_path / "a.mcap", message(string("x"))
+    path.write_bytes(bag(Part("", data, len(data), indexed_size=len(data) + 1)))
+    with pytest.raises(RecordingError, match="and its index claim different sizes"):
+        read_bag(path)["/a"]
 
 
 # -- definitions ------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -198,14 +200,15 @@ def test_a_disk_that_refuses_a_message_is_reported_once(
     recording.set_clock(S)
 
     def full(*_: Any) -> None:
-        raise RecordingError("no space left")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("spacerobot_ros.bag.mcap_file.McapFile.append_chunk", full)
+    monkeypatch.setattr("spacerobot_ros.bag.mcap_file._AppendedFile.commit", full)
     for _ in range(3):
         # More than a chunk.
         recording.record(bench.a, b"x" * 70_000)
     assert recording.state.value == "failed"
-    assert [str(failure) for failure in bench.failures] == ["no space left"]
+    (failure,) = map(str, bench.failures)
+    assert failure.endswith("No space left on device; the 0 messages before that are safe in it.")
     assert recording.messages == 0
     recording.close()
 

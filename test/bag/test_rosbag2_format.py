@@ -25,7 +25,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecordingError
+from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecordingError, type_hash
 
 Sample = tuple[str, str, Any]
 AssertSame = Callable[[Any, Any], None]
@@ -242,47 +242,48 @@ def test_the_bag_metadata_are_those_of_rosbag2(
     begun = yaml.safe_load(first.metadata["serialized_metadata"])
     assert (begun["version"], begun["message_count"]) == (9, 0)
     assert begun["topics_with_message_count"] == []
-    duration = "            sec: 9223372036\n            nsec: 854775807\n"
-    topic = (
-        "  - topic_metadata:\n"
-        "      name: {name}\n"
-        "      type: std_msgs/msg/String\n"
-        "      serialization_format: cdr\n"
-        "      offered_qos_profiles:\n"
-        "        - history: keep_last\n"
-        "          depth: 10\n"
-        "          reliability: reliable\n"
-        "          durability: volatile\n"
-        f"          deadline:\n{duration}"
-        f"          lifespan:\n{duration}"
-        "          liveliness: automatic\n"
-        f"          liveliness_lease_duration:\n{duration}"
-        "          avoid_ros_namespace_conventions: false\n"
-        "      type_description_hash: "
-        "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18\n"
-        "    message_count: {count}\n"
-    )
-    # Laid out as in the metadata.yaml of a bag recorded by `ros2 bag record` of Jazzy.
-    assert last.metadata["serialized_metadata"] == (
-        "version: 9\n"
-        "storage_identifier: mcap\n"
-        "duration:\n  nanoseconds: 200\n"
-        "starting_time:\n  nanoseconds_since_epoch: 100\n"
-        "message_count: 3\n"
-        "topics_with_message_count:\n"
-        + topic.format(name="/a", count=3)
-        + topic.format(name="/b", count=0)
-        + 'compression_format: ""\n'
-        'compression_mode: ""\n'
-        "relative_file_paths:\n  - flight_0.mcap\n"
-        "files:\n"
-        "  - path: flight_0.mcap\n"
-        "    starting_time:\n      nanoseconds_since_epoch: 100\n"
-        "    duration:\n      nanoseconds: 200\n"
-        "    message_count: 3\n"
-        "custom_data: ~\n"
-        "ros_distro: jazzy"
-    )
+    infinite = {"sec": 9223372036, "nsec": 854775807}
+    qos = {
+        "history": "keep_last",
+        "depth": 10,
+        "reliability": "reliable",
+        "durability": "volatile",
+        "deadline": infinite,
+        "lifespan": infinite,
+        "liveliness": "automatic",
+        "liveliness_lease_duration": infinite,
+        "avoid_ros_namespace_conventions": False,
+    }
+    content = {
+        "duration": {"nanoseconds": 200},
+        "starting_time": {"nanoseconds_since_epoch": 100},
+        "message_count": 3,
+    }
+    # As in the metadata.yaml of a bag recorded by `ros2 bag record` of Jazzy.
+    assert yaml.safe_load(last.metadata["serialized_metadata"]) == {
+        "version": 9,
+        "storage_identifier": "mcap",
+        **content,
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": name,
+                    "type": STRING,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": [qos],
+                    "type_description_hash": type_hash(STRING),
+                },
+                "message_count": count,
+            }
+            for name, count in (("/a", 3), ("/b", 0))
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": ["flight_0.mcap"],
+        "files": [{"path": "flight_0.mcap", **content}],
+        "custom_data": None,
+        "ros_distro": "jazzy",
+    }
 
 
 @pytest.mark.parametrize("name", ["a b: c.mcap", "12.5", "é\"'.mcap", "true", "-", "1e3.mcap"])

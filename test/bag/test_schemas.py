@@ -4,7 +4,7 @@ import importlib
 import json
 import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -207,6 +207,32 @@ def test_what_is_not_there_is_said(
         function(type_name)
     assert str(caught.value).endswith(".")
     assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def without_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Find no message package that is installed."""
+    functions = (message_definition, type_hash)
+    with monkeypatch.context() as patched:
+        patched.delenv("AMENT_PREFIX_PATH", raising=False)
+        patched.setattr(sys, "prefix", str(tmp_path))
+        for function in functions:
+            function.cache_clear()
+        yield
+    for function in functions:
+        function.cache_clear()
+
+
+@pytest.mark.parametrize("type_name", [*TYPES, "tf2_msgs/msg/TFMessage"])
+def test_types_of_jazzy_need_no_package(type_name: str, without_packages: None) -> None:
+    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    types = get_types_from_msg(message_definition(type_name), type_name)
+    assert {name: fields for name, (_, fields) in types.items()} == {
+        name: jazzy.fielddefs[name][1] for name in types
+    }
+    assert type_hash(type_name) == jazzy.hash_rihs01(type_name)
+    with pytest.raises(RecordingError, match="own_msgs is neither on AMENT_PREFIX_PATH nor in"):
+        message_definition("own_msgs/msg/A")
 
 
 def test_a_missing_dependency_is_named(prefix_with_package: Install) -> None:

@@ -24,9 +24,7 @@ from spacerobot_ros.batch import (
 from spacerobot_ros.model import (
     InertialParameters,
     SpaceRobot,
-    compilation,
     load_robot,
-    vector_machine,
 )
 from spacerobot_ros.model.compilation import cxx_compiler
 from spacerobot_ros.resources import share_directory
@@ -207,34 +205,30 @@ def test_without_a_compiler_the_plant_flies_them(
     np.testing.assert_array_equal(here.pose, there.pose)
 
 
-def look_at_the_processor_again() -> None:
-    for each in (compilation.processor_features, vector_machine.vector_unit):
-        each.cache_clear()
-
-
 def test_the_widest_registers_that_there_are_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     for flags, name in (
         ("fpu sse2 avx2 avx512f", "AVX-512"),
         ("fpu sse2 avx avx2", "AVX2"),
         ("fpu sse2", "SSE2"),
         ("asimd", "two at a time"),
+        (None, "two at a time"),
     ):
-        look_at_the_processor_again()
-        text = f"model name : avx512f\nflags\t\t: {flags}\n"
+        native.vector_unit.cache_clear()
+        text = f"model name : avx512f\nflags\t\t: {flags}\n" if flags else "no processor\n"
         monkeypatch.setattr(Path, "read_text", lambda *_, text=text, **__: text)
-        assert vector_machine.vector_unit().name == name
+        assert native.vector_unit().name == name
     monkeypatch.undo()
-    look_at_the_processor_again()
+    native.vector_unit.cache_clear()
 
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize("unit", [*vector_machine.VECTOR_UNITS, "plain"])
+@pytest.mark.parametrize("unit", [*native.VECTOR_UNITS, "plain"])
 def test_narrower_registers_give_the_same_flights(
     robots: dict[str, SpaceRobot], monkeypatch: pytest.MonkeyPatch, unit: str
 ) -> None:
-    widest = vector_machine.vector_unit()
-    chosen = vector_machine._PORTABLE_UNIT if unit == "plain" else vector_machine.VECTOR_UNITS[unit]
+    widest = native.vector_unit()
+    chosen = native._PORTABLE_UNIT if unit == "plain" else native.VECTOR_UNITS[unit]
     if chosen.lanes > widest.lanes:
         pytest.skip(f"this processor has no {chosen.name}")
     monkeypatch.setattr(native, "vector_unit", lambda: chosen)
@@ -245,6 +239,23 @@ def test_narrower_registers_give_the_same_flights(
         here = fly_lanes(flights)
         assert f"{chosen.lanes} lanes" in here.engine
         assert_equal_flights(here, fly_one_by_one(flights))
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_without_vector_functions_of_the_c_library_lanes_fly_as_well(
+    robots: dict[str, SpaceRobot], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    flights = velocity_flights(robots["servicer"], 9, each=True, deadband=0.0)
+    with_functions = fly_lanes(flights)
+    compiler = tmp_path / "c++"
+    script = f'#!/bin/sh\ncase "$*" in *-lmvec*) exit 1;; esac\nexec {cxx_compiler()} "$@"\n'
+    compiler.write_text(script, encoding="utf-8")
+    compiler.chmod(0o700)
+    monkeypatch.setenv("CXX", str(compiler))
+    here = fly_lanes(flights)
+    assert here.engine == with_functions.engine
+    assert_equal_flights(here, with_functions)
 
 
 @needs_compiler

@@ -12,11 +12,6 @@ ROOT = Path(__file__).resolve().parents[2]
 HELD_BY_TESTS = [
     (
         "docs/records.md",
-        "3 to 8 % larger than at level 3",
-        "bag/test_bag_files.py::test_the_fastest_compression_makes_telemetry_little_larger",
-    ),
-    (
-        "docs/records.md",
         "two runs in lockstep record messages of equal values in the same order",
         "session/test_run.py::test_two_runs_are_the_same_to_the_last_message",
     ),

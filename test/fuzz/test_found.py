@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.bag import BagWriter, RecordingError, read_bag
+from spacerobot_ros.bag import BagWriter, read_bag
 from spacerobot_ros.errors import (
     ParameterError,
     PlanningError,
@@ -98,7 +98,7 @@ def test_a_size_that_is_no_size_is_refused(number: str) -> None:
     assert_one_sentence(str(caught.value), "geometry of link")
 
 
-def test_a_chunk_that_claims_to_be_larger_than_the_memory_is_damage(tmp_path: Path) -> None:
+def test_a_chunk_that_claims_to_be_larger_than_the_memory_takes_no_more(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with BagWriter(path) as writer:
         channel = writer.add_topic("/a", "std_msgs/msg/Float64")
@@ -112,6 +112,4 @@ def test_a_chunk_that_claims_to_be_larger_than_the_memory_is_damage(tmp_path: Pa
     assert data[start] == CHUNK
     struct.pack_into("<Q", data, start + 9 + 8 + 8 + 8 + 4 + 4 + len("zstd"), 2**45)
     path.write_bytes(data)
-    with pytest.raises(RecordingError) as caught:
-        read_bag(path)["/a"]
-    assert_one_sentence(str(caught.value), str(path), "damaged")
+    assert read_bag(path)["/a"].field("data").tolist() == [1.0]

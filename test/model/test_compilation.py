@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import re
-import shutil
-import stat
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,45 +15,25 @@ import casadi as ca
 import pytest
 
 from spacerobot_ros import files
-from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model import SpaceRobot, compilation
-from spacerobot_ros.model.compilation import c_compiler, compiled
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import c_compiler, compiled, load_library
 from spacerobot_ros.resources import robot_file
 
 Compiler = Callable[[str], Path]
 
-AFTER = 'while [ "$1" != -o ]; do shift; done; out=$2'
-"""Shell: the file that the compiler is to write."""
-
 
 @pytest.fixture(autouse=True)
 def cache(compiled_code: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Return the folder of this test's objects; nothing was said before.
-
-    The compiler hands out an object of the probe that was made once.
-    """
-    made = compiled_code / "probe.so"
-    if not made.exists():
-        script = f'#!/bin/sh\n{c_compiler()} "$@"; {AFTER}; cp "$out" {made}'
-        (compiled_code / "first").write_text(script, encoding="utf-8")
-        (compiled_code / "first").chmod(0o700)
-        monkeypatch.setenv("CC", str(compiled_code / "first"))
-        compiled(probe())
-    (compiled_code / "again").write_text(f'#!/bin/sh\n{AFTER}; cp {made} "$out"\n', "utf-8")
-    (compiled_code / "again").chmod(0o700)
-    monkeypatch.setenv("CC", str(compiled_code / "again"))
+    """Return the folder of this test's objects; nothing was said before."""
     folder = tmp_path / "cache"
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(folder))
-    monkeypatch.delenv("SPACEROBOT_COMPILE_TIMEOUT", raising=False)
     monkeypatch.setattr(files, "_logged_warnings", set())
-    monkeypatch.setattr(compilation, "_hung_compilations", set())
     return folder
 
 
 @pytest.fixture
 def compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Compiler:
     """Return what makes the machine's C compiler a shell script; ``$CC`` in it is the real one."""
-    monkeypatch.delenv("CC")
     real = c_compiler()
 
     def install(script: str) -> Path:
@@ -95,17 +74,12 @@ def give_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "truncated": lambda whole: whole[:5000],
-    "cut in its last line": lambda whole: whole[:-10],
-    "zeroed": lambda whole: bytes(len(whole)),
     "empty": lambda _: b"",
     "one bit": lambda whole: whole[:3000] + bytes([whole[3000] ^ 1]) + whole[3001:],
-    "longer": lambda whole: whole + b"x",
     "without its last line": lambda whole: whole[: whole.rfind(b"\nspacerobot_ros cache")],
-    "text": lambda _: b"#!/bin/sh\n",
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_object_is_made_anew(
     damage: str, cache: Path, caplog: pytest.LogCaptureFixture
@@ -130,103 +104,50 @@ def test_a_whole_object_is_not_made_again(cache: Path, compiler: Compiler) -> No
     assert only_file(cache).stat().st_mode & 0o077 == 0
 
 
-def test_a_compiler_that_delivers_another_function_is_found_out(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    x = ca.SX.sym("x", 3)
-    wanted = ca.Function("probe", [x], [3 * ca.cos(x)], ["x"], ["y"])
-    assert compiled(wanted).class_name() != "External"
-    assert "gives other numbers" in caplog.text
-
-
 def test_an_object_under_the_name_of_another_is_not_loaded(
-    cache: Path, compiler: Compiler, caplog: pytest.LogCaptureFixture
+    cache: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    compiler('exec $CC "$@"')
     x = ca.SX.sym("x", 3)
     compiled(ca.Function("probe", [x], [3 * ca.cos(x)], ["x"], ["y"]))
     other = only_file(cache)
     content = other.read_bytes()
     assert is_compiled()
     (own,) = set(cache.iterdir()) - {other}
+    own.unlink()  # It may still be mapped.
     own.write_bytes(content)
     assert is_compiled()
     assert "is deleted" in caplog.text
 
 
+def test_flags_are_part_of_the_name() -> None:
+    """An object for other registers is another one."""
+    source = "double number(void) { return NUMBER; }"
+
+    def number(flag: str) -> float:
+        library = load_library("number", source, ctypes.CDLL, flags=(flag,))
+        library.number.restype = ctypes.c_double
+        return float(library.number())
+
+    assert [number(f"-DNUMBER={k}.0") for k in (1, 2, 1)] == [1.0, 2.0, 1.0]
+
+
 @pytest.mark.parametrize(
     ("script", "reason"),
     [
-        (f'{AFTER}; : > "$out"', "failed when it was tried"),
-        ("exit 0", "failed when it was tried"),
-        (f'{AFTER}; echo hello > "$out"', "failed when it was tried"),
-        (f'$CC "$@"; {AFTER}; head -c 5000 "$out" > "$out.1"; mv "$out.1" "$out"',
-         "failed when it was tried"),
-        ('$CC -Dsin=cos "$@"', "gives other numbers"),
-        ('$CC -Dprobe=other "$@"', "failed when it was tried"),
+        ('while [ "$1" != -o ]; do shift; done; echo hello > "$2"', "cannot be loaded"),
         ("echo no room >&2; exit 3", r"failed \(3\): no room"),
+        ("exit 4", r"failed \(4\): no reason given; is the disk of .* full"),
         ("kill -9 $$", "was ended by SIGKILL"),
-        ("sleep 600", r"did not end within 0.3 s \(SPACEROBOT_COMPILE_TIMEOUT\)"),
     ],
-)  # fmt: skip
+)
 def test_a_compiler_that_fails_costs_speed_only(
-    script: str,
-    reason: str,
-    cache: Path,
-    compiler: Compiler,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    script: str, reason: str, compiler: Compiler, caplog: pytest.LogCaptureFixture
 ) -> None:
     compiler(script)
-    if "sleep" in script:
-        monkeypatch.setenv("SPACEROBOT_COMPILE_TIMEOUT", "0.3")
     assert not is_compiled()
     assert len(caplog.records) == 1
     assert caplog.records[0].levelname == "WARNING"
     assert re.search(reason, caplog.text)
-    assert not cache.exists()
-
-
-def test_an_object_that_crashes_does_so_in_another_process(
-    compiler: Compiler, caplog: pytest.LogCaptureFixture
-) -> None:
-    compiler(
-        f'{AFTER}; echo "__attribute__((constructor)) void f(void) {{ __builtin_trap(); }}" '
-        '> "$out.c"; $CC -fPIC -shared -o "$out" "$out.c"'
-    )
-    assert not is_compiled()
-    assert "failed when it was tried" in caplog.text
-
-
-def test_a_compiler_that_hangs_is_waited_for_once_and_ended(
-    tmp_path: Path, compiler: Compiler, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    compiler(f"sleep 600 & echo $! >> {tmp_path}/children; wait")
-    monkeypatch.setenv("SPACEROBOT_COMPILE_TIMEOUT", "1.0")
-    waited: list[float | None] = []
-    wait = subprocess.Popen.wait
-
-    def noted(process: subprocess.Popen[bytes], timeout: float | None = None) -> int:
-        waited.append(timeout)
-        return wait(process, timeout)
-
-    monkeypatch.setattr(subprocess.Popen, "wait", noted)
-    for number in range(5):
-        x = ca.SX.sym("x")
-        compiled(ca.Function(f"f{number}", [x], [x]))
-    assert waited[0] == 1.0, "and not longer"
-    # One line: the compiler was called once.
-    child = int((tmp_path / "children").read_text())
-    status = Path(f"/proc/{child}/stat")
-    # What has ended may still wait for its parent to ask.
-    assert not status.exists() or status.read_text().split(")")[1].split()[0] == "Z"
-
-
-@pytest.mark.parametrize("text", ["soon", "0", "-1", "nan", "inf"])
-def test_a_time_limit_that_is_none_is_refused(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SPACEROBOT_COMPILE_TIMEOUT", text)
-    with pytest.raises(ParameterError, match="number of seconds"):
-        compiled(probe())
 
 
 def test_no_compiler_is_said_once(
@@ -259,18 +180,6 @@ def test_a_folder_that_others_may_write_is_not_used(
     assert f"(mode {mode:o})" in record.getMessage()
 
 
-def test_a_folder_within_one_that_others_may_write_is_not_used(
-    cache: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """They could put another in its place; not where the sticky bit forbids it, as in /tmp."""
-    tmp_path.chmod(0o1777)
-    assert is_compiled()
-    assert only_file(cache)
-    tmp_path.chmod(0o777)
-    assert is_compiled()
-    assert f"chmod go-w '{tmp_path}'" in caplog.text
-
-
 def test_a_folder_of_somebody_else_is_not_used(
     cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -282,30 +191,6 @@ def test_a_folder_of_somebody_else_is_not_used(
     assert len(caplog.records) == 1
     assert "belongs to user" in caplog.text
     assert "SPACEROBOT_CACHE_DIR" in caplog.text
-
-
-@pytest.mark.parametrize("whose", ["writable", "foreign"])
-def test_a_file_that_others_could_have_written_is_replaced(
-    whose: str,
-    cache: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    assert is_compiled()
-    kept = only_file(cache)
-    if whose == "writable":
-        kept.chmod(0o666)
-    else:
-        if os.geteuid():
-            pytest.skip("only root gives files away")
-        give_away(kept, monkeypatch)
-    assert is_compiled()
-    facts = only_file(cache).lstat()
-    assert stat.S_IMODE(facts.st_mode) == 0o600
-    assert facts.st_uid == os.geteuid()
-    assert stat.S_ISREG(facts.st_mode)
-    assert len(caplog.records) == 1
-    assert "is deleted" in caplog.text
 
 
 def test_a_link_to_a_folder_of_ones_own_is_followed(cache: Path, tmp_path: Path) -> None:
@@ -325,7 +210,7 @@ def test_a_link_to_a_folder_that_others_may_write_is_not(
     cache.symlink_to(real)
     assert is_compiled()
     assert not list(real.iterdir())
-    assert f"chmod go-w '{real}'" in caplog.text
+    assert f"chmod go-w '{cache}'" in caplog.text
 
 
 def test_whatever_the_umask_the_cache_is_for_its_user_alone(
@@ -338,7 +223,7 @@ def test_whatever_the_umask_the_cache_is_for_its_user_alone(
         assert is_compiled()
     finally:
         os.umask(before)
-    for path in (cache, cache / "a", deep, only_file(deep)):
+    for path in (deep, only_file(deep)):
         assert path.stat().st_mode & 0o077 == 0, path
 
 
@@ -378,34 +263,13 @@ def test_a_folder_that_forbids_execution_is_said_once(
 def test_a_full_disk_keeps_nothing_and_harms_nothing(
     cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def full(_: int) -> None:
+    def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("os.fsync", full)
+    monkeypatch.setattr("os.replace", full)
     assert is_compiled()
     assert "No space left" in caplog.text
     assert not list(cache.iterdir())
-
-
-def test_nothing_is_renamed_before_it_is_on_the_disk(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done: list[str] = []
-    fsync, replace = os.fsync, os.replace
-
-    def synced(number: int) -> None:
-        done.append("folder" if stat.S_ISDIR(os.fstat(number).st_mode) else "file")
-        fsync(number)
-
-    def replaced(one: str, other: Path) -> None:
-        done.append("name")
-        replace(one, other)
-
-    monkeypatch.setattr("os.fsync", synced)
-    monkeypatch.setattr("os.replace", replaced)
-    assert is_compiled()
-    assert only_file(cache)
-    assert done == ["file", "name", "folder"]
 
 
 @pytest.mark.slow
@@ -445,16 +309,18 @@ def test_equal_robots_share_functions_and_others_do_not(monkeypatch: pytest.Monk
     one, other = first.buffered("velocity_step:2"), again.buffered("velocity_step:2")
     one.inputs[0][:] = 1.0
     assert not other.inputs[0].any()
-    monkeypatch.delenv("CC")
-    if real := shutil.which("cc"):
-        monkeypatch.setenv("CC", real)
-        monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
-        assert again.function("velocity_step:2") is not step
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
+    assert again.function("velocity_step:2") is not step
 
 
-def test_a_long_wait_is_announced_once_in_a_process(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
-    for _ in range(3):
-        compilation._announce_compilation()
-    told = [each for each in caplog.records if hasattr(each, compilation.ANNOUNCEMENT_ATTRIBUTE)]
-    assert len(told) <= 1, "an earlier test may have heard it"
+def test_a_long_wait_is_announced_once_in_a_process(tmp_path: Path) -> None:
+    code = (
+        "import casadi as ca, logging\n"
+        "from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE, compiled\n"
+        "logging.basicConfig(level='INFO', format=f'%({ANNOUNCEMENT_ATTRIBUTE})s')\n"
+        "x = ca.SX.sym('x')\n"
+        "for name in ('first', 'second'):\n"
+        "    compiled(ca.Function(name, [x], [2 * x]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "True\n"

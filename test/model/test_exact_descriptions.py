@@ -89,23 +89,6 @@ def test_attributes_have_their_count_of_numbers(
         assert "has 'one', no number; write" in refusal(f'{name}="{"one " * count}"')
 
 
-@pytest.mark.parametrize(
-    ("root", "words"),
-    [
-        ("<sdf/>", "but an SDF model: its root element is <sdf>, and that of a URDF is <robot>."),
-        ("<mujoco/>", "but a MuJoCo model: its root element is <mujoco>"),
-        ("<COLLADA/>", "but a COLLADA file"),
-        ("<x/>", "but something else: its root element is <x>"),
-        ('<robot xmlns="a:b" name="r"/>', "its elements are in the namespace 'a:b'; remove xmlns="),
-        ('<robot name="r"><link name="a"/><link/></robot>', "the link number 2 has no name; write"),
-        ('<robot name="r"><joint name="j"/></robot>', "the joint 'j' has no type; write type="),
-    ],
-)
-def test_other_formats_are_named(root: str, words: str) -> None:
-    with pytest.raises(RobotDescriptionError, match=re.escape(words)):
-        parse_robot(root)
-
-
 # -- masses -------------------------------------------------------------------------------------
 
 ARM = InertialParameters.of(load_robot(robot_file("three_joint_arm")))

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from support.oracles import Array, PinocchioOracle, assert_agrees
 from support.random_robots import random_robot_urdf
 
-from spacerobot_ros.model import SpaceRobot, compilation
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.model_functions import SymbolicModels
 
 SEEDS = (70, 71, 72)
@@ -139,33 +139,18 @@ def test_compiled_step(compiled_code: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert interpreted.function("velocity_step:64").class_name() != "External"
 
 
-def test_functions_are_compiled_once_they_were_called_often(
-    compiled_code: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The numbers before and after are those of the virtual machine, bit for bit."""
-    monkeypatch.setattr(compilation, "_EVALUATIONS_BEFORE_COMPILING", 3)
+def test_a_robot_of_few_calls_is_not_compiled(compiled_code: Path) -> None:
+    """The numbers are those of compiled functions, bit for bit."""
     case = random_case(71)
     description = case.robot.description
     # Its functions have the mass properties as their last argument.
     robot = SpaceRobot(description, SymbolicModels.of(description))
-    steps, poses = (
-        robot.compiled_on_demand.buffered(name) for name in ("velocity_step:3", "link_poses")
-    )
-    x, found, compiled = case.x, [], []
-    for _ in range(5):
-        (x,) = steps(x, case.qdot, case.spin_W, DURATION)
-        found.append((x, *poses(x[: robot.n])))
-        compiled.append([each.function.class_name() == "External" for each in (steps, poses)])
-    assert compiled == [[False, False]] * 3 + [[True, True]] * 2
-    # Those that the cache has by now are there at once.
-    other = SpaceRobot(description, SymbolicModels.of(description)).compiled_on_demand
-    assert other.buffered("link_poses").function.class_name() == "External"
-    assert other.buffered("velocity_step:2").function.class_name() != "External"
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    steps, poses = (robot.buffered(name) for name in ("velocity_step:3", "link_poses"))
-    x = case.x
-    for number, (state, R, r) in enumerate(found):
-        (x,) = steps(x, case.qdot, case.spin_W, DURATION)
-        np.testing.assert_array_equal(state, x, err_msg=f"step {number}")
-        for here, there in zip((R, r), poses(x[: robot.n]), strict=True):
+    for name, arguments in (
+        ("velocity_step:3", (case.x, case.qdot, case.spin_W, DURATION)),
+        ("link_poses", (case.x[: robot.n],)),
+    ):
+        interpreted, compiled = (each.buffered(name) for each in (robot.interpreted, robot))
+        assert interpreted.function.class_name() != "External"
+        assert compiled.function.class_name() == "External"
+        for here, there in zip(interpreted(*arguments), compiled(*arguments), strict=True):
             np.testing.assert_array_equal(here, there)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -85,34 +84,17 @@ def test_a_xacro_file_takes_macros_properties_lists_and_files_of_its_package(
     assert load_robot(file_with(folder, text, "probe.xacro")).bodies[0].inertia.mass == 42.0
 
 
-ATTACKS = {
-    "a lambda": ("${(lambda: 1)()}", "has a Lambda"),
-    "a comprehension": ("${[x for x in [1]][0]}", "has a ListComp"),
-    "a generator": ("${sum(x for x in [1])}", "has a GeneratorExp"),
-    "an assignment": ("${(a := 1)}", "has a NamedExpr"),
-    "classes": ("${().__class__.__base__.__subclasses__()}", "has the name '__"),
-    "format": ("${'%s' % 'a'.format}", "has the name 'format'"),
-    "a type": ("${python.type(1)}", "has the name 'type'"),
-    "in an expression of substitution": ("$(eval [x for x in [1]])", "has a ListComp"),
-    "an expression that an expression makes": ("${'$' + '{().__class__}'}", "cannot be expanded"),
-    "a password file": ("${xacro.load_yaml('/etc/passwd')}", "outside of its package"),
-    "a hidden file": ("${xacro.load_yaml('.netrc')}", "no robot or YAML file"),
-    "another file": ("${xacro.load_yaml('probe.txt')}", "no robot or YAML file"),
-    "the environment": ("$(env SECRET_OF_TEST)", "SECRET_OF_TEST. is not set"),
-    "a number without end": ("${9**9**9}", "needs too much time or memory"),
-    "a text without end": ("${len('a' * 10**11)}", "cannot be expanded"),
-}
-
-
-@pytest.mark.parametrize(("expression", "reason"), ATTACKS.values(), ids=ATTACKS)
-def test_a_xacro_file_is_no_program(
+@pytest.mark.parametrize(
+    ("expression", "reason"),
+    [
+        ("${9**9**9}", "needs too much time or memory"),
+        ("${len('a' * 10**11)}", "cannot be expanded"),
+    ],
+)
+def test_a_xacro_file_has_limits_of_time_and_memory(
     tmp_path: Path, expression: str, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It computes with numbers and texts, for a second, and reads its package alone."""
-    monkeypatch.setenv("SECRET_OF_TEST", "42")
     monkeypatch.setattr("spacerobot_ros.model.urdf._XACRO_CPU_TIME", 1)
-    for name in (".netrc", "probe.txt"):
-        (tmp_path / name).write_text("42")
     path = file_with(tmp_path, urdf(mass=expression, attribute=HEADING), "probe.xacro")
     with pytest.raises(RobotDescriptionError, match=reason):
         load_robot(path)
@@ -158,7 +140,6 @@ BROKEN = {
     "SDF": ("<sdf version='1.9'><model name='a'/></sdf>", r"but an SDF model: .* <sdf>.* convert"),
     "MuJoCo": ("<mujoco><worldbody/></mujoco>", r"but a MuJoCo model: .* <mujoco>.* convert"),
     "a web page": ("<html><body/></html>", r"but something else: .* <html>"),
-    "a namespace": (changed("<robot ", '<robot xmlns="http://x" '), r"remove xmlns="),
     "no name": (changed(' name="probe"', ""), r"the <robot> has no name; write <robot name="),
     "no link": ('<robot name="a"/>', r"exactly one root link .* found: none\. Give it a <link>"),
     # Masses and inertias.
@@ -458,9 +439,6 @@ def test_a_folder_and_a_misspelt_file_are_named(tmp_path: Path) -> None:
     (tmp_path / "robots").mkdir()
     with pytest.raises(ParameterError, match="is a folder; name the URDF file in it"):
         robot_file(str(tmp_path / "robots"))
-    os.mkfifo(tmp_path / "pipe.urdf")
-    with pytest.raises(ParameterError, match="is no regular file; name a URDF file"):
-        robot_file(str(tmp_path / "pipe.urdf"))
     file_with(tmp_path, urdf(), "inspector.urdf")
     with pytest.raises(ParameterError, match=r"Did you mean 'inspector\.urdf'\?"):
         robot_file(str(tmp_path / "inspectr.urdf"))

@@ -34,24 +34,16 @@ def errors(probe: Probe) -> list[str]:
 def test_a_full_disk_ends_the_recording_with_one_sentence_and_not_the_flight(
     harness: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, many, room = BagWriter.write, BagWriter.write_many, 100
-
-    def take_room(self: BagWriter, count: int) -> None:
-        nonlocal room
-        room -= count
-        if room < 0:
-            raise RecordingError(f"The bag {self.path} cannot be written: no space left.")
+    whole, room = BagWriter.write, 100
 
     def write(self: BagWriter, *message: Any) -> None:
-        take_room(self, 1)
+        nonlocal room
+        room -= 1
+        if room < 0:
+            raise RecordingError(f"The bag {self.path} cannot be written: no space left.")
         whole(self, *message)
 
-    def write_many(self: BagWriter, *messages: Any) -> None:
-        many(self, *(each[: max(room, 0)] for each in messages))
-        take_room(self, len(messages[0]))
-
     monkeypatch.setattr(BagWriter, "write", write)
-    monkeypatch.setattr(BagWriter, "write_many", write_many)
     stack = Stack(harness, tmp_path / "flight.mcap")
     stack.configure(*STREAMS, *LATCHED_TOPICS)
     stack.recorder.trigger_activate()

@@ -22,7 +22,6 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
 from spacerobot_ros.bag.reader import columns
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TRANSFORMS, TransformTemplate
-from spacerobot_ros.messages.definitions import _OWN_DEFINITIONS
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion
@@ -240,7 +239,7 @@ def test_chains_of_frames_end_in_the_world_or_nowhere() -> None:
 
 def test_the_topic_has_the_frames_of_odom(harness: Harness) -> None:
     messages = pytest.importorskip("tf2_msgs.msg")
-    assert type_hash(TRANSFORM_TYPE) == _OWN_DEFINITIONS["tf2_msgs", "TFMessage"][1]
+    assert type_hash(TRANSFORM_TYPE) == get_typestore(Stores.ROS2_JAZZY).hash_rihs01(TRANSFORM_TYPE)
     plant = harness.make(
         PlantNode, {"robot": "servicer", "tick_rate": 50.0, "initial_position": [1.0, 2.0, 3.0]}
     )

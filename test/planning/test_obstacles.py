@@ -21,7 +21,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError, Proof, Unreacha
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.urdf import load_world, parse_world
-from spacerobot_ros.model.world import with_obstacles_around, with_world
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning import GaitSchedule, RobotState, plan
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.schedule import BasePath
@@ -290,7 +290,7 @@ def test_a_path_of_the_base_is_read_between_its_poses() -> None:
 def test_a_worker_plans_among_the_obstacles_that_it_is_given(*, obstacles: bool) -> None:
     loop = resting()
     robot, config = loop.plant.robot, PlannerConfig(clearance=0.0)
-    described = with_obstacles_around(robot.description, parse_world(BALL)) if obstacles else None
+    described = with_world(robot.description, parse_world(BALL)) if obstacles else None
     worker = PlanningWorker(robot, config, loop.method, described=described)
     if described is None:
         assert worker.clearance is None

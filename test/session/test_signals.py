@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from spacerobot_ros.termination import Terminated, ended_on_request, guarded
+from spacerobot_ros.termination import Terminated, graceful_shutdown, guarded
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -29,7 +29,7 @@ def noted() -> Iterator[list[int]]:
 def test_a_flight_is_asked_to_end_by_each_signal(noted: list[int], number: signal.Signals) -> None:
     asked: list[str] = []
     try:
-        with ended_on_request(lambda: asked.append("main")) as stopped:
+        with graceful_shutdown(lambda: asked.append("main")) as stopped:
             assert not stopped()
             os.kill(os.getpid(), number)
             assert stopped()
@@ -41,7 +41,7 @@ def test_a_flight_is_asked_to_end_by_each_signal(noted: list[int], number: signa
     # What was there before is there again.
     os.kill(os.getpid(), number)
     assert noted == [number]
-    with ended_on_request() as stopped:
+    with graceful_shutdown() as stopped:
         assert not stopped(), "a signal of an earlier flight"
 
 

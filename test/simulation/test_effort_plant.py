@@ -26,7 +26,7 @@ from support.slow import some_fast
 from support.wheels import HULL, WHEELS, text, wheeled_robot
 
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
-from spacerobot_ros.model import SpaceRobot, compilation
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction, c_compiler
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.integration import repeat_step
@@ -234,27 +234,6 @@ def test_compiled_flight_is_the_interpreted_one(
         compiled.step(effort, wrench)
     np.testing.assert_allclose(compiled.pose, interpreted.pose, rtol=1e-13, atol=1e-15)
     np.testing.assert_allclose(compiled.momentum, interpreted.momentum, rtol=1e-12, atol=1e-14)
-
-
-@pytest.mark.skipif(c_compiler() is None, reason="no C compiler")
-def test_vector_registers_change_no_bit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Results of the plant's code for any processor, compiled with few optimisations."""
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
-    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path / "lasting"))
-    rng = np.random.default_rng(91)
-    robot = robot_of(random_urdf(0))
-    start = tumbling(robot, rng)
-    lasting = EffortPlant(robot, TICK, start)
-    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path / "plain"))
-    monkeypatch.setattr(compilation, "processor_features", frozenset[str])
-    monkeypatch.setattr(compilation, "_LASTING_FLAGS", compilation._COMPILER_FLAGS)
-    plain = EffortPlant(SpaceRobot.from_urdf(random_urdf(0)), TICK, start)
-    assert len({path.name for path in tmp_path.glob("*/effort_tick_10-*.so")}) == 2
-    for effort, wrench in thrusts(rng, robot.n, 50):
-        lasting.step(effort, wrench)
-        plain.step(effort, wrench)
-    for name in ("pose", "twist", "q", "qdot", "momentum", "link_R", "link_r"):
-        np.testing.assert_array_equal(getattr(lasting, name), getattr(plain, name), name)
 
 
 # -- the plant under efforts: clipped commands, start and reset, refusals ------------------------

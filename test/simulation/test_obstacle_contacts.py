@@ -6,7 +6,7 @@ import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot, parse_world
-from spacerobot_ros.model.world import with_obstacles_around
+from spacerobot_ros.model.world import with_world
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.clearance import ClearanceMonitor
@@ -27,7 +27,7 @@ def test_contacts_go_on_or_end_among_other_obstacles() -> None:
     monitor: ClearanceMonitor | None = None
     events = []
     for time, text in ((1.0, ball_at(0.0)), (2.0, ball_at(0.001)), (3.0, ball_at(40.0))):
-        described = with_obstacles_around(robot.description, parse_world(text))
+        described = with_world(robot.description, parse_world(text))
         monitor = ClearanceMonitor.of(described, tuple(robot.link_names), monitor)
         assert monitor is not None
         status, news = monitor.measure(plant.link_R, plant.link_r, plant.pose, time)

@@ -35,8 +35,6 @@ import _pytest.main
 import numpy as np
 import pytest
 
-from spacerobot_ros.model import compilation, model_functions
-
 WAITED = 120.0
 """Wall time (s) beyond which a test that does not use the processor hangs; a multiple of what it
 takes otherwise comes on top."""
@@ -141,8 +139,6 @@ def _forget() -> None:
     """Forget what was computed while tests were collected: an error is to show in it."""
     for cached in _caches:
         cached.cache_clear()
-    compilation._functions_in_memory.clear()
-    model_functions._symbolic_models.clear()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -425,7 +425,7 @@ class FlightNode(LifecycleNode):
         """Report in the status of the node that an error stops it; it is deactivated then."""
 
     def interrupt(self) -> None:
-        """Cancel a long computation; called from another thread when the process must end."""
+        """Cancel a long computation; called when the process must end."""
 
     def on_silence(self, silence: SilenceReport) -> None:
         """React to a node that has become silent or is back."""

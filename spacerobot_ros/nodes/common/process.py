@@ -17,7 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.node import FlightNode
-from spacerobot_ros.termination import Terminated, ended_on_request, guarded
+from spacerobot_ros.termination import Terminated, graceful_shutdown, guarded
 
 _LOG = logging.getLogger(__name__)
 
@@ -144,9 +144,13 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
         gc.freeze()
         executor = EventsExecutor()
         executor.add_node(node)
-        with ended_on_request(lambda: stop.set_result(None), node.interrupt) as requested:
+
+        def request_end() -> None:
+            stop.set_result(None)
+            node.interrupt()
+
+        with graceful_shutdown(request_end):
             spin_until(executor, stop)
-            requested()
             node.drain(executor)
             node.finalize()
             _await_delivery(node)

@@ -30,7 +30,7 @@ from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.grasp import BodyMotion, Payload
 from spacerobot_ros.model.shared_parameters import robot_of
-from spacerobot_ros.model.world import obstacles_from_topic, with_obstacles_around
+from spacerobot_ros.model.world import obstacles_from_topic, with_world
 from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node
@@ -582,7 +582,7 @@ class PlantNode(FlightNode):
         self._obstacles = message.data
         self._markers.use_obstacles(world)
         if self._clearance_ticks:
-            described = with_obstacles_around(self.plant.robot.description, world)
+            described = with_world(self.plant.robot.description, world)
             with self.long_work():
                 # The plant in MuJoCo has the obstacles of the beginning alone.
                 self._clearance = ClearancePublisher.of(

@@ -101,8 +101,7 @@ class GoalFile:
             return
         text = json.dumps(entries)
         try:
-            # No fsync: a commander must not wait for the disk in flight.
-            write_whole(self._path, text.encode(), durable=False)
+            write_whole(self._path, text.encode())
         except OSError as error:
             raise ParameterError(
                 f"Parameter 'resume_file' is '{self._path}', which cannot be written: "

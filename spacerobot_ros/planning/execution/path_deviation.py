@@ -102,7 +102,7 @@ class PathCheck:
         masses: MassEstimate | None = None,
     ) -> None:
         # No compiler in flight.
-        self._robot = robot.compiled_on_demand
+        self._robot = robot.interpreted
         self._path, self._positions = schedule.path, schedule.positions
         self._period, self._deadband = schedule.control_period, config.shape_deadband
         self._deviation = PathDeviation(schedule.path, average, sensitivity, masses)
@@ -312,7 +312,7 @@ class PathSensitivity:
     """
 
     def __init__(self, robot: SpaceRobot) -> None:
-        self._robot = robot.compiled_on_demand
+        self._robot = robot.interpreted
         self.count = 2 * len(robot.description.bodies)
 
     @cached_property

@@ -313,7 +313,7 @@ class PlanningWorker:
         """
         config = self._config
         # Most manoeuvres have few ticks: compiling the step would take longer.
-        robot = self._robot.compiled_on_demand
+        robot = self._robot.interpreted
         prediction = BasePrediction(robot, config.control_period, config.integration_step)
         times: Array = config.control_period * np.arange(len(shapes), dtype=float)
         attitudes = prediction.attitudes(shapes, state.quaternion, state.angular_momentum)

@@ -196,7 +196,7 @@ class OptimalGait(GaitMethod):
 
     def _setup(self) -> None:
         # A plan calls the model's functions a few times each.
-        self.robot = robot = self.robot.compiled_on_demand
+        self.robot = robot = self.robot.interpreted
         chosen = self.options
         self._specification = GoalSpecification.of(robot, chosen)
         self.controls = self._specification.controls

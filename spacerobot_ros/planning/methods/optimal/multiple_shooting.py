@@ -32,7 +32,7 @@ TOLERANCE = 1e-5
 
 _IPOPT_OPTIONS = {
     "print_time": False,
-    # Compiled functions cannot be differentiated, so the solver must not ask for it.
+    # All derivatives are given: the solver is not to derive more.
     "no_nlp_grad": True,
     "calc_lam_p": False,
     "ipopt.print_level": 0,
@@ -143,9 +143,12 @@ class Neighbourhood:
 
 @dataclass(frozen=True)
 class _Solution:
-    """A solution, and the variables and multipliers from which a solver continues."""
+    """A solution, whether its duration was given, and the variables and multipliers from which a
+    solver continues.
+    """
 
     trajectory: Trajectory
+    fixed: bool
     variables: Mapping[str, ca.DM]
 
 
@@ -263,9 +266,12 @@ class MultipleShooting:
         self._monitor.begin(stop)
         solver = self._refining_solver if refining and not self._has_distances else self._solver
         begin: Mapping[str, Array | ca.DM]
-        begins_at_last = self._last is not None and guess is self._last.trajectory
-        if self._last is not None and begins_at_last:
-            solver, begin = self._continuing_solver, self._last.variables
+        last = self._last
+        begins_at_last = False
+        # The multipliers of least effort are not those of least time.
+        if last is not None and guess is last.trajectory and duration.fixed == last.fixed:
+            begins_at_last = True
+            solver, begin = self._continuing_solver, last.variables
         else:
             slower = self._has_distances and not duration.fixed and not boundary.is_timed
             first = guess.stretched(_WARM_STRETCH) if slower else guess
@@ -296,7 +302,7 @@ class MultipleShooting:
         self.lack = float(x[-1]) if layout.has_lack else 0.0
         if self._has_distances and self.converged:
             begin = {"x0": result["x"], "lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
-            self._last = _Solution(trajectory, begin)
+            self._last = _Solution(trajectory, duration.fixed, begin)
         return trajectory
 
     def _initial_variables(self, guess: Trajectory, lack: float) -> Array:

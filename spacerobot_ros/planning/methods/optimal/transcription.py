@@ -30,7 +30,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 
@@ -49,7 +49,6 @@ from spacerobot_ros.model.symbolic_rotations import (
     quaternion_multiply,
     relative_vector,
 )
-from spacerobot_ros.model.vector_machine import mapped
 from spacerobot_ros.planning.methods.optimal.problem import PathConstraints
 
 GAUSS = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
@@ -520,10 +519,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Program:
-    """Functions of variables x and parameters p, as IPOPT takes them; the bounds are those of g.
-
-    As long as the program is in use, so are ``called_functions``.
-    """
+    """Functions of variables x and parameters p, as IPOPT takes them; the bounds are those of g."""
 
     layout: Layout
     problem: dict[str, ca.MX]
@@ -531,7 +527,6 @@ class Program:
     hess_lag: ca.Function
     lower: Array
     upper: Array
-    called_functions: Sequence[ca.Function]
 
 
 @dataclass(frozen=True)
@@ -546,15 +541,12 @@ class _PlacedBlock:
         Places (count, ...) of its variables in x, and of its rows in g; rows of -1 are left out.
     parameters
         The part of p that it takes: a column for all places, or one for each.
-    called_functions
-        Those that the program calls: CasADi does not keep them alive.
     """
 
     block: ConstraintBlock
     variables: Indices
     rows: Indices
     parameters: ca.MX
-    called_functions: list[ca.Function] = field(default_factory=list)
 
     def called(self, function: ca.Function, x: ca.MX, *more: ca.MX) -> list[ca.MX]:
         """Return the results at all places, each place's nonzeros after the other's."""
@@ -562,9 +554,7 @@ class _PlacedBlock:
         z = ca.reshape(x[self.variables.ravel().tolist()], -1, count)
         p = self.parameters
         p = p if p.size2() == count else ca.repmat(p, 1, count)
-        at_all = mapped(function, count)
-        self.called_functions.append(at_all)
-        results = at_all(z, p, *more)
+        results = function.map(count)(z, p, *more)
         results = results if isinstance(results, (list, tuple)) else [results]
         # A single row of nonzeros becomes a column.
         return [ca.vec(result.nz[:]) for result in results]
@@ -643,7 +633,6 @@ def program(stages: Stages, intervals: int) -> Program:
         ca.Function("hess_lag", [x, parameters, lam_f, lam_g], [hessian]),
         np.zeros(rows),
         np.where(np.arange(rows) < equalities, 0.0, np.inf),
-        [function for each in placed for function in each.called_functions],
     )
 
 
