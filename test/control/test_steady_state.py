@@ -42,10 +42,6 @@ Array = npt.NDArray[np.float64]
 PUSH = np.array([0.6, -0.8, 0.3, 0.2, -0.1, 0.4])
 
 
-def at_rest(state: ControlState) -> ControlState:
-    return ControlState.at_rest(state.r_WB, state.quaternion_WB, state.q)
-
-
 @pytest.mark.parametrize("name", INVERTIBLE)
 def test_the_papers_laws_give_way_by_their_formulas(name: str) -> None:
     """With Jacobians and masses of Pinocchio: eq. (29) by Kp alone, eq. (27) by mobility."""

@@ -27,8 +27,6 @@ from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions, Path
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
 from spacerobot_ros.planning.methods.optimal.transcription import PathInequality, Stages, program
 
-Array = npt.NDArray[np.float64]
-
 EAST = [1.0, 0.0, 0.0]
 SUN = [float(np.cos(0.3)), float(np.sin(0.3)), 0.0]
 
@@ -368,8 +366,6 @@ def test_derivatives_of_the_program_are_those_of_its_functions(arm: SpaceRobot) 
 
 # -- plans that were kept are flown for the same request, and only if they are whole -------------
 
-
-Array_of_plan_cache = npt.NDArray[Any]
 
 ASKED: dict[str, Any] = {**QUICK, "cache": 1, "rotvec": [0, 0, 0.3], "joint_positions": [0.4, 0.1]}
 
