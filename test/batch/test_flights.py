@@ -231,23 +231,23 @@ def test_errors_are_distances_and_angles_to_a_pose(sliders: SpaceRobot) -> None:
 
 
 @pytest.fixture(scope="module")
-def sliders_of_scalar() -> SpaceRobot:
+def described_sliders() -> SpaceRobot:
     return SpaceRobot(load_robot(share_directory() / "urdf" / "sliding_masses.urdf"))
 
 
-def test_a_heavier_slider_carries_the_base_further(sliders_of_scalar: SpaceRobot) -> None:
+def test_a_heavier_slider_carries_the_base_further(described_sliders: SpaceRobot) -> None:
     """At zero momentum the centre of mass rests: M r_base = -sum m_k s_k, by hand."""
     positions = np.linspace([0.0, 0.0, 0.0], [0.2, 0.0, 0.0], 11)
-    nominal = InertialParameters.of(sliders_of_scalar.description)
+    nominal = InertialParameters.of(described_sliders.description)
     inertial = nominal.scaled(masses=np.array([[1, 1, 1, 1], [1, 1.5, 1, 1.0]]), inertias=1.0)
     start = InitialState(joint_positions=np.zeros(3))
     flights = Flights(
         *(
-            sliders_of_scalar,
+            described_sliders,
             "velocity",
             0.05,
             10,
-            InitialStates.repeated(sliders_of_scalar, start, 2),
+            InitialStates.repeated(described_sliders, start, 2),
         ),
         FollowedSchedule(positions),
         inertial,
@@ -262,32 +262,32 @@ def test_a_heavier_slider_carries_the_base_further(sliders_of_scalar: SpaceRobot
     assert moved[1] > 1.2 * moved[0] > 0.0
 
 
-def test_what_no_body_weighs_is_refused(sliders_of_scalar: SpaceRobot) -> None:
-    nominal = InertialParameters.of(sliders_of_scalar.description)
+def test_what_no_body_weighs_is_refused(described_sliders: SpaceRobot) -> None:
+    nominal = InertialParameters.of(described_sliders.description)
     with pytest.raises(RobotDescriptionError, match=r"mass_2.*must be positive"):
-        sliders_of_scalar.with_inertial(nominal.scaled([1.0, 1.0, -0.1, 1.0]))
+        described_sliders.with_inertial(nominal.scaled([1.0, 1.0, -0.1, 1.0]))
     broken = nominal.inertias.copy()
     broken[0] = np.diag([1.0, 1.0, 2.1])
     with pytest.raises(RobotDescriptionError, match=r"base_link.*no body"):
-        sliders_of_scalar.with_inertial(InertialParameters(nominal.masses, nominal.centers, broken))
+        described_sliders.with_inertial(InertialParameters(nominal.masses, nominal.centers, broken))
     with pytest.raises(RobotDescriptionError, match=r"mass_1.*not finite"):
-        sliders_of_scalar.with_inertial(nominal.shifted(np.diag([0.0, np.nan, 0.0, 0.0])[:, :3]))
+        described_sliders.with_inertial(nominal.shifted(np.diag([0.0, np.nan, 0.0, 0.0])[:, :3]))
 
 
-def test_a_payload_is_welded_on(sliders_of_scalar: SpaceRobot) -> None:
-    nominal = InertialParameters.of(sliders_of_scalar.description)
+def test_a_payload_is_welded_on(described_sliders: SpaceRobot) -> None:
+    nominal = InertialParameters.of(described_sliders.description)
     payload = Inertia(2.0, np.array([0.0, 0.3, 0.0]), np.diag([0.1, 0.2, 0.25]))
     loaded = nominal.with_payload(1, payload)
     assert loaded.masses[1] == 4.0
     np.testing.assert_allclose(loaded.centers[1], [0.0, 0.15, 0.0])
     # Two masses of 2 kg, 0.3 m apart: reduced mass 1 kg.
     np.testing.assert_allclose(loaded.inertias[1], np.diag([0.19, 0.2, 0.34]))
-    again = InertialParameters.of(sliders_of_scalar.with_inertial(loaded).description)
+    again = InertialParameters.of(described_sliders.with_inertial(loaded).description)
     np.testing.assert_array_equal(again.vector, loaded.vector)
 
 
-def test_flights_that_do_not_go_together_are_refused(sliders_of_scalar: SpaceRobot) -> None:
-    starts = InitialStates.repeated(sliders_of_scalar, InitialState(), 2)
+def test_flights_that_do_not_go_together_are_refused(described_sliders: SpaceRobot) -> None:
+    starts = InitialStates.repeated(described_sliders, InitialState(), 2)
     commands = HeldCommands(np.zeros((5, 3)))
     for arguments, sentence in (
         (("speed", 0.05, 10, starts, commands), "not velocity or effort"),
@@ -297,4 +297,4 @@ def test_flights_that_do_not_go_together_are_refused(sliders_of_scalar: SpaceRob
         (("effort", 0.05, 10, starts, FollowedSchedule(np.zeros((5, 3)))), "velocity actuation"),
     ):
         with pytest.raises(ParameterError, match=sentence):
-            Flights(sliders_of_scalar, *arguments)
+            Flights(described_sliders, *arguments)

@@ -348,7 +348,7 @@ HARMFUL = {
     "number": "a: " + 5000 * "9",
     "long": "a: " + 1_000_001 * "x",
 }
-own_COMMANDS = ("plan", "run")
+READING_COMMANDS = ("plan", "run")
 """They read scenarios as `campaign fly` reads its file, by one function."""
 
 REASONS = {
@@ -365,7 +365,7 @@ REASONS = {
 @pytest.mark.parametrize("name", HARMFUL)
 @pytest.mark.parametrize(
     "words",
-    [("campaign", "fly"), *(pytest.param((w,), marks=pytest.mark.slow) for w in own_COMMANDS)],
+    [("campaign", "fly"), *(pytest.param((w,), marks=pytest.mark.slow) for w in READING_COMMANDS)],
 )
 def test_harmful_yaml_is_one_sentence(words: tuple[str, ...], name: str, tmp_path: Path) -> None:
     file = tmp_path / "harmful.yaml"

@@ -187,7 +187,7 @@ def test_the_distance_of_a_reach_is_that_of_two_links() -> None:
 
 INERTIA = np.array([[30.0, 2.0, -1.5], [2.0, 45.0, 3.0], [-1.5, 3.0, 22.0]])
 GRAPPLE_R = Rotation.from_rotvec([0.4, -0.9, 0.3])
-BODY_OF_TARGET_MOTION = TargetBody(
+TUMBLER = TargetBody(
     Inertia(200.0, np.array([0.1, -0.05, 0.2]), INERTIA),
     Pose(GRAPPLE_R.as_matrix(), np.array([-0.6, 0.3, 0.25])),
 )
@@ -213,7 +213,7 @@ def integrated(times: Array) -> tuple[Array, Array, Array]:
     R0 = START.R_WT
     begin = np.concatenate([R0.ravel(), R0.T @ START.omega])
     found = solve_ivp(rate, (0, 150), begin, "DOP853", t_eval=times, rtol=1e-11, atol=1e-13).y.T
-    arm = R0 @ BODY_OF_TARGET_MOTION.inertia.com
+    arm = R0 @ TUMBLER.inertia.com
     velocity = START.v + np.cross(START.omega, arm)
     return (
         START.r_WT + arm + times[:, None] * velocity,
@@ -224,14 +224,12 @@ def integrated(times: Array) -> tuple[Array, Array, Array]:
 
 def test_the_grapple_frame_moves_as_an_independent_integration_has_it() -> None:
     centre, R, omega_T = integrated(TIMES)
-    motion = TorqueFreeMotion(BODY_OF_TARGET_MOTION, START).grapple(TIMES)
-    arm = BODY_OF_TARGET_MOTION.grapple.r - BODY_OF_TARGET_MOTION.inertia.com
+    motion = TorqueFreeMotion(TUMBLER, START).grapple(TIMES)
+    arm = TUMBLER.grapple.r - TUMBLER.inertia.com
     np.testing.assert_allclose(motion.R, R @ GRAPPLE_R.as_matrix(), atol=2e-8)
     np.testing.assert_allclose(motion.r, centre + R @ arm, atol=2e-8)
     np.testing.assert_allclose(motion.omega, np.einsum("kij,kj->ki", R, omega_T), atol=1e-9)
-    np.testing.assert_allclose(
-        motion.body_motion(0).v, START.at(BODY_OF_TARGET_MOTION.grapple).v, atol=1e-14
-    )
+    np.testing.assert_allclose(motion.body_motion(0).v, START.at(TUMBLER.grapple).v, atol=1e-14)
     turned = np.linalg.norm(motion.R[3] - motion.R[0])
     assert turned > 1.0, "the target tumbles on the way"
     constant = START.r_WT + TIMES[3] * START.v
@@ -250,7 +248,7 @@ def numerical(motion: FrameMotion, h: float) -> tuple[Array, Array, Array, Array
 def test_rates_and_accelerations_of_a_path_beside_the_target_are_those_of_its_poses(
     time: float,
 ) -> None:
-    target, h = TorqueFreeMotion(BODY_OF_TARGET_MOTION, START), 1e-3
+    target, h = TorqueFreeMotion(TUMBLER, START), 1e-3
     held = PoseReference(np.array([1.0, 0.2, 0.3]), np.array([0.0, 0.6, 0.0, 0.8]))
     begin = RelativeMotionOverTime.between(target.grapple([2.0]), FrameMotion.of_reference(held))
     path = RelativePath(begin, np.array([-0.3, 0.1, 0.05]), 7.0)
@@ -264,7 +262,7 @@ def test_rates_and_accelerations_of_a_path_beside_the_target_are_those_of_its_po
 
 
 def test_a_path_begins_in_the_motion_of_the_held_pose_and_ends_with_the_grapple_frame() -> None:
-    target = TorqueFreeMotion(BODY_OF_TARGET_MOTION, START)
+    target = TorqueFreeMotion(TUMBLER, START)
     held = PoseReference(
         np.array([1.0, 0.2, 0.3]),
         np.array([0.0, 0.6, 0.0, 0.8]),

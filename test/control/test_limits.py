@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from control.flights import END_EFFECTOR, load, servicer_start
-from control.flights import pose as pose_of_reference
+from control.flights import pose as flown_pose
 from scipy.spatial.transform import Rotation
 from support.oracles import PinocchioOracle
 
@@ -278,7 +278,7 @@ def test_held_velocities_have_their_mean_and_their_jump_at_a_command() -> None:
 # -- references from start to goal ---------------------------------------------------------------
 
 
-LIMITS_OF_REFERENCE = MotionLimits(0.3, 0.2, 0.5, 0.4, 0.6, 0.7)
+SIX_LIMITS = MotionLimits(0.3, 0.2, 0.5, 0.4, 0.6, 0.7)
 STEP = 1e-4
 
 
@@ -292,7 +292,7 @@ def random_profile(seed: int) -> QuinticReference:
         Reference(random_pose(rng), random_pose(rng), JointReference.at_rest(rng.uniform(-1, 1, 4)))
         for _ in range(2)
     )
-    return QuinticReference(start, goal, LIMITS_OF_REFERENCE)
+    return QuinticReference(start, goal, SIX_LIMITS)
 
 
 def parts(reference: Reference) -> tuple[PoseReference, PoseReference, JointReference]:
@@ -359,16 +359,15 @@ def test_limits_are_kept_and_one_is_used_up(seed: int) -> None:
     for time in np.linspace(0.0, profile.duration, 1001):
         base, end_effector, joints = parts(profile.at(float(time)))
         demands = [
-            *np.abs(joints.qdot) / LIMITS_OF_REFERENCE.joint_speed,
-            *np.abs(joints.qddot) / LIMITS_OF_REFERENCE.joint_acceleration,
+            *np.abs(joints.qdot) / SIX_LIMITS.joint_speed,
+            *np.abs(joints.qddot) / SIX_LIMITS.joint_acceleration,
         ]
         for frame in (base, end_effector):
             demands += [
-                np.linalg.norm(frame.velocity) / LIMITS_OF_REFERENCE.speed,
-                np.linalg.norm(frame.acceleration) / LIMITS_OF_REFERENCE.acceleration,
-                np.linalg.norm(frame.angular_velocity) / LIMITS_OF_REFERENCE.angular_speed,
-                np.linalg.norm(frame.angular_acceleration)
-                / LIMITS_OF_REFERENCE.angular_acceleration,
+                np.linalg.norm(frame.velocity) / SIX_LIMITS.speed,
+                np.linalg.norm(frame.acceleration) / SIX_LIMITS.acceleration,
+                np.linalg.norm(frame.angular_velocity) / SIX_LIMITS.angular_speed,
+                np.linalg.norm(frame.angular_acceleration) / SIX_LIMITS.angular_acceleration,
             ]
         used.append(max(demands))
     assert 0.999 < max(used) <= 1.0 + 1e-9
@@ -387,10 +386,10 @@ def test_every_limit_sets_the_pace_where_it_alone_is_small(
     limits = MotionLimits(**{**wide, prefix + bound: small})
     # Distance and angle differ, and so do those of base and end-effector.
     far = {
-        "base": pose_of_reference([1, 2, -2], [0.6, 0, 0]),
-        "end_effector": pose_of_reference([0, 5, 0], [0, 0, 0.8]),
+        "base": flown_pose([1, 2, -2], [0.6, 0, 0]),
+        "end_effector": flown_pose([0, 5, 0], [0, 0, 0.8]),
     }
-    still = pose_of_reference([0, 0, 0])
+    still = flown_pose([0, 0, 0])
     d = {"base": (3.0, 0.6), "end_effector": (5.0, 0.8)}.get(group, (0.7, 0.7))
     start = Reference(still, still, JointReference.at_rest(np.zeros(2)))
     goal = replace(start, joints=JointReference.at_rest(np.array([-0.7, 0.2])))
@@ -405,9 +404,9 @@ def test_every_limit_sets_the_pace_where_it_alone_is_small(
 
 
 def test_positions_move_on_a_line_and_attitudes_about_one_axis() -> None:
-    start = Reference(base=pose_of_reference([1, 2, 3], [0.3, -0.2, 0.1]))
-    goal = Reference(base=pose_of_reference([2, 0, 3], [-0.4, 0.5, 1.1]))
-    profile = QuinticReference(start, goal, LIMITS_OF_REFERENCE)
+    start = Reference(base=flown_pose([1, 2, 3], [0.3, -0.2, 0.1]))
+    goal = Reference(base=flown_pose([2, 0, 3], [-0.4, 0.5, 1.1]))
+    profile = QuinticReference(start, goal, SIX_LIMITS)
     first = Rotation.from_rotvec([0.3, -0.2, 0.1])
     whole = Rotation.from_rotvec([-0.4, 0.5, 1.1]) * first.inv()
     for fraction in (0.2, 0.5, 0.7):
@@ -421,18 +420,18 @@ def test_positions_move_on_a_line_and_attitudes_about_one_axis() -> None:
 
 def test_step_is_the_goal_at_once() -> None:
     start, goal = (
-        Reference(base=pose_of_reference([0, 0, 0])),
-        Reference(base=pose_of_reference([1, 0, 0])),
+        Reference(base=flown_pose([0, 0, 0])),
+        Reference(base=flown_pose([1, 0, 0])),
     )
-    profile = StepReference(start, goal, LIMITS_OF_REFERENCE)
+    profile = StepReference(start, goal, SIX_LIMITS)
     assert profile.duration == 0.0
     assert profile.at(0.0) is goal
     assert set(PROFILES) == {"step", "quintic"}
 
 
 def test_goal_at_the_start_takes_no_time() -> None:
-    there = Reference(base=pose_of_reference([1, 2, 3], [0.1, 0.2, 0.3]))
-    profile = QuinticReference(there, there, LIMITS_OF_REFERENCE)
+    there = Reference(base=flown_pose([1, 2, 3], [0.1, 0.2, 0.3]))
+    profile = QuinticReference(there, there, SIX_LIMITS)
     assert profile.duration < 1e-6
     assert profile.at(1e-6) is there
 
@@ -440,9 +439,7 @@ def test_goal_at_the_start_takes_no_time() -> None:
 def test_what_has_no_goal_is_not_in_the_reference() -> None:
     robot, start = load("servicer"), servicer_start()
     present = Reference.present(robot, start, END_EFFECTOR)
-    profile = QuinticReference(
-        present, Reference(base=pose_of_reference([1, 0, 0])), LIMITS_OF_REFERENCE
-    )
+    profile = QuinticReference(present, Reference(base=flown_pose([1, 0, 0])), SIX_LIMITS)
     reference = profile.at(0.5)
     assert reference.base is not None
     assert reference.end_effector is None
@@ -453,12 +450,10 @@ def test_goal_without_a_start_is_refused() -> None:
     present = Reference.present(load("servicer"), servicer_start())
     assert present.end_effector is None
     with pytest.raises(TargetNotSetError, match="end-effector has a goal"):
-        QuinticReference(
-            present, Reference(end_effector=pose_of_reference([1, 0, 0])), LIMITS_OF_REFERENCE
-        )
+        QuinticReference(present, Reference(end_effector=flown_pose([1, 0, 0])), SIX_LIMITS)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
-def test_limits_that_are_refused_of_reference(value: float) -> None:
+def test_limits_of_references_that_are_refused(value: float) -> None:
     with pytest.raises(ParameterError, match="'angular_speed'"):
-        replace(LIMITS_OF_REFERENCE, angular_speed=value)
+        replace(SIX_LIMITS, angular_speed=value)

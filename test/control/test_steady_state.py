@@ -21,7 +21,7 @@ from control.flights import (
 from control.servicer_motion import GAINS, KP, well_conditioned_state
 from scipy.spatial.transform import Rotation
 from support.executive_loop import AIM, PERIOD, TIP, ExecutiveLoop, goal_at
-from support.executive_loop import KP as KP_OF_AUTOMATIC_GAINS
+from support.executive_loop import KP as STEP_KP
 from support.oracles import PinocchioOracle, assert_agrees
 from support.sentences import assert_one_sentence
 
@@ -376,7 +376,7 @@ def test_gains_become_automatic_in_flight_and_back() -> None:
     fresh = ExecutiveLoop(**automatic_gains(*vars(Gains())))
     fresh.aim(base=goal_at(AIM))
     np.testing.assert_allclose(automatic, np.concatenate(fresh.answer()), rtol=1e-9)
-    loop.configure(gains=Gains.uniform(KP_OF_AUTOMATIC_GAINS, 2 * KP_OF_AUTOMATIC_GAINS))
+    loop.configure(gains=Gains.uniform(STEP_KP, 2 * STEP_KP))
     np.testing.assert_allclose(np.concatenate(loop.answer()), given, rtol=1e-9, atol=1e-9)
 
 
@@ -385,9 +385,7 @@ def test_a_group_with_gains_keeps_them() -> None:
     others = [group for group in vars(Gains()) if group != "base_position"]
     loop = ExecutiveLoop(**automatic_gains(*others))
     loop.aim(base=goal_at(AIM))
-    np.testing.assert_allclose(
-        loop.answer()[0][:3], KP_OF_AUTOMATIC_GAINS * AIM, rtol=1e-9, atol=1e-9
-    )
+    np.testing.assert_allclose(loop.answer()[0][:3], STEP_KP * AIM, rtol=1e-9, atol=1e-9)
 
 
 class _Spring(ControlLaw):

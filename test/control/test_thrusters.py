@@ -170,7 +170,7 @@ def test_without_thrusters_there_is_nothing() -> None:
 # -- tables of thrusters from URDF and YAML, and what is refused ---------------------------------
 
 
-SERVICER_OF_THRUSTER_TABLE = Path(__file__).parents[2] / "urdf" / "servicer.urdf"
+SERVICER_URDF = Path(__file__).parents[2] / "urdf" / "servicer.urdf"
 
 URDF = """<robot name="tug">
   <link name="bus"><inertial><mass value="10"/>
@@ -276,7 +276,7 @@ def test_files_without_thrusters_are_refused(entries: Any, tmp_path: Path) -> No
     with pytest.raises(ParameterError, match=r"table\.yaml"):
         of_yaml(tmp_path, entries)
     with pytest.raises(ParameterError, match="cannot be read"):
-        load_thrusters(tmp_path / "none.yaml", load_robot(SERVICER_OF_THRUSTER_TABLE))
+        load_thrusters(tmp_path / "none.yaml", load_robot(SERVICER_URDF))
 
 
 def test_a_urdf_without_thrusters_is_refused() -> None:
@@ -288,7 +288,7 @@ def test_a_urdf_without_thrusters_is_refused() -> None:
 
 def test_an_unknown_thruster_is_named() -> None:
     with pytest.raises(ParameterError, match="There is no thruster 'nose'"):
-        thrusters_of_urdf(load_robot(SERVICER_OF_THRUSTER_TABLE)).index("nose")
+        thrusters_of_urdf(load_robot(SERVICER_URDF)).index("nose")
 
 
 def test_what_a_table_cannot_give_is_named(tmp_path: Path) -> None:
@@ -305,7 +305,7 @@ def test_what_a_table_cannot_give_is_named(tmp_path: Path) -> None:
 
 
 def test_the_servicer_has_redundant_thrusters() -> None:
-    table = thrusters_of_urdf(load_robot(SERVICER_OF_THRUSTER_TABLE))
+    table = thrusters_of_urdf(load_robot(SERVICER_URDF))
     assert len(table.names) == 24
     assert table.missing() == ""
     assert all(table.missing([name]) == "" for name in table.names[::5])

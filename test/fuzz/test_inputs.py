@@ -349,10 +349,10 @@ def test_a_damaged_table_of_thrusters(tmp_path: Path, raw: bytes) -> None:
 # -- URDFs with elements and attributes changed: a robot whose numbers are finite, or a ----------
 
 
-own_TEXTS = [
+ROBOT_TEXTS = [
     robot_file(name).read_text(encoding="utf-8") for name in resource_names("urdf", ".urdf")
 ]
-own_VALUES = ["nan", "inf", "-inf", "-1", "0", "x", "", "1e308", "-1e308", "1e-320", "1e12", "1 2",
+ODD_VALUES = ["nan", "inf", "-inf", "-1", "0", "x", "", "1e308", "-1e308", "1e-320", "1e12", "1 2",
           "1 2 3", "0 0 0", "1e308 1e308 1e308", "1 2 3 4", "base_link", "revolute", "prismatic",
           "floating", "planar", "continuous", "fixed", "0x10", "1,5", "é",
           "a b\nc", "1_0"]  # fmt: skip
@@ -378,7 +378,7 @@ def changed(text: str, seed: int, changes: int) -> str:
                 values = [e.attrib[name] for e in root.iter() if name in e.attrib]
                 carrier.attrib[name] = draw.choice(values)
             else:
-                carrier.attrib[name] = draw.choice(own_VALUES)
+                carrier.attrib[name] = draw.choice(ODD_VALUES)
         elif kind == "drop":
             parent.remove(element)
         elif kind == "double":
@@ -392,7 +392,7 @@ def changed(text: str, seed: int, changes: int) -> str:
 
 
 MUTANTS = st.builds(
-    changed, st.sampled_from(own_TEXTS), st.integers(0, 2**32), st.sampled_from([1, 1, 2, 4])
+    changed, st.sampled_from(ROBOT_TEXTS), st.integers(0, 2**32), st.sampled_from([1, 1, 2, 4])
 )
 
 
@@ -422,7 +422,7 @@ def test_a_model_of_a_changed_urdf(text: str) -> None:
 
 @fuzz(
     "damaged URDF",
-    st.sampled_from(own_TEXTS).flatmap(lambda text: damaged(text.encode())),
+    st.sampled_from(ROBOT_TEXTS).flatmap(lambda text: damaged(text.encode())),
     fast=30,
     long=800,
 )

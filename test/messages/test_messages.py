@@ -19,7 +19,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
-from support.random_messages import few as few_of_trajectory_message
+from support.random_messages import few as few_trajectories
 from trajectory_msgs.msg import JointTrajectory
 
 from spacerobot_ros.bag import message_definition
@@ -357,7 +357,7 @@ def check_trajectory(message: Any, schedule: GaitSchedule, stamp_ns: int, frame:
 THREE = schedule_of(("slider_1", "slider_2", "slider_3"), np.arange(12.0).reshape(4, 3), 0.05)
 
 
-@settings(few_of_trajectory_message, max_examples=80)
+@settings(few_trajectories, max_examples=80)
 @given(schedules(), st.integers(0, 2**31 * 10**9 - 1), st.text("lmnop", max_size=9))
 @example(THREE, 0, "base_link")
 @example(THREE, 3, "base")
@@ -370,7 +370,7 @@ def test_a_schedule_is_serialised_as_rclpy_would(
 
 
 @pytest.mark.slow
-@few_of_trajectory_message
+@few_trajectories
 @given(schedules(), st.integers(0, 2**31 * 10**9 - 1), st.text("lmnop", max_size=9))
 @example(THREE, 0, "base_link")
 def test_other_readers_take_a_serialised_schedule(

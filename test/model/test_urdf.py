@@ -339,7 +339,7 @@ def test_the_package_has_a_world() -> None:
 # -- obstacles in texts from topics, and robots among others than so far -------------------------
 
 
-BALL_OF_OBSTACLES_FROM_TOPIC = (
+BALL_AND_POST = (
     '<robot name="w"><link name="w"/><link name="ball"><collision><geometry><sphere radius="0.3"/>'
     '</geometry></collision></link><link name="post"><visual><geometry><box size="1 2 3"/>'
     '</geometry></visual></link><joint name="a" type="fixed"><parent link="w"/>'
@@ -349,7 +349,7 @@ BALL_OF_OBSTACLES_FROM_TOPIC = (
 
 
 def test_a_text_is_obstacles_and_an_empty_one_is_none() -> None:
-    world = obstacles_from_topic(BALL_OF_OBSTACLES_FROM_TOPIC)
+    world = obstacles_from_topic(BALL_AND_POST)
     assert world is not None
     assert links_with_shapes(world) == ["ball", "post"]
     for empty in ("", " \n"):
@@ -360,16 +360,16 @@ def test_a_text_is_obstacles_and_an_empty_one_is_none() -> None:
     ("text", "message"),
     [
         (
-            BALL_OF_OBSTACLES_FROM_TOPIC.replace('"a" type="fixed"', '"a" type="continuous"'),
+            BALL_AND_POST.replace('"a" type="fixed"', '"a" type="continuous"'),
             "joint 'a' is (floating|continuous): give it",
         ),
         ('<robot name="w"><link name="w"/></robot>', "The world 'w' has no obstacle"),
         ("<robot", "is no XML"),
         (
-            BALL_OF_OBSTACLES_FROM_TOPIC.replace("</robot>", f"<world>{BALL}</world></robot>"),
+            BALL_AND_POST.replace("</robot>", f"<world>{BALL}</world></robot>"),
             "^Obstacles are not among others: leave the element <world> out",
         ),
-        (BALL_OF_OBSTACLES_FROM_TOPIC.replace("0.3", "${radius}"), "radius"),
+        (BALL_AND_POST.replace("0.3", "${radius}"), "radius"),
     ],
 )
 def test_other_texts_are_refused(text: str, message: str) -> None:
@@ -379,8 +379,8 @@ def test_other_texts_are_refused(text: str, message: str) -> None:
 
 def test_a_robot_is_among_the_obstacles_that_came_last() -> None:
     robot = load_robot(robot_file("planar_chain"))
-    before = with_world(robot, parse_world(BALL_OF_OBSTACLES_FROM_TOPIC.replace("ball", "stone")))
-    other = with_world(before, parse_world(BALL_OF_OBSTACLES_FROM_TOPIC))
+    before = with_world(robot, parse_world(BALL_AND_POST.replace("ball", "stone")))
+    other = with_world(before, parse_world(BALL_AND_POST))
     assert other.world is not None
     carried = parse_robot(other.urdf).world
     assert carried is not None

@@ -328,9 +328,7 @@ def changed(*replacements: tuple[str, str]) -> SpaceRobot:
     return SpaceRobot.from_urdf(text)
 
 
-def planner_of_area_loop_refusals(
-    robot: SpaceRobot, attitude: float = 1e-3, **options: Any
-) -> Planner:
+def refusing_planner(robot: SpaceRobot, attitude: float = 1e-3, **options: Any) -> Planner:
     return planner_of("area_loop", robot, 0.25, Tolerance(1.0, attitude), 0.05, **options)
 
 
@@ -341,13 +339,13 @@ def at(q: npt.ArrayLike, **momenta: Array) -> RobotState:
 def test_two_joints_are_too_few() -> None:
     chain = SpaceRobot.from_file(FOLDER / "planar_chain.urdf")
     with pytest.raises(PlanningError, match=r"needs three joints .* 'planar_chain' has 2"):
-        planner_of_area_loop_refusals(chain).plan(at([1, 1]), GOAL)
+        refusing_planner(chain).plan(at([1, 1]), GOAL)
 
 
 def test_a_planar_robot_is_turned_about_one_axis_alone() -> None:
     flat = changed(('<axis xyz="0 0 1"/>', '<axis xyz="0 1 0"/>'))
     with pytest.raises(PlanningError, match="span 1 of the three axes"):
-        planner_of_area_loop_refusals(flat).plan(at([0, 0, 0]), GOAL)
+        refusing_planner(flat).plan(at([0, 0, 0]), GOAL)
     with pytest.raises(PlanningError, match="span 1 of the three axes"):
         METHODS["area_loop"].require_suitable(flat)
 
@@ -356,28 +354,26 @@ def test_a_singular_nominal_shape_is_named(arm_of_area_loop_refusals: SpaceRobot
     # The arm straight up along the yaw axis: yaw then moves no mass off its axis.
     straight = [0.0, -np.pi / 2, 0.0]
     with pytest.raises(PlanningError, match=r"singular at the nominal shape \[0.0, -1.5708, 0.0\]"):
-        planner_of_area_loop_refusals(arm_of_area_loop_refusals, nominal=straight).plan(
-            at(NOMINAL), GOAL
-        )
+        refusing_planner(arm_of_area_loop_refusals, nominal=straight).plan(at(NOMINAL), GOAL)
 
 
 def test_joints_that_do_not_move_are_no_choice() -> None:
     servo = 'lower="-2.8" upper="2.8" velocity="0.5"'
     stuck = changed((servo, 'lower="-2.8" upper="2.8" velocity="0"'))
     with pytest.raises(PlanningError, match=r"three joints that move; .* has 2 with a velocity"):
-        planner_of_area_loop_refusals(stuck).plan(at(NOMINAL), GOAL)
+        refusing_planner(stuck).plan(at(NOMINAL), GOAL)
 
 
 def test_limits_without_room_name_the_joint() -> None:
     narrow = changed(('lower="-2.8" upper="2.8"', 'lower="1.0" upper="1.00001"'))
     with pytest.raises(PlanningError, match="leave joint 'elbow_pitch' no room"):
-        planner_of_area_loop_refusals(narrow).plan(at([0, 0, 1]), GOAL)
+        refusing_planner(narrow).plan(at([0, 0, 1]), GOAL)
 
 
 @pytest.mark.parametrize("name", ["linear_momentum", "angular_momentum"])
 def test_a_drifting_robot_is_refused(arm_of_area_loop_refusals: SpaceRobot, name: str) -> None:
     with pytest.raises(PlanningError, match="total momentum is not zero"):
-        planner_of_area_loop_refusals(arm_of_area_loop_refusals).plan(
+        refusing_planner(arm_of_area_loop_refusals).plan(
             at(NOMINAL, **{name: np.array([0, 0, 0.1])}), GOAL
         )
 
@@ -385,22 +381,20 @@ def test_a_drifting_robot_is_refused(arm_of_area_loop_refusals: SpaceRobot, name
 def test_a_goal_that_takes_too_many_cycles_is_refused_at_once(
     arm_of_area_loop_refusals: SpaceRobot,
 ) -> None:
-    planner_of_area_loop_refusals(arm_of_area_loop_refusals, most_cycles=60).plan(at(NOMINAL), GOAL)
+    refusing_planner(arm_of_area_loop_refusals, most_cycles=60).plan(at(NOMINAL), GOAL)
     with pytest.raises(PlanningError, match=r"takes about \d+\S* cycles, more than most_cycles"):
-        planner_of_area_loop_refusals(arm_of_area_loop_refusals, most_cycles=20).plan(
-            at(NOMINAL), GOAL
-        )
+        refusing_planner(arm_of_area_loop_refusals, most_cycles=20).plan(at(NOMINAL), GOAL)
     # Small loops, more of them.
     with pytest.raises(PlanningError, match="more than most_cycles"):
-        planner_of_area_loop_refusals(
-            arm_of_area_loop_refusals, most_cycles=60, largest_edge=0.05
-        ).plan(at(NOMINAL), GOAL)
+        refusing_planner(arm_of_area_loop_refusals, most_cycles=60, largest_edge=0.05).plan(
+            at(NOMINAL), GOAL
+        )
 
 
 def test_a_base_that_comes_no_nearer_is_given_up(arm_of_area_loop_refusals: SpaceRobot) -> None:
     # A plant that does not turn at all: the same attitude is measured again and again.
     method, stuck = (
-        planner_of_area_loop_refusals(arm_of_area_loop_refusals, most_cycles=60),
+        refusing_planner(arm_of_area_loop_refusals, most_cycles=60),
         at(NOMINAL),
     )
     needed = float(str(method.plan(stuck, GOAL).notes["expected_cycles"]))
@@ -415,20 +409,16 @@ def test_a_base_that_comes_no_nearer_is_given_up(arm_of_area_loop_refusals: Spac
 
 def test_no_tolerance_takes_for_ever(arm_of_area_loop_refusals: SpaceRobot) -> None:
     with pytest.raises(PlanningError, match="about inf cycles"):
-        planner_of_area_loop_refusals(arm_of_area_loop_refusals, 0.0).plan(at(NOMINAL), GOAL)
+        refusing_planner(arm_of_area_loop_refusals, 0.0).plan(at(NOMINAL), GOAL)
 
 
 def test_a_manoeuvre_that_takes_too_long_is_refused_with_the_time(
     arm_of_area_loop_refusals: SpaceRobot,
 ) -> None:
     with pytest.raises(PlanningError, match=r"cycles of \S+ s, more than longest = 600 s"):
-        planner_of_area_loop_refusals(arm_of_area_loop_refusals, longest=600.0).plan(
-            at(NOMINAL), GOAL
-        )
+        refusing_planner(arm_of_area_loop_refusals, longest=600.0).plan(at(NOMINAL), GOAL)
     with pytest.raises(PlanningError, match="more than longest = 2 s; the slowest joint is"):
-        planner_of_area_loop_refusals(arm_of_area_loop_refusals, longest=2.0).plan(
-            at(NOMINAL + 1), GOAL
-        )
+        refusing_planner(arm_of_area_loop_refusals, longest=2.0).plan(at(NOMINAL + 1), GOAL)
 
 
 @pytest.mark.parametrize(
@@ -440,7 +430,7 @@ def test_a_final_shape_that_is_none_is_refused(
 ) -> None:
     goal = Goal.checked(GOAL.position, GOAL.quaternion, shape)
     with pytest.raises(PlanningError, match=reason):
-        planner_of_area_loop_refusals(arm_of_area_loop_refusals).plan(at(NOMINAL), goal)
+        refusing_planner(arm_of_area_loop_refusals).plan(at(NOMINAL), goal)
 
 
 @pytest.mark.parametrize(
@@ -457,7 +447,7 @@ def test_options_that_do_not_fit_the_robot(
     arm_of_area_loop_refusals: SpaceRobot, options: dict[str, Any], reason: str
 ) -> None:
     with pytest.raises(ParameterError, match=reason):
-        planner_of_area_loop_refusals(arm_of_area_loop_refusals, **options)
+        refusing_planner(arm_of_area_loop_refusals, **options)
 
 
 def test_loops_that_turn_the_wrong_way_are_given_up_however_small(

@@ -259,7 +259,7 @@ ERRORS = {
     "planner.optimal.time_budget": 20.0,
 }
 
-ROBOTS_OF_CLEAR_FLIGHTS = {
+FLOWN_ROBOTS = {
     "three_joint_arm": ((0.0, -0.8, 1.5), ("area_loop", "optimal")),
     "servicer": ((0.0, -1.2, 2.0, 0.0, 0.8, 0.0), ("optimal",)),
     "seven_joint_arm": ((0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.4), ("optimal",)),
@@ -271,13 +271,11 @@ ROBOTS_OF_CLEAR_FLIGHTS = {
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "method"),
-    [(name, each) for name, (_, given) in ROBOTS_OF_CLEAR_FLIGHTS.items() for each in given],
+    [(name, each) for name, (_, given) in FLOWN_ROBOTS.items() for each in given],
 )
 def test_flights_with_errors_keep_clear(name: str, method: str, tmp_path: Path) -> None:
     robot = SpaceRobot.from_file(robot_file(name))
-    start = np.clip(
-        np.array(ROBOTS_OF_CLEAR_FLIGHTS[name][0] or np.zeros(robot.n)), robot.lower, robot.upper
-    )
+    start = np.clip(np.array(FLOWN_ROBOTS[name][0] or np.zeros(robot.n)), robot.lower, robot.upper)
     distances = Distances(robot, Clearance(robot.description, CLEARANCE), start, tmp_path)
     rng = np.random.default_rng(77)
     nearest, outcomes, corrections = [], Counter[str](), 0
@@ -316,10 +314,10 @@ def test_flights_with_errors_keep_clear(name: str, method: str, tmp_path: Path) 
 # -- plans to goals with a position or a shape are hardly longer than those of long --------------
 
 
-GOALS_OF_LONG_SEARCHES = int(os.environ.get("SPACEROBOT_LONG_SEARCHES", "1"))
+LONG_SEARCHES = int(os.environ.get("SPACEROBOT_LONG_SEARCHES", "1"))
 """Goals of each robot."""
 
-ROBOTS_OF_LONG_SEARCHES = ("seven_joint_arm", "servicer", "three_joint_arm")
+SEARCHED_ROBOTS = ("seven_joint_arm", "servicer", "three_joint_arm")
 """Arms that control the position of the base, and one that does not."""
 
 STARTS = 60
@@ -343,14 +341,14 @@ def goal_of(robot: SpaceRobot, start: Array, number: int, rng: np.random.Generat
 def test_plans_are_as_short_as_those_of_long_searches() -> None:
     """At least 97 % of the durations are within 2 % of those by a search from sixty guesses."""
     ratios: list[float] = []
-    for name in ROBOTS_OF_LONG_SEARCHES:
+    for name in SEARCHED_ROBOTS:
         robot = SpaceRobot.from_file(robot_file(name))
-        rng = np.random.default_rng([ROBOTS_OF_LONG_SEARCHES.index(name), 604])
+        rng = np.random.default_rng([SEARCHED_ROBOTS.index(name), 604])
         plain = OptimalGait(robot, PERIOD, options=OptimalOptions(cache=0))
         options = OptimalOptions(cache=0, starts=STARTS, answers=STARTS, agreeing=0)
         long = OptimalGait(robot, PERIOD, options=options)
         times: list[float] = []
-        for number in range(GOALS_OF_LONG_SEARCHES):
+        for number in range(LONG_SEARCHES):
             q = rng.uniform(np.maximum(robot.lower, -1.2), np.minimum(robot.upper, 1.2))
             state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
             goal = goal_of(robot, q, number, rng)
@@ -376,10 +374,10 @@ def test_plans_are_as_short_as_those_of_long_searches() -> None:
 # -- held commands take hardly longer than the continuous solutions that they are made of --------
 
 
-GOALS_OF_FLOWN_TIMES = int(os.environ.get("SPACEROBOT_FLOWN_TIMES", "1"))
+FLOWN_GOALS = int(os.environ.get("SPACEROBOT_FLOWN_TIMES", "1"))
 """Goals of each robot."""
 
-ROBOTS_OF_FLOWN_TIMES = (
+TIMED_ROBOTS = (
     *("three_joint_arm", "planar_chain", "solar_booms", "station_arm", "tender"),
     *("seven_joint_arm", "surveyor", "servicer", "quadruped", "dual_arm"),
 )
@@ -389,7 +387,7 @@ ROBOTS_OF_FLOWN_TIMES = (
 def planned(name: str, count: int) -> Iterator[GaitSchedule]:
     """Yield plans to random attitudes, half of them with a shape, that may bring links near."""
     robot = SpaceRobot.from_file(robot_file(name))
-    rng = np.random.default_rng([ROBOTS_OF_FLOWN_TIMES.index(name), 29])
+    rng = np.random.default_rng([TIMED_ROBOTS.index(name), 29])
     low, high = np.maximum(robot.lower, -1.0), np.minimum(robot.upper, 1.0)
     found = 0
     while found < count:
@@ -416,8 +414,8 @@ def planned(name: str, count: int) -> Iterator[GaitSchedule]:
 def test_flown_times_are_those_of_the_solutions() -> None:
     """Rounded up to a tick; beyond that, at most 3 % in 95 % of the cases and never three ticks."""
     longer, beyond, ticks = [], [], []
-    for name in ROBOTS_OF_FLOWN_TIMES:
-        for schedule in planned(name, GOALS_OF_FLOWN_TIMES):
+    for name in TIMED_ROBOTS:
+        for schedule in planned(name, FLOWN_GOALS):
             solution, tick = schedule.notes["solution_time"], schedule.control_period
             assert isinstance(solution, float)
             longer.append(schedule.duration / solution - 1)

@@ -211,8 +211,6 @@ def test_the_world_of_a_scenario_is_that_of_plant_and_planner(tmp_path: Path) ->
 # -- obstacles that come while a planner flies: which commands are looked at, and what is --------
 
 
-own_Array = npt.NDArray[np.float64]
-
 BALL = (
     '<robot name="w"><link name="w"/><link name="ball"><collision><geometry><sphere radius="0.3"/>'
     '</geometry></collision></link><joint name="a" type="fixed"><parent link="w"/>'
@@ -259,7 +257,7 @@ def test_a_goal_behind_an_obstacle_has_failed_with_both_reasons() -> None:
     loop = executing(ticks=60)
     loop.tick(20)
 
-    def approaches(positions: own_Array, base: Any) -> list[str]:
+    def approaches(positions: Array, base: Any) -> list[str]:
         raise PlanningError("Link 'a' and obstacle 'b' are 0.001 m apart at the start.")
 
     use(loop, approaches)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from support.effort_flights import robot_of
-from support.planner_loop import robot_of as robot_for_pages
+from support.planner_loop import robot_of as looped_robot
 
 from spacerobot_ros.campaign.targets import _list_values
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
@@ -190,8 +190,8 @@ def test_a_goal_shape_may_lie_beyond_a_limit_by_rounding_alone() -> None:
 # -- options with a number a joint that are given by the names of joints -------------------------
 
 
-ARM_OF_OPTIONS_BY_NAME = SpaceRobot.from_file(robot_file("three_joint_arm"))
-FIRST, SECOND, THIRD = ARM_OF_OPTIONS_BY_NAME.joint_names
+NAMED_ARM = SpaceRobot.from_file(robot_file("three_joint_arm"))
+FIRST, SECOND, THIRD = NAMED_ARM.joint_names
 
 
 def option(name: str) -> Parameter:
@@ -245,26 +245,22 @@ def test_lists_without_names_of_joints_take_numbers_alone() -> None:
 
 def test_limits_are_given_by_name_and_others_stay() -> None:
     slow = {"max_velocity": {THIRD: 0.125}, "max_acceleration": {SECOND: 0.0625, FIRST: 0.5}}
-    limits = MotionLimits.of(
-        ARM_OF_OPTIONS_BY_NAME, configured(OptimalOptions, {**slow, "ramp_time": 0.25})
-    )
-    first, second, _ = ARM_OF_OPTIONS_BY_NAME.velocity_limit
+    limits = MotionLimits.of(NAMED_ARM, configured(OptimalOptions, {**slow, "ramp_time": 0.25}))
+    first, second, _ = NAMED_ARM.velocity_limit
     assert limits.velocity.tolist() == [first, second, 0.125]
     assert limits.acceleration.tolist() == [0.5, 0.0625, 0.125 / 0.25]
 
 
 def test_a_faster_velocity_than_that_of_the_robot_is_not_taken() -> None:
-    limits = MotionLimits.of(
-        ARM_OF_OPTIONS_BY_NAME, configured(OptimalOptions, {"max_velocity": {FIRST: 1e3}})
-    )
-    assert limits.velocity.tolist() == ARM_OF_OPTIONS_BY_NAME.velocity_limit.tolist()
+    limits = MotionLimits.of(NAMED_ARM, configured(OptimalOptions, {"max_velocity": {FIRST: 1e3}}))
+    assert limits.velocity.tolist() == NAMED_ARM.velocity_limit.tolist()
 
 
 def test_efforts_are_given_by_name_and_others_stay() -> None:
     options = configured(OptimalOptions, {"max_effort": {SECOND: 0.375}, "effort_limits": 1})
-    efforts = LimitedEfforts.of(ARM_OF_OPTIONS_BY_NAME, options, 0.05)
+    efforts = LimitedEfforts.of(NAMED_ARM, options, 0.05)
     assert efforts is not None
-    expected = ARM_OF_OPTIONS_BY_NAME.effort_limit.copy()
+    expected = NAMED_ARM.effort_limit.copy()
     expected[1] = 0.375
     np.testing.assert_allclose(efforts.limit, 0.85 * expected)
 
@@ -273,7 +269,7 @@ def test_efforts_are_given_by_name_and_others_stay() -> None:
 def test_an_unknown_joint_is_refused(name: str) -> None:
     with pytest.raises(ParameterError) as refusal:
         MotionLimits.of(
-            ARM_OF_OPTIONS_BY_NAME,
+            NAMED_ARM,
             configured(OptimalOptions, {name: {f"{FIRST}x": 1.0}}),
             "planned",
         )
@@ -285,9 +281,7 @@ def test_an_unknown_joint_is_refused(name: str) -> None:
 
 def test_options_of_stuck_joints_are_left_out_by_name() -> None:
     options = configured(OptimalOptions, {"max_velocity": {THIRD: 0.1, FIRST: 0.2}})
-    kept = _options_of_remaining(
-        options, np.array([True, False, False]), ARM_OF_OPTIONS_BY_NAME.joint_names
-    )
+    kept = _options_of_remaining(options, np.array([True, False, False]), NAMED_ARM.joint_names)
     assert kept.max_velocity == (f"{THIRD}:0.1",)
 
 
@@ -425,7 +419,7 @@ def test_classes_that_a_page_names_exist_with_their_methods(page: Path) -> None:
 def test_any_law_of_proportional_joints_turns_the_base_alike_in_step_1(profile: object) -> None:
     """The turn of paper 3's step 1 is that of the straight line, whatever its legible half is."""
     assert callable(profile)
-    phase = PlanarPhase(robot_for_pages("planar_chain"))
+    phase = PlanarPhase(looped_robot("planar_chain"))
     along = np.asarray(profile(np.linspace(0.0, 1.0, 400)))[:, np.newaxis]
     shapes = (1 - along) * [np.pi, -np.pi]
     turn = phase.turns_by_legs(shapes[:-1], shapes[1:]).sum()

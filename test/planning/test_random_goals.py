@@ -17,9 +17,9 @@ from support.planar_manoeuvres import phase_density
 from support.planner_loop import NEAR, TICK, Loop, StubMethod
 from support.planners import Planner, planner_of
 from support.planning_refusals import refusal_in
-from support.slides_and_turns import PERIOD as PERIOD_OF_STATED_NUMBERS
+from support.slides_and_turns import PERIOD as GAIT_PERIOD
 from support.slides_and_turns import goal_at, note, origin, state_at
-from support.slides_and_turns import planner as planner_of_stated_numbers
+from support.slides_and_turns import planner as gait_planner
 
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
@@ -131,9 +131,7 @@ def test_tolerances_are_those_of_the_planner_where_none_are_given() -> None:
 def test_no_more_cycles_than_the_rates_of_the_sliders_demand(rate: float) -> None:
     """Amplitudes go as the root of the number of cycles: the fastest slider is at its rate."""
     goal = goal_at([0.0, 0.0, 0.0], Rotation.from_rotvec([0.02, 0.01, -0.015]))
-    schedule = planner_of_stated_numbers(paper_robot(rate=rate), Tolerance(1e-2, 1e-2)).plan(
-        origin(), goal
-    )
+    schedule = gait_planner(paper_robot(rate=rate), Tolerance(1e-2, 1e-2)).plan(origin(), goal)
     assert note(schedule, "cycles") > 20
     share = np.abs(schedule.velocities).max() / rate
     # One cycle more than necessary, and 1 in 1000.
@@ -156,7 +154,7 @@ def test_two_sliders_share_a_way_up_to_the_ends_of_both_strokes_and_no_further()
     goal = goal_at([-0.1, 0.0, 0.0], Rotation.identity())
     for reach, fits in ((0.225, True), (0.2249, False)):
         ends = state_at(np.zeros(3), Rotation.identity(), [-reach, 0.0, 0.0, -reach])
-        method = planner_of_stated_numbers(two_along_x(reach)).method
+        method = gait_planner(two_along_x(reach)).method
         assert isinstance(method, LieBracketGait)
         if fits:
             z_f = method.final_shape(ends, goal)
@@ -170,10 +168,10 @@ def test_two_sliders_share_a_way_up_to_the_ends_of_both_strokes_and_no_further()
 
 def test_the_path_of_many_cycles_is_predicted_at_the_end_of_some() -> None:
     goal = goal_at([0.0, 0.0, 0.0], Rotation.from_rotvec([0.02, 0.01, -0.015]))
-    gait = planner_of_stated_numbers(paper_robot(rate=0.02), Tolerance(1e-2, 1e-2))
+    gait = gait_planner(paper_robot(rate=0.02), Tolerance(1e-2, 1e-2))
     schedule = gait.plan(origin(), goal)
     cycle = schedule.ticks / note(schedule, "cycles")
-    ends = schedule.path.time[1:] / PERIOD_OF_STATED_NUMBERS / cycle
+    ends = schedule.path.time[1:] / GAIT_PERIOD / cycle
     np.testing.assert_allclose(ends, np.round(ends), atol=1e-9)
     assert 100 <= len(ends) <= 200
     assert np.diff(ends).max() <= 2 * note(schedule, "cycles") / 100

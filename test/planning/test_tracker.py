@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
-from support.effort_flights import robot_of as robot_for_averaging
+from support.effort_flights import robot_of as averaged_robot
 from support.oracles import PinocchioOracle
 from support.planner_loop import TICK, StubMethod, goal_at, robot_of
 
@@ -325,7 +325,7 @@ def pose(position: float = 0.0, turn: Rotation | None = None) -> np.ndarray:
 
 
 def test_the_mean_of_noisy_states_is_nearer_by_the_root_of_their_number() -> None:
-    rng, robot = np.random.default_rng(0), robot_for_averaging(URDF)
+    rng, robot = np.random.default_rng(0), averaged_robot(URDF)
     true = Rotation.from_rotvec([2.0, -1.5, 1.0])
     single, averaged = [], []
     for _ in range(60):
@@ -349,7 +349,7 @@ def test_the_mean_of_noisy_states_is_nearer_by_the_root_of_their_number() -> Non
 
 
 def test_the_mean_of_two_attitudes_is_half_way() -> None:
-    average = StateAverage(robot_for_averaging(URDF), 2)
+    average = StateAverage(averaged_robot(URDF), 2)
     first = Rotation.from_rotvec([2.0, -1.5, 1.0])
     for angle in (0.0, 0.02):
         turned = first * Rotation.from_rotvec([0.0, angle, 0.0])
@@ -361,7 +361,7 @@ def test_the_mean_of_two_attitudes_is_half_way() -> None:
 
 
 def test_momenta_are_those_measured_last_at_rest() -> None:
-    robot = robot_for_averaging(URDF)
+    robot = averaged_robot(URDF)
     average = StateAverage(robot)
     twist = np.array([0.01, 0.0, -0.02, 0.03, 0.0, 0.01])
     average.add(pose(), twist, Q, REST)
@@ -380,7 +380,7 @@ def test_momenta_are_those_measured_last_at_rest() -> None:
 
 
 def test_before_a_robot_was_at_rest_its_momenta_are_those_in_motion() -> None:
-    robot = robot_for_averaging(URDF)
+    robot = averaged_robot(URDF)
     average = StateAverage(robot)
     average.add(pose(), np.array([0.01, 0.0, -0.02, 0.03, 0.0, 0.01]), Q, REST)
     assert np.abs(average.state().angular_momentum).max() > 0.01
@@ -400,7 +400,7 @@ def test_before_a_robot_was_at_rest_its_momenta_are_those_in_motion() -> None:
 
 
 def test_rates_within_the_tolerance_are_rest_and_larger_ones_are_not() -> None:
-    robot = robot_for_averaging(URDF)
+    robot = averaged_robot(URDF)
     average = StateAverage(robot, 2, rest_tolerance=0.01)
     average.add(pose(), STILL + 0.012, Q, REST + 0.012)
     average.add(pose(), STILL + 0.006, Q, REST - 0.006)
@@ -414,7 +414,7 @@ def test_rates_within_the_tolerance_are_rest_and_larger_ones_are_not() -> None:
 def test_what_is_not_finite_is_refused(part: int) -> None:
     parts = [pose(), STILL.copy(), Q.copy(), REST.copy()]
     parts[part][1] = np.nan
-    average = StateAverage(robot_for_averaging(URDF), 2)
+    average = StateAverage(averaged_robot(URDF), 2)
     average.add(pose(), STILL, Q, REST)
     average.add(*parts)
     with pytest.raises(PlanningError, match="not finite"):

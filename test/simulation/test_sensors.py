@@ -254,7 +254,7 @@ def test_actuators_and_sensors_draw_from_different_streams() -> None:
 # -- measurements of a target: each error by itself, as published, and without new ones ----------
 
 
-TICK_OF_TARGET_SENSORS = 0.08
+TARGET_TICK = 0.08
 
 
 class Seen:
@@ -271,7 +271,7 @@ class Seen:
             target.target_twist[:] = [0.1, -0.2, 0.3 + 0.001 * tick, 0.05, 0.04, -0.06]
             if not tick:
                 plant: Any = target
-                self.sensors = TargetSensors(plant, config, seed, TICK_OF_TARGET_SENSORS)
+                self.sensors = TargetSensors(plant, config, seed, TARGET_TICK)
             self.sensors.measure()
             self.true.append(np.concatenate([target.target_pose, target.target_twist]))
             said = np.concatenate([self.sensors.pose, self.sensors.twist])
@@ -340,7 +340,7 @@ def test_a_rate_leaves_whole_ticks_between_measurements() -> None:
 
 
 def test_measurements_are_lost_at_random() -> None:
-    seen = Seen(600, loss=0.3, rate=1 / (2 * TICK_OF_TARGET_SENSORS))
+    seen = Seen(600, loss=0.3, rate=1 / (2 * TARGET_TICK))
     there = np.array([said is not None for said in seen.measured])
     assert not there[1::2].any()
     assert there[::2].mean() == pytest.approx(0.7, abs=0.06)

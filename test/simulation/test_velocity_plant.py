@@ -371,13 +371,13 @@ def test_a_bad_initial_state_is_refused(
 # -- where a run starts, and what is refused -----------------------------------------------------
 
 
-own_URDF = random_robot_urdf(np.random.default_rng(0), joints=3)
+TREE = random_robot_urdf(np.random.default_rng(0), joints=3)
 PLANTS = (EffortPlant, VelocityPlant)
 
 
 @cache
 def robot() -> SpaceRobot:
-    return SpaceRobot.from_urdf(own_URDF)
+    return SpaceRobot.from_urdf(TREE)
 
 
 @pytest.mark.parametrize("plant", PLANTS)
@@ -390,7 +390,7 @@ def test_center_of_mass_is_where_it_is_put(plant: Any) -> None:
         center_of_mass=center,
     )
     built = plant(robot(), 0.01, start)
-    oracle = PinocchioOracle(own_URDF, robot().joint_names)
+    oracle = PinocchioOracle(TREE, robot().joint_names)
     oracle.set_configuration(built.q, built.pose[3:], built.pose[:3])
     np.testing.assert_allclose(oracle.center_of_mass_W(), center, atol=1e-13)
 

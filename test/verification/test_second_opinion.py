@@ -212,10 +212,10 @@ def test_joints_that_follow_others_are_refused() -> None:
 # -- the reference bags: every scenario has one, every reader reads it, and it can be ------------
 
 
-BAGS_OF_REFERENCE_BAGS = share_directory() / "bags"
+SHARED_BAGS = share_directory() / "bags"
 NAMES = resource_names("config", ".yaml")
 
-QUICK_OF_REFERENCE_BAGS = ("sliding_masses", "arm_attitude", "planar_chain", "coordinated_control")
+QUICK_BAGS = ("sliding_masses", "arm_attitude", "planar_chain", "coordinated_control")
 """Bags of which all tests are quick."""
 
 MIN_TICKS = {"reach": 30, "two_hands": 25, "strut": 50, "capture": 150, "gravity_gradient": 200}
@@ -224,13 +224,13 @@ MIN_TICKS = {"reach": 30, "two_hands": 25, "strut": 50, "capture": 150, "gravity
 
 def test_every_scenario_has_a_bag_and_they_are_small() -> None:
     assert resource_names("bags", ".mcap") == NAMES
-    assert sum(path.stat().st_size for path in BAGS_OF_REFERENCE_BAGS.iterdir()) < 5_500_000
+    assert sum(path.stat().st_size for path in SHARED_BAGS.iterdir()) < 5_500_000
 
 
-@pytest.mark.parametrize("name", some_fast(NAMES, *QUICK_OF_REFERENCE_BAGS))
+@pytest.mark.parametrize("name", some_fast(NAMES, *QUICK_BAGS))
 def test_the_commands_in_it_give_the_states_in_it(name: str) -> None:
     # Where this fails, the plant behaves in another way than before: `make bags` if that is meant.
-    result = verify_bag(BAGS_OF_REFERENCE_BAGS / f"{name}.mcap")
+    result = verify_bag(SHARED_BAGS / f"{name}.mcap")
     assert result.difference is None, str(result.difference)
     assert result.ticks > MIN_TICKS.get(name, 300)
     # Clock, end-effector and base pose apart, three messages tell the state of every tick.
@@ -244,9 +244,9 @@ def pushed(message: JointState) -> JointState:
     return message
 
 
-@pytest.mark.parametrize("name", some_fast(NAMES, *QUICK_OF_REFERENCE_BAGS))
+@pytest.mark.parametrize("name", some_fast(NAMES, *QUICK_BAGS))
 def test_one_altered_command_is_found_at_its_time(name: str, tmp_path: Path) -> None:
-    bag = read_bag(BAGS_OF_REFERENCE_BAGS / f"{name}.mcap")
+    bag = read_bag(SHARED_BAGS / f"{name}.mcap")
     stamps = bag["/joint_commands"].stamp
     number = len(stamps) // 2
     copy = altered(bag.path, tmp_path / "b.mcap", "/joint_commands", number, pushed)
@@ -261,7 +261,7 @@ def test_one_altered_command_is_found_at_its_time(name: str, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("name", some_fast(NAMES, "planar_chain", "servicer_thrusters"))
 def test_every_reader_reads_every_message(name: str) -> None:
-    path = BAGS_OF_REFERENCE_BAGS / f"{name}.mcap"
+    path = SHARED_BAGS / f"{name}.mcap"
     own = [(topic, time_ns) for topic, _, time_ns, _, _ in iterate_raw(path)]
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
